@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import _lab
-from paper_tables import Settings, as_record, run_part, test_frames
+from paper_tables import Settings, as_record, run_part, test_frames, trials_of
 
-from bidnerf_core.evaluation import Plan, planned
+from bidnerf_core.evaluation import Plan
 
 WITHOUT_REACH: Settings = {"candidates": 1, "box_weight": 0.0}
 """The paper's objective alone; the defaults of ``bid`` add to it."""
@@ -102,13 +102,12 @@ def main() -> None:
     given = parser.parse_args()
     frames = test_frames(given.map, given.data, tuning=True)
     base = Plan(
-        given.map, given.data, method="bid", trials=given.trials, seed=given.seed, frames=frames,
-        device=given.device,
-    )  # fmt: skip
+        protocol="bid", method="bid", trials=given.trials, seed=given.seed, frames=frames, device=given.device
+    )
     for group in given.group:
         chosen = plans(group, base, given.variant, given.size)
         # One trial of every variant, then the next, so that the results at any moment compare all variants.
-        rounds = zip(*(planned(plan) for plan in chosen), strict=True)
+        rounds = zip(*(trials_of(plan, (given.map, given.data)) for plan in chosen), strict=True)
         trials = [trial for same in rounds for trial in same]
         name = f"bid_{group}_{trials[0].portable.map.replace(':', '_')}"
         groups = run_part(trials, given.out / f"{name}.jsonl", given.workers, given.stop_after)

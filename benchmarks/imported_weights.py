@@ -35,7 +35,6 @@ from bidnerf_core.evaluation import (
     RowStore,
     Trial,
     TrialResult,
-    key_of,
     run_trial,
     steps_of,
     summarize,
@@ -114,8 +113,8 @@ def cell_trial(folder: Path, given: argparse.Namespace, cell: Cell, frame: str, 
     blind = sensor == "RGB"
     settings = DESCENT | {"level": LEVELS[level], "depth_weight": 0.0 if blind else 1.0}
     return Trial(
-        str(folder), str(given.data), (frame,), "bid", (given.size,), "bid", json.dumps(settings, sort_keys=True),
-        seed, depth=not blind,
+        str(folder), str(given.data), (frame,), (given.size,), seed, protocol="bid", method="bid",
+        config=json.dumps(settings, sort_keys=True), depth=not blind,
     )  # fmt: skip
 
 
@@ -131,9 +130,9 @@ def all_trials(folder: Path, dataset: Capture, given: argparse.Namespace) -> dic
         for number in range(given.trials):
             for cell in CELLS if number < given.fine_trials else CELLS[:2]:
                 trial = cell_trial(folder, given, cell, names[number % len(names)], given.seed + number)
-                if key_of(trial) not in file.results:
+                if trial not in file:
                     file.add(run_trial(trial))
-                cells[cell].append(file.results[key_of(trial)])
+                cells[cell].append(file[trial])
                 print(f"{number + 1}/{given.trials} {row_text(cell, cells[cell][-1])}", flush=True)
     return cells
 

@@ -30,14 +30,13 @@ from bidnerf_core.evaluation import (
     Summary,
     Trial,
     TrialResult,
-    key_of,
-    local_processes,
     median,
     opened,
     planned,
     run_trials,
     summarize,
 )
+from bidnerf_core.progress import job_context
 from bidnerf_core.results import normalized_error_squared, success_rate
 
 Truth = dict[str, SE3]
@@ -90,15 +89,15 @@ def _ratio(one: float | None, two: float | None) -> float | None:
 def trials(given: argparse.Namespace, start: str, method: str) -> list[Trial]:
     """Return the trials of a method from one kind of start."""
     protocol, *size = start.split(":")
-    names = opened(given.map, given.data)[1].frame_names("test")
+    dataset = opened(given.map, given.data)[1]
+    names = dataset.frame_names("test")
     kept = names if given.all_frames else held_out(names, given.tuning_frames)
-    return planned(
-        Plan(
-            given.map, given.data, protocol, (tuple(map(float, size)),), method,
-            json.dumps(json.loads(given.config), sort_keys=True), given.trials or len(kept), given.seed,
-            frames=tuple(kept), depth=not given.no_depth,
-        )
+    plan = Plan(
+        protocol=protocol, sizes=[list(map(float, size))], method=method, trials=given.trials or len(kept),
+        config=json.dumps(json.loads(given.config), sort_keys=True), seed=given.seed, frames=kept,
+        depth=not given.no_depth,
     )  # fmt: skip
+    return planned(plan, given.map, given.data, dataset)
 
 
 def main() -> None:
@@ -123,16 +122,16 @@ def main() -> None:
         (start, method): trials(given, start, method) for start in given.start for method in given.method
     }
     partial = RESULTS / f"{given.name}.rows.jsonl"
-    with ResultsFile(partial) as file, local_processes(given.workers) as pool:
+    with ResultsFile(partial) as file, job_context(lambda now: print(".", end="", flush=True)):
         turns = [
             trial
             for start in given.start
             for same in zip(*(wanted[start, m] for m in given.method), strict=True)
             for trial in same
         ]
-        run_trials(turns, file, pool, given.workers, lambda row: print(".", end="", flush=True))
+        run_trials(turns, file, workers=given.workers)
         print()
-        rows = {which: [file.results[key_of(trial)] for trial in part] for which, part in wanted.items()}
+        rows = {which: [file[trial] for trial in part] for which, part in wanted.items()}
     truth = {view.frame.name: view.T_ref_camera for view in opened(given.map, given.data)[1].views("test")}
     starts: dict[str, Any] = {}
     for start in given.start:

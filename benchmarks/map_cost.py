@@ -42,7 +42,7 @@ from bidnerf_core.results import pose_error, success_rate
 MAIN = """
 import json, sys, time
 from bidnerf_core.cli import main
-from bidnerf_core.evaluation.trials import peak_memory_bytes
+from bidnerf_core.evaluation import peak_memory_bytes
 
 status = main(sys.argv[1:])
 print(json.dumps([time.process_time(), peak_memory_bytes()]))

@@ -22,6 +22,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -30,6 +31,7 @@ from typing import Any
 import _lab
 
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
+from bidnerf_core.errors import Cancelled
 from bidnerf_core.evaluation import (
     Group,
     Plan,
@@ -37,23 +39,20 @@ from bidnerf_core.evaluation import (
     Trial,
     changed_settings,
     grouped,
-    key_of,
-    left_to_do,
-    local_processes,
-    note_run,
     opened,
     pairwise_tests,
     planned,
-    provenance,
     run_trials,
-    script_command,
     summarize,
 )
 from bidnerf_core.localization import METHODS
+from bidnerf_core.progress import job_context
 
 Settings = dict[str, Any]
 Common = Callable[[str], Settings]
 """A function from a method's name to the settings that all cells share."""
+Scene = tuple[str, str]
+"""The folder of a map, and that of its dataset."""
 
 PAPER = {
     "table1": {"RGB-D fine": 87.5, "RGB-D coarse": 95.83, "RGB fine": 25.0, "RGB coarse": 75.0},
@@ -67,10 +66,10 @@ PAPER = {
 """Percentages as printed in the paper."""
 
 
-def table1(base: Plan, common: Common, trials: int | None) -> list[Plan]:
+def table1(base: Plan, common: Common, trials: int | None, scene: Scene) -> list[Plan]:
     """Return the cells of table 1; ``trials`` is the number over all three sizes."""
     each = -(-(trials or 24) // 3)
-    plan = replace(base, protocol="bid", sizes=((0.5,), (0.8,), (1.2,)), trials=each)
+    plan = replace(base, protocol="bid", sizes=(0.5, 0.8, 1.2), trials=each)
     return [
         replace(plan, depth=depth, config=_json(common("bid") | {"level": level}))
         for level in (0, None)
@@ -78,19 +77,19 @@ def table1(base: Plan, common: Common, trials: int | None) -> list[Plan]:
     ]
 
 
-def depth_weight(base: Plan, common: Common, trials: int | None) -> list[Plan]:
+def depth_weight(base: Plan, common: Common, trials: int | None, scene: Scene) -> list[Plan]:
     """Return the cells of ``table1`` that have depth, from the same starts, with a tenth of its weight."""
     return [
         replace(plan, config=_json(json.loads(plan.config) | {"depth_weight": 0.1}))
-        for plan in table1(base, common, trials)
+        for plan in table1(base, common, trials, scene)
         if plan.depth
     ]
 
 
-def table2(base: Plan, common: Common, trials: int | None) -> list[Plan]:
+def table2(base: Plan, common: Common, trials: int | None, scene: Scene) -> list[Plan]:
     """Return the cells of table 2."""
-    plan = replace(base, protocol="bid", sizes=((0.9,), (1.7,), (3.4,)), trials=trials or 16)
-    ending = sequence_ends(plan)  # one image is the last of the eight: the same frames for all
+    plan = replace(base, protocol="bid", sizes=(0.9, 1.7, 3.4), trials=trials or 16)
+    ending = sequence_ends(plan, scene)  # one image is the last of the eight: the same frames for all
     return [
         replace(plan, config=_json(common("bid")), frames=ending),
         replace(plan, config=_json(common("bid")), images=8),
@@ -98,7 +97,7 @@ def table2(base: Plan, common: Common, trials: int | None) -> list[Plan]:
     ]
 
 
-def inerf(base: Plan, common: Common, trials: int | None) -> list[Plan]:
+def inerf(base: Plan, common: Common, trials: int | None, scene: Scene) -> list[Plan]:
     """Return ``bid`` and ``inerf`` from the starts of iNeRF, both with its learning rate, as in the paper."""
     plan = replace(base, protocol="inerf", trials=trials or 25)
     return [
@@ -107,7 +106,7 @@ def inerf(base: Plan, common: Common, trials: int | None) -> list[Plan]:
     ]
 
 
-PARTS: dict[str, Callable[[Plan, Common, int | None], list[Plan]]] = {
+PARTS: dict[str, Callable[[Plan, Common, int | None, Scene], list[Plan]]] = {
     "table1": table1,
     "depth_weight": depth_weight,
     "table2": table2,
@@ -128,9 +127,14 @@ def test_frames(map_folder: str, data: str, tuning: bool) -> tuple[str, ...]:
     return tuple(_lab.held_out(dataset.frame_names("test"), tuning))
 
 
-def sequence_ends(plan: Plan) -> tuple[str, ...]:
+def trials_of(plan: Plan, scene: Scene) -> list[Trial]:
+    """Return the trials of a plan."""
+    return planned(plan, *scene, opened(*scene, plan)[1])
+
+
+def sequence_ends(plan: Plan, scene: Scene) -> tuple[str, ...]:
     """Return the frames with which a sequence of eight can end."""
-    every = planned(replace(plan, images=8, trials=10_000, sizes=((0.9,),)))
+    every = trials_of(replace(plan, images=8, trials=10_000, sizes=(0.9,)), scene)
     return tuple(dict.fromkeys(trial.frame for trial in every))
 
 
@@ -145,16 +149,15 @@ def run_part(trials: Sequence[Trial], path: Path, workers: int, minutes: float |
         return minutes is not None and time.monotonic() - began > 60 * minutes
 
     with ResultsFile(path) as file:
-        todo = left_to_do(trials, file)
-        if todo and minutes != 0:
-            note_run(path, provenance(script_command(), f"{workers} local processes of one thread"))
-            with local_processes(workers) as pool, Display() as display, stopped_by_ctrl_c() as cancel:
-                run_trials(todo, file, pool, workers, display, lambda: cancel() or late())
-        left = len(left_to_do(trials, file))
-        if left == len(trials) or (left and minutes is None):
+        with suppress(Cancelled), ExitStack() as stack:
+            display, ctrl_c = stack.enter_context(Display()), stack.enter_context(stopped_by_ctrl_c())
+            stack.enter_context(job_context(display, lambda: ctrl_c() or late()))
+            run_trials(trials, file, workers=workers)
+        done = [trial for trial in trials if trial in file]
+        if not done or (len(done) < len(trials) and minutes is None):
             raise SystemExit(f"stopped; {path} is kept, the same command goes on")
         file.put_in_order(trials)
-        return grouped([file.results[key_of(t)] for t in trials if key_of(t) in file.results])
+        return grouped([file[trial] for trial in done])
 
 
 def as_record(groups: Sequence[Group]) -> dict[str, Any]:
@@ -194,12 +197,12 @@ def main() -> None:
     common = partial(preset_settings, given.preset, own | json.loads(given.config))
     for part in given.part:
         for folder in given.map:
+            scene = folder, given.data
             base = Plan(
-                folder, given.data, method="bid", seed=given.seed, device=given.device,
-                frames=test_frames(folder, given.data, tuning=False),
-            )  # fmt: skip
-            plans = PARTS[part](base, common, given.trials)
-            trials = [trial for plan in plans for trial in planned(plan)]
+                method="bid", seed=given.seed, device=given.device, frames=test_frames(*scene, tuning=False)
+            )
+            plans = PARTS[part](base, common, given.trials, scene)
+            trials = [trial for plan in plans for trial in trials_of(plan, scene)]
             name = f"{part}_{trials[0].portable.map.replace(':', '_')}"
             groups = run_part(trials, given.out / f"{name}.jsonl", given.workers, given.stop_after)
             results = {"paper_percent": PAPER.get(part), "preset": given.preset, **as_record(groups)}

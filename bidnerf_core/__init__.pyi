@@ -5,6 +5,7 @@ from .datasets import open_sequence as open_sequence
 from .errors import Cancelled as Cancelled
 from .errors import InputError as InputError
 from .errors import InputWarning as InputWarning
+from .evaluation import Plan as Plan
 from .evaluation import compare as compare
 from .evaluation import evaluate as evaluate
 from .frames import Frame as Frame

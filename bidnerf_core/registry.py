@@ -38,6 +38,8 @@ GROUPS: Mapping[str, str] = {
 BUNDLED = "bidnerf"
 """The distribution whose plugins are bundled."""
 NAME = re.compile(r"[\w.-]+")
+TABLE = "*"
+"""The name of an entry point whose object is a mapping of plugins by name. Listing its group imports it."""
 
 Defects: TypeAlias = Callable[[Any], Iterator[str]]
 """A function that yields the reasons why an object is not of its kind, the most informative one first."""
@@ -145,7 +147,11 @@ def _declared(group: str) -> tuple[PluginInfo, ...]:
     """Return what installed distributions declare in a group. Of several versions of one, the first on ``sys.path`` counts."""
     try:
         points = entry_points(group=f"bidnerf.{group}")
-        infos = [PluginInfo(group, p.name, p.value, *_name_version_summary(p.dist)) for p in points]
+        infos = [
+            PluginInfo(group, name, p.value, *_name_version_summary(p.dist))
+            for p in points
+            for name in (p.load() if p.name == TABLE else [p.name])
+        ]
     except Exception as error:  # one malformed file stops all look-ups, also those of other programs
         raise PluginError(
             f"the metadata of an installed package cannot be read ({_described(error)}); reinstall or remove it"
@@ -195,6 +201,8 @@ def load_plugin(group: str, name: str, defects: Defects | None = None, wanted_by
     try:
         point = EntryPoint(name, info.value, group)
         plugin = registered[group, name] if (group, name) in registered else point.load()
+        if isinstance(plugin, Mapping):
+            plugin = plugin[name]
         doing = f"not {kind}"
         wrong = None if defects is None else next(defects(plugin), None)
     except KeyboardInterrupt:

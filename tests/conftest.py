@@ -7,9 +7,7 @@ import shutil
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
 
 from jaxtyping import install_import_hook
 
@@ -144,10 +142,9 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     """A comparison tries every map in this process: each of its own would spend seconds on importing PyTorch."""
     # Inside: what a process of a comparison does is done in this one
-    from bidnerf_core.evaluation.workers import measured
+    from bidnerf_core.evaluation.run import InThisProcess
 
-    here = nullcontext(SimpleNamespace(run=measured))
-    monkeypatch.setattr("bidnerf_core.evaluation.comparison.TrialProcess", lambda: here)
+    monkeypatch.setattr("bidnerf_core.evaluation.comparison.own_processes", lambda count: InThisProcess())
 
 
 @pytest.fixture

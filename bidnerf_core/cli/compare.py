@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from bidnerf_core.cli.evaluate import read_sizes, stated_reading
 from bidnerf_core.cli.folders import check_folder
@@ -14,9 +14,6 @@ from bidnerf_core.cli.parser import Flag, Option, Without, parse
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.progress import Progress
-
-if TYPE_CHECKING:
-    from bidnerf_core.evaluation import Comparison
 
 
 @dataclass(frozen=True)
@@ -48,10 +45,10 @@ class Compare:
     json: Json = False
     overwrite: Annotated[Flag, Option(None, "replace the contents of --out")] = False
     reading: Annotated[DatasetOptions, Without("largest", "background")] = DatasetOptions(split="test")
-    method: MethodOptions = MethodOptions("bid")
+    method: MethodOptions = MethodOptions()
 
     def run(self) -> None:
-        from bidnerf_core.evaluation import Plan, changed_settings, find_protocol, run_comparison
+        from bidnerf_core.evaluation import Plan, compare, comparison_figure
         from bidnerf_core.io import output_folder, to_plain
 
         if len(self.folders) < 2:
@@ -61,21 +58,23 @@ class Compare:
             )
         *maps, data = self.folders
         _ = self.reading.mask_folder  # rejects anything but a folder of masks
-        method, size = self.method, self.size
         with wrong_usage():
-            sizes = read_sizes([] if size is None else [size]) or find_protocol(self.protocol).sizes[:1]
+            sizes = read_sizes([] if self.size is None else [self.size]) or None
             plan = Plan(
-                maps[0], data, self.protocol, sizes, method.method, changed_settings(method.method, method.config),
-                self.trials, self.seed, self.reading.split, self.frame or None, **stated_reading(self.reading),
+                protocol=self.protocol, sizes=sizes, method=self.method.method, config=self.method.config,
+                trials=self.trials, seed=self.seed, frames=self.frame or None, **stated_reading(self.reading),
             )  # fmt: skip
         if self.out is None:
-            found = run_comparison(plan, maps, progress=_say)
+            found = compare(maps, data, plan, progress=_say)
         else:
             check_folder(self.out, (*maps, data))
             with output_folder(self.out, self.overwrite):
-                found = run_comparison(plan, maps, progress=_say)
+                found = compare(maps, data, plan, progress=_say)
                 found.save(self.out / "compare.json")
-                _draw(found, self.out)
+                try:
+                    say(f"look at {comparison_figure(self.out, found).with_suffix('.png')}")
+                except InputError as error:  # matplotlib is optional
+                    say(str(error))
         if self.json:
             print_json(to_plain(replace(found, results=())))
             return
@@ -85,16 +84,6 @@ class Compare:
 
 def _say(progress: Progress) -> None:
     say(f"{progress.done}/{progress.total}  {progress.text}")
-
-
-def _draw(found: Comparison, out: Path) -> None:
-    from bidnerf_core.evaluation import comparison_figure
-
-    try:
-        comparison_figure([out / "compare.png", out / "compare.svg"], found)
-        say(f"look at {out / 'compare.png'}")
-    except InputError as error:  # matplotlib is optional
-        say(str(error))
 
 
 def run(arguments: list[str]) -> None:

@@ -83,28 +83,28 @@ class Evaluate:
     method: MethodOptions = MethodOptions()
 
     def run(self, arguments: list[str]) -> None:
-        from bidnerf_core.evaluation import Plan, changed_settings, command_line, run_plan
+        from bidnerf_core.evaluation import Plan, command_line, evaluate
 
         _ = self.reading.mask_folder  # rejects anything but a folder of masks
         if self.data is None and not self.map.startswith("demo:"):
             raise UsageError(f"no DATA after map {self.map}; only closed-form maps have their own data")
-        method = self.method
         with wrong_usage():
-            plan = Plan(
-                self.map, self.data or self.map, self.protocol, read_sizes(self.size) or None, method.method,
-                changed_settings(method.method, method.config), self.trials, self.seed, self.reading.split, self.frame or None,
-                self.sequence, self.angle, self.device, self.depth, None if self.depth_points is None else str(self.depth_points),
-                faults=self.fault, **stated_reading(self.reading),
-            )  # fmt: skip
             require("--workers", 1 if self.workers is None else self.workers, 1, 10_000)
             require("--shards", self.shards, 1)
             require("--shard", self.shard, 0, self.shards - 1)
             if self.dask is not None and self.workers is not None:
                 raise UsageError("--workers and --dask contradict each other: a cluster has its own workers")
+            plan = Plan(
+                protocol=self.protocol, sizes=read_sizes(self.size) or None, method=self.method.method,
+                config=self.method.config, trials=self.trials, seed=self.seed, frames=self.frame or None,
+                images=self.sequence, angle=self.angle, device=self.device, depth=self.depth,
+                depth_points=None if self.depth_points is None else str(self.depth_points), faults=self.fault,
+                shard=self.shard, shards=self.shards, **stated_reading(self.reading),
+            )  # fmt: skip
         require_outside_maps(self.out.parent, self.out)
         with Display() as display, stopped_by_ctrl_c(STOPPING) as cancel:
-            found = run_plan(
-                plan, shard=self.shard, shards=self.shards, workers=self.workers, dask=self.dask, out=self.out,
+            found = evaluate(
+                self.map, self.data or self.map, plan, out=self.out, workers=self.dask or self.workers,
                 command=command_line("bidnerf evaluate", arguments), progress=display, cancel=cancel,
             )  # fmt: skip
         show(f"{amount(len(found.rows), 'trial')} in {self.out}; 'bidnerf report {self.out}' shows them")
@@ -114,6 +114,7 @@ def stated_reading(images: DatasetOptions) -> dict[str, Any]:
     """Return the options with which a dataset is opened, as the plain values that a plan of trials stores."""
     registration = images.registration
     return {
+        "split": images.split,
         "camera": None if images.camera is None else str(images.camera),
         "register_depth": registration if registration in (None, False) else str(registration),
         "depth_unit": images.depth_unit,

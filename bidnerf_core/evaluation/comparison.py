@@ -2,31 +2,58 @@
 
 from __future__ import annotations
 
+import logging
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import nn
 
-from bidnerf_core.datasets import Capture
-from bidnerf_core.errors import amount, printable
-from bidnerf_core.evaluation.bench import Plan, planned
-from bidnerf_core.evaluation.json_lines import as_line
+from bidnerf_core.errors import InputError, amount, printable
+from bidnerf_core.evaluation.lines import as_line
+from bidnerf_core.evaluation.plan import Plan, Trial, parse_settings, planned
 from bidnerf_core.evaluation.results import aligned
+from bidnerf_core.evaluation.run import (
+    Data,
+    InThisProcess,
+    Scene,
+    device_name,
+    ended_on_failure,
+    name_of,
+    open_both,
+    open_data,
+    own_processes,
+)
 from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, Success, summarize
-from bidnerf_core.evaluation.trial import Trial, TrialResult
-from bidnerf_core.evaluation.trials import Opened
-from bidnerf_core.evaluation.workers import Measured, TrialProcess, measured
-from bidnerf_core.geometry import LengthUnit, symbol
+from bidnerf_core.evaluation.trial import Opened, TrialResult, opened, registered_for, run_trial
+from bidnerf_core.fields import device_of, levels
+from bidnerf_core.frames import View, draw, uniform
+from bidnerf_core.geometry import SE3, LengthUnit, symbol
 from bidnerf_core.io import to_plain, write_file
+from bidnerf_core.localization import origin_of
 from bidnerf_core.maps import DESCRIPTION, Map, load_info
-from bidnerf_core.progress import Cancel, Progress, ProgressCallback, check_cancelled
+from bidnerf_core.progress import (
+    Cancel,
+    Progress,
+    ProgressCallback,
+    check_cancelled,
+    job_context,
+    report_progress,
+)
 from bidnerf_core.results import CRITERIA
 from bidnerf_core.scenes import is_closed_form
+from bidnerf_core.settings import to_flat
+
+log = logging.getLogger("bidnerf")
+
+COUNTED_RAYS = 2048
+"""The number of rays on which samples are counted."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +73,16 @@ class MapRow:
     peak_memory_bytes: int  # of the process of this map
     samples_per_ray: float  # mean
     map_bytes: int  # size of the map's description and weights
+
+    @classmethod
+    def of(cls, label: str, size: int, results: Sequence[TrialResult], samples: Sequence[float]) -> MapRow:
+        """Return the statistics of the trials on one map of ``size`` bytes; ``samples`` has the samples per ray of each."""
+        found = summarize(results)
+        return cls(
+            label, results[0].backend, results[0].weights, found.criteria, found.unit, found.translation,
+            found.rotation_deg, found.steps, found.seconds, found.milliseconds_per_step, found.peak_memory_bytes,
+            statistics.fmean(samples), size,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -72,8 +109,10 @@ class Comparison:
         return f"{trials} {start} on {self.data}/{self.split}, method {self.method}"
 
     def __str__(self) -> str:
+        stepwise = any(row.steps > 1 for row in self.rows)
+        shown = {name: cell for name, cell in LINES.items() if stepwise or "step" not in name}
         lines = [["", *(row.map for row in self.rows)]]
-        lines += [[name, *map(cell, self.rows)] for name, cell in LINES.items()]
+        lines += [[name, *map(cell, self.rows)] for name, cell in shown.items()]
         usual = RELATIVE if self.rows[0].success[RELATIVE] else ABSOLUTE
         note = (
             f"success: number and Wilson's 95 % interval; to success: median of the trials that met {usual}"
@@ -85,79 +124,139 @@ class Comparison:
         write_file(Path(path), as_line(to_plain(self)))
 
 
-def plan_comparison(plan: Plan, maps: Sequence[str], dataset: Capture) -> list[list[Trial]]:
-    """Return, for each start, one trial per map, with the frames and seeds of the protocol.
-
-    ``plan`` defines everything but the map. Raises ``InputError`` for a name or a number that cannot be used.
-    """
-    return [[replace(trial, map=m) for m in maps] for trial in planned(plan, dataset)]
-
-
-def compare_maps(
-    starts: Sequence[Sequence[Trial]],
-    labels: Sequence[str],
-    scenes: Sequence[Opened | None],
+def compare(
+    scenes: Sequence[Scene] | Mapping[str, Scene],
+    data: Data,
+    plan: Plan | None = None,
+    *,
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Comparison:
-    """Run the trials of each start, one map after another; a map without an entry in ``scenes`` runs in its
-    own process.
+    """Localize the same frames from the same starts in several maps, and return the success and cost of each.
 
-    Only one process works at a time, so that a change in the machine's load affects all maps alike. Raises
-    ``Cancelled`` once ``cancel`` returns True.
+    The plan's size is one, by default the first of its protocol. ``scenes`` may be a dictionary, whose keys then name the
+    maps. Maps in folders run in a process each, whose peak memory is measured, and which needs an importable main module;
+    maps in memory, and all maps if the data is in memory, run in this process. One trial runs at a time, so that a change
+    in the machine's load affects all maps alike. Raises ``InputError`` and ``Cancelled`` as ``evaluate`` does.
     """
-    done: list[list[Measured]] = [[] for _ in labels]
+    if isinstance(scenes, str | Path | Map):
+        raise InputError(
+            f"scenes is the one map {name_of(scenes)}", expected="a list of maps, or a dictionary of them"
+        )
+    named = dict(scenes) if isinstance(scenes, Mapping) else _named(scenes)
+    if not named:
+        raise InputError("no maps to compare", expected="at least one")
+    plan = plan or Plan()
+    if plan.sizes is None:
+        plan = replace(plan, sizes=plan.starts()[:1])
+    if len(plan.starts()) > 1 or len(plan.faults) > 1:
+        raise InputError("maps are compared from one kind of start", expected="one size and one fault")
+    with job_context(progress, cancel):
+        here = {
+            name: open_both(scene, data, plan)
+            if isinstance(scene, Map) or not isinstance(data, str | Path) else None
+            for name, scene in named.items()
+        }  # fmt: skip
+        dataset = next((scene[1] for scene in here.values() if scene is not None), None)
+        starts = planned(plan, "", name_of(data), open_data(data, plan) if dataset is None else dataset)
+        folders = [str(scene) for name, scene in named.items() if here[name] is None]
+        for folder in folders:
+            if not is_closed_form(folder):
+                load_info(Path(folder))
+        begins = "; a process for each begins" if folders else ""
+        log.info("%s in %s%s", amount(len(starts), "start"), amount(len(named), "map"), begins)
+        return _compared(named, here, starts, plan)
+
+
+def _compared(
+    named: Mapping[str, Scene], here: Mapping[str, Opened | None], starts: Sequence[Trial], plan: Plan
+) -> Comparison:
+    """Run the trials of each start, one map after another; a map that is not open ``here`` runs in its own process."""
+    results: dict[str, list[TrialResult]] = {name: [] for name in named}
+    samples: dict[str, list[float]] = {name: [] for name in named}
     with ExitStack() as stack:
-        processes = [stack.enter_context(TrialProcess()) if scene is None else None for scene in scenes]
-        for number, trials in enumerate(starts):
-            for place, (process, trial) in enumerate(zip(processes, trials, strict=True)):
-                check_cancelled("comparison", cancel)
-                done[place].append(process.run(trial) if process else measured(trial, scenes[place]))
-                if progress is not None:
-                    count = number * len(labels) + place + 1
-                    text = _found(labels[place], done[place][-1].result)
-                    progress(Progress("comparison", count, len(starts) * len(labels), "trials", text))
-    first, result = starts[0][0], done[0][0].result
-    rows = [
-        map_row(label, map_bytes(trial.map if scene is None else scene[0]), column)
-        for label, trial, scene, column in zip(labels, starts[0], scenes, done, strict=True)
-    ]
+        places = {
+            name: stack.enter_context(ended_on_failure(InThisProcess() if scene else own_processes(1)))
+            for name, scene in here.items()
+        }
+        for number, start in enumerate(starts):
+            for place, (name, scene) in enumerate(named.items()):
+                check_cancelled("comparison")
+                map_name = name if here[name] else str(scene)
+                trial = replace(start, map=map_name, device=device_name(scene, plan.device))
+                running = places[name].submit(measured, trial, here[name], registered_for(trial))
+                try:
+                    result, each = running.result()
+                except BrokenProcessPool as error:
+                    raise InputError(
+                        f"the process that localized frame {trial.frame} ended", where=trial.map,
+                        expected="a result; was memory short, or does the main module begin work outside of"
+                        " 'if __name__ == \"__main__\"'?",
+                    ) from error  # fmt: skip
+                results[name].append(result)
+                samples[name].append(each)
+                found = "not finite"
+                if result.error is not None:
+                    length = f"{result.error.translation:.3f} {symbol(result.unit)}"
+                    found = f"{length}, {result.error.rotation_deg:.2f} deg"
+                steps = f", {amount(result.steps, 'step')}" if result.steps > 1 else ""
+                text = f"{result.frame} in {name}: {found}{steps}, {result.seconds:.1f} s"
+                done = number * len(named) + place + 1
+                report_progress(Progress("comparison", done, len(starts) * len(named), "trials", text))
+    rows = [MapRow.of(name, map_bytes(scene), results[name], samples[name]) for name, scene in named.items()]
+    first, run = starts[0], next(iter(results.values()))[0]
     return Comparison(
-        first.portable.data, first.split, first.protocol, first.size, result.method, result.settings,
-        first.seed, len(starts), tuple(rows), tuple(tuple(m.result for m in column) for column in done),
+        run.trial.data, first.split, first.protocol, first.size, run.method, run.settings, first.seed,
+        len(starts), tuple(rows), tuple(map(tuple, results.values())),
     )  # fmt: skip
 
 
-def _found(label: str, result: TrialResult) -> str:
-    """Describe the outcome of a trial in words."""
-    error = result.error
-    off = (
-        f"{error.translation:.3f} {symbol(result.unit)}, {error.rotation_deg:.2f} deg"
-        if error
-        else "not finite"
-    )
-    return f"{result.frame} in {label}: {off}, {amount(result.steps, 'step')}, {result.seconds:.1f} s"
+def measured(
+    trial: Trial, scene: Opened | None = None, registered: Sequence[tuple[str, str]] = ()
+) -> tuple[TrialResult, float]:
+    """Run a trial as ``run_trial`` does, and count the samples on a ray in its last frame at the true pose.
+
+    They are the mean number of valid ones, on uniformly drawn rays, of the level that the method uses, else the finest.
+    """
+    result = run_trial(trial, scene, registered)
+    stored, dataset = scene or opened(trial.map, trial.data, trial)
+    (view,) = dataset.views(trial.split, trial.frames[-1:])
+    number = to_flat(parse_settings(trial.method, trial.config)).get("level")
+    level = stored.field if number is None else levels(stored.field)[number]
+    own = (View(view.frame, SE3.identity()),)
+    device = device_of(stored.field)
+    pixels = draw(own, COUNTED_RAYS, uniform, torch.Generator().manual_seed(trial.seed), device=device)
+    with torch.no_grad():
+        samples = level.sampler(pixels.rays(view.T_ref_camera.translated(-origin_of(stored)), stored.bounds))
+    return result, float(samples.valid.sum()) / COUNTED_RAYS
 
 
-def map_row(label: str, size: int, measured: Sequence[Measured]) -> MapRow:
-    """Return the statistics of the trials on one map whose size is ``size`` bytes."""
-    results = [m.result for m in measured]
-    found = summarize(results)
-    return MapRow(
-        map=label,
-        backend=results[0].backend,
-        weights=results[0].weights,
-        success=found.criteria,
-        unit=found.unit,
-        translation=found.translation,
-        rotation_deg=found.rotation_deg,
-        steps=found.steps,
-        seconds=found.seconds,
-        ms_per_step=found.milliseconds_per_step,
-        peak_memory_bytes=found.peak_memory_bytes,
-        samples_per_ray=statistics.fmean(m.samples_per_ray for m in measured),
-        map_bytes=size,
-    )
+def map_bytes(stored: Scene) -> int:
+    """Return the size of a map's description and weights in a folder, or of the field's tensors in memory; 0 in closed form."""
+    if isinstance(stored, Map):
+        state = stored.field.state_dict() if isinstance(stored.field, nn.Module) else {}
+        return sum(tensor.numel() * tensor.element_size() for tensor in state.values())
+    if is_closed_form(str(stored)):
+        return 0
+    folder = Path(stored)
+    return sum((folder / name).stat().st_size for name in (DESCRIPTION, load_info(folder).weights))
+
+
+def _named(scenes: Sequence[Scene]) -> dict[str, Scene]:
+    """Return the maps by the shortest names that distinguish them; maps in memory with the same backend are numbered."""
+    folders = [str(scene) for scene in scenes if not isinstance(scene, Map)]
+    if len({Path(folder).resolve() for folder in folders}) != len(folders):
+        raise InputError(f"{', '.join(folders)}: one is named twice", where="maps", expected="different ones")
+    labels = iter(map_labels(folders))
+    found: dict[str, Scene] = {}
+    for scene in scenes:
+        name = base = name_of(scene) if isinstance(scene, Map) else next(labels)
+        number = 1
+        while name in found:
+            number += 1
+            name = f"{base} {number}"
+        found[name] = scene
+    return found
 
 
 def map_labels(maps: Sequence[str]) -> list[str]:
@@ -167,18 +266,6 @@ def map_labels(maps: Sequence[str]) -> list[str]:
     while len({p[-length:] for p in parts}) < len(parts):
         length += 1
     return ["/".join(p[-length:]) for p in parts]
-
-
-def map_bytes(stored: Map | str | Path) -> int:
-    """Return the size of a map's description and weights in a folder, or of the field's tensors in memory; 0 in closed form."""
-    if isinstance(stored, Map):
-        if not isinstance(stored.field, nn.Module):
-            return 0
-        return sum(t.numel() * t.element_size() for t in stored.field.state_dict().values())
-    if is_closed_form(str(stored)):
-        return 0
-    folder = Path(stored)
-    return sum((folder / name).stat().st_size for name in (DESCRIPTION, load_info(folder).weights))
 
 
 def _rate(row: MapRow, criterion: str) -> str:
@@ -205,6 +292,7 @@ LINES: dict[str, Callable[[MapRow], str]] = {
     **{f"success {name}": partial(_rate, criterion=name) for name in CRITERIA},
     "median error": lambda row: f"{_known(row.translation, 4)} {symbol(row.unit)}",
     "median error, deg": lambda row: _known(row.rotation_deg, 2),
+    "s a trial": lambda row: f"{row.seconds:.2f}",
     "steps": lambda row: f"{row.steps:g}",
     "steps to success": lambda row: _known(_usual(row).steps, 0),
     "ms a step": lambda row: f"{row.ms_per_step:.1f}",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -21,18 +22,22 @@ SMALLEST_E_T, LARGEST_E_T = 0.5, 3.4
 """The range of e_t in the paper's tables: in units of a scene whose object fills a 2x2x2 cube, in metres in rooms."""
 
 
-def bid_start(T_true: SE3, size: float, seed: int) -> SE3:
+def bid_start(T_true: SE3, size: float, seed: int, widest: float = math.pi / 4) -> SE3:
     """Return the start of BID-NeRF, ``T_true exp((e_t u1, e_r u2))`` with random unit u1, u2 and e_t = ``size``.
 
     The paper does not state which e_r belongs to which e_t, only that errors stay below 45 degrees: here e_r
-    grows linearly from 0.2 rad at e_t = 0.5 to pi/4 at 3.4.
+    grows linearly from 0.2 rad at e_t = 0.5 to ``widest`` at 3.4.
     """
-    return _bid(T_true, size, math.pi / 4, seed)
+    _require_length("size", size)
+    u1, u2 = random_units(2, torch.Generator().manual_seed(seed))
+    return T_true.to(dtype=torch.float64).retract(
+        torch.cat([size * u1, max(0.0, rotation_of_size(size, widest)) * u2])
+    )
 
 
 def bid_hard_start(T_true: SE3, size: float, seed: int) -> SE3:
     """Return a start as ``bid_start`` does, with e_r up to 1.4 rad, the upper end of the range in the paper."""
-    return _bid(T_true, size, 1.4, seed)
+    return bid_start(T_true, size, seed, 1.4)
 
 
 def perturb(T_true: SE3, translation: float, rotation_deg: float, seed: int) -> SE3:
@@ -68,14 +73,6 @@ def random_units(count: int, generator: Generator) -> Float[Tensor, "n 3"]:
     return torch.nn.functional.normalize(normal, dim=-1)
 
 
-def _bid(T_true: SE3, size: float, widest: float, seed: int) -> SE3:
-    _require_length("size", size)
-    u1, u2 = random_units(2, torch.Generator().manual_seed(seed))
-    return T_true.to(dtype=torch.float64).retract(
-        torch.cat([size * u1, max(0.0, rotation_of_size(size, widest)) * u2])
-    )
-
-
 def _require_length(what: str, value: float) -> None:
     if not (math.isfinite(value) and value >= 0):
         raise InputError(f"{what} is {value}", where="perturbation", expected="a finite number, 0 or more")
@@ -93,15 +90,15 @@ PARALLEL_SEED, CHOSEN_FRAMES, STARTS = 1234, 5, 5
 PARALLEL_TRIALS = CHOSEN_FRAMES * STARTS
 ROTATION_DEG, TRANSLATION = 15.0, 0.25
 
-Drawn = tuple[Int[np.ndarray, "5"], Float[np.ndarray, "5 5 3"], Float[np.ndarray, "5 5 3"]]
 
-
-def draw_starts(frames: int) -> Drawn:
+def draw_starts(
+    frames: int,
+) -> tuple[Int[np.ndarray, "5"], Float[np.ndarray, "5 5 3"], Float[np.ndarray, "5 5 3"]]:
     """Return the published indices of frames, angles (degrees) and translations (units of the data), bit for bit."""
     generator = np.random.RandomState(PARALLEL_SEED)
-    chosen = generator.choice(frames, CHOSEN_FRAMES)
-    angles = generator.uniform(-ROTATION_DEG, ROTATION_DEG, size=(CHOSEN_FRAMES, STARTS, 3))
-    return chosen, angles, generator.uniform(-TRANSLATION, TRANSLATION, size=(CHOSEN_FRAMES, STARTS, 3))
+    chosen, shape = generator.choice(frames, CHOSEN_FRAMES), (CHOSEN_FRAMES, STARTS, 3)
+    angles = generator.uniform(-ROTATION_DEG, ROTATION_DEG, size=shape)
+    return chosen, angles, generator.uniform(-TRANSLATION, TRANSLATION, size=shape)
 
 
 def parallel_cases(frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
@@ -147,8 +144,16 @@ FARTHEST_START = 1e6
 MOST_TRIALS = 100_000
 """The maximum number of trials per size, since all trials of a plan are in memory."""
 
-Case = tuple[int, int]
-"""The index of a frame in its split, and the seed of a trial on it."""
+
+def each_in_turn(frames: int, trials: int, seed: int, times: int = 1) -> list[tuple[int, int]]:
+    """Return all frames in random order, each ``times`` in a row, repeatedly; every trial has its own seed."""
+    order = torch.randperm(frames, generator=torch.Generator().manual_seed(seed)).tolist()
+    return [(order[i // times % frames], seed + i) for i in range(trials)]
+
+
+def once_each(frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
+    """Return as many distinct frames as trials were requested, in random order; every trial has its own seed."""
+    return each_in_turn(frames, min(trials, frames), seed)
 
 
 @dataclass(frozen=True)
@@ -163,18 +168,17 @@ class Protocol:
     units: tuple[str, ...] = ()  # units of the numbers in a size
     trials: int = 24  # per size, by default
     seed: int = 0
-    plan: Callable[[int, int, int], list[Case]] | None = (
-        None  # takes the numbers of frames and trials, and the seed
-    )
+    cases_of: Callable[[int, int, int], list[tuple[int, int]]] = each_in_turn
+    """Takes the numbers of frames and trials and the seed; returns the index of the frame and the seed of each trial."""
     fixed: bool = False  # whether it always chooses from all frames of a split
 
-    def cases(self, frames: int, trials: int, seed: int) -> list[Case]:
+    def cases(self, frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
         """Return the cases for one size. A larger number of trials begins with the same cases."""
         if frames < 1:
             raise InputError("nothing to try:", expected="at least one frame")
         if trials > MOST_TRIALS:
             raise InputError(f"{trials} trials", expected=f"at most {MOST_TRIALS} per size")
-        return (self.plan or each_in_turn)(frames, trials, seed)
+        return self.cases_of(frames, trials, seed)
 
     def check_size(self, size: Size) -> None:
         """Raise ``InputError`` for a size with the wrong number of values, or with one that is out of range."""
@@ -185,23 +189,6 @@ class Protocol:
             raise InputError(
                 f"size is {':'.join(f'{x:g}' for x in size) or 'missing'}", expected=f"{expected}{limits}"
             )
-
-
-def each_in_turn(frames: int, trials: int, seed: int) -> list[Case]:
-    """Return all frames in random order, repeatedly; every trial has its own seed."""
-    order = torch.randperm(frames, generator=torch.Generator().manual_seed(seed)).tolist()
-    return [(order[i % frames], seed + i) for i in range(trials)]
-
-
-def once_each(frames: int, trials: int, seed: int) -> list[Case]:
-    """Return as many distinct frames as trials were requested, in random order; every trial has its own seed."""
-    return each_in_turn(frames, min(trials, frames), seed)
-
-
-def five_of_each(frames: int, trials: int, seed: int) -> list[Case]:
-    """Return five starts for each frame, as iNeRF does."""
-    order = torch.randperm(frames, generator=torch.Generator().manual_seed(seed)).tolist()
-    return [(order[i // 5 % frames], seed + i) for i in range(trials)]
 
 
 def find_protocol(name: str) -> Protocol:
@@ -228,14 +215,14 @@ PROTOCOLS = {
         "iNeRF: up to 40 degrees about a random axis and up to 0.2 along each axis; five starts per frame",
         lambda T_true, size, seed, frames: inerf_start(T_true, seed),
         trials=25,
-        plan=five_of_each,
+        cases_of=partial(each_in_turn, times=5),  # starts for each frame
     ),
     "parallel": Protocol(
         "Parallel Inversion: its 25 starts, up to 15 degrees and 0.25 along each axis",
         lambda T_true, size, seed, frames: parallel_start(T_true, seed, frames),
         trials=PARALLEL_TRIALS,
         seed=PARALLEL_SEED,
-        plan=parallel_cases,
+        cases_of=parallel_cases,
         fixed=True,
     ),
     "perturb": Protocol(
@@ -247,7 +234,7 @@ PROTOCOLS = {
     "none": Protocol(
         "no start at all; one trial per frame",
         lambda T_true, size, seed, frames: None,
-        plan=once_each,
+        cases_of=once_each,
     ),
 }
 """All protocols by name."""

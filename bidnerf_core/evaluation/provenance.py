@@ -11,10 +11,11 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import psutil
 import torch
 
 import bidnerf_core
@@ -24,6 +25,8 @@ from bidnerf_core.io import from_plain, read_record, to_plain, write_file
 VERSIONS = ("bidnerf", "torch", "numpy", "scipy", "kornia")
 SOURCES = ("bidnerf_core", "backends", "plugins", "benchmarks", ":!benchmarks/results")
 """Folders in which uncommitted changes make a run irreproducible from its commit."""
+RUNS = ".meta.json"
+"""The ending of the file that lists the runs behind a results file, next to it."""
 LINE = 120
 """Columns per line of a record: nested values that fit are written on one line."""
 
@@ -51,15 +54,15 @@ def provenance(command: str, workers: str) -> Provenance:
     return Provenance(
         date=datetime.now(UTC).isoformat(timespec="seconds"),
         command=command,
-        commit=git("rev-parse", "--verify", "HEAD") or None,
-        dirty=bool(git("status", "--porcelain", "--untracked-files=no", "--", *SOURCES)),
-        cpu=cpu_model(),
+        commit=_git("rev-parse", "--verify", "HEAD") or None,
+        dirty=bool(_git("status", "--porcelain", "--untracked-files=no", "--", *SOURCES)),
+        cpu=_cpu_model(),
         cores=os.cpu_count(),
         gpu=torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        memory_bytes=_memory(),
+        memory_bytes=psutil.virtual_memory().total,
         system=f"{platform.system()} {platform.machine()}",
         python=platform.python_version(),
-        versions={name: found for name in VERSIONS if (found := _version(name))},
+        versions={name: version(name) for name in VERSIONS} | {"torch": str(torch.__version__)},
         workers=workers,
     )
 
@@ -69,20 +72,15 @@ def command_line(name: str, arguments: list[str]) -> str:
     return shlex.join([*name.split(), *arguments])
 
 
-def beside(results: Path) -> Path:
-    """Return the path of the file that lists the runs behind a results file."""
-    return results.with_suffix(".meta.json")
-
-
 def note_run(results: Path, run: Provenance) -> None:
     """Add a run to the list next to a results file, which may take several runs to complete."""
     runs = [*read_runs(results), run]
-    write_file(beside(results), (json.dumps({"runs": to_plain(runs)}, indent=1) + "\n").encode())
+    write_file(results.with_suffix(RUNS), (json.dumps({"runs": to_plain(runs)}, indent=1) + "\n").encode())
 
 
 def read_runs(results: Path) -> list[Provenance]:
     """Return the runs behind a results file, in order; empty if there is no list next to it."""
-    path = beside(results)
+    path = results.with_suffix(RUNS)
     if not path.is_file():
         return []
     expected = "the list that 'bidnerf evaluate' writes next to its results"
@@ -92,7 +90,7 @@ def read_runs(results: Path) -> list[Provenance]:
     return [from_plain(Provenance, run, str(path)) for run in runs]
 
 
-def git(*arguments: str) -> str:
+def _git(*arguments: str) -> str:
     """Return the output of a git command in this package's checkout; empty if there is no checkout or no git."""
     root = Path(bidnerf_core.__file__).resolve().parents[1]
     if not (root / ".git").exists():  # installed, perhaps inside another project
@@ -104,7 +102,7 @@ def git(*arguments: str) -> str:
     return done.stdout.strip()
 
 
-def cpu_model() -> str:
+def _cpu_model() -> str:
     """Return the name of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -114,26 +112,19 @@ def cpu_model() -> str:
     return next(names, platform.processor())
 
 
-def _memory() -> int | None:
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):  # not available on all systems
-        return None
-
-
-def _version(name: str) -> str | None:
-    if name == "torch":  # its version names the build, unlike the distribution's
-        return str(torch.__version__)
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
-
-
 def script_command() -> str:
     """Return the command of the running script; paths are relative to the checkout, or only names outside it."""
     root = Path(bidnerf_core.__file__).resolve().parents[1]
-    return shlex.join(["python", *(_without_local_path(word, root) for word in sys.argv)])
+
+    def shortened(part: str) -> str:
+        path = Path(part)
+        if not path.is_absolute():
+            return part
+        return str(path.relative_to(root)) if path.is_relative_to(root) else path.name
+
+    # Words such as ``--out=PATH`` and ``MAP:DATA`` hold paths, too.
+    words = ("".join(map(shortened, re.split(r"([=:])", word))) for word in sys.argv)
+    return shlex.join(["python", *words])
 
 
 def write_record(path: Path, results: dict[str, Any], seed: int) -> Path:
@@ -163,13 +154,3 @@ def _in_lines(value: Any, indent: str = "") -> str:
         parts = [_in_lines(part, deeper) for part in value]
     first, last = "{}" if isinstance(value, dict) else "[]"
     return f"{first}\n{deeper}" + f",\n{deeper}".join(parts) + f"\n{indent}{last}"
-
-
-def _without_local_path(argument: str, root: Path) -> str:
-    """Return an argument with its paths shortened, also in words such as ``--out=PATH`` and ``MAP:DATA``."""
-    parts = re.split(r"([=:])", argument)
-    return "".join(_shortened(Path(part), root) if Path(part).is_absolute() else part for part in parts)
-
-
-def _shortened(path: Path, root: Path) -> str:
-    return str(path.relative_to(root)) if path.is_relative_to(root) else path.name

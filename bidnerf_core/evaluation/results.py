@@ -1,6 +1,4 @@
-"""Trial results: a table in memory, and a file of one JSON line per trial, each on disk before its trial
-counts as done.
-"""
+"""Trial results: a table in memory, and a file of one JSON line per trial, each on disk before its trial counts as done."""
 
 from __future__ import annotations
 
@@ -9,24 +7,27 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
-from typing import Any, TypeAlias
+from typing import Any
 
 from bidnerf_core.errors import printable
-from bidnerf_core.evaluation.groups import Condition, Group, Situation, grouped, situation_titles
-from bidnerf_core.evaluation.json_lines import JsonLinesFile, LineFormat, as_line
-from bidnerf_core.evaluation.summary import Success, Summary, summarize
-from bidnerf_core.evaluation.trial import Trial, TrialResult
+from bidnerf_core.evaluation.lines import LinesFile, as_line
+from bidnerf_core.evaluation.plan import Trial
+from bidnerf_core.evaluation.summary import (
+    Group,
+    Situation,
+    Success,
+    Summary,
+    grouped,
+    situation_titles,
+    summarize,
+)
+from bidnerf_core.evaluation.trial import TrialResult
 from bidnerf_core.geometry import symbol
 from bidnerf_core.io import from_plain, to_plain, write_file
 from bidnerf_core.results import CRITERIA
 
-Key: TypeAlias = str
-"""The identity of a trial, independent of the location of its folders."""
-
 WIDEST_FIRST = 60
 """Maximum number of characters of a line's first cell for it to share the line with the others."""
-RESULT_LINES = LineFormat(b'{"T_world_camera": ', "lines as written by 'bidnerf evaluate'")
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,6 @@ class SummaryRow:
     start: str  # title of the situation
     label: str  # of the condition
     situation: Situation
-    condition: Condition
     statistics: Summary
 
 
@@ -56,8 +56,7 @@ class ResultTable:
         """Success rates with Wilson's 95 % intervals, errors and cost of each group."""
         titles = situation_titles([group.situation for group in self.groups])
         return tuple(
-            SummaryRow(titles[g.situation], g.label, g.situation, g.condition, summarize(g.results))
-            for g in self.groups
+            SummaryRow(titles[g.situation], g.label, g.situation, summarize(g.results)) for g in self.groups
         )
 
     def __str__(self) -> str:
@@ -113,8 +112,8 @@ def aligned(lines: Sequence[Sequence[str]]) -> str:
     )
 
 
-def key_of(trial: Trial) -> Key:
-    """Return a key that is equal for two trials if and only if they are the same trial, on any machine."""
+def key_of(trial: Trial) -> str:
+    """Return a key that is equal for two trials if and only if they are the same trial, wherever their folders are."""
     return json.dumps(to_plain(trial.portable), sort_keys=True)
 
 
@@ -126,56 +125,34 @@ def read_results(paths: Iterable[Path]) -> list[TrialResult]:
     """
     found: dict[Any, TrialResult] = {}
     for path in paths:
-        for where, plain in RESULT_LINES.read(path):
-            result = from_plain(TrialResult, plain, where)
-            found.setdefault((key_of(result.trial), result.weights, result.inputs), result)
+        for key, result in ResultsFile.read(path):
+            found.setdefault((key, result.weights, result.inputs), result)
     return list(found.values())
 
 
-class ResultsFile:
-    """A file to which results are appended, locked by the process that has it open. Use it as a context manager.
+class ResultsFile(LinesFile[TrialResult]):
+    """A file of results by the key of their trials, see ``key_of``."""
 
-    Without a path, the results are kept in memory only.
-    """
+    opening, expected = b'{"T_world_camera": ', "lines as written by 'bidnerf evaluate'"
 
-    def __init__(self, path: Path | None) -> None:
-        self.path = path
-        self.results: dict[Key, TrialResult] = {}
-        self._file = None if path is None else JsonLinesFile(path, RESULT_LINES)
+    @classmethod
+    def parsed(cls, plain: Any, where: str) -> tuple[str, TrialResult]:
+        result = from_plain(TrialResult, plain, where)
+        return key_of(result.trial), result
 
-    def __enter__(self) -> ResultsFile:
-        if self._file is None:
-            return self
-        try:
-            for where, plain in self._file.open():
-                result = from_plain(TrialResult, plain, where)
-                self.results.setdefault(key_of(result.trial), result)
-            self._file.repair()
-        except BaseException:
-            self._file.close()
-            raise
-        return self
+    def plain(self, key: str, value: TrialResult) -> Any:
+        return to_plain(value)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._file is not None:
-            self._file.close()
+    def __contains__(self, trial: Trial) -> bool:
+        return key_of(trial) in self.values
+
+    def __getitem__(self, trial: Trial) -> TrialResult:
+        return self.values[key_of(trial)]
 
     def add(self, result: TrialResult) -> None:
         """Append a result, which is on disk when this returns. Raises ``InputError`` if the file was removed."""
-        if self._file is not None:
-            self._file.append(to_plain(result))
-        self.results[key_of(result.trial)] = result
+        self.append(key_of(result.trial), result)
 
     def put_in_order(self, trials: Sequence[Trial]) -> None:
         """Move the results of ``trials`` to the end of the file, in their order, in one atomic step."""
-        if self._file is None:
-            return
-        self._file.check_there()
-        wanted = [key_of(trial) for trial in trials]
-        asked = set(wanted)
-        order = [key for key in self.results if key not in asked] + [k for k in wanted if k in self.results]
-        if order != list(self.results):
-            self._file.replace(to_plain(self.results[key]) for key in order)
-            self.results = {key: self.results[key] for key in order}
+        self.reorder(map(key_of, trials))

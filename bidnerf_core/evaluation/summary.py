@@ -1,16 +1,16 @@
-"""Statistics of trials: success rates with intervals, steps and time to success, errors and cost, and
-significance tests.
-"""
+"""Results side by side: grouped by what was localized and by what localized it, with statistics and significance tests."""
 
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import statistics
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
-from bidnerf_core.evaluation.groups import Group
+from bidnerf_core.evaluation.faults import NO_FAULT
 from bidnerf_core.evaluation.trial import TrialResult
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.results import CRITERIA, Rate, Reduced, steps_to_success, success_rate_by_frame
@@ -20,6 +20,132 @@ NEVER = math.inf
 
 RELATIVE, ABSOLUTE = "10%", "5deg 0.05"
 """The criterion used where only one is shown: with a start, and without."""
+
+
+# Groups.
+
+
+@dataclass(frozen=True)
+class Situation:
+    """The map, the images and the starts of some trials. ``size`` is None if trials of all sizes are pooled."""
+
+    map: str
+    weights: str  # identifies the training run, see ``Map.training``
+    data: str
+    split: str
+    protocol: str
+    fault: str
+    size: tuple[float, ...] | None
+
+    @property
+    def start(self) -> str:
+        """The start in words, with the image faults if any."""
+        words = "no start" if self.protocol == "none" else self.protocol
+        if self.size is None:
+            words += ", all sizes"
+        elif self.protocol != "none":
+            words = f"{words} {' : '.join(f'{number:g}' for number in self.size)}".rstrip()
+        return words if self.fault == NO_FAULT else f"{words}, {self.fault}"
+
+
+@dataclass(frozen=True)
+class Group:
+    """The trials of one condition (a method with its settings, input and hardware) in one situation."""
+
+    situation: Situation
+    label: str  # of the condition, among the others
+    results: tuple[TrialResult, ...]
+
+
+def grouped(results: Sequence[TrialResult]) -> list[Group]:
+    """Group trial results by situation and condition, and add a pooled group for each condition tried at several sizes.
+
+    Groups are sorted by map, data, protocol and fault in order of appearance, then by size, with the pooled sizes last.
+    """
+    conditions = [_condition(result) for result in results]
+    labels = _labels(conditions)
+    found: dict[tuple[Situation, str], list[TrialResult]] = {}
+    sizes: dict[tuple[Situation, str], set[Any]] = {}
+    for result, condition in zip(results, conditions, strict=True):
+        t, label = result.trial, labels[json.dumps(condition, sort_keys=True)]
+        pooled = Situation(t.map, result.weights, t.data, t.split, t.protocol, t.fault, None)
+        found.setdefault((replace(pooled, size=t.size), label), []).append(result)
+        found.setdefault((pooled, label), []).append(result)
+        sizes.setdefault((pooled, label), set()).add(t.size)
+    order = {situation: place for place, (situation, _) in reversed(list(enumerate(sizes)))}
+    groups = [
+        Group(*key, tuple(rows)) for key, rows in found.items() if key not in sizes or len(sizes[key]) > 1
+    ]
+
+    def rank(group: Group) -> tuple[Any, ...]:
+        pooled, size = replace(group.situation, size=None), group.situation.size
+        return order[pooled], size is None, size or ()
+
+    return sorted(groups, key=rank)
+
+
+def situations(groups: Sequence[Group]) -> list[Situation]:
+    """Return the situations of ``groups``, each once, in order."""
+    return list(dict.fromkeys(group.situation for group in groups))
+
+
+def situation_titles(every: Sequence[Situation]) -> dict[Situation, str]:
+    """Return a title for each situation: its start, preceded by the map and data unless all situations share these."""
+    maps = {situation.map for situation in every}
+    trainings = {(situation.map, situation.weights) for situation in every}
+    datasets = {(situation.data, situation.split) for situation in every}
+    titles = {}
+    for s in every:
+        retrained = sum(name == s.map for name, _ in trainings) > 1
+        name = f"{s.map} ({s.weights.partition('.')[0]})" if retrained else s.map
+        places = [name] if len(maps) > 1 or retrained else []
+        places += [f"{s.data}/{s.split}"] if len(datasets) > 1 else []
+        titles[s] = ": ".join([" on ".join(places), s.start] if places else [s.start])
+    return titles
+
+
+def _condition(result: TrialResult) -> dict[str, Any]:
+    """Return all that distinguishes what localized one trial from what localized another, by name."""
+    trial = result.trial
+    own = {name: getattr(trial, name) for name in ("depth", "depth_points", "camera", "register_depth")}
+    own |= {"depth_unit": trial.depth_unit, "backend": result.backend, "device": trial.device}
+    hidden = None if trial.masks is None else f"{trial.mask_hides} of {trial.masks}"
+    return {"method": result.method, "images": len(trial.frames), "hidden": hidden, **own, **result.settings}
+
+
+WORDS: dict[str, Callable[[Any], str]] = {
+    "images": lambda count: f"{count} image{'s' if count != 1 else ''}",
+    "depth": lambda used: "RGB-D" if used else "RGB",
+    "depth_points": lambda folder: "no points" if folder is None else f"points of {folder}",
+    "hidden": lambda masks: "nothing hidden" if masks is None else f"{masks} hidden",
+    "backend": str,
+    "device": str,
+}
+"""How a property is named where it distinguishes conditions; others as ``depth weight 0.5``."""
+
+
+def _labels(conditions: Sequence[dict[str, Any]]) -> dict[str, str]:
+    """Return a label for each condition, by its JSON: its method, and the properties in which that method's conditions differ."""
+    every = {json.dumps(condition, sort_keys=True): condition for condition in conditions}
+    labels = {}
+    for key, own in every.items():
+        same = [other for other in every.values() if other["method"] == own["method"]]
+        words = [own["method"]]
+        for name, value in own.items():
+            if any(other.get(name) != value for other in same):
+                text = (
+                    f"{value:.12g}"
+                    if isinstance(value, float)
+                    else "none"
+                    if value is None
+                    else str(value).lower()
+                )
+                words.append(WORDS[name](value) if name in WORDS else f"{name.replace('_', ' ')} {text}")
+        labels[key] = ", ".join(words)
+    return labels
+
+
+# Statistics.
 
 
 @dataclass(frozen=True)
@@ -50,13 +176,34 @@ class Summary:
     right_but_not_converged: int
 
 
+def summarize(results: Sequence[TrialResult]) -> Summary:
+    """Return the statistics of at least one trial."""
+    pairs = [(result.converged, succeeded(result)) for result in results]
+    errors = [result.error for result in results]
+    return Summary(
+        trials=len(results),
+        frames=len({frame_of(result) for result in results}),
+        unit=unit_of(results),
+        criteria={name: success_of(results, name) for name in CRITERIA},
+        translation=median(e.translation if e else None for e in errors),
+        rotation_deg=median(e.rotation_deg if e else None for e in errors),
+        steps=statistics.median(r.steps for r in results),
+        seconds=statistics.median(r.seconds for r in results),
+        milliseconds_per_step=statistics.median(1000 * r.seconds / max(1, r.steps) for r in results),
+        peak_memory_bytes=max(r.peak_memory_bytes for r in results),
+        converged=sum(accepted for accepted, _ in pairs),
+        converged_but_wrong=sum(accepted and not right for accepted, right in pairs),
+        right_but_not_converged=sum(right and not accepted for accepted, right in pairs),
+    )
+
+
 def frame_of(result: TrialResult) -> tuple[str, str, tuple[str, ...]]:
     """Return the identity of a trial's images: trials of the same images are not independent."""
     return result.trial.data, result.trial.split, result.trial.frames
 
 
 def unit_of(results: Sequence[TrialResult]) -> LengthUnit:
-    """Return the unit of the errors of some trials: metres if that holds for all of them."""
+    """Return the unit of the errors of some trials: metres if all of them have it."""
     return "metres" if results and all(result.unit == "metres" for result in results) else "units"
 
 
@@ -71,6 +218,11 @@ def usual_criterion(results: Sequence[TrialResult]) -> str:
     return RELATIVE if applies(RELATIVE, results) else ABSOLUTE
 
 
+def are_stepwise(results: Sequence[TrialResult]) -> bool:
+    """Return whether a method moved the pose in steps, which have a speed; others answer at once."""
+    return statistics.median(result.steps for result in results) > 1
+
+
 def steps_of(results: Sequence[TrialResult], criterion: str) -> list[float]:
     """Return the steps to success of each trial, ``NEVER`` for those without success."""
     found = (steps_to_success(result.errors.as_error(), CRITERIA[criterion]) for result in results)
@@ -78,51 +230,40 @@ def steps_of(results: Sequence[TrialResult], criterion: str) -> list[float]:
 
 
 def seconds_to_success(results: Sequence[TrialResult], criterion: str) -> list[float]:
-    """Return the sorted times to success of the trials that met the criterion."""
-    steps = zip(steps_of(results, criterion), results, strict=True)
-    return sorted(s * milliseconds_per_step(r) / 1000 for s, r in steps if s < NEVER)
+    """Return the sorted times to success of the trials that met the criterion.
+
+    That of a method without steps is the time of the whole answer.
+    """
+    return sorted(
+        steps * result.seconds / result.steps if result.steps > 1 else result.seconds
+        for steps, result in zip(steps_of(results, criterion), results, strict=True)
+        if steps < NEVER
+    )
 
 
 def succeeded(result: TrialResult) -> bool:
     """Return whether the final pose is within 5 degrees and 0.05 (in the unit of the map) of the true one."""
-    return result.error is not None and steps_of([result], ABSOLUTE)[0] < NEVER
+    error = result.error
+    return error is not None and error.rotation_deg < 5.0 and error.translation < 0.05
 
 
-def summarize(results: Sequence[TrialResult]) -> Summary:
-    """Return the statistics of at least one trial."""
-    pairs = [(result.converged, succeeded(result)) for result in results]
-    errors = [result.error for result in results]
-    return Summary(
-        trials=len(results),
-        frames=len({frame_of(result) for result in results}),
-        unit=unit_of(results),
-        criteria={name: success_of(results, name) for name in CRITERIA},
-        translation=median(e.translation if e else None for e in errors),
-        rotation_deg=median(e.rotation_deg if e else None for e in errors),
-        steps=statistics.median(r.steps for r in results),
-        seconds=statistics.median(r.seconds for r in results),
-        milliseconds_per_step=statistics.median(map(milliseconds_per_step, results)),
-        peak_memory_bytes=max(r.peak_memory_bytes for r in results),
-        converged=sum(said for said, _ in pairs),
-        converged_but_wrong=sum(said and not right for said, right in pairs),
-        right_but_not_converged=sum(right and not said for said, right in pairs),
-    )
+def rate_of(results: Sequence[TrialResult], outcomes: Sequence[bool]) -> Rate:
+    """Return the rate of an outcome among trials, with an interval that accounts for repeated frames."""
+    return success_rate_by_frame(outcomes, [frame_of(result) for result in results])
 
 
 def success_of(results: Sequence[TrialResult], criterion: str) -> Success | None:
     """Return how often and how soon trials met a criterion; None if it does not apply to them."""
     if not applies(criterion, results):
         return None
-    reached = [s for s in steps_of(results, criterion) if s < NEVER]
+    steps = steps_of(results, criterion)
     times = [1000 * seconds for seconds in seconds_to_success(results, criterion)]
-    met = [s < NEVER for s in steps_of(results, criterion)]
-    rate = success_rate_by_frame(met, [frame_of(result) for result in results])
-    return Success(rate, median(reached), median(times))
+    rate = rate_of(results, [s < NEVER for s in steps])
+    return Success(rate, median(s for s in steps if s < NEVER), median(times))
 
 
 def median(values: Iterable[float | None]) -> float | None:
-    """Return the median (of an even number, the mean of the two middle values); an unknown value counts as
-    infinite.
+    """Return the median (of an even number, the mean of the two middle values); an unknown value counts as infinite.
 
     Returns None if there is no value, or if a middle value is unknown.
     """
@@ -131,16 +272,12 @@ def median(values: Iterable[float | None]) -> float | None:
     return middle if math.isfinite(middle) else None
 
 
-def milliseconds_per_step(result: TrialResult) -> float:
-    """Return the mean time per step of a trial."""
-    return 1000 * result.seconds / max(1, result.steps)
+# Tests.
 
 
 @dataclass(frozen=True)
 class PairTest:
-    """Tests of whether two groups of trials in the same situation differ, by one criterion. All p values are
-    two-sided.
-    """
+    """Tests of whether two groups of trials in the same situation differ, by one criterion. All p values are two-sided."""
 
     first: str
     second: str
@@ -168,6 +305,10 @@ def compare_pair(first: Group, second: Group, criterion: str) -> PairTest:
     reached = [[s for s in row if s < NEVER] for row in steps]
     tables = [[len(good), len(row) - len(good)] for good, row in zip(reached, steps, strict=True)]
     test = mannwhitneyu(*reached, alternative="two-sided") if all(reached) else None
+    # Over all trials, failures tie, behind every success; if all trials tie, nothing differs.
+    last = 1 + max(itertools.chain(*reached), default=0)
+    ranks = [[min(s, last) for s in row] for row in steps]
+    tie = len({*ranks[0], *ranks[1]}) == 1
     return PairTest(
         first=first.label,
         second=second.label,
@@ -177,16 +318,7 @@ def compare_pair(first: Group, second: Group, criterion: str) -> PairTest:
         median_steps=(median(reached[0]), median(reached[1])),
         steps_u=None if test is None else float(test.statistic),
         steps_p=None if test is None else float(test.pvalue),
-        all_p=_all_p(*steps),
+        all_p=1.0
+        if tie
+        else float(mannwhitneyu(*ranks, alternative="two-sided", method="asymptotic").pvalue),
     )
-
-
-def _all_p(first: list[float], second: list[float]) -> float:
-    """Return the p value over all trials. All failures tie; it is 1 if all trials tie."""
-    from scipy.stats import mannwhitneyu
-
-    if len({*first, *second}) == 1:
-        return 1.0
-    largest = 1 + max((s for s in (*first, *second) if s < NEVER), default=0)
-    ranks = [[min(s, largest) for s in row] for row in (first, second)]  # only the order matters
-    return float(mannwhitneyu(*ranks, alternative="two-sided", method="asymptotic").pvalue)

@@ -1,13 +1,19 @@
-"""A trial and its result as plain data: the inputs with their digests, and one line of a results file."""
+"""One trial: localize a frame from a start with a method, and measure the result.
+
+``run_trial`` depends only on its arguments and the files that these name, so trials may run in any order, in any process
+and on any machine; two runs of the same trial differ only in ``seconds`` and ``peak_memory_bytes``.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
 import os
+import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -16,64 +22,29 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import Capture, SparseChoice, SparsePoints
+from bidnerf_core.devices import one_thread, working_device
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import HiddenColour, View
-from bidnerf_core.geometry import LengthUnit
-from bidnerf_core.io import to_plain
-from bidnerf_core.results import PoseError
-from bidnerf_core.scenes import is_closed_form
+from bidnerf_core.evaluation.faults import faulty, parse_faults
+from bidnerf_core.evaluation.plan import Setup, Trial, parse_settings
+from bidnerf_core.evaluation.protocols import find_protocol
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3, LengthUnit
+from bidnerf_core.io import from_plain, to_plain
+from bidnerf_core.localization import Localizer
+from bidnerf_core.maps import DESCRIPTION, Map, MapInfo, cameras_of, load_map
+from bidnerf_core.registry import registered_names, require_registered
+from bidnerf_core.results import PoseError, plain_localization, pose_error
+from bidnerf_core.scenes import closed_form_map, is_closed_form
+from bidnerf_core.settings import to_flat
 
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
+Opened: TypeAlias = tuple[Map, Capture]
+"""A map, and a dataset of the same scene."""
 DIGEST_BYTES = 16  # enough that no two inputs coincide by chance
 LARGEST_COUNT = 2**63 - 1
 """The largest count. JSON can hold integers that no tensor or float can."""
-
-
-@dataclass(frozen=True)
-class Trial:
-    """Everything that the result of a trial depends on. Raises ``InputError`` for anything that cannot be a
-    folder name.
-    """
-
-    map: str  # folder, or demo:NAME
-    data: str  # folder, or demo:NAME
-    frames: tuple[str, ...]  # views of a rig, or one image; the pose of the last one is to be found
-    protocol: str = "bid"  # how the start is chosen
-    size: tuple[float, ...] = ()  # how far the start is from the truth, in the protocol's units
-    method: str = "auto"
-    config: str = "{}"  # JSON of the method's settings that differ from its defaults
-    seed: int = 0  # of the start and of every random choice of the method
-    split: str = "test"
-    device: str = "cpu"  # the map's device
-    depth: bool = True  # whether the method receives the measured depth
-    depth_points: str | None = None  # folder of a COLMAP model whose points the method receives as depth rays
-    masks: str | None = None  # folder of masks of the images, see ``MaskFolder``
-    mask_hides: HiddenColour = "black"
-    fault: str = "none"  # faults of the images and their sizes, such as depth-scale:1.02+exposure:0.7
-    camera: str | None = None  # file or name of the camera of images whose format stores none
-    register_depth: bool | str | None = None  # file of the depth sensor; False: depth is used as it is
-    depth_unit: float | None = None  # metres per step of depth images
-
-    def __post_init__(self) -> None:
-        for name in ("map", "data", "depth_points", "masks", "camera", "register_depth"):
-            if "\0" in str(getattr(self, name)):
-                raise InputError(f"{name} holds a NUL character", expected="the name of a file or folder")
-
-    @property
-    def frame(self) -> str:
-        """The name of the frame whose pose is to be found."""
-        return self.frames[-1]
-
-    @property
-    def portable(self) -> Trial:
-        """This trial with the names of folders instead of their paths, which differ between machines."""
-        points = None if self.depth_points is None else "/".join(_parts(self.depth_points)[-2:])  # sparse/0
-        masks, camera = (None if each is None else _name(each) for each in (self.masks, self.camera))
-        sensor = _name(self.register_depth) if isinstance(self.register_depth, str) else self.register_depth
-        return replace(
-            self, map=_name(self.map), data=_name(self.data), depth_points=points, masks=masks, camera=camera,
-            register_depth=sensor,
-        )  # fmt: skip
+STATUS, RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 @dataclass(frozen=True)
@@ -155,12 +126,104 @@ class TrialResult:
                 raise ValueError(f"{name} is larger than any measurement")
 
 
-def _name(folder: str) -> str:
-    return folder if is_closed_form(folder) else Path(os.path.realpath(folder)).name
+def run_trial(
+    trial: Trial, scene: Opened | None = None, registered: Sequence[tuple[str, str]] = ()
+) -> TrialResult:
+    """Run a trial on the map and dataset ``scene``, by default those named by the trial.
+
+    ``registered`` has the group and name of everything that the planning process registered for it. Raises
+    ``InputError`` for an unknown name, for a method that lacks an input it needs, and if this process has not
+    registered the same names.
+    """
+    require_registered(registered)
+    with one_thread():
+        stored, dataset = scene or opened(trial.map, trial.data, trial)
+        views = trial_views(trial, dataset)
+        truth, protocol = views[-1].T_ref_camera, find_protocol(trial.protocol)
+        protocol.check_size(trial.size)
+        start = protocol.start(truth, trial.size, trial.seed, len(dataset.frame_names(trial.split)))
+        settings = parse_settings(trial.method, trial.config)
+        digests = input_digests(trial, stored, views)
+        points = None if trial.depth_points is None else opened_points(trial.depth_points, stored)
+        rays = None if points is None else points.rays(views, trial.split)
+        localizer = Localizer(stored, trial.method, settings, warm_up=False)
+        forget_peak_memory()
+        found = localizer(views, start, rays, trial.seed)
+    trace = pose_error(found.poses, truth)
+    plain = plain_localization(found, stored.info.backend, pose_error(found.T_world_camera, truth))
+    more = {
+        "frame": trial.frame,
+        "seed": trial.seed,
+        "start_error": None if start is None else pose_error(start, truth).plain(),
+        "errors": {"translation": _finite(trace.translation), "rotation_deg": _finite(trace.rotation_deg)},
+        "peak_memory_bytes": peak_memory_bytes(),
+        "settings": to_flat(settings),
+        "weights": stored.training,
+        "trial": to_plain(trial.portable),
+        "inputs": to_plain(digests),
+    }
+    return from_plain(TrialResult, plain | more, "result")
 
 
-def _parts(folder: str) -> tuple[str, ...]:
-    return Path(os.path.realpath(folder)).parts[1:]
+def registered_for(trial: Trial) -> list[tuple[str, str]]:
+    """Return the group and name of everything registered in this process that a trial may need.
+
+    The map may need any detector and backend, and the dataset any reader.
+    """
+    named = {("methods", trial.method), *(("faults", fault.name) for fault in parse_faults(trial.fault))}
+    needed = ("backends", "features", "readers")
+    return [found for found in registered_names() if found in named or found[0] in needed]
+
+
+def trial_views(trial: Trial, dataset: Capture) -> list[View]:
+    """Return the views that the method receives, with T_world_camera.
+
+    They include the trial's faults, and have no depth if the trial withholds it.
+    """
+    views = [faulty(view, trial.fault, trial.seed) for view in dataset.views(trial.split, trial.frames)]
+    if trial.depth:
+        return views
+    return [View(view.frame.replace(depth=None), view.T_ref_camera) for view in views]
+
+
+def input_digests(trial: Trial, stored: Map, views: list[View]) -> InputDigests:
+    """Return digests of everything that the trial reads apart from the map's weights."""
+    points = None if trial.depth_points is None else folder_digest(trial.depth_points)
+    return InputDigests(views_digest(views), points, stored.info.surface)
+
+
+def open_map(name: str, device: str = "cpu") -> Map:
+    """Return the map in a folder, or of a closed-form scene."""
+    where = working_device(device)
+    return closed_form_map(name) if is_closed_form(name) else load_map(Path(name), where)
+
+
+def opened(map_name: str, data_name: str, setup: Setup | None = None) -> Opened:
+    """Return the map and dataset with these names, which are read once per process unless the map has changed since."""
+    version: tuple[int, int] | None = None
+    with contextlib.suppress(OSError):  # a closed-form scene, or not a map, which is detected on reading
+        file = os.stat(Path(map_name) / DESCRIPTION)
+        version = file.st_ino, file.st_mtime_ns
+    return _opened(map_name, data_name, (setup or Setup()).reading, version)
+
+
+@lru_cache(maxsize=4)
+def _opened(map_name: str, data_name: str, reading: Setup, version: tuple[int, int] | None) -> Opened:
+    stored = open_map(map_name, reading.device)
+    return stored, reading.open(data_name, stored)
+
+
+@lru_cache(maxsize=4)
+def opened_points(folder: str, stored: Map) -> SparsePoints:
+    """Return the points of the COLMAP model in ``folder``, scaled to the map with the poses of its training cameras."""
+    if not stored.info.cameras:
+        raise InputError("the map has no training cameras to determine the scale from", where=folder)
+    return SparsePoints(Path(folder), places_of(stored.info), SparseChoice())
+
+
+def places_of(info: MapInfo) -> list[tuple[str, SE3]]:
+    """Return the name and T_world_camera (float64) of each training image."""
+    return [(stored.name, T) for stored, (_, T) in zip(info.cameras, cameras_of(info), strict=True)]
 
 
 def views_digest(views: Sequence[View]) -> str:
@@ -170,10 +233,14 @@ def views_digest(views: Sequence[View]) -> str:
         frame = view.frame
         camera = json.dumps(to_plain(frame.intrinsics), sort_keys=True)
         hashed.update(f"{frame.name}\n{camera}\n".encode(errors="surrogatepass"))
-        for image in (frame.rgb, frame.depth, frame.alpha, view.T_ref_camera.matrix()):
-            _add_tensor(hashed, image)
-        if frame.hidden is not None:
-            _add_tensor(hashed, frame.hidden)
+        hidden = () if frame.hidden is None else (frame.hidden,)
+        for image in (frame.rgb, frame.depth, frame.alpha, view.T_ref_camera.matrix(), *hidden):
+            if image is None:
+                hashed.update(b"none\n")
+                continue
+            array = image.detach().cpu().contiguous().numpy()
+            hashed.update(f"{array.dtype} {array.shape}\n".encode())
+            hashed.update(array.tobytes())
     return hashed.hexdigest()
 
 
@@ -194,10 +261,31 @@ def folder_digest(folder: str) -> str:
     return hashed.hexdigest()
 
 
-def _add_tensor(hashed: hashlib.blake2b, tensor: Tensor | None) -> None:
-    if tensor is None:
-        hashed.update(b"none\n")
-        return
-    array = tensor.detach().cpu().contiguous().numpy()
-    hashed.update(f"{array.dtype} {array.shape}\n".encode())
-    hashed.update(array.tobytes())
+def forget_peak_memory() -> None:
+    """Reset the peaks that ``peak_memory_bytes`` reports.
+
+    Where the operating system cannot do that, the peak resident memory remains that since the process began.
+    """
+    if torch.cuda.is_available() and torch.cuda.is_initialized():
+        torch.cuda.reset_peak_memory_stats()
+    with contextlib.suppress(OSError):
+        RESET.write_text("5")  # proc(5): resets the peak resident set to the present one
+
+
+def peak_memory_bytes() -> int:
+    """Return the peak GPU memory if a GPU is in use, else the peak resident memory of this process."""
+    if torch.cuda.is_available() and torch.cuda.is_initialized():
+        return int(torch.cuda.max_memory_allocated())
+    with contextlib.suppress(OSError):
+        for line in STATUS.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def _finite(values: Tensor) -> list[float | None]:
+    return [value if math.isfinite(value) else None for value in values.tolist()]

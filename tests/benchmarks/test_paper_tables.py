@@ -12,7 +12,8 @@ from types import ModuleType
 
 import pytest
 
-from bidnerf_core.evaluation import Plan, planned
+from bidnerf_core.evaluation import Plan, Trial, planned
+from bidnerf_core.scenes import closed_form_data
 
 Script = Callable[[str], ModuleType]
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "paper_tables.py"
@@ -25,15 +26,19 @@ CELLS = {
 }
 
 
+def trials_of(plan: Plan) -> list[Trial]:
+    return planned(plan, PLACE, PLACE, closed_form_data(PLACE))
+
+
 @pytest.mark.parametrize("part", CELLS)
 def test_the_cells_of_a_part_can_be_tried_from_the_same_starts(part: str, script: Script) -> None:
     plans = script("paper_tables").PARTS[part](
-        Plan(PLACE, PLACE, method="bid", seed=0), lambda method: {"rays": 8, "max_steps": 2}, None
+        Plan(method="bid", seed=0), lambda method: {"rays": 8, "max_steps": 2}, None, (PLACE, PLACE)
     )
     conditions, sizes, each, methods = CELLS[part]
     assert len(plans) == conditions
     assert {plan.method for plan in plans} == methods
-    trials = [planned(plan) for plan in plans]  # raises where a method has no such setting
+    trials = [trials_of(plan) for plan in plans]  # raises where a method has no such setting
     assert all(len(cell) == sizes * each for cell in trials)
     for same in zip(*trials, strict=True):
         assert len({(trial.frame, trial.size, trial.seed) for trial in same}) == 1
@@ -54,8 +59,8 @@ def test_a_part_is_recorded(tmp_path: Path) -> None:
 def test_each_variant_of_bid_can_be_tried(script: Script) -> None:
     module = script("bid_variants")
     for group, (_, variants, sizes) in module.GROUPS.items():
-        found = module.plans(group, Plan(PLACE, PLACE, method="bid", trials=2, seed=0), None, None)
-        trials = [planned(plan) for plan in found]  # raises where there is no such setting
+        found = module.plans(group, Plan(protocol="bid", method="bid", trials=2, seed=0), None, None)
+        trials = [trials_of(plan) for plan in found]  # raises where there is no such setting
         assert [len(some) for some in trials] == [2 * len(sizes)] * len(variants)
         assert len({some[0].config for some in trials}) == len(variants)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 import os
@@ -17,6 +18,7 @@ import imageio.v3 as iio
 import pytest
 import torch
 
+import bidnerf_core as bn
 from bidnerf_core.cli import main
 from bidnerf_core.evaluation import (
     Plan,
@@ -31,11 +33,9 @@ from bidnerf_core.evaluation import (
     run_trials,
 )
 
-# Inside: shards and lines of results, of which a bench shows only the union; the middle of a sequence
+# Inside: lines of results, and the middle of a sequence
 from bidnerf_core.evaluation.arcs import arc, mean_up, seen_middle
-from bidnerf_core.evaluation.bench import shard_of
-from bidnerf_core.evaluation.json_lines import as_line
-from bidnerf_core.evaluation.workers import InThisProcess
+from bidnerf_core.evaluation.lines import as_line
 from bidnerf_core.geometry import look_at, turned_about
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import METHODS
@@ -71,50 +71,51 @@ def timeless(path: Path) -> list[dict[str, Any]]:
 
 def blob_trial(seed: int = 0, steps: int = 2) -> Trial:
     config = json.dumps({"rays": 16, "max_steps": steps})
-    return Trial(BLOBS, BLOBS, (f"{seed:04d}",), "bid", (0.3,), "bid", config, seed)
+    return Trial(BLOBS, BLOBS, (f"{seed:04d}",), (0.3,), seed, protocol="bid", method="bid", config=config)
+
+
+def trials_of(**options: Any) -> list[Trial]:
+    return planned(Plan(**{"protocol": "bid"} | options), BLOBS, BLOBS, closed_form_data(BLOBS))
 
 
 # Plans.
 
 
 def test_a_plan_is_its_protocol_for_each_size() -> None:
-    trials = planned(Plan(BLOBS, BLOBS))
+    trials = trials_of()
     assert len(trials) == 72
     assert [trials[i].size for i in (0, 24, 48)] == [(0.5,), (0.8,), (1.2,)]
     assert [t.seed for t in trials[:24]] == [t.seed for t in trials[24:48]] == list(range(24))
     assert len({t.frame for t in trials[:24]}) == 24
-    assert planned(Plan(BLOBS, BLOBS, seed=5))[0].seed == 5
-    few = planned(Plan(BLOBS, BLOBS, sizes=((0.9,),), trials=5, frames=("0003", "0007")))
+    assert trials_of(seed=5)[0].seed == 5
+    few = trials_of(sizes=[0.9], trials=5, frames=["0003", "0007"])
     assert sorted({t.frame for t in few}) == ["0003", "0007"]
-    (odd,) = planned(Plan(BLOBS, BLOBS, sizes=((0.1,),), trials=1, device="cpu:0", depth=False))
+    (odd,) = trials_of(sizes=[[0.1]], trials=1, device="cpu:0", depth=False)
     assert (odd.device, odd.depth) == ("cpu:0", False)
-    parallel = planned(Plan(BLOBS, BLOBS, "parallel"))
+    parallel = trials_of(protocol="parallel")
     assert [t.seed for t in parallel] == list(range(1234, 1259))
     assert len({t.frame for t in parallel[:5]}) == 1
 
 
 @pytest.mark.parametrize("shards", [1, 2, 3, 7, 100])
 def test_shards_share_all_trials_between_them(shards: int) -> None:
-    trials = planned(Plan(BLOBS, BLOBS))
-    parts = [shard_of(trials, number, shards) for number in range(shards)]
-    assert sorted(t.seed * 100 + t.size[0] for p in parts for t in p) == sorted(
-        t.seed * 100 + t.size[0] for t in trials
-    )
+    parts = [trials_of(shard=number, shards=shards) for number in range(shards)]
+    assert sorted((t.seed, t.size) for p in parts for t in p) == sorted((t.seed, t.size) for t in trials_of())
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
     with refused(found=f"shard is {shards}", expected=f"0 to {shards - 1}"):
-        shard_of(trials, shards, shards)
+        Plan(shard=shards, shards=shards)
 
 
 @pytest.mark.parametrize(
     ("change", "found", "expected"),
     [
-        ({"protocol": "inerf", "sizes": ((0.5,),)}, "size is 0.5", "none, since it has no sizes"),
-        ({"frames": ("nope",)}, "split 'test': no frame 'nope'", None),
+        ({"protocol": "inerf", "sizes": [0.5]}, "size is 0.5", "none, since it has no sizes"),
+        ({"frames": ["nope"]}, "split 'test': no frame 'nope'", None),
         ({"split": "train"}, "no split 'train'", "test"),
-        ({"protocol": "parallel", "frames": ("0000",)}, "'parallel' defines its own frames", "all frames"),
+        ({"protocol": "parallel", "frames": ["0000"]}, "'parallel' defines its own frames", "all frames"),
         ({"protocol": "parallel", "seed": 3}, "25 trials from seed 3", "at most 25 from seed 1234"),
-        ({"map": "demo:object"}, "has no map; train one with 'bidnerf demo'", None),
-        ({"map": "demo:blops"}, "'demo:blops'", "demo:blobs"),
+        ({"scene": "demo:object"}, "has no map; train one with 'bidnerf demo'", None),
+        ({"scene": "demo:blops"}, "'demo:blops'", "demo:blobs"),
         ({"data": "demo:rom"}, "'demo:rom'", "demo:room"),
         ({"device": "gpu"}, "device 'gpu' does not work", "cpu"),
         ({"device": "meta"}, "device 'meta' does not work", "cpu"),
@@ -122,8 +123,9 @@ def test_shards_share_all_trials_between_them(shards: int) -> None:
     ],
 )
 def test_what_cannot_be_planned_is_refused(change: dict[str, Any], found: str, expected: str | None) -> None:
+    scene, data = (change.pop(name, BLOBS) for name in ("scene", "data"))
     with refused(found=found, expected=expected):
-        planned(Plan(**({"map": BLOBS, "data": BLOBS} | change)))
+        bn.evaluate(scene, data, Plan(**change))
 
 
 # Sequences.
@@ -166,9 +168,7 @@ def test_closed_form_sequences_are_rendered_at_the_angle_asked_for() -> None:
     for first, second in itertools.pairwise(views):
         assert float(pose_error(first.T_ref_camera, second.T_ref_camera).rotation_deg) == pytest.approx(15)
     assert all(view.frame.has_depth for view in views)
-    trials = planned(
-        Plan(BLOBS, BLOBS, sizes=((0.9,),), method="bid", config=blob_trial().config, trials=2, images=3)
-    )
+    trials = trials_of(sizes=[0.9], method="bid", config=blob_trial().config, trials=2, images=3)
     assert len(run_trial(trials[0]).trial.frames) == 3
     with refused(found="no frame '0024'"):
         data.views("test", ["0024"])
@@ -189,7 +189,7 @@ def test_blobs_are_localized(monkeypatch: pytest.MonkeyPatch) -> None:
     """The bench's own map is a real one: its poses are found, to a millimetre of the cube of 2."""
     monkeypatch.undo()  # in images of the usual size
     config = json.dumps({"rays": 256, "max_steps": 100})
-    result = run_trial(Trial(BLOBS, BLOBS, ("0002",), "bid", (0.3,), "bid", config, 2))
+    result = run_trial(dataclasses.replace(blob_trial(2), config=config))
     assert result.error is not None
     assert result.error.translation < 0.01
     assert closed_form_map(BLOBS).info.weights == "exact"
@@ -248,7 +248,7 @@ def test_a_half_written_last_line_is_dropped_and_nothing_else(tmp_path: Path, ke
     path.write_bytes(as_line(to_plain(first)) + half[: max(1, int(kept * len(half)) - 1)])
     assert read_results([path]) == [first]
     with ResultsFile(path) as file:
-        assert list(file.results.values()) == [first]
+        assert list(file.values.values()) == [first]
         assert path.read_bytes() == as_line(to_plain(first))
         file.add(second)
     assert path.read_bytes() == whole
@@ -260,7 +260,7 @@ def test_a_last_line_that_lacks_only_its_end_is_kept(tmp_path: Path) -> None:
     whole = path.read_bytes()
     path.write_bytes(whole[:-1])
     with ResultsFile(path) as file:
-        assert list(file.results.values()) == results
+        assert list(file.values.values()) == results
     assert path.read_bytes() == whole
 
 
@@ -444,9 +444,9 @@ def test_shards_joined_are_the_whole(tmp_path: Path, evaluate: Evaluate) -> None
 
 
 def test_a_trial_that_fails_ends_the_run_and_keeps_the_others(tmp_path: Path) -> None:
-    good, bad = blob_trial(0), Trial(BLOBS, BLOBS, ("0000",), "none", (), "bid")
+    good, bad = blob_trial(0), Trial(BLOBS, BLOBS, ("0000",), method="bid")
     with ResultsFile(tmp_path / "r.jsonl") as file, refused(found="method 'bid' needs a start"):
-        run_trials([good, bad, blob_trial(1)], file, InThisProcess(), at_once=1)
+        run_trials([good, bad, blob_trial(1)], file)
     assert [r.seed for r in read_results([tmp_path / "r.jsonl"])] == [0]
 
 
@@ -458,7 +458,7 @@ def test_ctrl_c_keeps_what_is_finished(
 
     def add(self: ResultsFile, result: TrialResult) -> None:
         added(self, result)
-        if len(self.results) == 2:
+        if len(self.values) == 2:
             signal.raise_signal(signal.SIGINT)
 
     with monkeypatch.context() as patch:

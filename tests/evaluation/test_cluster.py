@@ -37,7 +37,7 @@ def test_two_dask_workers_give_the_results_of_one_process(tmp_path: Path) -> Non
 def test_a_scheduler_that_is_not_there_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bidnerf_core.evaluation.workers.PATIENCE", "1s")
+    monkeypatch.setattr("bidnerf_core.evaluation.run.PATIENCE", "1s")
     out = tmp_path / "r.jsonl"
     assert main(["evaluate", "demo:blobs", "--out", str(out), "--dask", "tcp://127.0.0.1:9", *WORDS]) == 1
     said = capsys.readouterr().err.splitlines()

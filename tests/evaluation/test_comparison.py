@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -20,14 +21,14 @@ from bidnerf_core.evaluation import (
     Plan,
     Trial,
     TrialResult,
+    compare,
     comparison_figure,
-    run_comparison,
+    planned,
     run_trial,
-    trials,
+    trial,
 )
-from bidnerf_core.evaluation.comparison import map_bytes, map_labels, map_row, plan_comparison
+from bidnerf_core.evaluation.comparison import MapRow, map_bytes, map_labels, measured
 from bidnerf_core.evaluation.summary import seconds_to_success, success_of
-from bidnerf_core.evaluation.workers import Measured, TrialProcess, measured, samples_per_ray
 from bidnerf_core.io import from_plain
 from refusals import refused
 from trial_results import trial_result
@@ -54,23 +55,25 @@ def maps(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def plan(data: Path) -> Plan:
-    return Plan("", str(data), "bid", ((0.5,),), "bid", QUICK, trials=2)
+def plan() -> Plan:
+    return Plan(protocol="bid", sizes=[0.5], method="bid", config=QUICK, trials=2)
 
 
 @pytest.fixture(scope="module")
 def usual(maps: list[Path], data: Path) -> Trial:
-    return Trial(str(maps[0]), str(data), ("t_0000",), "bid", (0.5,), "bid", QUICK, 0)
+    return Trial(str(maps[0]), str(data), ("t_0000",), (0.5,), protocol="bid", method="bid", config=QUICK)
 
 
 @pytest.fixture(scope="module")
-def compared(maps: list[Path], plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> Comparison:
+def compared(
+    maps: list[Path], data: Path, plan: Plan, tmp_path_factory: pytest.TempPathFactory
+) -> Comparison:
     """Run from a folder with a file that bears the name of a module of Python's."""
     folder = tmp_path_factory.mktemp("user")
     (folder / "statistics.py").write_text("raise SystemExit('a file of the user was run')")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        return run_comparison(plan, maps)
+        return compare(maps, data, plan)
 
 
 def result(times: float, trace: list[float], seconds: float = 1.0) -> TrialResult:
@@ -92,9 +95,12 @@ def test_every_map_is_tried_on_the_same_frames_from_the_same_starts(compared: Co
 def test_a_process_elsewhere_finds_what_this_one_finds(
     compared: Comparison, maps: list[Path], plan: Plan, data: Path
 ) -> None:
-    planned = plan_comparison(plan, [str(m) for m in maps], open_dataset(data))
-    for trial, found in ((planned[0][0], compared.results[0][0]), (planned[1][1], compared.results[1][1])):
-        again = run_trial(trial)
+    for place in (0, 1):
+        trials, found = (
+            planned(plan, str(maps[place]), str(data), open_dataset(data)),
+            compared.results[place],
+        )
+        again, found = run_trial(trials[place]), found[place]
         assert replace(again, seconds=0.0, peak_memory_bytes=0) == replace(
             found, seconds=0.0, peak_memory_bytes=0
         )
@@ -106,9 +112,9 @@ def test_a_process_elsewhere_takes_no_file_of_the_folder_for_a_module(compared: 
 
 def test_a_process_keeps_one_map(usual: Trial) -> None:
     """Its memory is measured as that of one."""
-    trials._opened.cache_clear()
+    trial._opened.cache_clear()
     measured(usual)
-    assert trials._opened.cache_info().currsize == 1
+    assert trial._opened.cache_info().currsize == 1
 
 
 def test_a_row_says_what_the_map_costs(compared: Comparison, maps: list[Path]) -> None:
@@ -123,9 +129,10 @@ def test_a_row_says_what_the_map_costs(compared: Comparison, maps: list[Path]) -
 
 def test_samples_are_those_of_the_level_that_the_method_uses(maps: list[Path], usual: Trial) -> None:
     trial = replace(usual, map=str(maps[1]), frames=("t_0000",))
-    fine = replace(trial, config=json.dumps({"level": None}))
-    assert samples_per_ray(trial) == samples_per_ray(replace(trial, config=json.dumps({"level": 0})))
-    assert samples_per_ray(fine) > 0
+    fine = replace(trial, config=json.dumps(json.loads(QUICK) | {"level": None}))
+    coarse = replace(trial, config=json.dumps(json.loads(QUICK) | {"level": 0}))
+    assert measured(trial)[1] == measured(coarse)[1]
+    assert measured(fine)[1] > 0
 
 
 def test_speed_is_that_of_the_trials_that_succeeded() -> None:
@@ -141,22 +148,20 @@ def test_speed_is_that_of_the_trials_that_succeeded() -> None:
 
 def test_a_median_error_counts_lost_poses_as_worst() -> None:
     good, gone = result(0.1, [1.0, 0.1]), replace(result(0.1, [1.0, 0.1]), error=None)
-    assert map_row("a", 0, [Measured(good, 1.0)] * 2 + [Measured(gone, 1.0)]).translation == pytest.approx(
-        0.01
-    )
-    assert map_row("a", 0, [Measured(good, 1.0)] + [Measured(gone, 1.0)] * 2).translation is None
+    assert MapRow.of("a", 0, [good, good, gone], [1.0] * 3).translation == pytest.approx(0.01)
+    assert MapRow.of("a", 0, [good, gone, gone], [1.0] * 3).translation is None
 
 
 def test_without_a_start_there_is_no_share_of_its_error(tmp_path: Path) -> None:
     free = replace(result(1.0, [0.04, 0.01]), start_error=None)
-    row = map_row("short", 0, [Measured(free, 1.0)])
+    row = MapRow.of("short", 0, [free], [1.0])
     assert row.success["10%"] is None
     absolute = row.success["5deg 0.05"]
     assert absolute is not None
     assert (absolute.rate.successes, absolute.steps) == (1, 0)
     found = Comparison("d", "test", "none", (), "auto", {}, 0, 1, (row,), ((free,),))
-    comparison_figure([tmp_path / "a.svg"], found)
-    assert "<svg" in (tmp_path / "a.svg").read_text()
+    assert "<svg" in comparison_figure(tmp_path, found).read_text()
+    assert "step" not in str(found).partition("\n")[2].partition("success:")[0]  # the method has no steps
 
 
 def test_maps_have_the_shortest_names_that_tell_them_apart() -> None:
@@ -164,35 +169,32 @@ def test_maps_have_the_shortest_names_that_tell_them_apart() -> None:
     assert map_labels(["/x/a", "/y/a", "/y/b"]) == ["x/a", "y/a", "y/b"]
 
 
-def test_the_plan_is_the_protocols(plan: Plan, data: Path) -> None:
-    planned = plan_comparison(replace(plan, trials=4), ["a", "b"], open_dataset(data))
-    assert [len(trials) for trials in planned] == [2] * 4
-    assert all(a.map == "a" and b == replace(a, map="b") for a, b in planned)
-    assert {a.frames for a, _ in planned[:3]} == {("t_0000",), ("t_0001",), ("t_0002",)}
+def test_maps_are_named_once(data: Path) -> None:
     with refused(where="maps", found="a, ./a: one is named twice", expected="different ones"):
-        run_comparison(plan, ["a", "./a"])
+        compare(["a", "./a"], data)
     with refused(found="no maps", expected="at least one"):
-        run_comparison(plan, [])
+        compare([], data)
 
 
-def test_a_trial_that_cannot_be_is_told_in_one_line(maps: list[Path], usual: Trial) -> None:
-    with TrialProcess() as process:
-        with refused(found="split 'test': no frame 'r_9999'"):
-            process.run(replace(usual, map=str(maps[0]), frames=("r_9999",)))
-        found = process.run(replace(usual, map=str(maps[0]), frames=("t_0000",)))  # it lives on
-        assert found.result.frame == "t_0000"
-        process._process.kill()
-        with refused(where=maps[0], found="frame t_0000 ended with status -9"):
-            process.run(replace(usual, map=str(maps[0]), frames=("t_0000",)))
+def end_process(*_: object) -> None:
+    os._exit(9)
+
+
+def test_a_process_that_ends_is_told_in_one_line(
+    maps: list[Path], data: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bidnerf_core.evaluation.comparison.measured", end_process)
+    with refused(where=maps[0], found="frame t_0002 ended", expected="memory"):
+        compare([maps[0]], data, plan)
 
 
 def test_the_picture_is_written(compared: Comparison, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    comparison_figure([tmp_path / "a.png", tmp_path / "a.svg"], compared)
-    image = iio.imread(tmp_path / "a.png")
+    drawn = comparison_figure(tmp_path, compared)
+    image = iio.imread(drawn.with_suffix(".png"))
     assert image.shape[0] > 400
     assert image[..., :3].std() > 5
-    assert "<svg" in (tmp_path / "a.svg").read_text()
+    assert "<svg" in drawn.read_text()
 
 
 @pytest.mark.usefixtures("no_processes")
@@ -200,7 +202,18 @@ def test_the_command_prints_a_table_and_writes_what_it_says(
     maps: list[Path], data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folders = [str(maps[0]), str(data)]
-    options = ["--trials", "1", "--rays", "32", "--max-steps", "2", "--out", str(tmp_path / "out")]
+    options = [
+        "--method",
+        "bid",
+        "--trials",
+        "1",
+        "--rays",
+        "32",
+        "--max-steps",
+        "2",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     assert main(["compare", *folders, *options]) == 0
     shown = capsys.readouterr()
     assert "short" in shown.out
@@ -215,7 +228,7 @@ def test_the_command_prints_a_table_and_writes_what_it_says(
 
 @pytest.mark.usefixtures("no_processes")
 def test_the_command_prints_json(maps: list[Path], data: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["--rays", "32", "--max-steps", "2", "--size", "0.3", "--frame", "t_0001", "--trials", "1", "--json"]  # fmt: skip
+    words = ["--method", "bid", "--rays", "32", "--max-steps", "2", "--size", "0.3", "--frame", "t_0001", "--trials", "1", "--json"]  # fmt: skip
     assert main(["compare", str(maps[0]), str(data), *words]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["size"] == [0.3]

@@ -21,17 +21,18 @@ import bidnerf_core as bn
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
-
-# Inside: counts how often a map is opened for its trials, and lets processes outlive an evaluation
 from bidnerf_core.evaluation import (
     Comparison,
+    Plan,
     ResultTable,
     TrialResult,
     local_processes,
     opened,
     read_results,
 )
-from bidnerf_core.evaluation.workers import InThisProcess
+
+# Inside: a map that stays in memory, and processes that outlive an evaluation
+from bidnerf_core.evaluation.run import InThisProcess
 from bidnerf_core.io import from_plain
 from bidnerf_core.localization import find_method
 from bidnerf_core.progress import Progress
@@ -44,11 +45,15 @@ QUICK: dict[str, Any] = {
     "protocol": "bid",
     "sizes": [0.3],
 }
-COMPARED = {name: value for name, value in QUICK.items() if name != "sizes"}
 WORDS = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--size", "0.3", "--workers", "1"]
 BLOBS = "demo:blobs"
 
 pytestmark = pytest.mark.usefixtures("quick_trials")
+
+
+def quick(**more: Any) -> Plan:
+    """A plan of few rays and steps."""
+    return Plan(**QUICK | more)
 
 
 def timeless(rows: Any) -> list[TrialResult]:
@@ -88,21 +93,21 @@ def test_a_table_has_what_the_command_writes(
     words = ["evaluate", str(scene), str(data), "--out", str(tmp_path / "command.jsonl"), "--trials", "3"]
     assert main([*words, *WORDS, "--fault", "none", "blur:1"]) == 0
     expected = timeless(read_results([tmp_path / "command.jsonl"]))
-    given = {"trials": 3, "faults": ["none", "blur:1"], **QUICK}
+    plan = quick(trials=3, faults=["none", "blur:1"])
     capsys.readouterr()
-    table = bn.evaluate(scene, data, out=tmp_path / "python.jsonl", **given)
+    table = bn.evaluate(scene, data, plan, out=tmp_path / "python.jsonl")
     assert capsys.readouterr() == ("", "")
     assert timeless(table.rows) == expected == timeless(read_results([tmp_path / "python.jsonl"]))
     loaded, dataset = bn.load_map(scene), open_dataset(data)
-    in_memory = bn.evaluate(loaded, dataset, **given)
+    in_memory = bn.evaluate(loaded, dataset, plan)
     assert placeless(in_memory.rows) == placeless(table.rows)
     assert [row.trial.map for row in in_memory.rows] == [loaded.info.backend] * 6
-    assert placeless(bn.evaluate(loaded, dataset.views("test"), **given).rows) == placeless(table.rows)
+    assert placeless(bn.evaluate(loaded, dataset.views("test"), plan).rows) == placeless(table.rows)
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_table_is_summed_up_saved_and_loaded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    table = bn.evaluate(BLOBS, BLOBS, trials=4, **QUICK)
+    table = bn.evaluate(BLOBS, BLOBS, quick(trials=4))
     (row,) = table.summary
     found = row.statistics.criteria["5deg 0.05"]
     assert found is not None
@@ -123,8 +128,8 @@ def test_a_map_is_read_once_until_it_changes(shared: Path, tmp_path: Path) -> No
     for steps in (4, 8):
         words = ["train", str(data), "--out", str(scene), "--overwrite", *tiny.options(steps)]
         assert main(words) == 0
-        found += [opened(str(scene), str(data), *device)[0] for device in ((), ("cpu",))]
-        (row,) = bn.evaluate(scene, data, trials=1, **QUICK).rows
+        found += [opened(str(scene), str(data), plan)[0] for plan in (None, quick(trials=1))]
+        (row,) = bn.evaluate(scene, data, quick(trials=1)).rows
         assert row.weights == found[-1].training == bn.load_map(scene).info.weights
     assert found[0] is found[1] is not found[2] is found[3]
 
@@ -132,7 +137,7 @@ def test_a_map_is_read_once_until_it_changes(shared: Path, tmp_path: Path) -> No
 def test_results_of_another_map_in_memory_are_not_taken_for_its_own(tmp_path: Path) -> None:
     """Maps in memory have no file of weights, so that their content tells them apart."""
     first, second = (bn.train(tiny.views(), config=tiny.config(steps), bake=False) for steps in (2, 6))
-    given: dict[str, Any] = {"data": tiny.views(2), "trials": 1, "out": tmp_path / "r.jsonl", **QUICK}
+    given: dict[str, Any] = {"data": tiny.views(2), "plan": quick(trials=1), "out": tmp_path / "r.jsonl"}
     (row,) = bn.evaluate(first, **given).rows
     assert row.weights == first.training
     assert timeless(bn.evaluate(first, **given).rows) == timeless([row])
@@ -150,7 +155,7 @@ def test_what_this_process_alone_has_registered_is_not_mistaken_for_what_is_inst
     bn.register("methods", "bid", mine, replace=True)
     bn.register("methods", "unused", mine)
     said = "method 'bid' was registered in one process but is unknown in another"
-    assert len(bn.evaluate(BLOBS, BLOBS, trials=2, workers=1, **QUICK).rows) == 2
+    assert len(bn.evaluate(BLOBS, BLOBS, quick(trials=2)).rows) == 2
     with local_processes(2) as pool:
 
         class Lasting(InThisProcess):
@@ -161,33 +166,33 @@ def test_what_this_process_alone_has_registered_is_not_mistaken_for_what_is_inst
                 wait([future])
                 return future
 
-        monkeypatch.setattr("bidnerf_core.evaluation.workers.local_processes", lambda count: Lasting())
+        monkeypatch.setattr("bidnerf_core.evaluation.run.local_processes", lambda count: Lasting())
         with refused(found=said):
-            bn.evaluate(BLOBS, BLOBS, trials=2, workers=2, **QUICK)
-        assert len(bn.evaluate(BLOBS, BLOBS, trials=2, workers=2, **{**QUICK, "method": "inerf"}).rows) == 2
+            bn.evaluate(BLOBS, BLOBS, quick(trials=2), workers=2)
+        assert len(bn.evaluate(BLOBS, BLOBS, quick(trials=2, method="inerf"), workers=2).rows) == 2
     with refused(found=said):
-        bn.compare([BLOBS], BLOBS, trials=1, method="bid", config=QUICK["config"])
+        bn.compare([BLOBS], BLOBS, quick(trials=1))
 
 
 def test_results_say_where_a_map_in_memory_computed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever ``device`` says, which is for maps in folders. No trial is run: a meta device computes nothing."""
+    """Whatever the plan's device says, which is for maps in folders. No trial is run: a meta device computes nothing."""
     scene = bn.train(tiny.views(2), config=tiny.config(1), bake=False)
     assert isinstance(scene.field, torch.nn.Module)
     elsewhere = dataclasses.replace(scene, field=scene.field.to("meta"))
     seen: list[Any] = []
-    monkeypatch.setattr(
-        import_module("bidnerf_core.evaluation.evaluate"),
-        "run_plan",
-        lambda plan, *_, **__: seen.append(plan),
-    )
-    monkeypatch.setattr(
-        import_module("bidnerf_core.evaluation.evaluate"),
-        "compare_maps",
-        lambda starts, *_: seen.extend(starts[0]),
-    )
-    bn.evaluate(elsewhere, tiny.views(2), trials=1, **QUICK)
-    bn.compare([elsewhere, BLOBS], tiny.views(2), trials=1, method="bid", protocol="bid")
-    assert [found.device for found in seen] == ["meta", "meta", "cpu"]
+
+    def stop(trial: Any, *_: Any) -> None:
+        seen.append(trial.device)
+        raise LookupError("no trial is run")
+
+    for module, name in (("run", "run_trial"), ("comparison", "measured")):
+        monkeypatch.setattr(import_module(f"bidnerf_core.evaluation.{module}"), name, stop)
+    for begin in (lambda: bn.evaluate(elsewhere, tiny.views(2), quick(trials=1)),
+                  lambda: bn.compare([elsewhere], tiny.views(2), quick(trials=1)),
+                  lambda: bn.compare([BLOBS], tiny.views(2), quick(trials=1))):  # fmt: skip
+        with pytest.raises(LookupError):
+            begin()
+    assert seen == ["meta", "meta", "cpu"]
 
 
 def test_masks_hide_parts_of_the_images_in_every_trial(shared: Path, masks: Masks, tmp_path: Path) -> None:
@@ -199,16 +204,15 @@ def test_masks_hide_parts_of_the_images_in_every_trial(shared: Path, masks: Mask
     whole, black, white = (read_results([tmp_path / f"{number}.jsonl"]) for number in range(3))
     assert len({result[0].loss for result in (whole, black, white)}) == 3
     given = bn.load_map(scene), open_dataset(data, masks=hiding[1])
-    in_memory = bn.evaluate(*given, **QUICK, trials=2, seed=5)
-    again = bn.evaluate(scene, data, **QUICK, trials=2, seed=5, masks=hiding[1])
+    in_memory = bn.evaluate(*given, quick(trials=2, seed=5))
+    again = bn.evaluate(scene, data, quick(trials=2, seed=5, masks=hiding[1]))
     assert [r.T_world_camera for r in in_memory.rows] == [r.T_world_camera for r in black]
     assert timeless(again.rows) == timeless(black)
     assert black[0].trial.masks == "masks"
     labels = {group.label for group in ResultTable((*whole, *black, *white)).groups}
     assert labels == {"bid, nothing hidden", "bid, black of masks hidden", "bid, white of masks hidden"}
-    compared = bn.compare([scene], data, method="bid", config=QUICK["config"], protocol="bid", size=0.3, trials=2,
-                          seed=5, masks=hiding[1])  # fmt: skip
-    assert timeless(compared.results[0]) == timeless(black)
+    compared = bn.compare([bn.load_map(scene)], data, quick(trials=2, seed=5, masks=hiding[1]))
+    assert placeless(compared.results[0]) == placeless(black)
 
 
 def test_frames_that_masks_hide_wholly_are_named_and_left_out(
@@ -222,10 +226,10 @@ def test_frames_that_masks_hide_wholly_are_named_and_left_out(
     assert capsys.readouterr().err.count(told) == 1
     assert {row.frame for row in read_results([tmp_path / "r.jsonl"])} == set(names[1:])
     with pytest.warns(bn.InputWarning, match="1 whole frame"):
-        found = bn.compare([bn.load_map(scene)], data, **COMPARED, trials=6, masks=place)
+        found = bn.compare([bn.load_map(scene)], data, quick(trials=6, masks=str(place)))
     assert {row.frame for row in found.results[0]} == set(names[1:])
     with refused(where=place, found=f"1 whole frame of 1, not tried: {names[0]};") as caught:
-        bn.evaluate(scene, data, **QUICK, frames=names[:1], masks=place)
+        bn.evaluate(scene, data, quick(frames=names[:1], masks=str(place)))
     assert "--mask-hides" in caught.error.found
 
 
@@ -238,9 +242,9 @@ def test_all_splits_are_evaluated_together(shared: Path, tmp_path: Path) -> None
     assert {row.trial.split for row in rows} == {"all"}
     assert len({row.frame for row in rows}) == count
     for given in (shared / "data", data):
-        found = bn.evaluate(shared / "map", given, **QUICK, split="all", trials=count)
+        found = bn.evaluate(shared / "map", given, quick(split="all", trials=count))
         assert timeless(found.rows) == timeless(rows)
-    compared = bn.compare([bn.load_map(shared / "map")], data, **COMPARED, split="all", trials=2)
+    compared = bn.compare([bn.load_map(shared / "map")], data, quick(split="all", trials=2))
     assert compared.split == "all"
 
 
@@ -256,24 +260,24 @@ def test_folders_without_masks_are_refused(
 def test_frames_of_one_name_are_refused() -> None:
     views = [dataclasses.replace(v, frame=dataclasses.replace(v.frame, name="image")) for v in tiny.views(2)]
     with refused(found="2 frames named 'image'", expected="different names"):
-        bn.evaluate(BLOBS, views, trials=1, **QUICK)
+        bn.evaluate(BLOBS, views, quick(trials=1))
 
 
 def test_a_file_of_results_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     out = tmp_path / "file" / "r.jsonl"
     with refused(where=out, found="cannot be written", expected="a file"):
-        bn.evaluate(BLOBS, BLOBS, trials=1, out=out, **QUICK)
+        bn.evaluate(BLOBS, BLOBS, quick(trials=1), out=out)
 
 
 def test_any_thread_evaluates_and_leaves_no_trace() -> None:
-    expected = timeless(bn.evaluate(BLOBS, BLOBS, trials=2, **QUICK).rows)
+    expected = timeless(bn.evaluate(BLOBS, BLOBS, quick(trials=2)).rows)
     handler, threads = signal.getsignal(signal.SIGINT), torch.get_num_threads()
     found: dict[int, Any] = {}
 
     def work(number: int) -> None:
         scene, data = closed_form_map(BLOBS), closed_form_data(BLOBS)
-        found[number] = placeless(bn.evaluate(scene, data, trials=2, **QUICK).rows)
+        found[number] = placeless(bn.evaluate(scene, data, quick(trials=2)).rows)
 
     others = [threading.Thread(target=work, args=(number,)) for number in range(2)]
     for other in others:
@@ -295,15 +299,15 @@ def test_a_cancelled_evaluation_goes_on(tmp_path: Path) -> None:
             stop.set()
 
     with pytest.raises(bn.Cancelled, match=r"3 trials are left in .*, the same command resumes"):
-        bn.evaluate(BLOBS, BLOBS, trials=5, out=out, progress=stop_at_two, cancel=stop.is_set, **QUICK)
+        bn.evaluate(BLOBS, BLOBS, quick(trials=5), out=out, progress=stop_at_two, cancel=stop.is_set)
     assert [(p.stage, p.done, p.total, p.unit) for p in seen] == [("trials", n, 5, "trials") for n in (1, 2)]
     before = out.read_bytes()
     assert len(read_results([out])) == 2
-    table = bn.evaluate(BLOBS, BLOBS, trials=5, out=out, **QUICK)
+    table = bn.evaluate(BLOBS, BLOBS, quick(trials=5), out=out)
     assert out.read_bytes().startswith(before)
-    assert timeless(table.rows) == timeless(bn.evaluate(BLOBS, BLOBS, trials=5, **QUICK).rows)
+    assert timeless(table.rows) == timeless(bn.evaluate(BLOBS, BLOBS, quick(trials=5)).rows)
     with pytest.raises(bn.Cancelled, match="nothing is kept"):
-        bn.evaluate(BLOBS, BLOBS, trials=1, cancel=lambda: True, **QUICK)
+        bn.evaluate(BLOBS, BLOBS, quick(trials=1), cancel=lambda: True)
 
 
 def test_an_error_of_the_callback_is_the_callers_and_its_trial_is_kept(tmp_path: Path) -> None:
@@ -311,7 +315,7 @@ def test_an_error_of_the_callback_is_the_callers_and_its_trial_is_kept(tmp_path:
         raise LookupError(str(progress))
 
     with pytest.raises(LookupError, match=r"trials: 1/3 trials, \d within"):
-        bn.evaluate(BLOBS, BLOBS, trials=3, out=tmp_path / "r.jsonl", progress=fail, **QUICK)
+        bn.evaluate(BLOBS, BLOBS, quick(trials=3), out=tmp_path / "r.jsonl", progress=fail)
     assert len(read_results([tmp_path / "r.jsonl"])) == 1
 
 
@@ -339,9 +343,12 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
         ({"data": [1]}, "data is a list", "a folder, a dataset or a list of views"),
     ]
     for change, found, expected in wrong:
-        given = {"scene": scene, "data": BLOBS, "trials": 1, **QUICK, **change}
+        given = {"scene": scene, "data": BLOBS, "workers": 1} | change
+        first, data, workers = (given.pop(name) for name in ("scene", "data", "workers"))
         with refused(found=found, expected=expected):
-            bn.evaluate(**given)
+            bn.evaluate(first, data, quick(**{"trials": 1} | given), workers=workers)
+    with refused(expected="one size and one fault"):
+        bn.compare([scene], BLOBS, quick(sizes=[0.3, 0.5]))
 
 
 @pytest.mark.slow
@@ -349,19 +356,19 @@ def test_maps_in_memory_and_in_folders_are_compared(
     shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.undo()  # the process of a map in a folder judges as usual
-    given = {"trials": 2, "method": "bid", "config": QUICK["config"], "protocol": "bid", "size": 0.3}
+    plan = quick(trials=2)
     scene, data = bn.load_map(shared / "map"), shared / "data"
     seen: list[str] = []
-    found = bn.compare([scene, shared / "map", scene], data, progress=lambda p: seen.append(str(p)), **given)
+    found = bn.compare([scene, shared / "map", scene], data, plan, progress=lambda p: seen.append(str(p)))
     assert len({row.map for row in found.rows}) == 3
     assert len(seen) == 6
     first, other, third = map(placeless, found.results)
     assert first == other == third
     assert found.rows[0].map_bytes > 0
-    named = bn.compare({"mine": scene}, open_dataset(data), **given)
+    named = bn.compare({"mine": scene}, open_dataset(data), plan)
     assert [row.map for row in named.rows] == ["mine"]
     assert "mine" in str(named)
     named.save(tmp_path / "c.json")
     assert from_plain(Comparison, json.loads((tmp_path / "c.json").read_text()), "c") == named
     with pytest.raises(bn.Cancelled):
-        bn.compare([scene], data, cancel=lambda: True, **given)
+        bn.compare([scene], data, plan, cancel=lambda: True)

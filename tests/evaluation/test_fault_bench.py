@@ -32,9 +32,9 @@ from bidnerf_core.evaluation import (
 )
 
 # Inside: the values of curves, which a report shows as pictures, and the images of a trial
-from bidnerf_core.evaluation.plots import draw_faults, fault_curves
-from bidnerf_core.evaluation.trials import trial_views
-from bidnerf_core.evaluation.workers import InThisProcess
+from bidnerf_core.evaluation.plots import Figures, fault_curves
+from bidnerf_core.evaluation.run import InThisProcess
+from bidnerf_core.evaluation.trial import trial_views
 from bidnerf_core.registry import registered
 from bidnerf_core.scenes import closed_form_data
 from refusals import refused
@@ -45,21 +45,25 @@ QUICK = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--workers", "1"
 
 
 def trial(fault: str = NO_FAULT, seed: int = 0) -> Trial:
-    return Trial("demo:blobs", "demo:blobs", ("0003",), "none", (), "auto", "{}", seed, fault=fault)
+    return Trial("demo:blobs", "demo:blobs", ("0003",), (), seed, fault)
+
+
+def trials_of(**options: Any) -> list[Trial]:
+    return planned(Plan(**options), "demo:blobs", "demo:blobs", closed_form_data("demo:blobs"))
 
 
 def test_a_plan_tries_each_fault_on_the_same_frames() -> None:
     faults = ("none", "depth-scale:1.02", "exposure:0.7+blur:3")
-    trials = planned(Plan("demo:blobs", "demo:blobs", "none", trials=3, faults=faults))
+    trials = trials_of(trials=3, faults=faults)
     assert [t.fault for t in trials] == [fault for fault in faults for _ in range(3)]
     assert len({(t.frames, t.seed) for t in trials}) == 3
     assert len({key_of(t) for t in trials}) == 9
     with refused(
         found="fault depth-scale:1.02 changes the measured depth, which the method does not receive"
     ):
-        planned(Plan("demo:blobs", "demo:blobs", "none", depth=False, faults=faults))
+        trials_of(depth=False, faults=faults)
     with refused(found="no fault 'blurr', did you mean 'blur'?"):
-        planned(Plan("demo:blobs", "demo:blobs", "none", faults=("blurr:1",)))
+        Plan(faults=["blurr:1"])
 
 
 def test_the_method_gets_the_faulty_views() -> None:
@@ -94,14 +98,16 @@ def test_results_notice_when_a_fault_has_changed(tmp_path: Path, monkeypatch: py
     words = ["evaluate", "demo:blobs", "--out", str(tmp_path / "r.jsonl"), *QUICK, "--trials", "1"]
     words += ["--fault", "exposure:0.7"]
     assert main(words) == 0
-    plan = Plan("demo:blobs", "demo:blobs", sizes=((0.3,),), trials=1, method="bid", faults=("exposure:0.7",),
-                config='{"max_steps": 2, "rays": 16}')  # fmt: skip
+    trials = trials_of(
+        protocol="bid", sizes=[0.3], trials=1, method="bid", faults=["exposure:0.7"],
+        config='{"max_steps": 2, "rays": 16}',
+    )  # fmt: skip
     with ResultsFile(tmp_path / "r.jsonl") as file:
-        assert left_to_do(planned(plan), file) == []
+        assert left_to_do(trials, file) == []
         other = dataclasses.replace(FAULTS["exposure"], change=FAULTS["blur"].change)
         monkeypatch.setitem(registered, ("faults", "exposure"), other)
         with refused(where=tmp_path / "r.jsonl", found="made with other images"):
-            left_to_do(planned(plan), file)
+            left_to_do(trials, file)
 
 
 def result(fault: str, seed: int, right: bool, converged: bool) -> TrialResult:
@@ -138,10 +144,10 @@ def test_the_figure_shows_success_acceptance_and_silent_errors(
     results: list[TrialResult], tmp_path: Path
 ) -> None:
     pytest.importorskip("matplotlib")
-    drawn = draw_faults(grouped(results), tmp_path)
+    drawn = Figures(grouped(results), tmp_path, "5deg 0.05").faults()
     assert drawn is not None
-    assert drawn.with_suffix(".png").stat().st_size > 5000
-    assert draw_faults(grouped(results[:10]), tmp_path / "none") is None
+    assert drawn.file.with_suffix(".png").stat().st_size > 5000
+    assert Figures(grouped(results[:10]), tmp_path / "none", "5deg 0.05").faults() is None
     lines = tmp_path / "r.jsonl"
     ResultTable(tuple(results)).save(lines)
     assert main(["report", str(lines), "--out", str(tmp_path / "report")]) == 0

@@ -37,10 +37,9 @@ from bidnerf_core.evaluation import (
 )
 
 # Inside: statistical tests, groups and figures before they are put on a page
-from bidnerf_core.evaluation.groups import situation_titles, situations
 from bidnerf_core.evaluation.plots import Figures
 from bidnerf_core.evaluation.report import page
-from bidnerf_core.evaluation.summary import compare_pair
+from bidnerf_core.evaluation.summary import compare_pair, situation_titles, situations
 from bidnerf_core.io import to_plain
 from bidnerf_core.results import success_rate_by_frame
 from trial_results import trial_result
@@ -55,7 +54,9 @@ def result(seed: int, reached: int | None, size: float = 0.5, **settings: Any) -
     turned = [12.0] * far + [0.1] * (STEPS + 1 - far)
     protocol, images = settings.pop("protocol", "bid"), settings.pop("images", 1)
     sizes, config = () if protocol == "none" else (size,), json.dumps(settings)
-    trial = Trial("house", "photos", ("a",) * images, protocol, sizes, "bid", config, seed)
+    trial = Trial(
+        "house", "photos", ("a",) * images, sizes, seed, protocol=protocol, method="bid", config=config
+    )
     found = trial_result(trial, moved, turned, converged=reached is not None)
     start = None if protocol == "none" else found.start_error
     return dataclasses.replace(found, start_error=start, settings={"rays": 64, "level": 0, **settings})
@@ -179,7 +180,7 @@ def test_the_page_needs_nothing_beside_it(
     assert page.fetched == []
     assert page.open == 0, "an element is not closed"
     assert "url(" not in (tmp_path / "out" / "index.html").read_text()
-    assert len(page.pictures) == 5
+    assert len(page.pictures) == 3
     for picture in page.pictures:
         ET.fromstring(base64.b64decode(picture.partition(",")[2]))
     for said in (
@@ -187,7 +188,7 @@ def test_the_page_needs_nothing_beside_it(
         "100.0 %6/6 on 1 frame, 21 to 100 %", "50.0 %6/12 on 1 frame, 5 to 95 %", "Fisher",
     ):  # fmt: skip
         assert said in page.text
-    for name in ("rates", "steps", "share", "translation", "rotation"):
+    for name in ("rates", "errors", "convergence"):
         assert iio.imread(tmp_path / "out" / f"{name}.png").std() > 1
         assert (tmp_path / "out" / f"{name}.svg").stat().st_size > 2000
     out = capsys.readouterr().out
@@ -204,8 +205,8 @@ def test_a_report_of_one_hopeless_trial_without_a_start(tmp_path: Path) -> None:
 
 
 def test_figures_are_the_same_each_time(tmp_path: Path, results: list[TrialResult]) -> None:
-    first, second = (Figures(grouped(results), tmp_path / name, "10%").steps() for name in ("a", "b"))
-    assert first.read_bytes() == second.read_bytes()
+    first, second = (Figures(grouped(results), tmp_path / name, "10%").errors() for name in ("a", "b"))
+    assert first.file.read_bytes() == second.file.read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -256,14 +257,14 @@ def test_an_interrupted_report_is_written_again(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(Figures, "steps", interrupt)
+        patch.setattr(Figures, "errors", interrupt)
         assert main(["report", str(file), "--out", str(out)]) == 130
     assert (out / "rates.png").exists()
     assert main(["report", str(file), "--out", str(out)]) == 0
     assert read(out).fetched == []
     written = (out / "index.html").read_bytes()
     with monkeypatch.context() as patch:  # the page of before stays until the new one is whole
-        patch.setattr(Figures, "steps", interrupt)
+        patch.setattr(Figures, "errors", interrupt)
         assert main(["report", str(file), "--out", str(out)]) == 130
     assert (out / "index.html").read_bytes() == written
 
@@ -296,8 +297,8 @@ def test_a_report_without_starts_uses_no_share_of_their_error(
     free = [result(seed, 2 + seed, protocol="none") for seed in range(3)]
     file, out = write(tmp_path / "r.jsonl", *free), tmp_path / "out"
     assert main(["report", str(file), "--out", str(out)]) == 0
-    assert "Steps to success (under 5° and 0.05 units)" in read(out).text
-    assert "(translation error at most 10 %" not in read(out).text
+    assert "meet the criterion (under 5° and 0.05 units)" in read(out).text
+    assert "at most 10 %" not in read(out).text
     capsys.readouterr()
     assert main(["report", str(file), "--out", str(out), "--criterion", "10%"]) == 2
     err = capsys.readouterr().err
@@ -305,7 +306,22 @@ def test_a_report_without_starts_uses_no_share_of_their_error(
     assert err.count("\n") == 1
     mixed = write(tmp_path / "m.jsonl", *free, result(0, 2), result(1, 3))
     assert main(["report", str(mixed), "--out", str(out), "--criterion", "10%"]) == 0
-    assert "Trials without a start are not shown" in read(out).text
+
+
+def test_a_method_without_steps_has_confidence_and_deviations_instead(tmp_path: Path) -> None:
+    """Nothing is said or drawn of steps that there are not."""
+    spread = tuple(tuple(1e-4 * (i == j) for j in range(6)) for i in range(6))
+    results = [
+        trial_result(
+            Trial("house", "photos", (f"{n}",), (), n), [0.01 * n], confidence=n / 40, covariance=spread,
+            start_error=None, converged=n % 2 == 0,
+        )
+        for n in range(40)
+    ]  # fmt: skip
+    assert main(["report", str(write(tmp_path / "r.jsonl", *results)), "--out", str(tmp_path / "out")]) == 0
+    assert {path.stem for path in (tmp_path / "out").glob("*.svg")} == {"rates", "errors", "calibration"}
+    for text in ("ms per step", "steps to", "10 %"):
+        assert text not in read(tmp_path / "out").text
 
 
 @pytest.mark.parametrize(
@@ -390,7 +406,7 @@ def test_hostile_names_are_harmless_everywhere(tmp_path: Path, capfd: pytest.Cap
     ):
         assert shown in page.text
     drawings = list((tmp_path / "out").glob("*.svg"))
-    assert len(drawings) == len(page.pictures) == 5
+    assert len(drawings) == len(page.pictures) == 3
     for drawing in drawings:
         ET.parse(drawing)
 
@@ -417,9 +433,9 @@ def test_more_than_can_be_drawn_is_in_the_tables(tmp_path: Path, monkeypatch: py
     figures, whole = (Figures(groups, tmp_path, "5deg 0.05") for groups in (table.groups, table.groups[:3]))
     assert "At most 3 of 8 groups" in figures.omitted
     assert whole.omitted == ""
-    heights = [iio.imread(each.rates().with_suffix(".png")).shape[0] for each in (figures, whole)]
+    heights = [iio.imread(each.rates().file.with_suffix(".png")).shape[0] for each in (figures, whole)]
     assert heights[0] == heights[1]
-    assert "map 7" in page("Many", table, [], [], "5deg 0.05")
+    assert "map 7" in page("Many", table, [], "5deg 0.05")
 
 
 def test_warnings_of_other_libraries_cannot_control_the_terminal(

@@ -33,9 +33,8 @@ QUICK = '{"max_steps": 4, "rays": 64}'
 
 @pytest.fixture
 def trial(shared: Path) -> Trial:
-    return Trial(
-        str(shared / "map"), str(shared / "data"), ("t_0001",), "bid", (0.5,), "bid", config=QUICK, seed=3
-    )
+    folders = str(shared / "map"), str(shared / "data")
+    return Trial(*folders, ("t_0001",), (0.5,), 3, protocol="bid", method="bid", config=QUICK)
 
 
 def timeless(result: TrialResult) -> TrialResult:

@@ -1,0 +1,382 @@
+"""Evaluation: many localizations in one map as a table, run in this process, in others, or on a cluster."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import replace
+from multiprocessing import connection, get_context, parent_process
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import torch
+
+from bidnerf_core.datasets import Capture, of_views
+from bidnerf_core.devices import usable_cores
+from bidnerf_core.errors import Cancelled, InputError, amount
+from bidnerf_core.evaluation.faults import NO_FAULT
+from bidnerf_core.evaluation.plan import Plan, Trial, listed, parse_settings, planned, repeated_frames
+from bidnerf_core.evaluation.provenance import note_run, provenance, script_command
+from bidnerf_core.evaluation.results import ResultsFile, ResultTable
+from bidnerf_core.evaluation.summary import succeeded
+from bidnerf_core.evaluation.trial import (
+    Opened,
+    TrialResult,
+    input_digests,
+    open_map,
+    opened,
+    opened_points,
+    registered_for,
+    run_trial,
+    trial_views,
+)
+from bidnerf_core.fields import device_of
+from bidnerf_core.frames import View
+from bidnerf_core.io import to_plain
+from bidnerf_core.localization import find_method, require_use_of_depth
+from bidnerf_core.maps import Map
+from bidnerf_core.progress import (
+    Cancel,
+    Progress,
+    ProgressCallback,
+    check_cancelled,
+    job_context,
+    report_progress,
+)
+from bidnerf_core.settings import to_flat
+
+log = logging.getLogger("bidnerf")
+
+Scene: TypeAlias = Map | str | Path
+"""A map in memory, the folder of a map, or demo:NAME."""
+Data: TypeAlias = Capture | Sequence[View] | str | Path
+"""A dataset in memory, posed images (T_world_camera), the folder of a dataset, or demo:NAME."""
+Workers: TypeAlias = int | str | None
+"""A number of processes, None for one per core, or the address of a dask scheduler such as ``tcp://host:8786``."""
+PATIENCE = "20s"
+"""Time to wait for the scheduler of a cluster."""
+CHANGED = {
+    "views": "images, depth, masks or cameras than {trial.data} has now",
+    "points": "depth points than {trial.depth_points} has now",
+    "surface": "surface than map {trial.map} has now, which was rebaked",
+}
+"""Meaning of a change in each digest of a trial's input, by the digest's name."""
+
+
+def evaluate(
+    scene: Scene,
+    data: Data,
+    plan: Plan | None = None,
+    *,
+    out: str | Path | None = None,
+    workers: Workers = 1,
+    command: str | None = None,
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+) -> ResultTable:
+    """Localize many frames of ``data`` in a map, from the starts of a protocol or from none, and return all results.
+
+    ``out`` is a results file: trials already in it are not run again, and each result is on disk before the next trial
+    begins, so that the same call resumes an evaluation that was interrupted or cancelled. ``command`` is recorded next to
+    it as the origin of the results, by default that of the running script. ``workers`` is the number of processes (None:
+    one per core, and one on a GPU), or the address of a dask scheduler; more than one requires a map and data in folders
+    and an importable main module, and finds registered names only if importing that module registers them. With one,
+    everything runs in the calling thread.
+
+    Raises ``InputError`` for an evaluation that cannot be carried out, and ``Cancelled`` once ``cancel`` returns True and
+    the running trials have ended.
+    """
+    in_memory = isinstance(scene, Map) or not isinstance(data, str | Path)
+    if in_memory and workers not in (1, None):
+        raise InputError(
+            f"workers is {workers}",
+            expected="1: other processes read the map and the data from folders, and these are in memory",
+        )
+    plan = plan or Plan()
+    plan = replace(plan, device=device_name(scene, plan.device))
+    with job_context(progress, cancel):
+        here = open_both(scene, data, plan)
+        trials = planned(plan, name_of(scene), name_of(data), here[1])
+        _check_points(plan, trials, here, name_of(data))
+        if repeated := repeated_frames(trials):
+            log.info(repeated)
+        with ResultsFile(None if out is None else Path(out)) as file:
+            run_trials(trials, file, here, 1 if in_memory else workers, command)
+            file.put_in_order(trials)
+            return ResultTable(tuple(file[trial] for trial in trials))
+
+
+def run_trials(
+    trials: Sequence[Trial],
+    file: ResultsFile,
+    scene: Opened | None = None,
+    workers: Workers = 1,
+    command: str | None = None,
+) -> None:
+    """Run the trials without results in ``file``, and store each result as soon as it is available.
+
+    At most as many trials as there are workers run concurrently, so that a kill loses little. None begins once the job is
+    cancelled. A trial that fails ends the run with its error, after the results of the running trials have been stored.
+    ``scene`` is the map and data of all trials, by default those that they name; other processes read them from folders.
+    Raises ``InputError`` as ``left_to_do`` does, and ``Cancelled``.
+    """
+    todo = left_to_do(trials, file, scene)
+    if len(todo) < len(trials):
+        log.info("%s: %d of %d trials are already there", file.path, len(trials) - len(todo), len(trials))
+    unchecked = sum(file[trial].inputs is None for trial in trials if trial in file)
+    if unchecked:
+        log.info(
+            "%s: %d results of an earlier version do not record their images and are kept unchecked", file.path, unchecked
+        )  # fmt: skip
+    if not todo:
+        return
+    where = "" if file.path is None else f" in {file.path}"
+    with executor_of(workers, len(todo), todo[0].device == "cpu") as (executor, at_once, description):
+        if file.path is not None:
+            note_run(file.path, provenance(command or script_command(), description))
+        try:
+            _run(todo, file, executor, at_once, scene if at_once == 1 else None)
+        except BrokenProcessPool as error:
+            raise InputError(
+                f"a worker process died (is there enough memory for {at_once} of them, and does the main module"
+                f" begin work only under 'if __name__ == \"__main__\"'?); finished trials are kept{where}, the same"
+                " command resumes"
+            ) from error
+        except Cancelled as error:
+            left = sum(trial not in file for trial in trials)
+            kept = (
+                "nothing is kept without a results file" if file.path is None else "the same command resumes"
+            )
+            are = "is" if left == 1 else "are"
+            raise Cancelled(f"stopped; {amount(left, 'trial')} {are} left{where}, {kept}") from error
+
+
+def _run(
+    todo: Sequence[Trial], file: ResultsFile, executor: Executor, at_once: int, scene: Opened | None
+) -> None:
+    """Run trials and store their results, ``at_once`` at a time; raise the first error once the running ones have ended."""
+    waiting, running = iter(todo), set[Future[TrialResult]]()
+    failure: BaseException | None = None
+    count = right = 0
+    while True:
+        while len(running) < at_once and failure is None and (trial := next(waiting, None)) is not None:
+            try:
+                check_cancelled("trials")
+            except Cancelled as stopped:
+                failure = stopped
+                break
+            running.add(executor.submit(run_trial, trial, scene, registered_for(trial)))
+        if not running:
+            break
+        done, running = wait(running, return_when=FIRST_COMPLETED)
+        for future in done:
+            error = future.exception()
+            if error is not None:
+                failure = failure or error
+                continue
+            file.add(future.result())
+            count, right = count + 1, right + succeeded(future.result())
+            try:
+                report_progress(
+                    Progress("trials", count, len(todo), "trials", f"{right} within 5 deg and 0.05")
+                )
+            except Cancelled as stopped:
+                failure = failure or stopped
+    if failure is not None:
+        raise failure
+
+
+def left_to_do(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None = None) -> list[Trial]:
+    """Return the trials without results in the file. ``scene`` is their map and data, by default those they name.
+
+    Raises ``InputError`` if the file holds a result from another training run or surface of the map, other images or
+    other settings. Settings unknown to the version that made a result had their defaults.
+    """
+    digests: dict[Any, dict[str, Any]] = {}
+    advice = "name another --out, or remove the file to start again"
+    for trial in (trial for trial in trials if trial in file):
+        known = file[trial]
+        stored, dataset = scene or opened(trial.map, trial.data, trial)
+        if known.weights != stored.training:
+            raise InputError(
+                f"holds results of another training run of map {trial.map} ({known.weights}, expected"
+                f" {stored.training}); {advice}",
+                where=file.path,
+            )
+        usual = to_flat(find_method(trial.method).config_type())
+        for name, value in to_flat(parse_settings(trial.method, trial.config)).items():
+            before = known.settings.get(name, usual[name])
+            if before != value:
+                raise InputError(
+                    f"was made with {name} {before}, expected {value}; {advice}", where=file.path
+                )
+        if known.inputs is None:  # not recorded by an earlier version
+            continue
+        # The images depend on the seed only if they have faults.
+        seed = None if trial.fault == NO_FAULT else trial.seed
+        read = trial.frames, trial.depth, trial.depth_points, trial.fault, seed
+        if read not in digests:
+            digests[read] = to_plain(input_digests(trial, stored, trial_views(trial, dataset)))
+        for name, digest in to_plain(known.inputs).items():
+            if digest != digests[read][name]:
+                what = CHANGED[name].format(trial=trial)
+                raise InputError(
+                    f"holds results of frame {trial.frame} made with other {what}; {advice}", where=file.path
+                )
+    return [trial for trial in trials if trial not in file]
+
+
+def _check_points(plan: Plan, trials: Sequence[Trial], scene: Opened, data: str) -> None:
+    """Raise ``InputError`` if the method does not use the plan's depth points, or if the views of some trial observe none."""
+    if plan.depth_points is None:
+        return
+    require_use_of_depth(plan.method)
+    points, rigs = opened_points(plan.depth_points, scene[0]), dict.fromkeys(t.frames for t in trials)
+    blind = [rig[-1] for rig in rigs if not any(len(points.seen(name, plan.split)) for name in rig)]
+    if blind:
+        raise InputError(
+            f"has no points for {len(blind)} of {len(rigs)} frames ({listed(blind)}); choose others with --frame",
+            where=plan.depth_points,
+        )
+
+
+# Executors.
+
+
+class InThisProcess(Executor):
+    """An executor that runs every call immediately, in this process.
+
+    What runs neither reports to the job at hand nor is stopped with it: cancelling ends an evaluation between trials.
+    """
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        try:
+            with job_context(lambda progress: None, lambda: False):
+                future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+def local_processes(count: int) -> Executor:
+    """Return an executor of ``count`` single-threaded processes, which end when this process ends, for whatever reason.
+
+    With one, everything runs in this process.
+    """
+    return InThisProcess() if count == 1 else own_processes(count)
+
+
+def own_processes(count: int) -> ProcessPoolExecutor:
+    """Return an executor of processes other than this one, as ``local_processes`` does."""
+    return ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_prepare_worker)
+
+
+def _prepare_worker() -> None:
+    """Set up a worker: it leaves Ctrl-C to its parent and exits when the parent is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    torch.set_num_threads(1)
+    parent = parent_process()
+
+    def follow() -> None:
+        if parent is not None:
+            connection.wait([parent.sentinel])
+            os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
+@contextmanager
+def executor_of(workers: Workers, trials: int, on_cpu: bool) -> Iterator[tuple[Executor, int, str]]:
+    """Yield an executor for a number of trials, how many of them to run on it at once, and its description.
+
+    If the work fails, its processes are ended with their trials. Workers of a cluster need this package, the same
+    backends, and the maps and data under the same paths. Peak memory is measured per process: it is that of a single
+    trial only if the worker has one thread (``dask worker --nthreads 1``).
+
+    Raises ``InputError`` for a number below 1, if dask is missing, and if no scheduler or worker responds.
+    """
+    if isinstance(workers, str):
+        try:
+            from distributed import Client
+
+            client = Client(workers, timeout=PATIENCE, set_as_default=False)
+        except ImportError as error:
+            raise InputError("--dask needs dask, which is missing: pip install 'bidnerf[cluster]'") from error
+        except (OSError, ValueError) as error:  # TimeoutError is an OSError
+            raise InputError(
+                f"no dask scheduler at {workers} ({error})", expected="one such as tcp://host:8786"
+            ) from error
+        with client:
+            threads = sum(client.nthreads().values())
+            if threads == 0:
+                raise InputError(f"the dask scheduler at {workers} has no workers", expected="at least one")
+            yield client.get_executor(), 2 * threads, f"dask, {threads} threads"
+        return
+    if workers is not None and workers < 1:
+        raise InputError(f"workers is {workers}", expected="1 or more, or None for one per core")
+    count = min(workers or (usable_cores() if on_cpu else 1), trials)
+    with ended_on_failure(local_processes(count)) as executor:
+        yield executor, count, f"{count} local process{'es' if count > 1 else ''} of one thread"
+
+
+@contextmanager
+def ended_on_failure(executor: Executor) -> Iterator[Executor]:
+    """Yield an executor that is shut down afterwards; if the block fails, its processes are ended with their work."""
+    try:
+        yield executor
+    except BaseException:
+        for process in (getattr(executor, "_processes", None) or {}).values():
+            process.terminate()
+        raise
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+# Maps and data, in memory or in folders.
+
+
+def open_both(scene: Scene, data: Data, plan: Plan) -> Opened:
+    """Return the map and the dataset, each read from its folder unless it is in memory."""
+    if isinstance(scene, str | Path) and isinstance(data, str | Path):
+        return opened(str(scene), str(data), plan)
+    stored = scene if isinstance(scene, Map) else open_map(str(scene), plan.device)
+    return stored, open_data(data, plan, stored)
+
+
+def open_data(data: Data, plan: Plan, stored: Map | None = None) -> Capture:
+    """Return a dataset, read from its folder unless it is in memory."""
+    if isinstance(data, str | Path):
+        return plan.open(str(data), stored)
+    if isinstance(data, Capture):
+        return plan.prepared(data)
+    views = tuple(view for view in data if isinstance(view, View)) if isinstance(data, Sequence) else ()
+    if not views or len(views) < len(data):
+        raise InputError(
+            f"data is a {type(data).__name__}", expected="a folder, a dataset or a list of views"
+        )
+    name, count = Counter(view.frame.name for view in views).most_common(1)[0]
+    if count > 1:  # trials identify their frames by name
+        raise InputError(f"data holds {count} frames named {name!r}", expected="different names")
+    return plan.prepared(of_views(views, Path("views")))
+
+
+def device_name(scene: Scene, given: str) -> str:
+    """Return the device on which a map computes: that of a map in memory, else the given one."""
+    return str(device_of(scene.field)) if isinstance(scene, Map) else given
+
+
+def name_of(value: Scene | Data) -> str:
+    """Return the name of a map or dataset in results: its folder, or the backend of a map in memory."""
+    if isinstance(value, Map):
+        return value.info.backend
+    if isinstance(value, str | Path):
+        return str(value)
+    return str(value.path) if isinstance(value, Capture) else "views"
