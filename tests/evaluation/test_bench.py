@@ -491,7 +491,7 @@ def test_a_mistake_is_told_in_one_line(evaluate: Evaluate, words: list[str], sta
 def test_every_method_has_its_settings_on_the_command_line(
     method: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["evaluate", "--method", method, "--help"]) == 0
+    assert main(["evaluate", "--method", method, "--help-all"]) == 0
     page = capsys.readouterr().out
     names = [f"--{name.replace('_', '-')}" for name in to_flat(METHODS[method].config_type())]
     assert sum(f"{name} " in page for name in names) > 3
