@@ -39,6 +39,7 @@ from urllib.parse import urlsplit
 
 import _openapi
 import numpy as np
+import psutil
 from _lab import Row, parser, record
 
 from bidnerf_core.evaluation import provenance
@@ -108,11 +109,8 @@ class Server:
 
     def processes(self) -> list[int]:
         """Return the service, the process with the maps, and the workers."""
-        found = [self.process.pid]
-        for parent in found:  # which grows
-            with contextlib.suppress(OSError):
-                found += map(int, Path(f"/proc/{parent}/task/{parent}/children").read_text().split())
-        return found
+        children = psutil.Process(self.process.pid).children(recursive=True)
+        return [self.process.pid, *(child.pid for child in children)]
 
     def memory(self) -> float:
         """Return the memory of all processes in MiB, with each page that they share counted once."""
