@@ -280,13 +280,9 @@ def malformed(folder: Path, given: list[Photo], workers: int, seconds: float) ->
     small = form(
         photo=png(40, 30), focal=b"30", seed=b"1", start=b"[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
     )
-    geopose = json.dumps(
-        {"sensorReadings": {"cameraReadings": [{"imageBytes": "aGFsbG8=", "size": [4, 4]}]}}
-    ).encode()
     bodies = [
         (b"/localize", FORM, small),
         (b"/localize", FORM, given[0].body),
-        (b"/geopose", "application/json", geopose),
     ]
     bodies += [(b"/localize?focal=30", "image/png", png(40, 30)), (b"/maps/x/localize", FORM, small)]
     with served(folder, workers) as server:
