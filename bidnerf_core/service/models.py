@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
@@ -58,17 +58,18 @@ class Upload:
 
 def _decimal(value: Any) -> Any:
     if isinstance(value, str) and not DECIMAL.fullmatch(value):
-        raise PydanticCustomError("number", "expected a number")
+        raise PydanticCustomError("number", "a number")
     return value
 
 
 def _without_aliases(text: str) -> str:
     """Refuse YAML, whose aliases and merge keys expand without a limit."""
     if text.lstrip("\ufeff \t\r\n").startswith(("%YAML", "---")):
-        raise PydanticCustomError("camera", "expected JSON, or a row of COLMAP's cameras.txt")
+        raise PydanticCustomError("camera", "JSON, or a row of COLMAP's cameras.txt")
     return text
 
 
+Model = TypeVar("Model", bound=BaseModel)
 Number = Annotated[float, BeforeValidator(_decimal)]
 
 
@@ -115,30 +116,34 @@ class PhotoForm(PhotoParameters):
     depth: bytes = Field(ABSENT, description="a depth image, or the .npy of an array: planar z")
 
 
-def checked(model: type[BaseModel], values: Any) -> Any:
-    """Return values, or JSON as bytes, as an instance of a model. Raises ``InputError`` that names the first that is wrong."""
+EXPECTED = {
+    "greater_than_equal": "a number from {ge:g} up", "less_than_equal": "a number up to {le:g}",
+    "float_type": "a number", "float_parsing": "a number", "finite_number": "a finite number", "int_type": "a whole number",
+    "int_parsing": "a whole number", "int_parsing_size": "a whole number", "int_from_float": "a whole number",
+    "string_type": "text", "string_too_short": "{min_length} or more characters", "string_too_long": "{max_length} or fewer characters",
+    "list_type": "a list", "too_short": "{min_length} or more values", "too_long": "{max_length} or fewer values",
+    "bool_type": "true or false", "bool_parsing": "true or false", "model_type": "a JSON object", "dict_type": "a JSON object",
+}  # fmt: skip
+"""What messages expect, by the type of pydantic's error; other messages are our own."""
+
+
+def checked(model: type[Model], values: Any) -> Model:
+    """Return values as an instance of a model. Raises ``InputError`` that names the first that is wrong."""
     try:
-        return (
-            model.model_validate_json(values) if isinstance(values, bytes) else model.model_validate(values)
-        )
+        return model.model_validate(values)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False)[0]
-    except RecursionError as error:
-        raise InputError("the body is nested too deeply", expected="JSON of this request") from error
-    name = ".".join(map(str, first["loc"]))
-    expected = re.sub(
-        r"^(Input|String|List|Value) should (be (?=(less|greater))|be )?", "expected ", first["msg"]
-    )
-    expected = re.sub(r"^expected (less|greater)", r"expected a number \1", expected)
-    if first["type"] == "extra_forbidden":
+        first = error.errors(include_url=False)[0]
+    name, kind = ".".join(map(str, first["loc"])), first["type"]
+    if kind == "extra_forbidden":
         known = list(model.model_fields)
         hint = spelling_hint(name, known, f", expected any of {', '.join(known)}")
         raise InputError(f"unknown parameter {short(name)}{hint}")
-    if not name:
-        raise InputError(expected if first["type"] in ("cameras",) else f"the body: {expected}")
-    if first["type"] == "missing":
+    if kind == "missing":
         raise InputError(f"no {name!r}", expected="all that the description requires")
-    raise InputError(f"{name} is {short(first['input'])}, {expected}")
+    text = EXPECTED.get(kind, first["msg"].removeprefix("Value error, ")).format(**first.get("ctx", {}))
+    if kind == "cameras":
+        raise InputError(text)
+    raise InputError(f"{name or 'the body'} is {short(first['input'])}", expected=text)
 
 
 def short(value: Any) -> str:

@@ -45,7 +45,7 @@ class Quaternion(_Part):
     def _has_unit_length(self) -> Quaternion:
         length = (self.x**2 + self.y**2 + self.z**2 + self.w**2) ** 0.5
         if not 0.9 < length < 1.1:
-            raise ValueError(f"the length is {length:.3g}, expected 1")
+            raise ValueError(f"length 1, not {length:.3g}")
         return self
 
 

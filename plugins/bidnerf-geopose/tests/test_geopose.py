@@ -151,7 +151,7 @@ def test_requests_that_contradict_the_protocol_are_refused_with_the_part_that_is
     for wrong, part in (
         ({"timestamp": "now"}, "timestamp"), ({"type": 1}, "type"), ({"sensors": [1]}, "sensors.0"),
         ({"sensors": [{"id": 1}]}, "sensors.0.id"), ({"priorPoses": {}}, "priorPoses"), ({"priorPoses": [prior]}, "position.lon"),
-        ({"priorPoses": [stretched]}, "expected 1"), ({"sensorReadings": {"cameraReadings": []}}, "cameraReadings"),
+        ({"priorPoses": [stretched]}, "expected length 1, not 2"), ({"sensorReadings": {"cameraReadings": []}}, "cameraReadings"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=part):
             asked(None, localization(), **wrong)
