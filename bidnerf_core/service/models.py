@@ -140,7 +140,8 @@ def checked(model: type[Model], values: Any) -> Model:
         raise InputError(f"unknown parameter {short(name)}{hint}")
     if kind == "missing":
         raise InputError(f"no {name!r}", expected="all that the description requires")
-    text = EXPECTED.get(kind, first["msg"].removeprefix("Value error, ")).format(**first.get("ctx", {}))
+    text = first["msg"].removeprefix("Value error, ")
+    text = EXPECTED[kind].format(**first.get("ctx", {})) if kind in EXPECTED else text
     if kind == "cameras":
         raise InputError(text)
     raise InputError(f"{name or 'the body'} is {short(first['input'])}", expected=text)
