@@ -172,6 +172,9 @@ class Pool:
         self.metrics.waited.observe(job.waited or 0.0)
         os.makedirs(tempfile.gettempdir(), exist_ok=True)  # something may have removed it
         while job.attempts < ATTEMPTS and (worker := self._workers.get(number)) is not None:
+            if worker.ended:  # since it was last looked at, and not by this job
+                self._replace(number, worker, "ended")
+                continue
             job.attempts += 1
             folder = tempfile.mkdtemp(prefix="bidnerf-serve-")
             try:
