@@ -30,8 +30,9 @@ pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
 pytest.importorskip("uvicorn", reason="the extra 'serve' is not installed")
 
 from bidnerf_core import InputError, ServiceClient, open_dataset, serve
+from bidnerf_core.camera import WAYS, WAYS_OF_PHOTO
 from bidnerf_core.localization import settings_of
-from bidnerf_core.service import ServiceError, ServiceLimits, service_app
+from bidnerf_core.service import ServiceError, ServiceLimits, public_message, service_app
 
 # Inside: workers are killed, and the description is compared with the parameters that are read
 from bidnerf_core.service.models import Localization, MapFacts, PhotoParameters
@@ -326,6 +327,13 @@ def test_what_is_missing_is_named(service: Service, place: Place) -> None:
     for number in ("1_0", "\u0663", " 5", "infinity", "0x10"):
         reply = service.post(f"/localize?map=map&focal={number}", place.photo)
         assert "expected a number" in reply.json["detail"]
+
+
+def test_messages_name_the_parameters_of_requests(tmp_path: Path) -> None:
+    for ways in (WAYS, WAYS_OF_PHOTO):
+        error = InputError("no focal length", where=tmp_path / "photo", expected=f"a camera: {ways}")
+        shown = public_message(error, tmp_path)
+        assert shown == "photo: no focal length, expected a camera: focal, hfov or camera"
 
 
 def test_requests_beyond_the_bound_are_turned_away(service: Service, place: Place) -> None:
