@@ -6,6 +6,7 @@ without PyTorch; the answers are made in ``answers``.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
@@ -43,7 +44,7 @@ class Quaternion(_Part):
 
     @model_validator(mode="after")
     def _has_unit_length(self) -> Quaternion:
-        length = (self.x**2 + self.y**2 + self.z**2 + self.w**2) ** 0.5
+        length = math.hypot(self.x, self.y, self.z, self.w)
         if not 0.9 < length < 1.1:
             raise ValueError(f"length 1, not {length:.3g}")
         return self

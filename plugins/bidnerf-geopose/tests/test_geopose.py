@@ -148,10 +148,12 @@ def test_requests_that_contradict_the_protocol_are_refused_with_the_part_that_is
     stretched = {
         "geopose": {"position": {"lat": 1, "lon": 2, "h": 3}, "quaternion": {"x": 0, "y": 0, "z": 0, "w": 2}}
     }
+    endless = {"geopose": stretched["geopose"] | {"quaternion": dict.fromkeys("xyzw", 1.7e308)}}
     for wrong, part in (
         ({"timestamp": "now"}, "timestamp"), ({"type": 1}, "type"), ({"sensors": [1]}, "sensors.0"),
         ({"sensors": [{"id": 1}]}, "sensors.0.id"), ({"priorPoses": {}}, "priorPoses"), ({"priorPoses": [prior]}, "position.lon"),
-        ({"priorPoses": [stretched]}, "expected length 1, not 2"), ({"sensorReadings": {"cameraReadings": []}}, "cameraReadings"),
+        ({"priorPoses": [stretched]}, "expected length 1, not 2"), ({"priorPoses": [endless]}, "expected length 1, not inf"),
+        ({"sensorReadings": {"cameraReadings": []}}, "cameraReadings"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=part):
             asked(None, localization(), **wrong)
