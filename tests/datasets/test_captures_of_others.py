@@ -14,9 +14,7 @@ from PIL import Image
 
 from bidnerf_core import Frame, open_dataset, open_sequence
 from bidnerf_core.errors import InputWarning
-
-# Inside: the photos that structure from motion begins with
-from bidnerf_core.structure.sources import photos_of, refuse_panoramas
+from bidnerf_core.structure import photos_of, refuse_panoramas
 from refusals import refused
 from scan_layouts import (
     SMALL,
