@@ -1,14 +1,16 @@
-"""The files of a COLMAP sparse model: ``cameras``, ``images`` and ``points3D``, as .bin or .txt.
+"""The files of a COLMAP sparse model: ``cameras``, ``images`` and ``points3D``, as .bin or .txt; and depth maps.
 
 Formats: https://colmap.github.io/format.html. Poses are ``cam_from_world`` with OpenCV's camera axes. The
 files ``rigs`` and ``frames`` of newer versions are not needed, since these versions still write each image's
-pose to ``images``. pycolmap is not used because it hangs on a truncated ``points3D.bin``.
+pose to ``images``. pycolmap is not used because it hangs on a truncated ``points3D.bin``. A depth map is the text
+``width&height&channels&``, then 32-bit floats, row by row: planar z of the undistorted image in units of the model, 0
+where nothing was reconstructed.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,19 +22,26 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bidnerf_core.camera import MODEL_IDS, MODELS, Camera, colmap_camera, read_text_cameras
+from bidnerf_core.depth import DepthImage, depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import Row, read_file, read_lines
+from bidnerf_core.io import Row, is_file, read_file, read_lines
 
 _Item = TypeVar("_Item")
+_Point = tuple[int, tuple[float, float, float], float, int]
+"""The id of a point, its position, its error and the number of its observations."""
 
-NAMES = ("images", "points3D")
 COUNT, IMAGE, POINT = struct.Struct("<Q"), struct.Struct("<I7dI"), struct.Struct("<q3d3BdQ")
 OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 CAMERA_RECORD = struct.Struct("<IiQQ")
 MODEL_FILE = "a file of a COLMAP sparse model"
 LARGEST_MODEL = 2**30  # bytes of one file of a model
 TRACK_BYTES = 8  # an image and one of its keypoints, 4 bytes each
+DEPTH_FOLDER = "stereo/depth_maps"
+KINDS = ("geometric", "photometric")
+"""The kinds of depth maps, the more reliable one first."""
+LARGEST_HEAD = 64
+"""Bytes of the text before the numbers of a depth map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,40 +54,36 @@ class ModelImage:
     points: Int[Tensor, "n"]  # ids of the observed points
 
 
-@dataclass(frozen=True)
-class ModelPoint:
-    """A triangulated point of the model."""
-
-    id: int
-    position: tuple[float, float, float]  # model frame, in units of the model
-    error: float  # mean reprojection error, pixels; negative where it was never computed
-    track: int  # number of observations
-
-
 @dataclass(frozen=True, eq=False)
 class ModelPoints:
-    """All points of a model, in the order of their ids."""
+    """All triangulated points of a model, in the order of their ids."""
 
     ids: Int[Tensor, "p"]
     positions: Float[Tensor, "p 3"]  # model frame, in units of the model
-    errors: Float[Tensor, "p"]  # see ModelPoint
-    tracks: Int[Tensor, "p"]
+    errors: Float[Tensor, "p"]  # mean reprojection error, pixels; negative where it was never computed
+    tracks: Int[Tensor, "p"]  # number of observations
 
 
 def read_model(folder: Path) -> tuple[list[ModelImage], ModelPoints]:
     """Read the model in ``folder``. Raises ``InputError`` if there is none, or if a file is damaged."""
-    suffix = next((s for s in (".bin", ".txt") if _is_model(folder, s)), None)
-    if suffix is None:
-        inside = [
-            child for child in (folder / "sparse/0", folder / "sparse", folder / "0") if _any_model(child)
-        ]
-        hint = f"; did you mean {inside[0]}?" if inside else ""
+    images, points = files_of(folder, "images", "points3D") or (None, None)
+    if images is None or points is None:
+        places = (folder / place for place in ("sparse/0", "sparse", "0"))
+        inside = next((place for place in places if files_of(place, "images", "points3D")), None)
+        hint = "" if inside is None else f"; did you mean {inside}?"
         wanted = "images.bin and points3D.bin, or the same as .txt"
         raise InputError("no COLMAP sparse model in it", where=folder, expected=f"{wanted}{hint}")
-    images, points = (folder / f"{name}{suffix}" for name in NAMES)
-    if suffix == ".bin":
-        return _binary(images, _binary_image), _together(points, _binary(points, _binary_point))
-    return _text_images(images), _together(points, _text_points(points))
+    found = _binary(points, _binary_point) if points.suffix == ".bin" else list(_text_points(points))
+    found.sort()
+    ids, positions, errors, tracks = zip(*found, strict=True) if found else ((), (), (), ())
+    if len(set(ids)) < len(ids):
+        raise InputError("two points have the same id", where=points, expected="unique ids")
+    return _images(images), ModelPoints(
+        torch.tensor(ids, dtype=torch.int64),
+        torch.tensor(positions, dtype=torch.float64).reshape(-1, 3),
+        torch.tensor(errors, dtype=torch.float64),
+        torch.tensor(tracks, dtype=torch.int64),
+    )
 
 
 def read_posed_images(folder: Path) -> tuple[list[ModelImage], dict[int, Camera]]:
@@ -87,33 +92,35 @@ def read_posed_images(folder: Path) -> tuple[list[ModelImage], dict[int, Camera]
     Raises ``InputError`` if there is no model, if a file is damaged, and for a camera that is not
     perspective.
     """
-    suffix = next((s for s in (".bin", ".txt") if has_posed_images(folder, s)), None)
-    if suffix is None:
-        raise InputError(
-            "no cameras and images of a COLMAP sparse model", where=folder, expected=".bin or .txt"
-        )
-    cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
-    if suffix == ".txt":
-        return _text_images(images), read_text_cameras(cameras)
-    return _binary(images, _binary_image), dict(_binary(cameras, _binary_camera))
+    files = files_of(folder, "cameras", "images")
+    if files is None:
+        expected = ".bin or .txt"
+        raise InputError("no cameras and images of a COLMAP sparse model", where=folder, expected=expected)
+    cameras, images = files
+    if cameras.suffix == ".txt":
+        return _images(images), read_text_cameras(cameras)
+    return _images(images), dict(_binary(cameras, _binary_camera))
 
 
 def count_posed_images(folder: Path) -> int:
     """Return the number of images that the model in ``folder`` declares. Raises ``InputError`` as
     ``read_posed_images`` does.
     """
-    if has_posed_images(folder, ".bin"):
-        (count,) = _Bytes(folder / "images.bin").take(COUNT)
-        return int(count)
-    return len(_text_images(folder / "images.txt"))
+    _, images = files_of(folder, "cameras", "images") or (folder, folder / "images.bin")
+    return int(_Bytes(images).take(COUNT)[0]) if images.suffix == ".bin" else len(_images(images))
 
 
-def has_posed_images(folder: Path, suffix: str | None = None) -> bool:
-    """Return whether a folder has a model's cameras and images, as .bin or .txt unless ``suffix`` restricts it."""
-    suffixes = (".bin", ".txt") if suffix is None else (suffix,)
-    return any(
-        all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")) for suffix in suffixes
-    )
+def files_of(folder: Path, *names: str) -> list[Path] | None:
+    """Return the files of a model with these names, all as .bin or else all as .txt; None if any is missing."""
+    found = ([folder / f"{name}{suffix}" for name in names] for suffix in (".bin", ".txt"))
+    return next((files for files in found if all(map(is_file, files))), None)
+
+
+def depth_map_of(model: Path, name: str) -> Path | None:
+    """Return the depth map of an image of a model ``WORKSPACE/sparse`` or ``WORKSPACE/sparse/0``, or None."""
+    folders = (model.parent / DEPTH_FOLDER, model.parent.parent / DEPTH_FOLDER)
+    files = (folder / f"{name}.{kind}.bin" for folder in folders for kind in KINDS)
+    return next(filter(is_file, files), None)
 
 
 def _binary_camera(file: _Bytes) -> tuple[int, Camera]:
@@ -132,19 +139,36 @@ def _binary_camera(file: _Bytes) -> tuple[int, Camera]:
     )
 
 
-def _is_model(folder: Path, suffix: str) -> bool:
-    return all((folder / f"{name}{suffix}").is_file() for name in NAMES)
+def read_colmap_depth(path: Path, unit: float) -> DepthImage:
+    """Read a depth map, with ``unit`` metres per unit of the model. Raises ``InputError`` for other or
+    truncated files.
+    """
+    content = read_file(path, "a COLMAP depth map")
+    *sizes, numbers = content.split(b"&", 3)
+    if len(sizes) != 3 or not all(size.isdigit() and len(size) < LARGEST_HEAD for size in sizes):
+        raise InputError(
+            "does not begin with width&height&channels&", where=path, expected="a COLMAP depth map"
+        )
+    width, height, channels = map(int, sizes)
+    if channels != 1 or width * height < 1 or len(numbers) != 4 * width * height:
+        raise InputError(
+            f"has {len(numbers)} bytes after {width}&{height}&{channels}&",
+            where=path,
+            expected=f"{4 * width * height} of one channel",
+        )
+    values = np.frombuffer(numbers, "<f4").reshape(height, width)
+    return depth_image(np.where(values > 0, values, 0), unit, f"{path}: depth")
 
 
-def _any_model(folder: Path) -> bool:
-    return _is_model(folder, ".bin") or _is_model(folder, ".txt")
+def _images(file: Path) -> list[ModelImage]:
+    return _binary(file, _binary_image) if file.suffix == ".bin" else list(_text_images(file))
 
 
 class _Bytes:
     """A binary file that is parsed from its beginning to its end."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self._content, self._place = path, _content(path), 0
+        self.path, self._content, self._place = path, read_file(path, MODEL_FILE, LARGEST_MODEL), 0
 
     def take(self, layout: struct.Struct) -> tuple[Any, ...]:
         start = self._advance(layout.size)
@@ -191,47 +215,42 @@ def _binary(path: Path, one: Callable[[_Bytes], _Item]) -> list[_Item]:
 def _binary_image(file: _Bytes) -> ModelImage:
     _, *pose, camera = file.take(IMAGE)
     name = file.text()
-    (count,) = file.take(COUNT)
-    observed = file.array(OBSERVATION, int(count))["point"]
-    return _image(str(file.path), name, int(camera), pose, observed[observed >= 0])
+    observed = file.array(OBSERVATION, int(file.take(COUNT)[0]))["point"]
+    return _image(str(file.path), name, int(camera), pose, observed)
 
 
-def _binary_point(file: _Bytes) -> ModelPoint:
+def _binary_point(file: _Bytes) -> _Point:
     number, x, y, z, *_, error, track = file.take(POINT)
     file.skip(TRACK_BYTES * int(track))
-    return ModelPoint(int(number), (x, y, z), error, int(track))
+    return int(number), (x, y, z), error, int(track)
 
 
-def _text_images(path: Path) -> list[ModelImage]:
-    """Read two lines per image; the second is empty if nothing was observed."""
-    found, rows = [], iter(_rows(path, "id, pose, camera and name of an image"))
+def _text_images(path: Path) -> Iterator[ModelImage]:
+    """Yield the images of pairs of lines; the second is empty if nothing was observed."""
+    rows = iter(read_lines(path, MODEL_FILE, "id, pose, camera and name of an image", LARGEST_MODEL))
     for row in rows:
         if not row.text or row.text.startswith("#"):
             continue
         words = row.text.split(maxsplit=9)  # a name may contain spaces
         if len(words) < 10:
             raise row.error(f" has {len(words)} entries")
-        following = replace(next(rows, replace(row, text="")), columns="x, y, id of points")
+        following: Row = replace(next(rows, replace(row, text="")), columns="x, y, id of points")
         observed = following.words
         if len(observed) % 3:
             raise following.error(f" has {len(observed)} entries")
         points = np.array([following.integer(word) for word in observed[2::3]], dtype=np.int64)
-        pose = row.numbers(words[1:8])
-        found.append(_image(row.where, words[9], row.integer(words[8]), pose, points[points >= 0]))
-    return found
+        yield _image(row.where, words[9], row.integer(words[8]), row.numbers(words[1:8]), points)
 
 
-def _text_points(path: Path) -> list[ModelPoint]:
-    found = []
-    for row in _rows(path, "id, x y z, r g b, error and a track"):
+def _text_points(path: Path) -> Iterator[_Point]:
+    for row in read_lines(path, MODEL_FILE, "id, x y z, r g b, error and a track", LARGEST_MODEL):
         if not row.text or row.text.startswith("#"):
             continue
         words = row.words
         if len(words) < 8 or len(words) % 2:
             raise row.error(f" has {len(words)} entries")
         x, y, z, error = row.numbers([*words[1:4], words[7]])
-        found.append(ModelPoint(row.integer(words[0]), (x, y, z), error, (len(words) - 8) // 2))
-    return found
+        yield row.integer(words[0]), (x, y, z), error, (len(words) - 8) // 2
 
 
 def _image(where: str, name: str, camera: int, pose: Sequence[float], points: np.ndarray) -> ModelImage:
@@ -240,23 +259,4 @@ def _image(where: str, name: str, camera: int, pose: Sequence[float], points: np
         raise InputError(f"image {name!r} has an invalid pose", where=where, expected="a unit quaternion")
     rotation = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix()
     T = SE3(torch.from_numpy(rotation), torch.tensor(pose[4:], dtype=torch.float64))
-    return ModelImage(name, camera, T, torch.from_numpy(np.unique(points)))
-
-
-def _together(path: Path, points: list[ModelPoint]) -> ModelPoints:
-    ordered = sorted(points, key=lambda point: point.id)
-    ids = torch.tensor([point.id for point in ordered], dtype=torch.int64)
-    if bool((ids.diff() == 0).any()):
-        raise InputError("two points have the same id", where=path, expected="unique ids")
-    positions = torch.tensor([point.position for point in ordered], dtype=torch.float64).reshape(-1, 3)
-    errors = torch.tensor([point.error for point in ordered], dtype=torch.float64)
-    tracks = torch.tensor([point.track for point in ordered], dtype=torch.int64)
-    return ModelPoints(ids, positions, errors, tracks)
-
-
-def _rows(path: Path, columns: str) -> list[Row]:
-    return read_lines(path, MODEL_FILE, columns, LARGEST_MODEL)
-
-
-def _content(path: Path) -> bytes:
-    return read_file(path, MODEL_FILE, LARGEST_MODEL)
+    return ModelImage(name, camera, T, torch.from_numpy(np.unique(points[points >= 0])))

@@ -24,18 +24,19 @@ from pathlib import Path
 
 from bidnerf_core.camera import Camera
 from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, present, remark
-from bidnerf_core.datasets.colmap_depth import depth_map_of, read_colmap_depth
 from bidnerf_core.datasets.colmap_files import (
     ModelImage,
     count_posed_images,
-    has_posed_images,
+    depth_map_of,
+    files_of,
+    read_colmap_depth,
     read_posed_images,
 )
 from bidnerf_core.datasets.file_names import FileNames, posix_name
 from bidnerf_core.datasets.reader import DatasetOptions, Reader
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import natural_order
-from bidnerf_core.io import HEIF_SUFFIXES, IMAGE_SUFFIXES, is_file
+from bidnerf_core.io import HEIF_SUFFIXES, IMAGE_SUFFIXES
 
 MODELS = (
     "sparse",
@@ -114,13 +115,8 @@ def _models_at(folder: Path) -> list[Path]:
     """
     inside = [child for child in folder.glob("*") if child.name.isdecimal()]
     places = [folder, *sorted(inside, key=lambda child: natural_order(child.name))]
-    incomplete = [
-        place
-        for place in places
-        for suffix in (".bin", ".txt")
-        if all(is_file(place / f"{name}{suffix}") for name in ("cameras", "points3D"))
-    ]
-    return [place for place in places if has_posed_images(place)] or incomplete[:1]
+    complete = [place for place in places if files_of(place, "cameras", "images")]
+    return complete or [place for place in places if files_of(place, "cameras", "points3D")][:1]
 
 
 def _largest(path: Path, models: Sequence[Path]) -> Path:
