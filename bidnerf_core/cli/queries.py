@@ -88,8 +88,8 @@ class QueryOptions:
                 raise UsageError(
                     f"{option} was given without --depth", expected="the depth image that it belongs to"
                 )
-        source, sensor = self.camera.source(images, assumed), images.sensor("--register-depth")
-        return Photos(files, source, depth, images.depth_unit, sensor, background, points, images.mask_folder)
+        options = replace(images, camera=self.camera.source(images, assumed), background=background)
+        return Photos(files, options, depth, points)
 
     def _frames(
         self,

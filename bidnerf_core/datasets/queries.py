@@ -9,22 +9,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets.capture import Capture
 from bidnerf_core.datasets.colmap import SparsePoints
 from bidnerf_core.datasets.formats.photos import PhotoShot
 from bidnerf_core.datasets.points import read_depth_points
-from bidnerf_core.datasets.reader import file_of_dataset, no_dataset
-from bidnerf_core.depth import DepthCamera
+from bidnerf_core.datasets.reader import DatasetOptions, file_of_dataset, no_dataset
 from bidnerf_core.errors import InputError, InputWarning, UsageError, amount
 from bidnerf_core.fields import Observations
-from bidnerf_core.frames import DEPTH_STEM, Frame, MaskFolder, View, photos_in
+from bidnerf_core.frames import DEPTH_STEM, Frame, View, photos_in
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import Background, background_colour, looks_like_image
+from bidnerf_core.io import looks_like_image
 from bidnerf_core.localization import window as windowed
 
 log = logging.getLogger("bidnerf")
 
+AS_STORED = DatasetOptions()
 NAMED = 5
 """Largest number of files named in a message."""
 
@@ -123,38 +122,32 @@ class Queries:
 
 
 class Photos(Queries):
-    """Image files, each of them a query.
+    """Image files, each of them a query. ``depth`` holds the depth files of photos that have one.
 
-    ``depth`` holds the depth files of photos that have one, ``depth_unit`` is the length of one of its steps
-    (metres), and ``sensor`` the camera from which depth is registered to the photos. ``masks`` hide parts of
-    the photos.
+    Without a background among the ``options``, the map in which a photo is localized gives it.
     """
 
     def __init__(
         self,
         files: Sequence[Path],
-        camera: CameraSource | None = None,
+        options: DatasetOptions = AS_STORED,
         depth: Mapping[Path, Path] | None = None,
-        depth_unit: float | None = None,
-        sensor: DepthCamera | None = None,
-        background: Background | None = None,
         points: DepthPoints | None = None,
-        masks: MaskFolder | None = None,
     ) -> None:
-        source, depth = camera or CameraSource(), depth or {}
+        depth, sensor = depth or {}, options.sensor("register_depth")
         shots = [
             PhotoShot(
                 image=file,
-                camera=source,
+                camera=options.camera_source,
                 depth_image=depth.get(file),
-                depth_unit=depth_unit,
+                depth_unit=options.depth_unit,
                 sensor=sensor,
-                awaits_background=background is None,
+                awaits_background=options.background is None,
             )
             for file in files
         ]
-        capture = Capture(Path("photos"), shots, background_colour(background or "black"))
-        if masks is not None:
+        capture = Capture(Path("photos"), shots, options.colour)
+        if (masks := options.mask_folder) is not None:
             capture = capture.masked(masks, by_stem=True)
         super().__init__(capture, [(name,) for name in capture.names], None, points)
         self._without_depth = {shot.name for shot in capture.shots if depth and shot.file not in depth}

@@ -172,7 +172,7 @@ def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], lis
             source = open_dataset(path, background)
         else:
             camera = CameraSource(assumed=landmark_cameras(scene))
-            source = Photos(photo_files([path]), camera, background=background)
+            source = Photos(photo_files([path]), DatasetOptions(camera, background=background))
     else:
         source = photos
     if isinstance(source, Capture | Photos):

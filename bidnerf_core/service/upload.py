@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 from bidnerf_core.camera import WAYS, WAYS_OF_PHOTO, CameraSource
-from bidnerf_core.datasets import Photos
+from bidnerf_core.datasets import DatasetOptions, Photos
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import is_heif, read_header
@@ -52,8 +52,8 @@ def read_upload(
     own = CameraSource(texts.get("camera"), focal, hfov, usual.assumed)
     photo, depth = images["photo"], images.get("depth")
     photos = Photos(
-        [photo], own if own.is_given else usual, {} if depth is None else {photo: depth},
-        upload.parameters.get("depth_unit"),
+        [photo], DatasetOptions(own if own.is_given else usual, depth_unit=upload.parameters.get("depth_unit")),
+        {} if depth is None else {photo: depth},
     )  # fmt: skip
     return photos, read_pose(texts["start"]) if "start" in texts else None
 

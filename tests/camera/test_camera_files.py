@@ -16,8 +16,8 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bidnerf_core.camera import CameraSource, CentralLens, Intrinsics, read_camera
-from bidnerf_core.datasets import Photos, depth_files
+from bidnerf_core.camera import CentralLens, Intrinsics, read_camera
+from bidnerf_core.datasets import DatasetOptions, Photos, depth_files
 from bidnerf_core.frames import Frame
 from photo_files import noise, write_photo
 from refusals import refused
@@ -225,7 +225,7 @@ def test_the_camera_of_a_photo_is_chosen_by_its_name(tmp_path: Path) -> None:
             read_camera(file, SIZE, "c.jpg")
     for name in ("a", "b"):
         write_photo(tmp_path / f"{name}.png", noise(48, 64))
-    queries = Photos([tmp_path / "a.png", tmp_path / "b.png"], CameraSource(tmp_path / "splats.json"))
+    queries = Photos([tmp_path / "a.png", tmp_path / "b.png"], DatasetOptions(tmp_path / "splats.json"))
     assert [queries.read(place).frame.intrinsics.fx for place in range(2)] == [50, 60]
 
 

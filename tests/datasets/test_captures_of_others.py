@@ -13,8 +13,6 @@ import pytest
 from PIL import Image
 
 from bidnerf_core import Frame, open_dataset, open_sequence
-from bidnerf_core.errors import InputWarning
-from bidnerf_core.structure import photos_of, refuse_panoramas
 from refusals import refused
 from scan_layouts import (
     SMALL,
@@ -254,28 +252,6 @@ def test_raw_photos_are_no_thumbnails(tmp_path: Path) -> None:
     Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "IMG_1.dng", format="TIFF")
     with refused(where=tmp_path / "IMG_1.dng", found="is a raw photo"):
         Frame.open(tmp_path / "IMG_1.dng", hfov=60)
-
-
-def test_smaller_copies_of_photos_are_left_out(tmp_path: Path) -> None:
-    for number in range(3):
-        image = Image.fromarray(np.full((63, 85, 3), 60 * number, np.uint8))
-        for folder, factor in (("images", 1), ("images_2", 2), ("images_4", 4), ("right", 1)):
-            (tmp_path / folder).mkdir(exist_ok=True)
-            size = round(85 / factor), round(63 / factor)
-            image.resize(size).save(tmp_path / folder / f"{number}.png")
-    with pytest.warns(InputWarning, match="images_2 and images_4: smaller copies"):
-        found = photos_of(tmp_path)
-    assert {image.file.parent.name for image in found} == {"images", "right"}  # two cameras of a rig
-
-
-def test_panoramas_are_not_taken_for_pinhole_images(tmp_path: Path) -> None:
-    image = Image.fromarray(np.zeros((20, 40, 3), np.uint8))
-    image.save(tmp_path / "0.jpg")
-    with pytest.warns(InputWarning, match="twice as wide as high"):
-        refuse_panoramas(photos_of(tmp_path))
-    image.save(tmp_path / "1.jpg", xmp=b'<x:xmpmeta GPano:ProjectionType="equirectangular"/>')
-    with refused(where=tmp_path / "1.jpg", found="is a panorama", expected="EQUIRECTANGULAR"):
-        refuse_panoramas(photos_of(tmp_path))
 
 
 def test_a_playlist_named_like_a_video_opens_no_other_file(tmp_path: Path) -> None:

@@ -20,8 +20,7 @@ from hypothesis import strategies as st
 import bidnerf_core as bn
 import drawn
 from bidnerf_core import SE3, Frame, InputError, InputWarning, Localization, Localizer, Outcome
-from bidnerf_core.camera import CameraSource
-from bidnerf_core.datasets import Capture, Photos, Shot, write_transforms
+from bidnerf_core.datasets import Capture, DatasetOptions, Photos, Shot, write_transforms
 from bidnerf_core.frames import BLACK, View
 from bidnerf_core.localization import Evidence
 from bidnerf_core.progress import Progress
@@ -227,7 +226,7 @@ def test_a_query_that_fails_does_not_stop_the_others(tmp_path: Path, monkeypatch
     for file in (files[0], files[2]):
         iio.imwrite(file, np.zeros((3, 4, 3), dtype=np.uint8))
     monkeypatch.setattr(Localizer, "__call__", lambda self, *given: replace(FOUND, outcome=Outcome.CONVERGED))
-    source = Photos(files, CameraSource(CAMERA))
+    source = Photos(files, DatasetOptions(CAMERA))
     seen = list[str]()
     answers = localize_each(
         Localizer(scene(), warm_up=False), source, each=lambda query, answer: seen.append(answer.name)
@@ -239,7 +238,7 @@ def test_a_query_that_fails_does_not_stop_the_others(tmp_path: Path, monkeypatch
     keys = [set(found) for found in json.loads((tmp_path / "found.json").read_text())]
     assert keys[0] == keys[1] == keys[2]
     with refused(where=files[1], found="no such file", expected="an image file"):
-        localize_each(Localizer(scene(), warm_up=False), Photos([files[1]], CameraSource(CAMERA)))
+        localize_each(Localizer(scene(), warm_up=False), Photos([files[1]], DatasetOptions(CAMERA)))
 
 
 @pytest.mark.parametrize(("by_chance", "asked"), [(4.0, False), (30.0, True)])

@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 import viewed
 from bidnerf_core import Localizer, Map
 from bidnerf_core.camera import CameraSource
-from bidnerf_core.datasets import Photos
+from bidnerf_core.datasets import DatasetOptions, Photos
 from bidnerf_core.service import ServiceLimits
 from bidnerf_core.viewer import LiveView, serve_view
 from photo_room import CAMERA
@@ -68,7 +68,7 @@ def serving(
     """Run a viewer of the room, with one photo to choose; ``camera`` is that of other photos."""
     stop, ready = threading.Event(), SimpleQueue[str]()
     with tempfile.TemporaryDirectory() as folder:
-        source = Photos([viewed.photo_file(Path(folder))], CameraSource(assumed=(CAMERA,)))
+        source = Photos([viewed.photo_file(Path(folder))], DatasetOptions(CameraSource(assumed=(CAMERA,))))
         shown = LiveView(Localizer(room, method), source, camera=camera)
         options = {"token": token, "limits": LIMITS, "ready": ready.put, "stop": stop, "port": 0}
         thread = threading.Thread(target=serve_view, args=[shown], kwargs=options)
