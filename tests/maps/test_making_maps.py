@@ -349,12 +349,12 @@ def test_photos_to_map_to_pose_to_overlay(tmp_path: Path) -> None:
     tiny.write_dataset(tmp_path / "capture")
     script = """
 import bidnerf_core as bn
+from bidnerf_core.results import overlay, pose_error
 data = bn.open_dataset("capture")
 scene = bn.train(data, config=config, bake=False)
 print(scene.describe())
 view = data.views("test", ["t_0000"])[0]
-start = perturb(view.T_ref_camera, translation=0.1, rotation_deg=5, seed=0)
-found = bn.Localizer(scene, "bid", settings_of("bid", {"max_steps": 3}))(view.frame, start)
+found = bn.Localizer(scene, "bid", {"max_steps": 3})(view.frame, view.T_ref_camera)
 print(found.outcome, pose_error(found.T_world_camera, view.T_ref_camera))
 picture = overlay(scene, view.frame, found)
 """
