@@ -1,7 +1,10 @@
 r"""Track a sequence in a map: error, undetected losses, recovery from faults, consistency, time and memory, beside baselines.
 
+    BIDNERF_DATA=FOLDER BIDNERF_MAPS=FOLDER python benchmarks/tracking.py --name tracking
     python benchmarks/tracking.py MAP:SEQUENCE [MAP:SEQUENCE ...] --name tracking
     python benchmarks/tracking.py MAP:SEQUENCE --memory 10000 --name tracking_memory
+
+Without arguments, the sequences are TUM and the corridor in the maps that ``answer_maps.py`` has trained.
 
 Each sequence is tracked in chronological order; and its first 160 frames backwards, with every 2nd and 4th frame, and with
 faults; with depth and without. Frames of splits other than the training split are also summarised separately. Baselines:
@@ -33,12 +36,14 @@ import cv2
 import torch
 import torch.nn.functional as F
 from _lab import RESULTS, one_thread, parser, record
+from answer_maps import folder_of, map_folder
 
 from bidnerf_core import SE3, Frame, Localization, Localizer, Map, Outcome, Tracker, load_map
 from bidnerf_core.datasets import TimedFrame, open_sequence
 from bidnerf_core.evaluation import RowStore
 from bidnerf_core.results import TrajectoryErrors, pose_error, spans, within
 
+SEQUENCES = ("tum_fr1_xyz", "iphone_corridor")
 WRONG = 0.05, 5.0
 """An accepted pose with a larger error (metres, degrees) is an undetected loss."""
 RIGHT = 0.02, 1.0
@@ -438,7 +443,7 @@ def memory(stored: Map, path: Path, count: int, depth: bool) -> dict[str, Any]:
 
 def main() -> None:
     arguments = parser(__doc__, "tracking")
-    arguments.add_argument("scenes", nargs="+", metavar="MAP:SEQUENCE")
+    arguments.add_argument("scenes", nargs="*", metavar="MAP:SEQUENCE")
     arguments.add_argument("--tuning-frames", action="store_true", help="the training split alone")
     arguments.add_argument(
         "--quick", action="store_true", help="leave out auto on each frame, which takes longest"
@@ -453,7 +458,7 @@ def main() -> None:
     one_thread()
     results: dict[str, Any] = {"sift_cpu_ms": sift_milliseconds()}
     with RowStore(RESULTS / f"{given.name}.rows.jsonl") as store:
-        for pair in given.scenes:
+        for pair in given.scenes or [f"{map_folder(s)}:{folder_of('BIDNERF_DATA') / s}" for s in SEQUENCES]:
             folder, path = map(Path, pair.split(":", 1))
             stored = load_map(folder)
             if given.memory:
