@@ -187,17 +187,7 @@ class TrackerConfig(Settings):
     """Settings of a tracker."""
 
     # maximum number of landmarks tracked from image to image
-    points: Annotated[int, Range(20, 10**4)] = 250
+    points: Annotated[int, Range(20, 10**4)] = 400
     depth_points: Annotated[int, Range(50, 10**6)] = 400  # maximum number of measured pixels that are aligned
-    # number of keypoints of an image that are matched with landmarks
-    keypoints: Annotated[int, Range(50, 10**5), EXPERT] = 600
-    # remaining fraction of the tracked landmarks or corners at which new ones are detected
-    refresh_share: Annotated[float, Range(0, 1), EXPERT] = 0.5
-    # number of frames after which new landmarks are detected in any case
-    refresh_frames: Annotated[int, Range(1, 10**6), EXPERT] = 20
-    # number of second-order steps on depth in addition to landmarks
-    depth_steps: Annotated[int, Range(1, 100), EXPERT] = 1
-    # number of lost frames that are all searched; after that, every second one is
-    patience: Annotated[int, Range(1, 10**6), EXPERT] = 3
     # interval between frames without time stamps, seconds
     frame_seconds: Annotated[float, Above(0.0, 1e4)] = 1 / 30

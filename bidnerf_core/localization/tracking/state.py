@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import torch
@@ -25,57 +25,15 @@ from bidnerf_core.io import (
     with_tensors,
     write_file,
 )
-from bidnerf_core.localization.result import Localization
-from bidnerf_core.localization.tracking.keyframes import Points
 from bidnerf_core.localization.tracking.motion import Clock, Motion
+from bidnerf_core.localization.tracking.points import Points
+from bidnerf_core.mapping import true_intrinsics
 
-STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 9
+STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 10
 
 
-@dataclass(frozen=True)
-class CorrectedCamera:
-    """The stated intrinsics of a frame, and the better ones found for it."""
-
-    given: Intrinsics
-    found: Intrinsics
-    # Whether the frame's focal length was approximate; frames of the other kind are from another source.
-    approximate: bool
-
-    def applies_to(self, frame: Frame) -> bool:
-        """Return whether the intrinsics of a frame are from the same source."""
-        return frame.focal_is_approximate == self.approximate
-
-    def focal_factor(self, frame: Frame) -> float:
-        """Return the ratio of a frame's corrected to its given focal length (geometric mean of both axes)."""
-        if not self.applies_to(frame):
-            return 1.0
-        return math.sqrt(self.found.fx * self.found.fy / (self.given.fx * self.given.fy))
-
-    def corrected(self, frame: Frame) -> Frame:
-        """Return the frame with corrected intrinsics."""
-        return frame.replace(intrinsics=self.changed(frame.intrinsics)) if self.applies_to(frame) else frame
-
-    def stated_in(self, answer: Localization, frame: Frame) -> Localization:
-        """Return the answer for a frame with the intrinsics that replace the frame's own, if any."""
-        taken = self.corrected(frame).intrinsics
-        corrected = None if taken == frame.intrinsics else taken
-        return replace(answer, focal_factor=self.focal_factor(frame), intrinsics=corrected)
-
-    def changed(self, camera: Intrinsics) -> Intrinsics:
-        """Return corrected intrinsics; those with another focal length or size are changed in proportion."""
-        given, found = self.given, self.found
-        if camera == given:
-            return found
-        x, y = camera.width / given.width, camera.height / given.height
-        return replace(
-            camera, fx=camera.fx * found.fx / given.fx, fy=camera.fy * found.fy / given.fy,
-            cx=camera.cx + x * (found.cx - given.cx), cy=camera.cy + y * (found.cy - given.cy),
-            distortion=found.distortion if camera.distortion == given.distortion else camera.distortion,
-        )  # fmt: skip
-
-    def then(self, later: CorrectedCamera) -> CorrectedCamera:
-        """Return this correction followed by the correction ``later``."""
-        return replace(self, found=later.changed(self.found))
+def _zeros(*shape: int) -> Tensor:
+    return field(default_factory=lambda: torch.zeros(shape, dtype=torch.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,28 +45,39 @@ class TrackerState:
     frames: int = 0  # number of frames so far
     lost: int = 0  # consecutive frames without an accepted pose, up to the last one
     searchable: int = 0  # of these, the searchable frames
-    waited: float = 0.0  # seconds since the loss, or since the last search of an image
     points: Points = field(default_factory=Points.none)
     image: UInt8[Tensor, "h w"] | None = None  # the last one, grey, in which the points were observed
-    sought: int = 0  # number of points when they were last detected
+    sought: int = 0  # number of landmarks when they were last recognised
     age: int = 0  # frames since then
-    camera: CorrectedCamera | None = None  # found by searches; None while the given intrinsics are used
-    noise: float = 1.0  # pixels: of the points in the last image
     moves: bool = False  # whether the camera moved during the readout of the last image
-    # Covariance of the pose due to errors of the intrinsics.
-    doubt: Float[Tensor, "6 6"] = field(default_factory=lambda: torch.zeros((6, 6), dtype=torch.float64))
+    misread: int = 0  # frames whose depth disagreed with the landmarks
+    depth_factor: float = 1.0  # ratio of the measured depth to that of the landmarks in the last of them
+    # Corrections of the stated camera (see ``NUISANCES``) that a search has found, for frames whose focal length is as approximate.
+    camera: Float[Tensor, "6"] = _zeros(6)
+    is_approximate: bool = False
+    doubt: Float[Tensor, "6 6"] = _zeros(6, 6)  # covariance of the pose due to errors of the intrinsics
 
     def __post_init__(self) -> None:
-        for name in ("frames", "lost", "searchable", "waited", "sought", "age"):
+        for name in ("frames", "lost", "searchable", "sought", "age", "misread"):
             if getattr(self, name) < 0:
                 raise InputError(f"{name} is {getattr(self, name)}", expected="0 or more")
-        if self.clock.interval <= 0 or self.noise <= 0:
-            raise InputError("the interval or the noise is 0 or less", expected="positive numbers")
+        if self.clock.interval <= 0:
+            raise InputError("the interval is 0 or less", expected="a positive number")
 
-    @property
-    def tracking(self) -> bool:
-        """Whether the pose of the last frame was accepted."""
-        return self.motion is not None and self.lost == 0
+    def corrected(self, frame: Frame) -> Frame:
+        """Return a frame with the corrections of its camera; frames of the other kind are from another source."""
+        if frame.focal_is_approximate != self.is_approximate or not bool(self.camera.any()):
+            return frame
+        return frame.replace(intrinsics=true_intrinsics(frame.intrinsics, self.camera))
+
+
+def correction_of(stated: Intrinsics, true: Intrinsics) -> Float[Tensor, "6"]:
+    """Return the correction by which ``true_intrinsics`` makes ``true`` of the ``stated`` intrinsics."""
+    across, down = true.fx / stated.fx, true.fy / stated.fy
+    bent = [camera.distortion[0] if camera.distortion else 0.0 for camera in (stated, true)]
+    centre = (true.cx - stated.cx) / stated.fx, (true.cy - stated.cy) / stated.fy
+    log_focal, log_aspect = math.log(across * down) / 2, math.log(across / down)
+    return torch.tensor([log_focal, *centre, bent[1] - bent[0], log_aspect, 0.0], dtype=torch.float64)
 
 
 def save_state(path: Path, state: TrackerState, key: str) -> None:
@@ -131,16 +100,16 @@ def load_tracker_state(path: Path, key: str) -> TrackerState:
         raise InputError(f"version {found.get('version')!r}", where=path, expected=hint)
     if found.get("map") != key:
         raise InputError(f"belongs to map {found.get('map')!r}, the tracker's is {key!r}", where=path)
-    plain = with_tensors(found.get("state"), tensors, str(path))
-    state = from_plain(TrackerState, plain, str(path))
+    state = from_plain(TrackerState, with_tensors(found.get("state"), tensors, str(path)), str(path))
     for name, value in tensors.items():
+        if not value.is_floating_point():
+            continue
         kind = torch.float32 if name == "points.pixels" else torch.float64
-        if value.is_floating_point() and (value.dtype != kind or not bool(value.isfinite().all())):
+        if value.dtype != kind or not bool(value.isfinite().all()):
             raise InputError(f"{name} is not finite, or {value.dtype}", where=path, expected=str(kind))
-        if value.is_floating_point() and value.numel() and float(value.abs().max()) > LARGEST_LENGTH:
-            raise InputError(
-                f"{name} is {float(value.abs().max()):g}", where=path, expected=f"at most {LARGEST_LENGTH:g}"
-            )
+        if value.numel() and float(value.abs().max()) > LARGEST_LENGTH:
+            largest = f"at most {LARGEST_LENGTH:g}"
+            raise InputError(f"{name} is {float(value.abs().max()):g}", where=path, expected=largest)
     points, motion = state.points, state.motion
     if len({len(getattr(points, part.name)) for part in fields(points)}) > 1:
         raise InputError("the points have different numbers of pixels, positions or landmarks", where=path)

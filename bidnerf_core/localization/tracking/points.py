@@ -1,0 +1,184 @@
+"""The points that are tracked from image to image: recognised landmarks, and corners with measured depth.
+
+Landmarks give the camera's pose in the map; corners give the motion between frames with depth (odometry).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import numpy as np
+import poselib
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from bidnerf_core.camera import Intrinsics, exposure_times
+from bidnerf_core.depth import DepthNoise
+from bidnerf_core.frames import Frame, visible_at
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization.loop import CELLS
+from bidnerf_core.localization.matching import log10_nfa
+from bidnerf_core.localization.query import THRESHOLD
+from bidnerf_core.localization.tracking.flow import Grey, alike, corners, flow
+from bidnerf_core.mapping import Landmarks, Sights, States, measured_depth, point_variance
+
+FRESH = -1
+"""Landmark number of points that are not landmarks."""
+INLIER = 3.0
+"""Maximum deviation of an inlier, in standard deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points in an image and their positions in the world; all tensors are on the CPU."""
+
+    pixels: Float[Tensor, "m 2"]  # (u, v) in the last image
+    positions: Float[Tensor, "m 3"]  # metres, world; float64
+    deviations: Float[Tensor, "m 2"]  # metres, across and along ``directions``; float64
+    directions: Float[Tensor, "m 3"]  # unit, world; float64
+    landmark: Int[Tensor, "m"]  # its number in the map; FRESH for points measured in an image
+
+    @staticmethod
+    def none() -> Points:
+        wide = torch.zeros((0, 3), dtype=torch.float64)
+        return Points(torch.zeros((0, 2)), wide, wide[:, :2], wide, torch.zeros(0, dtype=torch.long))
+
+    @staticmethod
+    def measured(frame: Frame, image: Grey, T_world_camera: SE3, count: int, noise: DepthNoise) -> Points:
+        """Return up to ``count`` corners of a frame with depth of the given ``noise``, taken at a known pose."""
+        pixels = corners(image, count, 0.7 * (image.shape[0] * image.shape[1] / count) ** 0.5)
+        pixels = pixels[visible_at(frame, pixels)]
+        depth = measured_depth(frame, pixels)
+        pixels, depth = pixels[depth > 0], depth[depth > 0]
+        ray = frame.intrinsics.unproject(pixels.double())
+        return Points(
+            pixels,
+            T_world_camera.apply(ray * depth[:, None]),
+            torch.stack([0.5 * depth / frame.intrinsics.fx, noise.deviation(depth)], dim=-1),
+            -T_world_camera.rotate(torch.nn.functional.normalize(ray, dim=-1)),
+            torch.full((len(pixels),), FRESH),
+        )
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def __getitem__(self, index: Tensor) -> Points:
+        return Points(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    @property
+    def landmarks(self) -> Points:
+        return self[self.landmark != FRESH]
+
+    @property
+    def fresh(self) -> Points:
+        return self[self.landmark == FRESH]
+
+    def followed(self, before: Grey, now: Grey, frame: Frame, predicted: SE3) -> Points:
+        """Return the points that are found in the next image, by optical flow from where a predicted pose projects them."""
+        guess = frame.intrinsics.project(predicted.inverse().apply(self.positions)).float()
+        guess = torch.where(guess.isfinite().all(-1, keepdim=True), guess, self.pixels)
+        pixels, found = flow(before, now, self.pixels, guess)
+        if 2 * int(found.sum()) < len(found):  # the prediction may be wrong
+            again, found_again = flow(before, now, self.pixels, self.pixels)
+            if int(found_again.sum()) > int(found.sum()):
+                pixels, found = again, found_again
+        fresh = (self.landmark == FRESH) & found
+        if bool(fresh.any()):  # unlike corners, landmarks are known to be distinctive
+            found[fresh.clone()] = alike(before, now, self.pixels[fresh], pixels[fresh])
+        found &= visible_at(frame, pixels)
+        return replace(self, pixels=pixels)[found]
+
+    def well_spread(self, camera: Intrinsics, most: int) -> Points:
+        """Return up to ``most`` points, taken in turn from the cells of the image, of points that are sorted best first."""
+        if len(self) <= most:
+            return self
+        cell = cells(self.pixels, camera)
+        order = cell.argsort(stable=True)
+        rank = torch.empty_like(cell)
+        rank[order] = torch.arange(len(cell)) - torch.searchsorted(cell[order], cell[order])
+        return self[rank.argsort(stable=True)[:most].sort().values]
+
+
+def cells(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Int[Tensor, "m"]:
+    """Return the numbers of the cells of the image in which pixels (u, v) lie."""
+    size = torch.tensor([camera.width, camera.height])
+    column, row = (pixels / size * CELLS).long().clamp(0, CELLS - 1).unbind(-1)
+    return row * CELLS + column
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The pose of a static camera that observes points."""
+
+    points: Points
+    camera: Intrinsics
+    states: States  # (1)
+    term: Landmarks
+    keypoints: int = 0  # in the image, if the points were recognised in it
+    by_chance: int | None = None  # points that would be recognised at a wrong pose; None if they were tracked
+
+    @staticmethod
+    def of(points: Points, camera: Intrinsics, start: SE3, correlation: float) -> Fit:
+        """Fit a pose near ``start`` to points of which ``correlation`` count as one."""
+        focal, inverse, count = (camera.fx * camera.fy) ** 0.5, start.inverse(), len(points)
+        threshold = max(2.0, THRESHOLD * math.hypot(camera.width, camera.height))
+        image = camera.unproject(points.pixels.double())[:, :2]
+        pose = poselib.CameraPose()
+        pose.R, pose.t = inverse.rotation.numpy(), inverse.translation.numpy()
+        model = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
+        options = {"loss_type": "CAUCHY", "loss_scale": threshold / 2}
+        pose, _ = poselib.refine_absolute_pose(
+            (image * focal).numpy(), points.positions.numpy(), pose, model, options
+        )
+        T = SE3(torch.from_numpy(np.array(pose.R)), torch.from_numpy(np.array(pose.t)).flatten()).inverse()
+        T = T.polished() if bool(T.is_rigid()) else start
+        states = States.known(T, torch.zeros(6, dtype=torch.float64))
+        zero, one = torch.zeros((1, count, 3), dtype=torch.float64), torch.ones(count, dtype=torch.float64)
+        sights = Sights(
+            image[None], exposure_times(points.pixels, camera)[None],
+            torch.eye(3, dtype=torch.float64).expand(1, count, 3, 3), zero,
+        )  # fmt: skip
+        variance = point_variance(points, torch.arange(count), states, focal * one)
+        correlated = torch.tensor([correlation], dtype=torch.float64)
+        term = Landmarks(
+            points.positions[None], sights, one[None], variance[None], focal * one[None], correlated,
+            1 / correlated, float(camera.width * camera.height), threshold,
+        )  # fmt: skip
+        return Fit(points, camera, term.with_noise(states), term)
+
+    @cached_property
+    def _residuals(self) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
+        """The reprojection errors in standard deviations and in pixels."""
+        squared, off, _ = self.term.residuals(self.states)
+        return squared[0].sqrt(), off[0].norm(dim=-1)
+
+    @property
+    def is_recognised(self) -> bool:
+        """Whether the points were recognised in this image, rather than tracked to it."""
+        return self.by_chance is not None
+
+    @property
+    def is_inlier(self) -> Bool[Tensor, "m"]:
+        return self._residuals[0] <= INLIER
+
+    @property
+    def agreeing(self) -> int:
+        """The number of points within the largest reprojection error of an inlier."""
+        return int((self._residuals[1] <= self.term.most_noise).sum())
+
+    @property
+    def log10_nfa(self) -> float:
+        """The number of false alarms if each point is a match that would be anywhere in the image if it were wrong."""
+        by_chance = min(0.5, math.pi * self.term.most_noise**2 / self.term.area)
+        return log10_nfa(len(self.points), self.agreeing, by_chance)
+
+    @property
+    def is_accurate(self) -> bool:
+        """Whether the points fit better than if spread evenly over a disc with the radius of inliers, as after failed flow.
+
+        These have a standard deviation of half that radius along each axis.
+        """
+        return float(self.states.noise) <= self.term.most_noise / 2
