@@ -5,7 +5,6 @@ compute.
 from __future__ import annotations
 
 import copy
-import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -149,12 +148,6 @@ def _is_on(tensor: Tensor, device: torch.device) -> bool:
 # Threads of torch's operators on a CPU.
 
 _setting = Lock()
-
-
-def usable_cores() -> int:
-    """Return the number of cores that this process may use."""
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return usable or 1
 
 
 @contextmanager

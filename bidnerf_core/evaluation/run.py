@@ -19,7 +19,6 @@ from typing import Any, TypeAlias
 import torch
 
 from bidnerf_core.datasets import Capture, of_views
-from bidnerf_core.devices import usable_cores
 from bidnerf_core.errors import Cancelled, InputError, amount
 from bidnerf_core.evaluation.faults import NO_FAULT
 from bidnerf_core.evaluation.plan import Plan, Trial, listed, parse_settings, planned, repeated_frames
@@ -39,7 +38,7 @@ from bidnerf_core.evaluation.trial import (
 )
 from bidnerf_core.fields import device_of
 from bidnerf_core.frames import View
-from bidnerf_core.io import to_plain
+from bidnerf_core.io import to_plain, usable_cores
 from bidnerf_core.localization import find_method, require_use_of_depth
 from bidnerf_core.maps import Map
 from bidnerf_core.progress import (

@@ -42,6 +42,7 @@ from .json import read_record as read_record
 from .json import to_plain as to_plain
 from .json import with_tensors as with_tensors
 from .memory import available_memory as available_memory
+from .memory import usable_cores as usable_cores
 from .ply import PlyHeader as PlyHeader
 from .ply import check_ply_size as check_ply_size
 from .ply import read_ply as read_ply

@@ -1,8 +1,9 @@
-"""The memory still available to this process."""
+"""The memory and the cores that are available to this process."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 from pathlib import Path
 
 import psutil
@@ -17,3 +18,9 @@ def available_memory() -> int:
         limit, used = (int((CGROUP / name).read_text()) for name in ("memory.max", "memory.current"))
         available = min(available, max(0, limit - used))
     return available
+
+
+def usable_cores() -> int:
+    """Return the number of cores that this process may use."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return usable or 1

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from typing import Annotated
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.io import usable_cores
 from bidnerf_core.settings import Above, Range, Settings
 
 MEBIBYTE = 2**20
@@ -36,8 +36,7 @@ class ServiceLimits(Settings):
     @property
     def processes(self) -> int:
         """The number of worker processes, by default that of the cores that this process may use."""
-        usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        return self.workers or usable or 1
+        return self.workers or usable_cores()
 
     @property
     def max_bytes(self) -> int:
