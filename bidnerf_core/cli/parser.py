@@ -94,9 +94,16 @@ class Parameter:
 
     @property
     def option(self) -> Option:
+        """How it is called; a string among the annotations is the name of its value."""
         return self.note(Option) or Option(
             next((n for n in self.notes if isinstance(n, str) and n != FLAG), None)
         )
+
+    @property
+    def left_out(self) -> frozenset[str]:
+        """The fields of the dataclass, if it is one, that are no options."""
+        without = self.note(Without)
+        return frozenset() if without is None else without.names
 
 
 def parse(command: str, target: Callable[..., T], arguments: Sequence[str]) -> T:
@@ -136,8 +143,7 @@ def _walk(
         group = group if dataclasses.is_dataclass(group) else None
         yield parameter, group
         if group is not None:
-            without = parameter.note(Without)
-            yield from _walk(type(group), loaded, group, frozenset() if without is None else without.names)
+            yield from _walk(type(group), loaded, group, parameter.left_out)
 
 
 def _built(
@@ -149,7 +155,8 @@ def _built(
         usual = parameter.default if default is None else getattr(default, parameter.name)
         group = loaded.get(parameter.name, usual)
         if dataclasses.is_dataclass(group):
-            value = _built(type(group), given, loaded, group)
+            own = {name: value for name, value in given.items() if name not in parameter.left_out}
+            value = _built(type(group), own, loaded, group)
             if value is not usual:
                 values[parameter.name] = value
         elif parameter.name in given:
@@ -176,6 +183,7 @@ class _Parser(argparse.ArgumentParser):
             formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, 2, 24, self.width),
         )  # fmt: skip
         self.names, self._short, self._options_only = set[str](), for_help and loaded is None, options_only
+        self._positional, self._required = list[str](), list[str]()  # for the usage
         own = self.add_argument_group("options")
         announced, groups = list[str](), dict[str, Any]()  # group of each parameter
         for parameter, default in _walk(target, loaded or {}):
@@ -191,9 +199,7 @@ class _Parser(argparse.ArgumentParser):
             own.add_argument("-h", HELP, action="store_true", help="show the usual options")
             more = "show all options" + (f", also {' and '.join(announced)}" if announced else "")
             own.add_argument(HELP_ALL, action="store_true", help=more)
-        positional = [str(action.metavar) for action in self._get_positional_actions()]
-        required = [f"{a.option_strings[0]} {a.metavar}" for a in self._get_optional_actions() if a.required]
-        usage = " ".join([f"bidnerf {command} [OPTIONS]", *positional, *required])
+        usage = " ".join([f"bidnerf {command} [OPTIONS]", *self._positional, *self._required])
         self.usage = textwrap.fill(usage, self.width - len("usage: "), subsequent_indent="  ").replace(
             "%", "%%"
         )
@@ -216,6 +222,7 @@ class _Parser(argparse.ArgumentParser):
         }
         if option.positional:
             if not self._options_only:
+                self._positional.append(shown)
                 nargs = nargs if is_required else {None: "?", "+": "*"}[nargs]  # type: ignore[index]
                 self.add_argument(parameter.name, nargs=nargs, **common)
             return
@@ -227,6 +234,8 @@ class _Parser(argparse.ArgumentParser):
             action = argparse.BooleanOptionalAction if pair else "store_true"
             group.add_argument(flag, action=action, dest=parameter.name, help=common["help"])
             return
+        if is_required:
+            self._required.append(f"{flag} {shown}")
         common["metavar"] = tuple(shown.split()) if isinstance(nargs, int) else shown.removesuffix("...")
         group.add_argument(
             flag, action="extend" if nargs == "+" else "store", nargs=nargs, dest=parameter.name,
@@ -277,13 +286,9 @@ def _escaped(words: Sequence[str]) -> list[str]:
     return [f" {word}" if NEGATIVE.match(word) else word for word in words]
 
 
-def parameters_of(target: Callable[..., Any]) -> list[Parameter]:
-    """Return the parameters of a function or a dataclass."""
-    return _parameters(target)
-
-
 @functools.cache
-def _parameters(target: Any) -> list[Parameter]:
+def parameters_of(target: Any) -> list[Parameter]:
+    """Return the parameters of a function or a dataclass."""
     kinds: Any = [kind for kind in getattr(target, "__mro__", (target,)) if kind is not object]
     names = _Names()
     for kind in reversed(kinds):
