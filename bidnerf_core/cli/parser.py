@@ -188,9 +188,10 @@ class _Parser(argparse.ArgumentParser):
         announced, groups = list[str](), dict[str, Any]()  # group of each parameter
         for parameter, default in _walk(target, loaded or {}):
             if default is not None:
-                text = parameter.doc or (inspect.getdoc(type(default)) or "").split("\n\n")[0]
+                kind: Any = type(default)
+                text = parameter.doc or (inspect.getdoc(kind) or "").split("\n\n")[0]
                 group = self.add_argument_group(parameter.name.replace("_", " "), self._filled(text, 2))
-                groups |= {inner.name: group for inner in parameters_of(type(default))}
+                groups |= {inner.name: group for inner in parameters_of(kind)}
             elif parameter.note(Settings) is not None:
                 announced.append(parameter.doc)
             else:
