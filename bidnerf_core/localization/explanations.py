@@ -1,6 +1,7 @@
-"""What may be true of a query: its camera, the camera's motion, and where the photo was taken, each with a prior probability.
+"""What may be true of a query's camera and of its motion, each with a prior probability.
 
-An explanation is a Gaussian prior on the nuisances of ``states``; a seed is a pose from which all explanations are refined.
+An explanation is a Gaussian prior on the nuisances of ``states``; a seed is a pose from which all explanations are refined. Other places
+and other images, such as the mirror image, are modes of the ``loop``, each with all explanations.
 """
 
 from __future__ import annotations

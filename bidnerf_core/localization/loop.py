@@ -244,20 +244,14 @@ class Loop:
         self, nearest: Nearest, seed: Seed, given: Explanations, nfa: float, searched: bool
     ) -> tuple[list[Mode], States]:
         """Return the modes, and the most probable state of each, refined on matches by projection."""
-        modes: list[Mode] = []
-        best: list[States] = []
-        for name, query, found, start in self._places(nearest, seed, nfa, best):
-            known = States.known(start.T, start.camera)
-            near = found[inliers(query, self.landmarks, found, known, RADII[0])]
-            if not searched and not modes:
-                within = RADII[0] * query.threshold
-                near = Projected(query, self.landmarks, known, within).matches(within)
-            if len(near) < LEAST_AGREEING:
-                continue
-            modes.append(Mode(name, query, near, found))
-            best.append(self._compared(modes[-1], start, given, query.threshold / 2))
-            if searched and len(modes) == 1:
-                best[0] = self._warped(modes[0], start, given, best[0])
+        first = self._mode(seed.name, self.query, nearest.best, seed, given, searched)
+        if first is None:
+            return [], States.known(seed.T, seed.camera)
+        if searched:
+            first = first[0], self._warped(first[0], seed, given, first[1])
+        rivals = (self._mode(*place, given, True) for place in self._rivals(nearest, nfa, first[1]))
+        both = [first, *(rival for rival in rivals if rival is not None)]
+        modes, best = [mode for mode, _ in both], [state for _, state in both]
         seen: list[Projected | None] = [None] * len(modes)
         for radius in RADII:
             for g, mode in enumerate(modes):
@@ -274,7 +268,24 @@ class Loop:
                 term = self._term([mode], best[g])
                 best[g], _ = descend(term.with_noise(best[g]), [term], 3)
         numbered = [replace(state, mode=state.mode + g) for g, state in enumerate(best)]
-        return modes, States.cat(numbered) if numbered else States.known(seed.T, seed.camera)
+        return modes, States.cat(numbered)
+
+    def _mode(
+        self, name: str, query: Query, found: Matches, seed: Seed, given: Explanations, searched: bool
+    ) -> tuple[Mode, States] | None:
+        """Return the mode at a seed, and its most probable state; None if too few matches agree.
+
+        Unless the seed was ``searched`` for among them, the matches are those by projection.
+        """
+        known, within = States.known(seed.T, seed.camera), RADII[0] * query.threshold
+        if searched:
+            near = found[inliers(query, self.landmarks, found, known, RADII[0])]
+        else:
+            near = Projected(query, self.landmarks, known, within).matches(within)
+        if len(near) < LEAST_AGREEING:
+            return None
+        mode = Mode(name, query, near, found)
+        return mode, self._compared(mode, seed, given, query.threshold / 2)
 
     def _compared(self, mode: Mode, seed: Seed, given: Explanations, noise: float) -> States:
         """Return the most probable state of a mode, comparing kinds of cameras, each with its own noise, on some of the matches."""
@@ -306,23 +317,20 @@ class Loop:
         more = int(inliers(query, self.landmarks, found, state).sum())
         return state if more > MANY_MORE * agreeing else best
 
-    def _places(
-        self, nearest: Nearest, seed: Seed, nfa: float, best: list[States]
+    def _rivals(
+        self, nearest: Nearest, nfa: float, best: States
     ) -> Iterator[tuple[str, Query, Matches, Seed]]:
-        """Yield the seed and the places that compete with it; ``best`` has the state refined from it before those are asked for.
+        """Yield what competes with the place of the state ``best``.
 
-        A scene may be repetitive, such as two rooms with the same furniture: keypoints that agree with the seed may agree as well
+        A scene may be repetitive, such as two rooms with the same furniture: keypoints that agree with the state may agree as well
         with similar landmarks elsewhere. And the image may be mirrored.
         """
-        query, matches = self.query, nearest.best
-        yield seed.name, query, matches, seed
-        if not best:
-            return
+        query = self.query
         rivals: list[tuple[str, Query, Matches]] = []
         q, k = nearest.landmark.shape
         own = nearest.keypoint.repeat_interleave(k)
         points = self.landmarks.positions[nearest.landmark.flatten()].double()[None]
-        seen = project(best[0], points, query.sights[own])
+        seen = project(best, points, query.sights[own])
         off = ((seen.image[0] - query.sights.image[own]) * query.focal[own, None]).norm(dim=-1)
         near = ((off <= RADII[0] * query.threshold) & seen.front[0]).view(q, k)
         agreeing = torch.zeros(len(query.view), dtype=torch.bool)
@@ -335,7 +343,7 @@ class Loop:
             mirrored = query.mirrored
             rivals.append((MIRROR, mirrored, Nearest.of(mirrored, self.matcher, STRONGEST).best))
         for name, there, found in rivals:
-            other = consensus(there, self.landmarks, found, best[0].nuisances[0, :6], name)
+            other = consensus(there, self.landmarks, found, best.nuisances[0, :6], name)
             if other is not None:
                 yield name, there, found, other[0]
 
@@ -344,7 +352,7 @@ class Loop:
     ) -> Answer:
         """Fuse all measurements under all explanations, and judge the result."""
         problem, terms = self.problem, list[Term]([landmarks])
-        best, quadratic = self._settled(best, landmarks, given)
+        best, quadratic = self._settled(best, terms, landmarks, given)
         found = self._posterior(quadratic, landmarks, given)
         points, fused = None, list[str]()
         others: dict[str, float | None] = {}
@@ -386,11 +394,13 @@ class Loop:
         credible, shared = given.credible[found.states.row], self.landmarks.pose_covariance
         return found.mass(term.distance(found.chosen), shared, TOLERANCE, ANGLE, credible)
 
-    def _settled(self, best: States, term: Landmarks, given: Explanations) -> tuple[States, Quadratic]:
+    def _settled(
+        self, best: States, terms: Sequence[Term], landmarks: Landmarks, given: Explanations
+    ) -> tuple[States, Quadratic]:
         """Return the most probable state of each mode (g), and the model about it by which it is the most probable."""
         for _ in range(REFITS):
-            best, _ = descend(term.with_noise(best), [term], 4)
-            quadratic = self._linearized(best, [term], given)
+            best, _ = descend(landmarks.with_noise(best), terms, 4)
+            quadratic = self._linearized(best, terms, given)
             states, normal = quadratic.minimum(given.about(quadratic.here))
             member = states.mode[None] == torch.arange(len(best))[:, None]
             found = states[torch.where(member, log_evidence(states, normal)[None], -torch.inf).argmax(-1)]

@@ -28,7 +28,6 @@ class Query:
     keypoints: Keypoints  # (q)
     view: Int[Tensor, "q"]
     sights: Sights  # (q)
-    depth: Float[Tensor, "q"]  # metres, 0 where none was measured
     focal: Float[Tensor, "q"]  # pixels
     approximate: bool  # whether the focal length was only assumed or read from EXIF
 
@@ -58,7 +57,6 @@ class Query:
             Keypoints(*joined),
             view,
             sights,
-            torch.cat([image.depth for image in images]),
             focal,
             approximate,
         )
@@ -76,6 +74,7 @@ class Query:
             keypoints=there,
             rays=rays,
             intrinsics=replace(c, cx=c.width - c.cx),
+            hidden=None if image.hidden is None else image.hidden.flip(1),
             T_ref_camera=SE3.identity(),
         )
         return Query.seen((swapped,), self.approximate)

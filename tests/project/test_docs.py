@@ -327,7 +327,7 @@ def test_site_builds_strictly_and_needs_no_network(
     assert {hit for page in pages for hit in fetched.findall(page.read_text())} == set()
     methods = (tmp_path / "site" / "methods.html").read_text()
     assert "<!-- settings of" not in methods
-    assert "<code>search_poses</code>" in methods
+    assert "<code>fused_rays</code>" in methods
     reference = (tmp_path / "site" / "reference.html").read_text()
     described = set(re.findall(r'id="bidnerf_core\.\w+\.(\w+)"', reference))
     assert sorted(set(bidnerf_core.__all__) - described) == []
