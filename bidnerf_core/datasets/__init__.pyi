@@ -3,7 +3,6 @@ from .capture import BreaksOff as BreaksOff
 from .capture import Capture as Capture
 from .capture import DepthFile as DepthFile
 from .capture import MaskFile as MaskFile
-from .capture import ReadingProgress as ReadingProgress
 from .capture import Shot as Shot
 from .capture import TimedFrame as TimedFrame
 from .capture import hold_out as hold_out
@@ -16,7 +15,6 @@ from .colmap_files import read_posed_images as read_posed_images
 from .formats.transforms_json import read_frames as read_frames
 from .lidar import LidarDepth as LidarDepth
 from .names import in_other_split as in_other_split
-from .names import positions as positions
 from .names import unique_names as unique_names
 from .options import DatasetOptions as DatasetOptions
 from .options import DepthRegistration as DepthRegistration

@@ -138,23 +138,6 @@ class MaskFolder:
                 expected=f"{names[0]}.png or the like, found {next(iter(self._by_name))}",
             )
 
-    def hides_all(self, name: str) -> bool:
-        """Return whether the mask of the frame named ``name`` leaves nothing visible. Raises ``InputError`` for
-        one that is not an image.
-        """
-        file = self.file_of(name)
-        return file is not None and hides_everything(file, self.hides)
-
-    def hidden(self, name: str, raster: Raster, size: tuple[int, int]) -> Bool[Tensor, "h w"] | None:
-        """Return what the mask of the frame named ``name`` hides, as ``read_mask`` does; None if it has no
-        mask.
-
-        Raises ``InputError`` as ``read_mask`` does, and ``WhollyHidden`` for a mask that leaves nothing
-        visible.
-        """
-        file = self.file_of(name)
-        return None if file is None else read_mask(file, raster, size, self.hides)
-
 
 def masks_sentence(hidden: Sequence[Bool[Tensor, "h w"] | None]) -> str | None:
     """Return one sentence on how much of some images is hidden; None if nothing is.

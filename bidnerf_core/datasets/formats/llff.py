@@ -43,6 +43,8 @@ class LLFFReader(Reader):
         if rows.ndim != 2 or rows.shape[1] != NUMBERS or rows.dtype.kind != "f":
             found = f"has an array of shape {rows.shape} and type {rows.dtype}"
             raise InputError(found, where=file, expected=f"rows of {NUMBERS} numbers")
+        if not np.isfinite(rows).all():
+            raise InputError("has numbers that are not finite", where=file, expected="finite ones")
         folders = [path / name for name in IMAGES if (path / name).is_dir()]
         folder, images = next(
             ((f, photos) for f in folders if (photos := photos_in(f)[0])), (path / "images", [])

@@ -48,7 +48,12 @@ class MetashapeReader(Reader):
         metric = chunk.find("transform/scale")
         scale = 1.0 if metric is None else _numbers(metric, f"{file}: the scale of the chunk", 1)[0]
         places = [FileNames(path / place) for place in IMAGES if (path / place).is_dir()]
-        cameras = {camera.get("label") or "": camera for camera in chunk.iter("camera")}
+        listed = list(chunk.iter("camera"))
+        cameras = {camera.get("label") or "": camera for camera in listed}
+        if len(cameras) < len(listed):
+            raise InputError(
+                "two cameras have the same label", where=file, expected="unique labels of photos"
+            )
         files = {
             label: image
             for label in cameras
@@ -126,7 +131,12 @@ def _camera(sensor: ElementTree.Element, where: str) -> Camera | None:
     )
     if size is None:
         return None
-    width, height = (int(size.get(side) or 0) for side in ("width", "height"))
+    sides = [size.get(side) or "" for side in ("width", "height")]
+    if not all(side.isdecimal() for side in sides):
+        raise InputError(
+            f"its resolution is {' x '.join(sides)}", where=where, expected="whole numbers of pixels"
+        )
+    width, height = map(int, sides)
     if sensor.get("type") == "spherical":
         return PanoramaFace("front", (width, height))
     if adjusted is None:

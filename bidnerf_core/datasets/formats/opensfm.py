@@ -85,7 +85,7 @@ def _file(path: Path) -> Path | None:
 def _shot(file: Path, name: str, entry: Any, cameras: Any, image: Path) -> Shot:
     where = f"{file}: {name}"
     record = Record(where, entry if isinstance(entry, dict) else {})
-    own = cameras.get(record.value("camera")) if isinstance(cameras, dict) else None
+    own = cameras.get(str(record.value("camera"))) if isinstance(cameras, dict) else None
     if not isinstance(own, dict):
         raise record.error(f"has the camera {record.value('camera')!r}", expected="one of cameras")
     numbers = [

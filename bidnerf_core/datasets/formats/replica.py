@@ -21,7 +21,7 @@ from bidnerf_core.depth import DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import rigid_pose
-from bidnerf_core.io import is_file, read_record, read_rows
+from bidnerf_core.io import Record, is_file, read_record, read_rows
 
 TRAJECTORY, PARAMETERS = "traj.txt", "cam_params.json"
 CAMERA = Intrinsics(600.0, 600.0, 600.0, 340.0, 1200, 680)
@@ -72,7 +72,7 @@ def _camera(path: Path) -> tuple[Intrinsics, float]:
         return CAMERA, METRES_PER_STEP
     record = read_record(file)
     camera = record.value("camera")
-    own = record if not isinstance(camera, dict) else type(record)(f"{file}: camera", camera)
+    own = record if not isinstance(camera, dict) else Record(f"{file}: camera", camera)
     numbers, width, height = [own.number(key) for key in KEYS], own.size("w"), own.size("h")
     fx, fy, cx, cy, scale = (number or 0.0 for number in numbers)
     if None in numbers or width is None or height is None or scale <= 0:
