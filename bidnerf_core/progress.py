@@ -73,9 +73,9 @@ def current_job() -> Job:
     return _JOB.get()
 
 
-def check_cancelled(stage: str = "localization", cancel: Cancel | None = None) -> None:
+def check_cancelled(stage: str = "localization") -> None:
     """Raise ``Cancelled`` if this thread's work should stop, see ``job_context``. Called once per iteration of a long loop."""
-    cancel = cancel or _JOB.get().cancel
+    cancel = _JOB.get().cancel
     if cancel is not None and cancel():
         raise Cancelled(f"cancelled during stage {stage!r}")
 
