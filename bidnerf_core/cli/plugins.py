@@ -31,21 +31,24 @@ def print_infos(
     infos: list[PluginInfo], json: bool, with_group: bool = False, all_kinds: bool = False
 ) -> None:
     """Print plugins as a table, with their faults if any, or as a JSON list."""
-    rows = [
-        {
-            **({"group": info.group} if with_group else {}),
-            "name": info.name,
-            "summary": info.summary,
-            "distribution": info.distribution,
-            "version": info.version,
-            "value": info.value,
-            "fault": info.fault,
-        }
-        for info in infos
-    ]
     if json:
-        print_json(rows)
+        keys = [
+            *(["group"] if with_group else []),
+            "name",
+            "summary",
+            "distribution",
+            "version",
+            "value",
+            "fault",
+        ]
+        print_json([{key: getattr(info, key) for key in keys} for info in infos])
         return
-    faults = ["fault"] if any(info.fault for info in infos) else []
-    columns = [*(["group"] if all_kinds else []), "name", "summary", "distribution", "version", *faults]
-    print_table(columns, [[row[column] or "" for column in columns] for row in rows], wide="summary")
+    table = []
+    for info in infos:
+        text = info.summary.replace("``", "'")
+        if not info.is_bundled:
+            text += f" [{f'{info.distribution} {info.version}'.strip()}]"
+        if info.fault is not None:
+            text += f" fault: {info.fault}"
+        table.append([*([info.group] if all_kinds else []), info.name, text.strip()])
+    print_table([*(["group"] if all_kinds else []), "name", "summary"], table, wide="summary")
