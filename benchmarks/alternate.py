@@ -117,8 +117,10 @@ def localized(ask: Respondents, scene: str, count: int | None) -> Iterator[tuple
                 for name in shown
                 for frame in names[name][: count if name == scene else -(-(count or 8) // FOREIGN)]
             ]
-            if pairs := [pair for pair in pairs if "converged" in pair["new"]]:
-                yield mode + kind, pairs
+            pairs = [pair for pair in pairs if "converged" in pair["new"]]
+            if not pairs:
+                break  # the scene was recorded without depth
+            yield mode + kind, pairs
 
 
 def summary(pairs: Sequence[Pair]) -> dict[str, Any]:
@@ -184,17 +186,18 @@ def main() -> None:
     given = arguments.parse_args()
     scenes, pairs_of = TASKS[given.task]
     cells: dict[str, dict[str, Any]] = {}
+    commit = subprocess.run(
+        ["git", "-C", str(given.checkout), "rev-parse", "HEAD"], capture_output=True, text=True, check=False
+    )
     for scene in given.scenes or scenes:
         with Respondents({"old": given.checkout.resolve(), "new": HERE}) as ask:
             ask("open", map=str(map_folder(scene)), data=str(folder_of("BIDNERF_DATA") / scene))
             for kind, pairs in pairs_of(ask, scene, given.count):
                 cells[f"{scene}, {kind}"] = cell = summary(pairs)
                 print(_line(f"{scene}, {kind}", cell), flush=True)
+        # What is done is on record if a later scene is interrupted.
+        record(given.name, {"old_commit": commit.stdout.strip(), "overall": overall(cells), "cells": cells})
     print(json.dumps(overall(cells)))
-    commit = subprocess.run(
-        ["git", "-C", str(given.checkout), "rev-parse", "HEAD"], capture_output=True, text=True, check=False
-    )
-    record(given.name, {"old_commit": commit.stdout.strip(), "overall": overall(cells), "cells": cells})
 
 
 def _line(name: str, cell: dict[str, Any]) -> str:
