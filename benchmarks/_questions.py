@@ -10,6 +10,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from itertools import islice
 from typing import Any
 
 from _lab import Scene, errors_of, one_thread, without_depth
@@ -46,7 +47,7 @@ class Answers:
     def begin(self, data: str, first: int | None = None) -> dict[str, Any]:
         """Begin to track a sequence; its frames are read once."""
         if not hasattr(self, "_frames"):
-            self._frames = list(open_sequence(data))[:first]
+            self._frames = list(islice(open_sequence(data), first))
         self._tracker = Tracker(self._localizer)
         return {"frames": len(self._frames), "with colour": [f.frame.has_colour for f in self._frames]}
 
