@@ -256,7 +256,7 @@ class Capture:
 
     @property
     def times(self) -> list[float | None]:
-        """The times of the frames (seconds)."""
+        """The frames' timestamps, seconds; None where unknown."""
         return [shot.time for shot in self.shots]
 
     def __len__(self) -> int:

@@ -60,9 +60,7 @@ class FileNames:
         return place if is_file(place) else None
 
     def _entries(self, folder: Path) -> dict[str, str]:
-        """Return the names in a folder by their lower-case form; names that differ only in case are keyed by
-        themselves.
-        """
+        """Return the names in a folder by lower-case form, without those that differ only in case."""
         if folder not in self._listed:
             try:
                 names = [child.name for child in folder.iterdir()]

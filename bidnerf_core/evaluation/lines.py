@@ -31,7 +31,7 @@ Value = TypeVar("Value")
 
 
 class LinesFile(ABC, Generic[Value]):
-    """A file of values by key, a line each, locked by the process that has it open. Use it as a context manager.
+    """A key-value file with one entry per line, locked by the process that has it open. Use it as a context manager.
 
     Without a path, the values are kept in memory only.
     """

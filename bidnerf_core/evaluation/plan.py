@@ -71,7 +71,7 @@ class Setup:
         return Setup(**{name: getattr(self, name) for name in READING})
 
     def open(self, name: str, stored: Map | None = None) -> Capture:
-        """Return the dataset in a folder, or of a closed-form scene; a map gives the colour behind its images."""
+        """Open the dataset in the folder ``name``, or of the closed-form scene of that name; ``stored`` gives the background colour."""
         if is_closed_form(name):
             return self.prepared(closed_form_data(name))
         options = DatasetOptions(

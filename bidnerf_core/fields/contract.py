@@ -159,7 +159,7 @@ LARGEST_LENGTH = 1e15
 
 @dataclass(frozen=True)
 class SceneBounds:
-    """Information about a scene available before training: plain numbers, stored as JSON."""
+    """Extent, depth range and background of a scene, known before training; plain numbers, stored as JSON."""
 
     lower: tuple[float, float, float]  # metres, world: corners of the box that holds all matter
     upper: tuple[float, float, float]

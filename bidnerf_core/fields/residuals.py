@@ -195,7 +195,7 @@ def free_space_term(robust: Robust, weight: float) -> Term:
 
 
 def opacity_term(weight: float) -> Term:
-    """Return the term for light that passes where a distance was measured: the scene must be opaque there."""
+    """Return a term that penalizes transmittance along rays with a measured distance, as the scene must be opaque there."""
     return Term(
         lambda rendering, observed: (1 - rendering.opacity)[..., None], Robust("l2", 1.0), weight, measured
     )

@@ -190,7 +190,7 @@ class SE3:
 
     @staticmethod
     def cat(batches: list[SE3]) -> SE3:
-        """Concatenate batches along one axis."""
+        """Concatenate batches of transforms along the first axis."""
         return SE3(torch.cat([b.rotation for b in batches]), torch.cat([b.translation for b in batches]))
 
 

@@ -205,7 +205,7 @@ def pixel_array(pixels: np.ndarray | Tensor, what: str) -> Float[Tensor, "h w c"
 
 
 def to_numpy(array: np.ndarray | Tensor) -> np.ndarray:
-    """Return the values of a NumPy array or torch tensor (any device and dtype) as a NumPy array. Raises ``InputError``."""
+    """Convert an array or tensor (any device and dtype) to NumPy. Raises ``InputError`` for what NumPy cannot convert."""
     if not isinstance(array, Tensor):
         try:
             return np.asarray(array)

@@ -29,7 +29,7 @@ from bidnerf_core.io import from_plain, read_record, to_plain, write_file
 
 
 class Outcome(StrEnum):
-    """The reason for which a pose is accepted or rejected; only ``CONVERGED`` means accepted."""
+    """Why a pose was accepted or rejected; only ``CONVERGED`` means accepted."""
 
     CONVERGED = "converged"
     AMBIGUOUS = "ambiguous"  # another pose explains the measurements about as well

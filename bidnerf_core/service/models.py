@@ -27,7 +27,7 @@ DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
 class Refused(Exception):
-    """A request that is answered with an error: its status, a ``detail``, headers, and further JSON values."""
+    """Raised to refuse a request; carries the HTTP status, a ``detail``, headers, and further JSON fields."""
 
     def __init__(
         self, status: int, detail: str, headers: Mapping[str, str] | None = None, **more: Any

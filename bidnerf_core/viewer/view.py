@@ -118,5 +118,5 @@ def read_and_localized(localizer: Localizer, source: QuerySource, place: int) ->
 def page_of(
     scene: Map, answers: Iterable[ShownAnswer], trajectory: ShownTrajectory | None = None, results: Iterable[ShownRow] = (),
 ) -> MapView:  # fmt: skip
-    """Return the page of a map with answers, a trajectory and rows of results."""
+    """Build the viewer page of a map with answers, a trajectory and rows of results."""
     return MapView(PageState(shown_map(scene), tuple(answers), trajectory=trajectory, results=tuple(results)))

@@ -110,7 +110,7 @@ class AdjustmentSystem:
     point: Int[Tensor, "m"]
 
     def step(self, damping: float) -> tuple[Float[Tensor, "v k"], Float[Tensor, "n 3"]]:
-        """Return the updates of images and points that solve the damped equations."""
+        """Solve the damped normal equations for the updates of image poses and points, by the Schur complement."""
         inverse = torch.linalg.inv(_damped(self.point_blocks, damping))
         eliminated = self.mixed_blocks @ inverse[self.point]
         mixed, product = self._sparse(self.mixed_blocks), self._sparse(eliminated)

@@ -118,7 +118,7 @@ def find_features(name: str, wanted_by: str = "") -> Features:
 
 
 def detected(features: Features, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
-    """Return the keypoints of an image. Raises ``PluginError`` if the detector returns anything but keypoints within it."""
+    """Run the detector on an image. Raises ``PluginError`` unless it returns ``Keypoints`` that lie inside the image."""
     found, who = features(rgb), f"detector {getattr(features, '__name__', type(features).__name__)}"
     if not isinstance(found, Keypoints):
         raise PluginError(

@@ -121,7 +121,7 @@ class LandmarkMap:
         return moved(self, working_device(device))
 
     def correlation_of(self, matches: int) -> float:
-        """Return the number of keypoints that count as one measurement in an image with this number of ``matches``.
+        """Return how many keypoints amount to one independent measurement in an image with this many ``matches``.
 
         Errors are correlated between neighbouring keypoints, of which there are more in images with many matches. On several
         captures, the number grew with the square root of the matches.

@@ -80,7 +80,7 @@ def _by_similarity(poses: Sequence[SE3]) -> Iterator[Int[Tensor, "r v"]]:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Pairs of keypoints of two images that are similar and lie on each other's epipolar lines."""
+    """Keypoint pairs of two images with similar descriptors, each near the other's epipolar line."""
 
     pairs: Int[Tensor, "p 2"]
     ambiguity: Float[Tensor, "p"]  # ratio of the best to the second-best descriptor distance
