@@ -436,8 +436,7 @@ def read_rows(path: Path) -> dict[tuple[str, ...], Row]:
     content = path.read_bytes()
     if path.suffix == ".xz":
         content = lzma.decompress(content)
-    lines = [plain for _, plain in RowStore.FORMAT.parse(path, content)[0]]
-    return {tuple(json.loads(line["key"])): line["row"] for line in lines}
+    return {tuple(json.loads(key)): row for key, row in RowStore.parse(path, content)}
 
 
 def answers_of(rows: dict[tuple[str, ...], Row]) -> dict[tuple[str, ...], Row]:

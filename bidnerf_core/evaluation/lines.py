@@ -58,8 +58,12 @@ class LinesFile(ABC, Generic[Value]):
     @classmethod
     def read(cls, path: Path) -> list[tuple[str, Value]]:
         """Return the key and value of each complete line. Raises ``InputError`` if the file cannot be read."""
-        lines, _ = cls._lines(path, read_file(path, cls.expected, LARGEST_LINES))
-        return [cls.parsed(plain, where) for where, plain in lines]
+        return cls.parse(path, read_file(path, cls.expected, LARGEST_LINES))
+
+    @classmethod
+    def parse(cls, path: Path, content: bytes) -> list[tuple[str, Value]]:
+        """Return the key and value of each complete line of the content of a file. Raises ``InputError``."""
+        return [cls.parsed(plain, where) for where, plain in cls._lines(path, content)[0]]
 
     @classmethod
     def _lines(cls, path: Path, content: bytes) -> tuple[list[tuple[str, Any]], int]:

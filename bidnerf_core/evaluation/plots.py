@@ -9,7 +9,7 @@ import math
 import textwrap
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,13 +20,15 @@ from jaxtyping import Float
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.comparison import Comparison, MapRow
-from bidnerf_core.evaluation.faults import NO_FAULT, find_fault, parse_faults
+from bidnerf_core.evaluation.faults import NO_FAULT, find_fault
 from bidnerf_core.evaluation.summary import (
     NEVER,
+    FaultCurve,
     Group,
     Situation,
     applies,
     are_stepwise,
+    fault_curves,
     rate_of,
     situation_titles,
     situations,
@@ -399,37 +401,6 @@ SHARES: dict[str, tuple[Callable[[TrialResult], bool], str]] = {
     "accepted, but wrong": (lambda result: result.converged and not succeeded(result), COLOURS[1]),
 }
 """The lines of a panel of faults: which trials each counts, and its colour."""
-
-
-@dataclass(frozen=True)
-class FaultCurve:
-    """The trials of one condition under one kind of fault, by the fault's size in ascending order."""
-
-    situation: Situation  # without fault
-    label: str  # of the condition
-    name: str  # of the fault
-    points: tuple[tuple[float, Group], ...]
-
-
-def fault_curves(groups: Sequence[Group]) -> list[FaultCurve]:
-    """Return a curve for each fault that was tried on its own.
-
-    Trials without any fault belong to every curve of their situation and condition whose fault has a neutral size.
-    """
-    found: dict[tuple[Situation, str, str], list[tuple[float, Group]]] = {}
-    for group in groups:
-        parts = parse_faults(group.situation.fault)
-        if len(parts) == 1 and group.situation.size is not None:
-            key = replace(group.situation, fault=NO_FAULT), group.label, parts[0].name
-            found.setdefault(key, []).append((parts[0].size, group))
-    clean = {(group.situation, group.label): group for group in groups}
-    for (situation, label, name), points in found.items():
-        neutral, usual = find_fault(name).neutral, clean.get((situation, label))
-        if neutral is not None and usual is not None and neutral not in dict(points):
-            points.append((neutral, usual))
-    return [
-        FaultCurve(*key, tuple(sorted(points, key=lambda point: point[0]))) for key, points in found.items()
-    ]
 
 
 def _draw_curve(axes: Any, curve: FaultCurve) -> None:

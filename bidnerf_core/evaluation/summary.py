@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from bidnerf_core.evaluation.faults import NO_FAULT
+from bidnerf_core.evaluation.faults import NO_FAULT, find_fault, parse_faults
 from bidnerf_core.evaluation.trial import TrialResult
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.results import CRITERIA, Rate, Reduced, steps_to_success, success_rate_by_frame
@@ -322,3 +322,34 @@ def compare_pair(first: Group, second: Group, criterion: str) -> PairTest:
         if tie
         else float(mannwhitneyu(*ranks, alternative="two-sided", method="asymptotic").pvalue),
     )
+
+
+@dataclass(frozen=True)
+class FaultCurve:
+    """The trials of one condition under one kind of fault, by the fault's size in ascending order."""
+
+    situation: Situation  # without fault
+    label: str  # of the condition
+    name: str  # of the fault
+    points: tuple[tuple[float, Group], ...]
+
+
+def fault_curves(groups: Sequence[Group]) -> list[FaultCurve]:
+    """Return a curve for each fault that was tried on its own.
+
+    Trials without any fault belong to every curve of their situation and condition whose fault has a neutral size.
+    """
+    found: dict[tuple[Situation, str, str], list[tuple[float, Group]]] = {}
+    for group in groups:
+        parts = parse_faults(group.situation.fault)
+        if len(parts) == 1 and group.situation.size is not None:
+            key = replace(group.situation, fault=NO_FAULT), group.label, parts[0].name
+            found.setdefault(key, []).append((parts[0].size, group))
+    clean = {(group.situation, group.label): group for group in groups}
+    for (situation, label, name), points in found.items():
+        neutral, usual = find_fault(name).neutral, clean.get((situation, label))
+        if neutral is not None and usual is not None and neutral not in dict(points):
+            points.append((neutral, usual))
+    return [
+        FaultCurve(*key, tuple(sorted(points, key=lambda point: point[0]))) for key, points in found.items()
+    ]

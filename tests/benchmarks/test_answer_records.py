@@ -201,7 +201,7 @@ def test_a_record_is_compressed_and_compares_as_its_files(
     summaries: list[Any] = []
     monkeypatch.setattr(answers, "record", lambda name, results, seed: summaries.append(results))
     rows = written(tmp_path / "a.jsonl", [row(0.03, True), row(9.0, False, None)])
-    answers.keep([rows])
+    answers.keep([rows], "answers")
     assert answers.read_rows(tmp_path / "answers.rows.jsonl.xz") == answers.read_rows(rows)
     (results,) = summaries
     assert results["counts"]["room, RGB"]["all"]["right"] == 1

@@ -565,7 +565,7 @@ def test_points_of_a_sensor_are_used(bidnerf: Run, shared: Path, tmp_path: Path)
 
 def test_inerf_takes_one_image(bidnerf: Run, shared: Path) -> None:
     place = ["localize", shared / "map", shared / "data", *QUICK, "--method", "inerf"]
-    assert bidnerf(*place, "--frame", "t_0000", "--pixels", "interest-points", "--no-renew").status == 0
+    assert bidnerf(*place, "--frame", "t_0000", "--pixels", "interest-points").status == 0
     assert_refused(bidnerf(*place, "--frame", "t_0000", "t_0001"), 1, "inerf", "one image", "got 2")
 
 

@@ -82,7 +82,8 @@ def test_never_and_images_without_keypoints_keep_the_given_poses(
         kept = "the poses are kept: refining them takes at least 8 images" in found.err
         assert kept == (when == "always")
         info = load_info(tmp_path / when)
-        assert info.cameras == stored_cameras(views)
+        stored = [replace(camera, file=None) for camera in info.cameras]
+        assert stored == list(stored_cameras(views))
         assert info.pose_refinement is None
         assert json.loads(bidnerf("info", tmp_path / when, "--json").out)["moved"] == []
     assert bidnerf(*train, "maybe", "--out", tmp_path / "x").status == 2

@@ -32,8 +32,9 @@ from bidnerf_core.evaluation import (
 )
 
 # Inside: the values of curves, which a report shows as pictures, and the images of a trial
-from bidnerf_core.evaluation.plots import Figures, fault_curves
+from bidnerf_core.evaluation.plots import Figures
 from bidnerf_core.evaluation.run import InThisProcess
+from bidnerf_core.evaluation.summary import fault_curves
 from bidnerf_core.evaluation.trial import trial_views
 from bidnerf_core.registry import registered
 from bidnerf_core.scenes import closed_form_data

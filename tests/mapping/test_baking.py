@@ -22,6 +22,7 @@ from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
 # Inside: the size of cells and the noise of depth are compared with those of the scene
 from bidnerf_core.mapping.surface.cell_size import chosen_grid, depth_noise, footprint, spacing, surface_bytes
 from bidnerf_core.mapping.surface.posed_depth import PosedDepthImage, measured_image
+from bidnerf_core.progress import job_context
 from bidnerf_core.scenes import Box, HomogeneousBall, Sphere, blotches, orbit
 
 RADIUS = 0.6
@@ -90,13 +91,13 @@ def test_measured_views_are_taken_as_they_are() -> None:
 
 def test_a_field_shows_its_surface() -> None:
     poses, told = orbit(3.5, 10, seed=0), []
-    surface = bake(
-        HomogeneousBall(RADIUS, 300.0),
-        baked.BOUNDS,
-        [(baked.CAMERA, T) for T in poses],
-        config=BakeConfig(rays=20_000, cells=30_000),
-        progress=lambda done, total: told.append((done, total)),
-    )
+    with job_context(lambda progress: told.append((progress.done, progress.total))):
+        surface = bake(
+            HomogeneousBall(RADIUS, 300.0),
+            baked.BOUNDS,
+            [(baked.CAMERA, T) for T in poses],
+            config=BakeConfig(rays=20_000, cells=30_000),
+        )
     assert told == [(i, 10) for i in range(1, 11)]
     assert height(surface).abs().max() < 1
     assert torch.equal(surface.keyframes, torch.stack([T.matrix() for T in poses]))

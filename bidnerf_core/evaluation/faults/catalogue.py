@@ -90,11 +90,3 @@ CATALOGUE: dict[str, Fault] = {
 }
 # fmt: on
 """All bundled faults by name."""
-
-
-def __getattr__(name: str) -> Fault:
-    """Return a fault by its name in metadata that still lists each one."""
-    try:
-        return CATALOGUE[name.replace("_", "-")]
-    except KeyError as error:
-        raise AttributeError(name) from error
