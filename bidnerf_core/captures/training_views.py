@@ -188,7 +188,7 @@ def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> 
 
 
 def usual_unit(estimated: float) -> float:
-    """Return the usual unit of depth images (metres per step) near an estimated one, or the estimate if none is."""
+    """Return the common unit of depth images (metres per step) closest to the estimate, or the estimate itself if none is close."""
     nearest = min(USUAL_UNITS, key=lambda unit: abs(math.log(unit / estimated)))
     return nearest if abs(nearest / estimated - 1) < UNUSUAL_RATIO else estimated
 

@@ -268,7 +268,7 @@ def _description(parameter: Parameter) -> str:
     """Return the help of a parameter, with its default."""
     option, default = parameter.option, parameter.default
     words = option.default
-    if words is None and default is not MISSING and default not in (None, (), "", False):
+    if words is None and default is not MISSING and default not in (None, (), "") and default is not False:
         words = " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
     text = " ".join((option.help or parameter.doc).replace("``", "'").split())
     if default is MISSING and not option.positional:
@@ -366,7 +366,7 @@ def _bare(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 def conversion(hint: Any) -> tuple[int | str | None, Callable[[str], Any], str]:
-    """Return how many words a type takes (None: one), the function that reads one, and what it is called."""
+    """Return argparse's ``nargs`` for a type (None: one word), the function that converts one word, and the name of the value."""
     hint, _ = _bare(hint)
     members = [_bare(part)[0] for part in typing.get_args(hint)] if _is_union(hint) else [hint]
     optional = type(None) in members

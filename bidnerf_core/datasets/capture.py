@@ -165,7 +165,7 @@ class Shot:
         return Frame.taken(self.name, camera, rgb, metres, alpha, hidden)
 
     def read(self, background: Colour = BLACK, side: int | None = None) -> Frame:
-        """Read the frame, and hide what its masks hide. Raises ``WhollyHidden`` if that is everything."""
+        """Read the frame and apply its masks. Raises ``WhollyHidden`` if they hide every pixel."""
         found = self.frame(background, side)
         for mask in self.masks:
             found = found.with_hidden(_hidden(mask, found))

@@ -134,9 +134,9 @@ def compare(
 ) -> Comparison:
     """Localize the same frames from the same starts in several maps, and return the success and cost of each.
 
-    The plan's size is one, by default the first of its protocol. ``scenes`` may be a dictionary, whose keys then name the
-    maps. Maps in folders run in a process each, whose peak memory is measured, and which needs an importable main module;
-    maps in memory, and all maps if the data is in memory, run in this process. One trial runs at a time, so that a change
+    The plan must have a single size of starts, by default the first of its protocol. ``scenes`` may be a dictionary, whose keys
+    then name the maps. Each map in a folder runs in its own process, so that its peak memory can be measured; this requires an
+    importable main module. Maps in memory, and all maps if the data is in memory, run in this process. One trial runs at a time, so that a change
     in the machine's load affects all maps alike. Raises ``InputError`` and ``Cancelled`` as ``evaluate`` does.
     """
     if isinstance(scenes, str | Path | Map):

@@ -1,4 +1,8 @@
-"""The loop: propose a pose, refine it under all explanations, fuse all measurements, accept it or go on."""
+"""The loop: propose a pose, refine it under all explanations, fuse all measurements, accept it or go on.
+
+``docs/methods.md#code`` says which module does which step. A further measurement is a term of ``Loop._fused``; between places it decides
+only by the log odds of ``Loop._posterior``. What the image may be other than a photo of the scene is a rival of ``Loop._rivals``.
+"""
 
 from __future__ import annotations
 

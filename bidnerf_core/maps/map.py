@@ -131,7 +131,7 @@ class Map:
 
     @property
     def colour_noise(self) -> float | None:
-        """Root mean square error of the field's colours (in [0, 1]) on its own training images."""
+        """Root mean square error of the field's colours (in [0, 1]) on its own training images; None if unknown."""
         return self.info.colour_noise
 
     @cached_property

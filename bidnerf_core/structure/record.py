@@ -135,8 +135,9 @@ def gives_way(folder: Path) -> bool:
 
 
 def give_up(folder: Path) -> None:
-    """Keep the keypoints and matches of photos without poses for another attempt with the same photos, or
-    remove everything if there are none.
+    """Mark the work in a folder as failed: its keypoints and matches are kept for another attempt with the same photos.
+
+    A folder without any is cleared.
     """
     if not (folder / WORK / DATABASE).exists():
         clear(folder)

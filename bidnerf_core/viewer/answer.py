@@ -76,7 +76,7 @@ class ShownStep:
 
 @dataclass(frozen=True)
 class ShownMatches:
-    """Keypoints, and the projections of the landmarks with which they were matched at the last pose by landmarks."""
+    """Keypoints and the projections of their matched landmarks, at the last pose that was estimated from landmarks."""
 
     keypoints: Packed  # float32 (m, 2), as fractions of the image's width and height
     projections: Packed  # the same; NaN behind the camera

@@ -37,8 +37,7 @@ def stretched(frame: Frame, factor: float, generator: Generator) -> Frame:
 
 
 def cropped(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Crop to a ``share`` of the width and height at a random corner, and state the principal point as if
-    nothing were cropped.
+    """Crop away a ``share`` of the width and height at a random corner; the stated principal point ignores the crop.
 
     Its stated offset from the centre of the cropped image is its true offset from the centre of the whole
     one.

@@ -71,7 +71,7 @@ LEAST_SECONDS = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """A pose measured in one frame, with the two parts of its covariance; right updates, translation (metres) first."""
+    """The pose measured from one image. Its covariance, of a right update with the translation (metres) first, has two parts."""
 
     T_world_camera: SE3  # float64
     noise: Float[Tensor, "6 6"]  # independent of other frames'

@@ -72,7 +72,7 @@ class TrackerState:
 
 
 def correction_of(stated: Intrinsics, true: Intrinsics) -> Float[Tensor, "6"]:
-    """Return the correction by which ``true_intrinsics`` makes ``true`` of the ``stated`` intrinsics."""
+    """Return the correction with which ``true_intrinsics`` turns ``stated`` into ``true`` (focal lengths, centre and k1 only)."""
     across, down = true.fx / stated.fx, true.fy / stated.fy
     bent = [camera.distortion[0] if camera.distortion else 0.0 for camera in (stated, true)]
     centre = (true.cx - stated.cx) / stated.fx, (true.cy - stated.cy) / stated.fy
