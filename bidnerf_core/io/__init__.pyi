@@ -1,5 +1,6 @@
 from .archives import Archive as Archive
 from .files import FileInUse as FileInUse
+from .files import PackedFile as PackedFile
 from .files import is_file as is_file
 from .files import is_temporary as is_temporary
 from .files import locked as locked

@@ -43,7 +43,7 @@ def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
     ``expected`` briefly describes what the file should be. With ``mapped``, tensors stay in the file until they are used, so that
     one of any size is recognised quickly; files in the format of torch before version 1.6, which are not zip archives,
     cannot be mapped and are read. Raises a one-line ``InputError`` if there is no such file, it is damaged, it would
-    run code, or it unpacks to more than its size or holds a tensor that does, such as an expanded one (stride 0).
+    run code, it unpacks to more than its size or, unless ``mapped``, it holds a tensor that does, such as an expanded one (stride 0).
     """
     if not path.is_file():
         raise InputError("no such file", where=path, expected=expected)
@@ -67,7 +67,7 @@ def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
         else:
             found = f"not written by torch.save, or damaged ({type(error).__name__});"
         raise InputError(found, where=path, expected=expected) from error
-    for tensor in _tensors(content):
+    for tensor in () if mapped else _tensors(content):  # those that stay in the file take no memory
         needed = tensor.numel() * tensor.element_size()
         stored = tensor.untyped_storage().nbytes() if tensor.layout is torch.strided else 0
         if needed > min(stored, size):

@@ -15,6 +15,7 @@ from bidnerf_core.captures import StoredCamera
 from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import SE3, Similarity
+from bidnerf_core.io import open_binary
 from bidnerf_core.registry import Plugins, interface_defects
 
 UNMOVED = Similarity(1.0, SE3.identity())
@@ -87,12 +88,14 @@ def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
     """Return an importer and its name: the one with that name or, without a name, the one that recognizes the
     file.
 
-    Raises ``InputError`` if there is no such file, and if none or several recognize it.
+    Raises ``InputError`` if there is no such file, if it is unreadable or a pointer of Git LFS, and if none or several recognize it.
     """
     if not path.exists():
         raise InputError("no such file or folder", where=path, expected="a trained field")
     if name is not None:
         return name, IMPORTERS.load(name)
+    if path.is_file():
+        open_binary(path, "a trained field").close()
     found = [(each, IMPORTERS.load(each)) for each in IMPORTERS]
     able = [(each, importer) for each, importer in found if importer.recognises(path)]
     if len(able) == 1:

@@ -102,6 +102,7 @@ def test_a_number_that_stands_for_many(saved: Saved) -> None:
         path = saved({"a": [large]})
         with refused(where=path, found="has only", expected="a checkpoint"):
             read_saved(path, "a checkpoint")
+        assert read_saved(path, "a checkpoint", mapped=True)["a"][0].shape == large.shape
 
 
 def test_an_archive_that_unpacks_to_more_than_its_size_is_not_unpacked(saved: Saved) -> None:

@@ -141,6 +141,10 @@ def test_who_reads_a_file(file: Path, tmp_path: Path, monkeypatch: pytest.Monkey
     with refused(where=tmp_path / "a.txt", found="(tiny reads files that end in .tiny)"):
         importer_of(tmp_path / "a.txt")
     assert importer_of(tmp_path / "a.txt", "tiny")[0] == "tiny"
+    pointer = tmp_path / "scene.ply"
+    pointer.write_text("version https://git-lfs.github.com/spec/v1\n")
+    with refused(where=pointer, found="is a pointer of Git LFS, not the file", expected="git lfs pull"):
+        importer_of(pointer)
     monkeypatch.setitem(registered, ("importers", "twin"), TinyImporter())
     with refused(where=file, found="tiny and twin can each read it"):
         importer_of(file)

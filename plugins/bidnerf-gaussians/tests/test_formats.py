@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import math
 import os
 import pickle
 import struct
@@ -20,9 +21,11 @@ import zstandard
 from PIL import Image
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.maps import UNMOVED
 from bidnerf_gaussians import Gaussians, read_gaussians, write_gaussians
 from bidnerf_gaussians.formats import format_of, spz
 from bidnerf_gaussians.gaussians import cleaned
+from bidnerf_gaussians.importer import GaussiansImporter, ImportSettings
 from bidnerf_gaussians.quaternions import matrices
 
 Some = Callable[..., Gaussians]
@@ -61,6 +64,24 @@ def test_a_written_spz_is_read_again_to_within_its_bytes(tmp_path: Path, some: S
         assert found["rotation"] < 0.01
         assert found["harmonics"] < 0.02
         assert found["logits"] < 0.05
+
+
+def test_discs_of_2d_gaussian_splatting_are_thin_gaussians(tmp_path: Path, some: Some) -> None:
+    gaussians, path = some(40), tmp_path / "discs.ply"
+    columns = torch.cat(
+        [
+            gaussians.means, gaussians.harmonics[:, 0], gaussians.logits[:, None], gaussians.log_scales[:, :2],
+            gaussians.quaternions,
+        ],
+        dim=-1,
+    )  # fmt: skip
+    body = columns.numpy().astype("<f4").tobytes()
+    path.write_bytes(inria(40, body=body).replace(b"property float scale_2\n", b""))
+    thin = gaussians.log_scales.clone()
+    thin[:, 2] = thin[:, :2].amin(-1) + math.log(1e-3)
+    expected = replace(gaussians, log_scales=thin, harmonics=gaussians.harmonics[:, :1])
+    assert max(differences(read_gaussians(path), expected).values()) < 1e-5
+    assert "2D Gaussian Splatting" in GaussiansImporter().read(path, ImportSettings(), UNMOVED).found[0]
 
 
 def test_an_spz_has_other_axes_than_a_ply(tmp_path: Path, some: Some) -> None:

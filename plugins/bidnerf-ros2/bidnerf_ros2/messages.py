@@ -5,7 +5,6 @@ They only read attributes, so they accept messages of ROS itself and those read 
 
 from __future__ import annotations
 
-import io
 import struct
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from bidnerf_core import Frame, InputError, Intrinsics
+from bidnerf_core.io import PackedFile, open_image
 
 COLOURS = {
     "rgb8": (0, 1, 2),
@@ -125,19 +125,10 @@ def _raster(message: Any, kind: np.dtype, channels: int) -> np.ndarray:
 
 
 def _decoded(content: bytes) -> Image.Image:
-    try:
-        image = Image.open(io.BytesIO(content), formats=("JPEG", "PNG", "TIFF", "WEBP"))
-        if image.width * image.height > LARGEST:
-            raise InputError(
-                f"an image has {image.width}x{image.height} pixels",
-                expected=f"at most {LARGEST // 10**6} megapixels",
-            )
+    """Decode an image within the limits of files. Raises ``InputError`` for one that is damaged, too large or too slow."""
+    with open_image(PackedFile("a compressed image", lambda: content)) as image:
         image.load()
-    except InputError:
-        raise
-    except Exception as error:  # decoders may raise anything
-        raise InputError(f"a compressed image is not readable ({type(error).__name__})") from error
-    return image
+        return image.copy()
 
 
 def _compressed_depth(message: Any) -> tuple[np.ndarray, float]:

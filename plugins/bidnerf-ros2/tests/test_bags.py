@@ -122,6 +122,14 @@ def test_depth_as_plain_png_is_depth() -> None:
     assert not is_depth(SimpleNamespace(format="rgb8; jpeg compressed bgr8", data=b""))
 
 
+def test_a_compressed_image_of_endless_segments_is_refused() -> None:
+    content = io.BytesIO()
+    Image.new("RGB", (8, 6)).save(content, format="JPEG")
+    data = content.getvalue()[:2] + b"\xff\xfe\0\2" * 2000 + content.getvalue()[2:]
+    with pytest.raises(InputError, match="a compressed image: has more than"):
+        colour_image(SimpleNamespace(format="rgb8; jpeg compressed bgr8", data=data))
+
+
 def test_cameras_after_binning_and_in_a_region() -> None:
     info = bags.camera_info(bags.ROS2, 0, 400.0, 400.0, 319.5, 239.5, 640, 480)
     info.d = np.array([0.1, 0.01, 0.0, 0.0, 0.0])

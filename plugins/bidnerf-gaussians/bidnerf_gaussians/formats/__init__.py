@@ -23,6 +23,12 @@ class Format:
 
 
 FORMATS = (
+    Format(
+        "PLY of 2D Gaussian Splatting, whose discs become thin Gaussians",
+        ply.recognises_discs,
+        ply.read,
+        "as trained, as in a PLY",
+    ),
     Format("PLY of splats", ply.recognises, ply.read, "as trained (COLMAP: y down, z forward)"),
     Format("compressed PLY", ply.recognises_compressed, ply.read_compressed, "as trained, as in a PLY"),
     Format(".splat", splat.recognises, splat.read, "as trained, as in a PLY"),

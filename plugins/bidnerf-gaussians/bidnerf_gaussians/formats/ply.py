@@ -1,7 +1,8 @@
-"""PLY files of splats: the layout of the original 3DGS code, and PlayCanvas's compressed one."""
+"""PLY files of splats: the layouts of the original 3DGS and 2DGS codes, and PlayCanvas's compressed one."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -19,6 +20,8 @@ MEANS, SCALES, TURNS = ("x", "y", "z"), ("scale_0", "scale_1", "scale_2"), tuple
 COLOUR = tuple(f"f_dc_{i}" for i in range(3))
 NEEDED = (*MEANS, *COLOUR, "opacity", *SCALES, *TURNS)
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+DISC = math.log(1e-3)
+"""Logarithm of the thickness given to a disc of 2D Gaussian Splatting, relative to its shorter axis."""
 CHUNK = 256
 """Number of Gaussians that share a range in a compressed file."""
 DEGREES = {3 * (count - 1): degree for degree, count in COEFFICIENTS.items()}
@@ -30,6 +33,13 @@ def recognises(path: Path) -> bool:
     header = _header(path)
     vertex = None if header is None else header.element("vertex")
     return vertex is not None and {"opacity", "scale_0", "rot_0"} <= set(vertex.names)
+
+
+def recognises_discs(path: Path) -> bool:
+    """Return whether the file is a PLY of 2D Gaussian Splatting (Huang et al. 2024), whose splats have two scales."""
+    header = _header(path) if recognises(path) else None
+    vertex = None if header is None else header.element("vertex")
+    return vertex is not None and "scale_1" in vertex.names and "scale_2" not in vertex.names
 
 
 def recognises_compressed(path: Path) -> bool:
@@ -49,18 +59,24 @@ def _header(path: Path) -> PlyHeader | None:
 
 
 def read(path: Path) -> Gaussians:
-    """Read the Gaussians of a PLY: log scales, logits of the opacities, quaternions w, x, y, z."""
+    """Read the Gaussians of a PLY: log scales, logits of the opacities, quaternions w, x, y, z.
+
+    Those with two scales are discs, whose normal is their third axis.
+    """
     vertices = _vertices(read_ply(path, EXPECTED), path)
     names = vertices.dtype.names or ()
-    missing = [name for name in NEEDED if name not in names]
+    missing = [name for name in NEEDED if name not in names and name != "scale_2"]
     if missing:
         raise InputError(f"has no property {', '.join(missing)}", where=path, expected=EXPECTED)
     rest = sum(name.startswith("f_rest_") for name in names)
     harmonics = _columns(vertices, COLOUR)[:, None]
     if rest:
         harmonics = np.concatenate([harmonics, _rest(vertices, rest, path)], axis=1)
+    scales = _columns(vertices, SCALES if "scale_2" in names else SCALES[:2])
+    if scales.shape[1] == 2:
+        scales = np.concatenate([scales, scales.min(axis=1, keepdims=True) + np.float32(DISC)], axis=1)
     return gaussians_of(
-        _columns(vertices, MEANS), _columns(vertices, SCALES), _columns(vertices, TURNS),
+        _columns(vertices, MEANS), scales, _columns(vertices, TURNS),
         vertices["opacity"], harmonics,
     )  # fmt: skip
 
