@@ -84,7 +84,7 @@ def _landmarks_only(sharp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_baked_map_needs_no_start(sharp: Path, folder: Path, bidnerf: Run) -> None:
     data = sharp / "data"
-    unbaked = bidnerf("info", folder, "--draw", folder / "capture.png")
+    unbaked = bidnerf("info", folder, "--draw", folder.parent / "capture.png")
     assert_refused(unbaked, 1, "no record of its photos")
     status, out, err = bidnerf("bake", folder, "--data", data, *COARSE)
     assert (status, out) == (0, "")
@@ -116,10 +116,10 @@ def test_a_baked_map_needs_no_start(sharp: Path, folder: Path, bidnerf: Run) -> 
     # Baking the photos has left a record of them.
     (line,) = [line for line in err.splitlines() if "24 photos, " in line and "horizon" in line]
     assert len(facts["capture"]["photos"]) == 24
-    status, out, _ = bidnerf("info", folder, "--draw", folder / "capture.png")
+    status, out, _ = bidnerf("info", folder, "--draw", folder.parent / "capture.png")
     assert (status, line in out) == (0, True)
-    assert (folder / "capture.png").read_bytes().startswith(b"\x89PNG")
-    assert_refused(bidnerf("info", folder, "--draw", folder / "capture.jpg"), 1, "PNG")
+    assert (folder.parent / "capture.png").read_bytes().startswith(b"\x89PNG")
+    assert_refused(bidnerf("info", folder, "--draw", folder.parent / "capture.jpg"), 1, "PNG")
 
 
 @pytest.mark.usefixtures("_ball")
