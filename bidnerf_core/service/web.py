@@ -118,7 +118,9 @@ class Gate:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "websocket":
             await send({"type": "websocket.close", "code": 1008})
-        if scope["type"] != "http":
+            return
+        if scope["type"] != "http":  # the startup and the shutdown
+            await self.app(scope, receive, send)
             return
         began, status = time.perf_counter(), 0
 

@@ -673,6 +673,23 @@ def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidne
     assert bidnerf("serve", place.folder / "map", "--port", 99999).status == 2
 
 
+def test_startup_of_another_server_starts_the_pool(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An ASGI server starts the workers and ends them by events, which are not requests and carry no token."""
+    app, told = service_app("MAP", token="0123456789abcdef"), list[str]()
+    events = [{"type": "lifespan.startup"}, {"type": "lifespan.shutdown"}]
+    monkeypatch.setattr(app.state.pool, "start", lambda: told.append("started"))
+    monkeypatch.setattr(app.state.pool, "close", lambda: told.append("ended"))
+
+    async def receive() -> Any:
+        return events.pop(0)
+
+    async def send(message: Any) -> None:
+        told.append(message["type"])
+
+    asyncio.run(app({"type": "lifespan", "asgi": {"version": "3.0"}, "state": {}}, receive, send))
+    assert told == ["started", "lifespan.startup.complete", "ended", "lifespan.shutdown.complete"]
+
+
 @pytest.mark.slow
 def test_a_folder_without_a_map_is_refused(place: Place, bidnerf: Run) -> None:
     """The process that would hold the maps refuses it, and the command prints its line."""
