@@ -22,6 +22,8 @@ import time
 from multiprocessing.connection import Connection
 from typing import Any
 
+import psutil
+
 from bidnerf_core.errors import InputError
 from bidnerf_core.service.jobs import Job, Queue
 from bidnerf_core.service.metrics import Metrics
@@ -58,6 +60,13 @@ class WorkerProcess:
             connection.close()
             raise InputError(first["error"])
         self.pid: int = first["pid"]
+        try:
+            self._process = psutil.Process(
+                self.pid
+            )  # remembers when it began: its number may be another's, later
+        except psutil.NoSuchProcess as error:
+            connection.close()
+            raise EOFError from error
 
     @property
     def ended(self) -> bool:
@@ -75,8 +84,8 @@ class WorkerProcess:
 
     def kill(self) -> None:
         """Kill the process; ``ask`` then raises in the thread that waits there."""
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(self.pid, signal.SIGKILL)
+        with contextlib.suppress(psutil.NoSuchProcess):
+            self._process.kill()
 
     def close(self) -> None:
         """Close the connection to a process that has ended or was killed."""
