@@ -67,7 +67,7 @@ class Setup:
 
     @property
     def reading(self) -> Setup:
-        """The same map and data, with everything else at its default."""
+        """The setup that reads the same map and data, with everything else at its default."""
         return Setup(**{name: getattr(self, name) for name in READING})
 
     def open(self, name: str, stored: Map | None = None) -> Capture:

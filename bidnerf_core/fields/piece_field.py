@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import torch
@@ -26,7 +27,7 @@ LARGEST_ALPHA = 0.999
 """Largest opacity of a piece along a ray, as in gsplat: the optical thickness stays finite."""
 
 
-class PieceField(nn.Module):
+class PieceField(nn.Module, ABC):
     """A field of pieces, such as Gaussians or triangles, each of which a ray meets at one point.
 
     ``hits`` returns these points with the opacity alpha of each piece. The density that ``query`` returns distributes the optical
@@ -40,25 +41,25 @@ class PieceField(nn.Module):
     """Metres from a piece's box within which the line of sight through a point must meet it for the piece to have density there;
     None if the box must contain the point."""
 
+    @abstractmethod
     def meet(
         self, index: Int[Tensor, "p"], origins: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
     ) -> Meeting:
         """Return where lines meet the pieces with indices ``index``; an opacity below ``LEAST_ALPHA`` counts as none."""
-        raise NotImplementedError
 
+    @abstractmethod
     def colours(
         self, index: Int[Tensor, "p"], meeting: Meeting, directions: Float[Tensor, "p 3"]
     ) -> Float[Tensor, "p 3"]:
         """Return the colours in [0, 1] of pieces where lines meet them."""
-        raise NotImplementedError
 
+    @abstractmethod
     def profile(self, meeting: Meeting) -> Float[Tensor, "p"]:
         """Return the share per metre of a piece's optical thickness at the lines' origins; its integral along a line is 1."""
-        raise NotImplementedError
 
+    @abstractmethod
     def half_length(self, meeting: Meeting) -> Float[Tensor, "p"]:
         """Return half the length (metres) of the interval that a piece has in ``sampler``."""
-        raise NotImplementedError
 
     def register_tree(self, count: int) -> None:
         """Register the buffers of the tree of ``count`` pieces."""

@@ -1,7 +1,6 @@
 from .robust import CORNERS_PER_INDEPENDENT as CORNERS_PER_INDEPENDENT
 from .robust import KEYPOINTS_PER_INDEPENDENT as KEYPOINTS_PER_INDEPENDENT
 from .robust import MAD_TO_SIGMA as MAD_TO_SIGMA
-from .robust import USUAL as USUAL
 from .robust import Robust as Robust
 from .robust import RobustName as RobustName
 from .robust import cauchy_loss as cauchy_loss

@@ -29,7 +29,7 @@ from bidnerf_core.mapping import States, damped_solution
 SHAPE_SIGMA = 0.012
 """Uncertainty of the map's surfaces in coarse steps with depth, relative to the scene's mean side."""
 COLOUR_SIGMA = SHAPE_SIGMA / 5
-"""The same by colour alone from a search."""
+"""Uncertainty of the map's surfaces in steps by colour alone from a search, relative to the scene's mean side."""
 
 
 @dataclass(frozen=True)

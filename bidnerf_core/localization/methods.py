@@ -252,7 +252,7 @@ INERF = Method(
 # Second-order methods.
 
 IMAGE_STAGES = ((16, 0, 24), (16, 8, 6), (24, 6, 2), (48, 4, 2))
-"""Of a search with small renderings: pixels of the longer side, steps, poses kept."""
+"""The stages of a search with small renderings: pixels of the longer side, steps, poses kept."""
 COARSE_BLUR = 8
 """Width, in pixels, of the squares over which colours are averaged in coarse steps with depth."""
 

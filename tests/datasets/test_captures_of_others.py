@@ -69,7 +69,7 @@ def companions(write: Callable[[Path, Any], Path]) -> Write:
 
 
 def empty_columns(root: Path) -> Path:
-    """As Stray Scanner writes since 2026; the second frame has no pose, and the third no lens of its own."""
+    """Write what Stray Scanner writes since 2026; the second frame has no pose, and the third no lens of its own."""
     file = write_stray_scanner(root, small_views(COUNT + 1)) / "odometry.csv"
     head, *rows = file.read_text().splitlines()
     rows = [f"{row}, 20, 21, 8, 5.75, , " for row in rows]

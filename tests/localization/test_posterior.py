@@ -192,7 +192,7 @@ def test_prior_odds_and_evidence_of_landmarks_decide_between_places() -> None:
 
 
 def test_the_pose_is_that_of_the_true_camera_where_the_apparent_one_is_spurious() -> None:
-    """Of an apparent focal length, the part that errors of the landmarks explain does not move the pose."""
+    """The part of an apparent focal length that errors of the landmarks explain does not move the pose."""
     true = torch.zeros(len(NUISANCES), dtype=torch.float64)
     true[0] = 0.02
     term, depths = matches(0, nuisances=true), []

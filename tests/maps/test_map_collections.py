@@ -67,7 +67,7 @@ def test_the_map_that_an_image_shows_is_found(grounds: list[Map]) -> None:
 
 
 def test_transparent_pixels_show_the_background_of_the_map(grounds: list[Map], tmp_path: Path) -> None:
-    """Of whichever map a photo is tried in, and unless the user names another."""
+    """The background is that of whichever map a photo is tried in, unless the user names another."""
     rgb, alpha = photo(SEEDS[0]).frame.rgb.numpy(), np.zeros((CAMERA.height, CAMERA.width, 1), np.float32)
     alpha[: CAMERA.height // 2] = 1.0
     rgba = (255 * np.concatenate([rgb, alpha], axis=-1)).round().astype(np.uint8)

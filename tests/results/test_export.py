@@ -72,7 +72,7 @@ def test_transforms_json_is_read_again(scene: Map, tmp_path: Path) -> None:
 
 
 def test_colmap_reads_the_model(scene: Map, tmp_path: Path) -> None:
-    """With the keypoints that the landmarks were built from, which lie near their projections."""
+    """The model has the keypoints that the landmarks were built from, which lie near their projections."""
     pycolmap = pytest.importorskip("pycolmap")
     bn.export_map(scene, tmp_path / "out", "colmap")
     model = pycolmap.Reconstruction(str(tmp_path / "out"))

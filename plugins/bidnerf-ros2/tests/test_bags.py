@@ -106,7 +106,7 @@ def test_images_of_all_encodings() -> None:
 
 
 def test_depth_as_plain_png_is_depth() -> None:
-    """As image_transport's plugin "compressed" records it, in a topic beside the colour images."""
+    """The plugin "compressed" of image_transport records it so, in a topic beside the colour images."""
     depth = np.arange(500, 500 + 24 * 32, dtype=np.uint16).reshape(24, 32)
     content = io.BytesIO()
     Image.fromarray(depth).save(content, format="PNG")
