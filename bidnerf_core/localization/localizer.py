@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from numbers import Integral
+from operator import length_hint
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -15,7 +19,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.depth import DepthSensorModel, find_depth_sensor
-from bidnerf_core.devices import constant
+from bidnerf_core.devices import constant, set_threads_here
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import Observations, device_of, render
 from bidnerf_core.frames import Frame, View
@@ -39,7 +43,10 @@ from bidnerf_core.localization.problem import (
     unit_of,
 )
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
+from bidnerf_core.progress import counter, current_job, job_context
 
+STREAMS = 8
+"""Number of queries that share an accelerator, which computes for some while the host detects keypoints of others."""
 Start = SE3 | Float[Tensor, "4 4"] | np.ndarray | Sequence[Sequence[float]]
 """A pose T_world_camera: an ``SE3``, or any 4x4 matrix, by rows."""
 
@@ -98,6 +105,60 @@ class Localizer:
         origin = origin_of(self.scene)
         near = None if start is None else start_pose(start).translated(-origin)
         return self.solved(self.problem(query, near, depth_rays), seed).translated(origin)
+
+    def many(
+        self,
+        queries: Iterable[Frame | View | Sequence[View] | str | Path],
+        seed: int = 0,
+        workers: int | None = None,
+    ) -> Iterator[Localization | InputError]:
+        """Localize independent queries, each as by a call, and yield the answers in their order.
+
+        A query that cannot be localized at all gives its ``InputError`` in place of an answer. ``workers`` threads, each with a
+        stream of its own on a GPU, localize at the same time; by default as many as torch uses or, on a GPU, ``STREAMS``.
+        ``queries`` may be an iterator, from which they draw a few queries in advance. Raises ``InputError`` unless ``workers`` is
+        positive, and ``Cancelled`` as usual.
+        """
+        device = device_of(self.scene.field)
+        count = (torch.get_num_threads() if device.type == "cpu" else STREAMS) if workers is None else workers
+        if count < 1:
+            raise InputError(f"workers is {workers!r}", expected="at least 1")
+        return self._many(queries, _checked_seed(seed), count, device)
+
+    def _many(
+        self, queries: Iterable[Any], seed: int, workers: int, device: torch.device
+    ) -> Iterator[Localization | InputError]:
+        stopped, cancel = Event(), current_job().cancel
+        waiting, done = deque[Future[Localization | InputError]](), 0
+        total, count = length_hint(queries), counter("localizing", "images")
+
+        def begin() -> None:
+            set_threads_here(1)  # other queries are better for the other cores than parts of one
+            if device.type == "cuda":
+                torch.cuda.set_stream(torch.cuda.Stream(device))
+
+        def answer(query: Any) -> Localization | InputError:
+            with job_context(cancel=lambda: stopped.is_set() or (cancel is not None and cancel())):
+                try:
+                    return self(query, seed=seed)
+                except InputError as error:
+                    return error
+
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)  # streams do not wait for what was queued on another
+        with ThreadPoolExecutor(workers, "bidnerf-localizer", begin) as pool:
+            try:
+                for query in queries:
+                    waiting.append(pool.submit(answer, query))
+                    while len(waiting) > 2 * workers or (waiting and waiting[0].done()):
+                        count(done := done + 1, max(total, done))
+                        yield waiting.popleft().result()
+                for future in waiting:
+                    count(done := done + 1, max(total, done))
+                    yield future.result()
+            finally:
+                stopped.set()
+                pool.shutdown(cancel_futures=True)
 
     def problem(
         self,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +16,12 @@ import torch
 
 import baked
 import tiny
-from bidnerf_core import Localizer, View
+from bidnerf_core import Cancelled, InputError, Localization, Localizer, View
 from bidnerf_core.evaluation import perturb
 from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.localization import METHODS, AutoConfig, settings_of
-from bidnerf_core.testing import DEVICE, Elsewhere
+from bidnerf_core.progress import Progress, job_context
+from bidnerf_core.testing import DEVICE, Elsewhere, textured_map, training_views, unseen
 from bidnerf_hashgrid import backend as hashgrid
 from blob_images import BOUNDS, FIELD, FRAME, POSES, TRUTH, photograph
 from problems import FieldMap
@@ -188,6 +190,41 @@ def test_eight_threads_share_a_localizer(method: str) -> None:
         together = list(pool.map(answer, range(8)))
     for one, other in zip(alone, together, strict=True):
         assert torch.equal(one, other)
+
+
+def test_many_queries_have_the_answers_of_each_alone_in_order() -> None:
+    """A bad query gives its error, and queries are drawn a few at a time."""
+    made, drawn, stages = Localizer(textured_map()), list[int](), list[Progress]()
+    frames = [unseen().frame, *(view.frame for view in training_views()[:4])]
+    queries: list[Any] = [*frames[:3], Path("missing.png"), *frames[3:]]
+
+    def source() -> Iterator[Any]:
+        for number, query in enumerate(queries):
+            drawn.append(number)
+            yield query
+
+    with job_context(stages.append):
+        answers = made.many(source(), seed=3, workers=2)
+        found = [next(answers)]
+        assert len(drawn) <= 5
+        found += answers
+    assert [progress.done for progress in stages] == [1, 2, 3, 4, 5, 6]
+    for query, answer in zip(queries, found, strict=True):
+        if isinstance(query, Path):
+            assert isinstance(answer, InputError)
+            assert "missing.png" in str(answer)
+        else:
+            assert isinstance(answer, Localization)
+            assert torch.equal(answer.poses.matrix(), made(query, seed=3).poses.matrix())
+
+
+def test_many_queries_can_be_cancelled_and_need_workers() -> None:
+    done = list[Any]()
+    with job_context(cancel=lambda: len(done) >= 2), pytest.raises(Cancelled):
+        list(map(done.append, localizer().many([FRAME] * 9, workers=1)))
+    assert len(done) == 2
+    with refused(found="workers is 0", expected="at least 1"):
+        localizer().many([FRAME], workers=0)
 
 
 def test_a_device_that_is_another_one_gets_a_copy_of_the_field() -> None:
