@@ -31,7 +31,7 @@ import torch
 from paper_tables import test_frames
 
 from bidnerf_core import Localizer
-from bidnerf_core.devices import without_waiting
+from bidnerf_core.devices import captured, without_waiting
 from bidnerf_core.evaluation import RowStore, opened, perturb
 from bidnerf_core.fields import levels
 from bidnerf_core.localization import (
@@ -41,7 +41,6 @@ from bidnerf_core.localization import (
     DescentSettings,
     ReachSettings,
     SampledLoss,
-    captured,
     objective_of,
     pivot,
     rig,

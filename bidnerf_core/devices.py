@@ -1,11 +1,13 @@
-"""Torch devices and threads: where tensors reside, when the host may wait for them, and how many threads
-compute.
+"""Torch devices and threads: where tensors reside, when the host may wait for them, work that is launched as
+one CUDA graph, and how many threads compute.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -16,7 +18,7 @@ from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Shaped
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
 from bidnerf_core.errors import InputError
 
@@ -54,8 +56,9 @@ def _constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.devic
 
 
 def forget() -> None:
-    """Discard all constants, for instance when a device no longer exists."""
+    """Discard all constants and graphs, for instance when a device no longer exists."""
     _constant.cache_clear()
+    _free.clear()
 
 
 # Whether code may make the host wait for the device. On a GPU, each number that the host reads from a tensor,
@@ -81,6 +84,170 @@ def may_wait(device: torch.device) -> bool:
     is queued.
     """
     return device.type == "cpu" or _allowed.get()
+
+
+# CUDA graphs. A localization or a training step consists of hundreds of short operations, each of which takes longer to
+# launch from Python than to compute; a graph launches all of them at once. Work can be captured if it never waits
+# for the device, has the same shapes each time, and reads and writes the same tensors. Numbers computed in Python
+# keep their values from the capture.
+
+MOST_GRAPHS = 64
+"""Number of functions with different shapes whose graphs are kept, the least recently used being discarded."""
+_capturing = Lock()
+"""Allows one capture at a time: a capture begins by waiting for the device, which is forbidden during another."""
+_ALIGNMENT = 16
+"""Bytes to whose multiples tensors of any dtype are aligned in a common buffer."""
+_sharing = Lock()
+_free: OrderedDict[Hashable, list[_Remote]] = OrderedDict()
+
+
+class Resident:
+    """Base of objects that stay on their device, such as a map's surface: ``run_on`` uses them where they are."""
+
+
+def captured(
+    step: Callable[[], None], device: torch.device, generator: Generator | None = None
+) -> Callable[[], None]:
+    """Return a callable equivalent to ``step``; on a GPU, it replays a CUDA graph.
+
+    ``generator`` is the one from which the step draws, if any. Capturing does not execute the step. If the
+    capture fails, ``step`` itself is returned, with a warning. Take a step or two before: these fill caches and
+    load kernels, as a capture does not allow.
+    """
+    if device.type != "cuda":
+        return step
+    graph, before = torch.cuda.CUDAGraph(), None if generator is None else generator.clone_state()
+    if generator is not None:
+        graph.register_generator_state(generator)
+    # If a capture fails, torch leaves the thread on the capture's stream; the outer context restores it.
+    with _capturing, torch.cuda.device(device), torch.cuda.stream(torch.cuda.current_stream(device)):
+        try:
+            # Each device has its own stream. Other threads may continue to launch.
+            stream = torch.cuda.Stream(device)
+            with (
+                noted() as constants,
+                torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
+            ):
+                step()
+        except RuntimeError as error:  # it waits for the device somewhere, as a third party's field may
+            if generator is not None and before is not None:
+                generator.graphsafe_set_state(before)  # the registered one still expects a capture
+            why = str(error).partition("\n")[0]
+            warnings.warn(
+                f"operations are launched one by one, since a step cannot be captured: {why}",
+                stacklevel=2,
+            )
+            return step
+
+    def replay(read: list[Tensor] = constants) -> None:  # keeps alive what the graph reads
+        graph.replay()
+
+    return replay
+
+
+def run_on(device: torch.device, function: Callable[..., T], *values: Any) -> T:
+    """Return ``function(*values)``, computed on ``device``, with all tensors of the result on the CPU.
+
+    Tensors in ``values`` are found as by ``moved``, except in modules and in ``Resident`` objects, which must be on the
+    device. All that are on the CPU go there in one copy, and the results return in another, which is the only time
+    that the host waits. On a GPU, repeated calls with values of the same shapes replay a CUDA graph, so the
+    function must not draw random numbers, nor depend on the numbers in a tensor for what it computes.
+    """
+    if device.type == "cpu":
+        return function(*values)
+    tensors: list[Tensor] = []
+    key = (function, device, _structure(values, tensors))
+    with _sharing:
+        free = _free.setdefault(key, [])
+        _free.move_to_end(key)
+        while len(_free) > MOST_GRAPHS:
+            _free.popitem(last=False)
+        remote = free.pop() if free else _Remote(function, values, tensors, device)
+    found: T = remote(tensors)
+    with _sharing:
+        free.append(remote)
+    return found
+
+
+class _Remote:
+    """A function with fixed tensors on a device for its arguments, as a CUDA graph requires; one thread at a time may call it."""
+
+    def __init__(
+        self, function: Callable[..., Any], values: Any, tensors: Sequence[Tensor], device: torch.device
+    ) -> None:
+        self._device, self._calls = device, 0
+        sizes = [-(-t.nbytes // _ALIGNMENT) * _ALIGNMENT if t.device.type == "cpu" else 0 for t in tensors]
+        self._sent = torch.empty(sum(sizes), dtype=torch.uint8, pin_memory=device.type == "cuda")
+        self._received = torch.empty_like(self._sent, device=device)
+        self._sources, self._arguments, first = list[Tensor](), list[Tensor](), 0
+        for tensor, size in zip(tensors, sizes, strict=True):
+            if tensor.device.type == "cpu":
+                parts = (buffer[first : first + tensor.nbytes] for buffer in (self._sent, self._received))
+                source, argument = (part.view(tensor.dtype).view(tensor.shape) for part in parts)
+            else:
+                source = argument = torch.empty_like(tensor)
+            self._sources.append(source)
+            self._arguments.append(argument)
+            first += size
+
+        def step() -> None:
+            self._result = function(*_rebuilt(values, iter(self._arguments)))
+            parts: list[Tensor] = []
+            _structure(self._result, parts)
+            self._parts = parts
+            self._bytes = torch.cat([part.reshape(-1).view(torch.uint8) for part in parts])
+
+        self._step: Callable[[], None] = step
+
+    @torch.no_grad()
+    def __call__(self, tensors: Sequence[Tensor]) -> Any:
+        for source, tensor in zip(self._sources, tensors, strict=True):
+            source.copy_(tensor)
+        self._received.copy_(self._sent, non_blocking=True)
+        if self._calls == 1:  # the first call, of a rare shape perhaps, loads kernels and fills caches
+            self._step = captured(self._step, self._device)
+        self._calls += 1
+        with without_waiting():
+            self._step()
+        bytes_of = self._bytes.cpu().split([part.nbytes for part in self._parts])
+        shapes = zip(bytes_of, self._parts, strict=True)
+        return _rebuilt(self._result, (b.clone().view(part.dtype).view(part.shape) for b, part in shapes))
+
+
+def _structure(value: Any, tensors: list[Tensor]) -> Hashable:
+    """Append the tensors in ``value`` to ``tensors``, and return all else that a graph depends on."""
+    if isinstance(value, Tensor):
+        tensors.append(value)
+        return value.shape, value.dtype, value.device
+    if isinstance(value, nn.Module | Resident):
+        return value
+    if is_dataclass(value) and not isinstance(value, type):
+        return type(value), *(_structure(getattr(value, part.name), tensors) for part in fields(value))
+    if isinstance(value, dict):
+        return dict, tuple(value), *(_structure(part, tensors) for part in value.values())
+    if isinstance(value, list | tuple):
+        return type(value), *(_structure(part, tensors) for part in value)
+    kept: Hashable = value
+    return kept
+
+
+def _rebuilt(value: Any, tensors: Iterator[Tensor]) -> Any:
+    """Return ``value`` with its tensors replaced by the next of ``tensors``."""
+    if isinstance(value, Tensor):
+        return next(tensors)
+    if isinstance(value, nn.Module | Resident):
+        return value
+    if is_dataclass(value) and not isinstance(value, type):
+        found = object.__new__(type(value))
+        vars(found).update(
+            {part.name: _rebuilt(getattr(value, part.name), tensors) for part in fields(value)}
+        )
+        return found
+    if isinstance(value, dict):
+        return {key: _rebuilt(part, tensors) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)([_rebuilt(part, tensors) for part in value])
+    return value
 
 
 # Moving objects that hold tensors to a device.

@@ -46,7 +46,7 @@ WEIGHTS: dict[RobustName, Callable[[Tensor, float], Tensor]] = {
 """``rho'(r) / r`` of each loss; that of ``l1``, which is unbounded at 0, is limited there."""
 
 
-def inlier_weight(squared: Values, half: float) -> Values:
+def inlier_weight(squared: Values, half: Values | float) -> Values:
     """Return ``1 / (1 + s / half^2)`` of squared residuals s: 1 at 0, a half where the residual is ``half``.
 
     This is the weight of ``cauchy_loss``. It is also the degree to which a residual is an inlier (Geman and

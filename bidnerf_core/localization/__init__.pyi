@@ -6,7 +6,6 @@ from .accept import LogisticModel as LogisticModel
 from .accept import features as features
 from .accept import judge as judge
 from .adam import AdamSteps as AdamSteps
-from .adam import captured as captured
 from .advice import ADVICE as ADVICE
 from .auto import localization_of as localization_of
 from .by_rays import RayTerms as RayTerms

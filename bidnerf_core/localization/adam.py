@@ -1,23 +1,15 @@
-"""First-order descent: Adam on updates of one pose (Alg. 1 of the paper, with its loop condition corrected).
-
-A step on a few thousand rays consists of hundreds of short operations, each of which takes longer to launch from Python than to
-compute; a CUDA graph launches all of them at once. A step can be captured if it never waits for the device (see
-``devices.without_waiting``), has the same shapes each time, and writes its results into existing tensors. Numbers computed in
-Python keep their values from the capture.
-"""
+"""First-order descent: Adam on updates of one pose (Alg. 1 of the paper, with its loop condition corrected)."""
 
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable
-from threading import Lock
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
-from bidnerf_core.devices import constant, moved, noted, without_waiting
+from bidnerf_core.devices import captured, constant, moved, without_waiting
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.settings import AdamSettings
@@ -27,48 +19,11 @@ WINDOW = 20
 """Steps over which the noisy loss of a few rays is averaged."""
 WARM_UP = 3
 """Steps before the capture, which fill caches and load kernels, as a capture does not allow this."""
-_capturing = Lock()
-"""Allows one capture at a time: a capture begins by waiting for the device, which is forbidden during another."""
 Loss = Callable[[SE3], Tensor]
 RATE = 0.0125
 """Usual learning rate: of translations as a fraction of the distance to the pivot, of rotations in radians."""
 BETAS, EPSILON = (0.9, 0.999), 1e-8
 """Decay rates of the moments, and the constant added to the root of the second (Kingma and Ba 2015, Alg. 1)."""
-
-
-def captured(step: Callable[[], None], device: torch.device, generator: Generator) -> Callable[[], None]:
-    """Return a callable equivalent to ``step``; on a GPU, it replays a CUDA graph.
-
-    ``generator`` is the one from which the step draws. Capturing does not execute the step. If the capture fails, ``step`` itself
-    is returned, with a warning.
-    """
-    if device.type != "cuda":
-        return step
-    graph, before = torch.cuda.CUDAGraph(), generator.clone_state()
-    graph.register_generator_state(generator)
-    # If a capture fails, torch leaves the thread on the capture's stream; the outer context restores it.
-    with _capturing, torch.cuda.device(device), torch.cuda.stream(torch.cuda.current_stream(device)):
-        try:
-            # Each device has its own stream. Other threads may continue to launch.
-            stream = torch.cuda.Stream(device)
-            with (
-                noted() as constants,
-                torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
-            ):
-                step()
-        except RuntimeError as error:  # it waits for the device somewhere, as a third party's field may
-            generator.graphsafe_set_state(before)  # the registered one still expects a capture
-            why = str(error).partition("\n")[0]
-            warnings.warn(
-                f"operations are launched one by one, since a step cannot be captured: {why}",
-                stacklevel=2,
-            )
-            return step
-
-    def replay(read: list[Tensor] = constants) -> None:  # keeps alive what the graph reads
-        graph.replay()
-
-    return replay
 
 
 class AdamSteps:

@@ -107,7 +107,7 @@ class Explanations:
     @property
     def prior_of_all(self) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
         """Mean and deviation of a prior that fixes nothing which any explanation frees."""
-        return torch.zeros(N, dtype=torch.float64), self.deviation.amax(0)
+        return self.deviation.new_zeros(N), self.deviation.amax(0)
 
     def first(self, seed: Seed, mode: int, noise: float) -> States:
         """Return the states with which the search begins: one of each kind of camera, and the stated one in motion.
@@ -136,9 +136,9 @@ class Explanations:
     def about(self, free: States) -> States:
         """Return a state for each explanation of each mode: the poses of ``free`` (g), with the nuisances at their means."""
         k, g = len(self), len(free)
-        index = torch.arange(g).repeat_interleave(k)
-        row = torch.arange(k).repeat(g)
-        z = torch.zeros((g * k, N), dtype=torch.float64)
+        index = torch.arange(g, device=free.z.device).repeat_interleave(k)
+        row = torch.arange(k, device=free.z.device).repeat(g)
+        z = free.z.new_zeros((g * k, N))
         parts = self.mean[row], self.deviation[row], self.log_prior[row]
         return States(free.T[index], z, *parts, free.noise[index], free.mode[index], row)
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.utils.rnn import pad_sequence
 
+from bidnerf_core.devices import run_on
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Evidence, judge
@@ -64,6 +64,8 @@ REFITS = 3
 """Most fits of a mode until the explanation that it is linearized about is the most probable one."""
 MOST_FIRST = 100
 """Number of matches on which kinds of cameras are compared."""
+PADDED = 128
+"""Matches are padded to multiples of this number on an accelerator, so that few CUDA graphs are captured."""
 RADII = (3.0, 1.5)
 """Radii of the rounds of matching by projection, in units of the inlier threshold."""
 TOLERANCE, ANGLE = 0.03, 0.05
@@ -163,6 +165,8 @@ class Loop:
         self.query = Query.of(views, features or matcher.features)
         noise = None if problem is None else problem.colour_noise
         self.rays = rays if problem is not None and (noise is None or noise <= SHARPEST) else 0
+        places = {matcher.device} if problem is None else {matcher.device, problem.device}
+        self.device = places.pop() if len(places) == 1 else torch.device("cpu")
         self._nearest: dict[int, Nearest] = {}
 
     @torch.no_grad()
@@ -192,8 +196,8 @@ class Loop:
         if not modes:
             return None
         term = self._term(modes, states)
-        states = term.with_noise(states)
-        return self._fused(modes, states, term.weighted_for(states), given, searched)
+        states, term = run_on(self.device, _weighted, states, term)
+        return self._fused(modes, states, term, given, searched)
 
     def nearest(self, strongest: int) -> Nearest:
         """Return the landmarks most similar to the strongest keypoints of each image."""
@@ -226,18 +230,22 @@ class Loop:
         return float((front if len(front) else local).norm(dim=-1).median())
 
     def _term(self, modes: Sequence[Mode], best: States) -> Landmarks:
-        """Return the reprojection errors of the modes' matches, padded; ``best`` (g) are the modes' states."""
-        parts = []
+        """Return the reprojection errors of the modes' matches, padded; ``best`` (g) are the modes' states.
+
+        On an accelerator, few sizes occur.
+        """
+        parts, size = [], max(len(mode.matches) for mode in modes)
+        size = size if self.device.type == "cpu" else -(-size // PADDED) * PADDED
         for number, mode in enumerate(modes):
-            query, found, here = mode.query, mode.matches, best[number : number + 1]
+            count, here = len(mode.matches), best[number : number + 1]
+            index = torch.arange(size)
+            query, found = mode.query, mode.matches[index.clamp(max=count - 1)]
             focal, sights = query.focal[found.keypoint], query.sights[found.keypoint]
             points = self.landmarks.positions[found.landmark].double()
             variance = point_variance(self.landmarks, found.landmark, here, focal)
             of_sights = sights.image, sights.times, sights.rotation, sights.translation
-            parts.append((points, *of_sights, torch.ones_like(focal), variance, focal))
-        fillers = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0)
-        columns = zip(zip(*parts, strict=True), fillers, strict=True)
-        points, *seen, valid, variance, focal = (pad_sequence(list(x), True, fill) for x, fill in columns)
+            parts.append((points, *of_sights, (index < count).double(), variance, focal))
+        points, *seen, valid, variance, focal = (torch.stack(x) for x in zip(*parts, strict=True))
         counts = [self.landmarks.correlation_of(len(mode.matches)) for mode in modes]
         correlation, query = torch.tensor(counts, dtype=torch.float64), modes[0].query
         return Landmarks(
@@ -270,7 +278,7 @@ class Loop:
                     again = Seed(mode.name, best[g].T[0], best[g].nuisances[0, :6], distance)
                     best[g] = self._compared(mode, again, given, float(best[g].noise))
                 term = self._term([mode], best[g])
-                best[g], _ = descend(term.with_noise(best[g]), [term], 3)
+                best[g] = run_on(self.device, _refined, best[g], term)
         numbered = [replace(state, mode=state.mode + g) for g, state in enumerate(best)]
         return modes, States.cat(numbered)
 
@@ -298,9 +306,7 @@ class Loop:
         states = given.first(seed, 0, noise)
         term = self._term([replace(mode, matches=mode.matches[some])], states[:1])
         term = replace(term, share=term.share * (count / len(some)))
-        states, _ = descend(states, [term], 4)
-        states, normal = descend(term.with_noise(states), [term], 3)
-        return states[log_evidence(states, normal).argmax()[None]]
+        return run_on(self.device, _most_probable, states, term)
 
     def _warped(self, mode: Mode, seed: Seed, given: Explanations, best: States) -> States:
         """Return the fit of a camera that explains any warp of the image, if many more matches agree with it, or else ``best``.
@@ -315,9 +321,7 @@ class Loop:
         states = given.first(seed, 0, query.threshold / 2)
         state = states[(states.row == given.widest).nonzero()[:, 0]]
         term = self._term([replace(mode, matches=found)], best)
-        for factor in GRADUATED:
-            state = replace(state, noise=torch.full_like(state.noise, factor * query.threshold / 2))
-            state, _ = descend(state, [term], 4)
+        state = run_on(self.device, _graduated, state, term)
         more = int(inliers(query, self.landmarks, found, state).sum())
         return state if more > MANY_MORE * agreeing else best
 
@@ -356,21 +360,24 @@ class Loop:
     ) -> Answer:
         """Fuse all measurements under all explanations, and judge the result."""
         problem, terms = self.problem, list[Term]([landmarks])
-        best, quadratic = self._settled(best, terms, landmarks, given)
+        for _ in range(REFITS):
+            row = best.row
+            there, quadratic, best = run_on(self.device, _settled, best, landmarks, given)
+            if torch.equal(best.row, row):
+                best = there
+                break
         found = self._posterior(quadratic, landmarks, given)
         points, fused = None, list[str]()
         others: dict[str, float | None] = {}
         if problem is not None and problem.surface is not None and problem.has_depth:
             points = Surface.of(problem.views, problem.depth_rays, problem.surface, self.seed)
         if points is not None:
-            points = points.fitted_noise(found.chosen)
-            if float(points.inliers(found.chosen)[0].mean()) < LEAST_ON_SURFACE:
-                points = None
+            noise, near, _ = run_on(self.device, _fitted_noise, points, found.chosen)
+            points = replace(points, noise=noise) if float(near) >= LEAST_ON_SURFACE else None
         if points is not None and found.mode == 0:
             terms.append(points)
             fused.append("depth")
-            best, _ = descend(best, terms, 5)
-            quadratic = self._linearized(best, terms, given)
+            best, quadratic = run_on(self.device, _fitted, best, terms, given, 5)
             found = self._posterior(quadratic, landmarks, given)
         before = found  # rays about one camera's pose must not decide between cameras
         blurred = self._blur(found, landmarks) > RAYS_BEYOND
@@ -378,17 +385,17 @@ class Loop:
             here = found.chosen
             rays = Rays.of(problem.views, problem.field, problem.bounds, self.rays, self.seed).fitted(here)
             fused.append("rendering")
-            here, _ = descend(here, [*terms, rays], 8)
-            quadratic = self._linearized(States.cat([here, best[1:]]), terms, given)
-            # Rays are too expensive to be rendered for all hypotheses.
-            by_rays = Quadratic.of(rays(quadratic.here[:1]), quadratic.here[:1])
+            # A number that changes from query to query is a tensor, so that they share a graph.
+            rays = replace(rays, noise=here.noise.new_tensor(rays.noise))  # type: ignore[arg-type]
+            best = States.cat([here, best[1:]])
+            quadratic, by_rays = run_on(self.device, _rendered, best, terms, rays, given)
             quadratic = quadratic.with_first(by_rays)
             systematic = torch.zeros_like(quadratic.hessian)
             systematic[:1] = (FIELD_ERRORS - 1) * by_rays.hessian
             found = self._posterior(quadratic, landmarks, given, systematic)
         if points is not None:
-            near, alike = points.inliers(found.chosen)
-            others |= {"on_surface": float(near.mean()), "colour_inliers": float((near * alike).mean())}
+            near, both = run_on(self.device, _agreement, points, found.chosen)
+            others |= {"on_surface": float(near), "colour_inliers": float(both)}
         mass = min(self._mass(each, landmarks, given) for each in (found, before))
         answer = self._judged(found, mass, modes, landmarks, given, searched, others)
         return replace(answer, fused=tuple(fused))
@@ -397,26 +404,6 @@ class Loop:
         """Return the probability that the pose is within the tolerance, and its camera credible."""
         credible, shared = given.credible[found.states.row], self.landmarks.pose_covariance
         return found.mass(term.distance(found.chosen), shared, TOLERANCE, ANGLE, credible)
-
-    def _settled(
-        self, best: States, terms: Sequence[Term], landmarks: Landmarks, given: Explanations
-    ) -> tuple[States, Quadratic]:
-        """Return the most probable state of each mode (g), and the model about it by which it is the most probable."""
-        for _ in range(REFITS):
-            best, _ = descend(landmarks.with_noise(best), terms, 4)
-            quadratic = self._linearized(best, terms, given)
-            states, normal = quadratic.minimum(given.about(quadratic.here))
-            member = states.mode[None] == torch.arange(len(best))[:, None]
-            found = states[torch.where(member, log_evidence(states, normal)[None], -torch.inf).argmax(-1)]
-            if bool((found.row == best.row).all()):
-                break
-            best = found
-        return best, quadratic
-
-    def _linearized(self, best: States, terms: Sequence[Term], given: Explanations) -> Quadratic:
-        """Return the model of the sum of terms about each mode's state."""
-        free = best.under(*given.prior_of_all)
-        return Quadratic.of(total(free, terms) - prior(free), free)
 
     def _posterior(
         self,
@@ -478,3 +465,73 @@ class Loop:
         if (record := current_record()) is not None:
             record.add(f"refined on {count} landmarks", found.pose())
         return Answer(modes, found, given, term, covariance, distance, evidence, verdict, contradicted)
+
+
+# Functions of tensors alone, each of which a GPU replays as one graph.
+
+
+def _most_probable(states: States, term: Landmarks) -> States:
+    """Return the most probable state, comparing them with the noise of each."""
+    states, _ = descend(states, [term], 4)
+    states, normal = descend(term.with_noise(states), [term], 3)
+    return states[log_evidence(states, normal).argmax()[None]]
+
+
+def _graduated(states: States, term: Landmarks) -> States:
+    for factor in GRADUATED:
+        states = replace(states, noise=torch.full_like(states.noise, factor * term.most_noise))
+        states, _ = descend(states, [term], 4)
+    return states
+
+
+def _refined(states: States, term: Landmarks) -> States:
+    return descend(term.with_noise(states), [term], 3)[0]
+
+
+def _weighted(states: States, term: Landmarks) -> tuple[States, Landmarks]:
+    states = term.with_noise(states)
+    return states, term.weighted_for(states)
+
+
+def _fitted(best: States, terms: Sequence[Term], given: Explanations, steps: int) -> tuple[States, Quadratic]:
+    best, _ = descend(best, terms, steps)
+    return best, _linearized(best, terms, given)
+
+
+def _linearized(best: States, terms: Sequence[Term], given: Explanations) -> Quadratic:
+    """Return the model of the sum of terms about each mode's state."""
+    free = best.under(*given.prior_of_all)
+    return Quadratic.of(total(free, terms) - prior(free), free)
+
+
+def _settled(best: States, term: Landmarks, given: Explanations) -> tuple[States, Quadratic, States]:
+    """Return the refined state of each mode (g), the model about it, and the explanation's state that is then the most probable."""
+    best, quadratic = _fitted(term.with_noise(best), [term], given, 4)
+    states, normal = quadratic.minimum(given.about(quadratic.here))
+    member = states.mode[None] == best.mode[:, None]
+    log = torch.where(member, log_evidence(states, normal)[None], -torch.inf)
+    return best, quadratic, states[log.argmax(-1)]
+
+
+def _rendered(
+    best: States, terms: Sequence[Term], rays: Rays, given: Explanations
+) -> tuple[Quadratic, Quadratic]:
+    """Refine the first state with rays, and return the models of the other terms, and that of rays about this state alone.
+
+    Rays are too expensive to be rendered for all hypotheses.
+    """
+    here, _ = descend(best[:1], [*terms, rays], 8)
+    quadratic = _linearized(States.cat([here, best[1:]]), terms, given)
+    return quadratic, Quadratic.of(rays(quadratic.here[:1]), quadratic.here[:1])
+
+
+def _agreement(points: Surface, state: States) -> tuple[Tensor, Tensor]:
+    """Return the fractions of the points on the surface, and on it with its colour."""
+    near, alike = points.inliers(state)
+    return near.mean(), (near * alike).mean()
+
+
+def _fitted_noise(points: Surface, state: States) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the noise of points at a state, and their agreement with it."""
+    fitted = points.fitted_noise(state)
+    return torch.as_tensor(fitted.noise), *_agreement(fitted, state)

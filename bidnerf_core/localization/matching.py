@@ -72,6 +72,11 @@ class LandmarkMatcher:
             self._cells = _Cells(landmarks.descriptors, seed)
 
     @property
+    def device(self) -> torch.device:
+        """The device of the given landmarks, on which descriptors are compared."""
+        return self._descriptors.device
+
+    @property
     def features(self) -> Features:
         """The keypoint detector and descriptor that the landmarks were built with.
 

@@ -4,11 +4,13 @@ Tensors on the device "meta" stand in for those on a GPU. While ``Elsewhere`` is
 which are stored and computed on the CPU, so that code runs as it would on a GPU; but operations on tensors of
 both devices, which a GPU does not allow, raise ``DeviceFault``. Within ``strict``, so does anything that
 makes the host wait for the device: copies to and from the CPU, reading numbers from a tensor (``float``,
-``bool``, ``item``, ``tolist``), and sizes that depend on values (``nonzero``, indexing by a mask).
+``bool``, ``item``, ``tolist``), and sizes that depend on values (``nonzero``, indexing by a mask). Elsewhere,
+these are counted.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -82,14 +84,18 @@ class _There(torch.Tensor):
     def __torch_dispatch__(  # type: ignore[override]
         cls, func: Any, types: Any, args: Any = (), kwargs: Any = None
     ) -> Any:
-        return _run(func, args, kwargs or {}, strict=False)
+        return _run(func, args, kwargs or {}, None)
 
 
 class Elsewhere(TorchDispatchMode):
-    """Makes ``DEVICE`` usable. Outside ``strict()``, tensors may be moved between devices and read, but not mixed."""
+    """Makes ``DEVICE`` usable. Outside ``strict()``, tensors may be moved between devices and read, but not mixed.
+
+    ``waits`` counts, by operation, how often the host waited for the device.
+    """
 
     def __init__(self) -> None:
         super().__init__()
+        self.waits = Counter[str]()
         self._strict = False
 
     def __enter__(self) -> Any:
@@ -113,10 +119,10 @@ class Elsewhere(TorchDispatchMode):
             self._strict = False
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        return _run(func, args, kwargs or {}, self._strict)
+        return _run(func, args, kwargs or {}, self)
 
 
-def _run(func: Any, args: Any, kwargs: dict[str, Any], strict: bool) -> Any:
+def _run(func: Any, args: Any, kwargs: dict[str, Any], mode: Elsewhere | None) -> Any:
     flat = _leaves((args, kwargs))
     there = any(isinstance(part, _There) for part in flat)
     asked = kwargs.get("device")
@@ -128,8 +134,10 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any], strict: bool) -> Any:
         )
     if not there and not made_there:
         return func(*args, **kwargs)
-    if strict:
-        _check_waiting(func, args, flat, there, wanted)
+    if mode is not None and (fault := _waiting(func, args, flat, there, wanted)) is not None:
+        if mode._strict:
+            raise DeviceFault(fault)
+        mode.waits[func._schema.name.removeprefix("aten::")] += 1
     _check_mixing(func, args, flat, there)
     if made_there or func is _aten._to_copy.default:
         kwargs = kwargs | {"device": torch.device("cpu")}
@@ -154,25 +162,24 @@ def _wrapped(func: Any, args: Any, kwargs: dict[str, Any], found: Any) -> Any:
     return _mapped(lambda part: _There(part) if type(part) is Tensor else part, found)
 
 
-def _check_waiting(func: Any, args: Any, flat: list[Any], there: bool, wanted: torch.device | None) -> None:
-    """Raise ``DeviceFault`` for copies, and for operations that make the host wait."""
+def _waiting(func: Any, args: Any, flat: list[Any], there: bool, wanted: torch.device | None) -> str | None:
+    """Return why an operation makes the host wait for the device, or copies between them; None if it does neither."""
     name = func._schema.name.removeprefix("aten::")
     if there and name in READS:
-        raise DeviceFault(f"{name} {READS[name]}: the host waits for the device")
+        return f"{name} {READS[name]}: the host waits for the device"
     here = [part for part in flat if isinstance(part, Tensor) and not isinstance(part, _There)]
     if name in ("_to_copy", "copy_"):
         target = wanted.type if wanted is not None else args[0].device.type
         if name == "copy_" and here:
-            raise DeviceFault("copy_ copies between devices")
+            return "copy_ copies between devices"
         if name == "_to_copy" and there != (target == DEVICE.type):
-            raise DeviceFault(f"a tensor of shape {tuple(args[0].shape)} is copied between devices")
-        return
+            return f"a tensor of shape {tuple(args[0].shape)} is copied between devices"
+        return None
     if name in INDEXED and any(i is not None and i.dtype == torch.bool for i in args[1]):
-        raise DeviceFault(
-            "an index by a mask has a size that depends on values: the host waits for the device"
-        )
+        return "an index by a mask has a size that depends on values: the host waits for the device"
     if there and name in INDEXED and any(part.ndim > 0 for part in here):
-        raise DeviceFault(f"{name} copies an index between devices")
+        return f"{name} copies an index between devices"
+    return None
 
 
 def _check_mixing(func: Any, args: Any, flat: list[Any], there: bool) -> None:

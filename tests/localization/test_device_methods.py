@@ -94,6 +94,17 @@ def test_auto_by_landmarks(depth: bool) -> None:
     assert ("fused with depth and rendering" if depth else "fused with rendering") in here.reason
 
 
+@pytest.mark.parametrize(("depth", "most"), [(False, 18), (True, 40)])
+def test_the_host_waits_a_handful_of_times_for_a_query(depth: bool, most: int) -> None:
+    """It uploads and reads once for the matches, for each round of matching by projection, and for each measurement."""
+    frame = unseen().frame if depth else without_depth(unseen().frame)
+    with Elsewhere() as mode:
+        localizer = Localizer(ground(), config=AutoConfig(fused_rays=0), device=DEVICE)
+        mode.waits.clear()
+        assert localizer(frame).converged
+    assert 10 <= mode.waits.total() <= most, mode.waits
+
+
 @pytest.mark.parametrize("landmarks", [True, False])
 def test_a_tracker_follows_landmarks_and_the_surface(landmarks: bool) -> None:
     """Its pose comes from followed landmarks and depth or, without landmarks, from depth alone."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 import pytest
@@ -16,7 +16,7 @@ import module_fields
 import tiny
 from bidnerf_core import Localizer, Map
 from bidnerf_core.backend import load_backend
-from bidnerf_core.devices import moved
+from bidnerf_core.devices import Resident, moved, run_on
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.mapping import LandmarkMap
@@ -133,6 +133,33 @@ def test_tensors_move_wherever_they_are_held() -> None:
         assert sum(1 for _ in tensors_in(there)) == 5
     assert elsewhere_of(here, CPU) == []
     assert there.named["a"][1] == 5
+
+
+@dataclass(frozen=True, eq=False)
+class Table(Resident):
+    values: Tensor
+
+
+def looked_up(given: Nested, table: Table, place: Tensor, number: float) -> tuple[Tensor, Nested, bool]:
+    numbers = given.named["a"][0][place] + table.values.sum() * number
+    return numbers, replace(given, given=[numbers > 1, place]), True
+
+
+def test_functions_run_elsewhere_with_one_copy_there_and_one_back() -> None:
+    """Repeated calls reuse the tensors of the first, whose results are not overwritten."""
+    table, given = Table(torch.ones(2)), nested()
+    calls = [(given, table, torch.tensor([k, 1, 0]).int(), 0.5) for k in range(3)]
+    expected = [looked_up(*call) for call in calls]
+    with Elsewhere() as mode:
+        there = moved(table, DEVICE)
+        mode.waits.clear()
+        found = [run_on(DEVICE, looked_up, call[0], there, *call[2:]) for call in calls]
+        assert mode.waits == {"copy_": 3, "_to_copy": 3}
+    for ours, theirs in zip(found, expected, strict=True):
+        assert elsewhere_of(ours, CPU) == []
+        assert torch.equal(ours[0], theirs[0])
+        assert all(map(torch.equal, ours[1].given, theirs[1].given))
+        assert (ours[1].module, ours[2]) == (given.module, True)
 
 
 @pytest.mark.parametrize(

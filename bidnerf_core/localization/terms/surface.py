@@ -73,7 +73,7 @@ class Surface:
     fixed: Float[Tensor, "n 3"]  # metres: points of another sensor, relative to it, for which z is 0
     rgb: Float[Tensor, "n 3"]
     coloured: Float[Tensor, "n"]  # 1 where a colour was measured, else 0
-    noise: float  # metres
+    noise: float | Float[Tensor, ""]  # metres
     colour_weight: float = 0.0  # of colours, relative to distances
     independent: float = INDEPENDENT  # number of independent measurements among the points
 
@@ -179,9 +179,8 @@ class Surface:
     def fitted_noise(self, states: States) -> Surface:
         """Return the term with the noise of the points at the first state."""
         r = self._offsets(moved(states[:1], self.surface.device))[0].abs()
-        return replace(
-            self, noise=min(max(MAD * float(r.median()), 0.25 * self.surface.cell), 3 * self.noise)
-        )  # host
+        found = (MAD * r.median()).clamp(min=0.25 * self.surface.cell)
+        return replace(self, noise=found.clamp(max=3 * self.noise))
 
     def exposed(self, states: States) -> Surface:
         """Return the term with colours converted to the map's exposure, by the points on the surface at the first state.

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt for h hypotheses at once: damping and acceptance are tensors, so an accelerator's host need not wait."""
+"""Levenberg-Marquardt for h hypotheses at once: damping, acceptance and the end are tensors, so an accelerator's host need not wait."""
 
 from __future__ import annotations
 
@@ -75,11 +75,12 @@ def descend(
         if path is not None:
             path.append((states.T, here.cost))
         step = damped_solution(here, damping, about)
-        if step.device.type == "cpu" and bool(((step * here.gradient).sum(-1) < SETTLED).all()):
+        settled = ((step * here.gradient).sum(-1) < SETTLED).all()
+        if step.device.type == "cpu" and bool(settled):
             break  # where the host need not wait for this
         moved = states.retract(-step)
         there = total(moved, terms)
-        better = there.cost < here.cost  # false for NaN
+        better = (there.cost < here.cost) & ~settled  # false for NaN
         states, here = moved.where(better, states), there.where(better, here)
         damping = torch.where(better, damping * WHEN_BETTER, damping * WHEN_WORSE)
     return states, here

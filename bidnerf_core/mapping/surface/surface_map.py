@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from bidnerf_core.devices import moved, working_device
+from bidnerf_core.devices import Resident, moved, working_device
 from bidnerf_core.fields import VoxelGrid
 from bidnerf_core.geometry import multiplied
 from bidnerf_core.mapping.surface.surfel_index import SurfelIndex
@@ -87,7 +87,7 @@ def _gradient(
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceMap:
+class SurfaceMap(Resident):
     """Surfels with an index for nearest-neighbour look-up in constant time."""
 
     surfels: Surfels
