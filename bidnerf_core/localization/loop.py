@@ -32,6 +32,17 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.propose import CONVINCING, LEAST_AGREEING, best_consensus, consensus, inliers
 from bidnerf_core.localization.query import Query
 from bidnerf_core.localization.recording import current_record
+from bidnerf_core.localization.refinement import (
+    agreement,
+    fit,
+    fit_noise,
+    fit_with_rays,
+    graduate,
+    most_probable,
+    refine,
+    settle,
+    weigh,
+)
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.terms.rays import FIELD_ERRORS, Rays
 from bidnerf_core.localization.terms.surface import Surface
@@ -44,12 +55,8 @@ from bidnerf_core.mapping import (
     Sights,
     States,
     Term,
-    descend,
-    log_evidence,
     point_variance,
-    prior,
     project,
-    total,
 )
 
 MIRROR = "mirror image"
@@ -81,9 +88,9 @@ RAYS_BEYOND = 0.6
 """Standard deviation of the scene's projection by landmarks, in pixels, from which rays add to them."""
 HEAVY_TAILS = 1.7
 """Factor of the covariance by which the ellipsoid of a Gaussian's 95 % holds 95 % of the poses: errors have heavier tails."""
-AGREEING, MANY_MORE, GRADUATED = 0.7, 1.3, (16.0, 8.0, 4.0, 2.0, 1.0)
-"""Fraction of the matches by descriptors that agree with a usual camera, from which no other is tried; how many times more must agree with
-another; and the noise of its fits, relative to that at first.
+AGREEING, MANY_MORE = 0.7, 1.3
+"""Fraction of the matches by descriptors that agree with a usual camera, from which no other is tried, and how many times more must agree
+with another.
 """
 FROM_START = 6.0
 """Log odds of a place per factor e of its distance from the start: in six dimensions, the density of a normal distribution of unknown
@@ -196,7 +203,7 @@ class Loop:
         if not modes:
             return None
         term = self._term(modes, states)
-        states, term = run_on(self.device, _weighted, states, term)
+        states, term = run_on(self.device, weigh, states, term)
         return self._fused(modes, states, term, given, searched)
 
     def nearest(self, strongest: int) -> Nearest:
@@ -278,7 +285,7 @@ class Loop:
                     again = Seed(mode.name, best[g].T[0], best[g].nuisances[0, :6], distance)
                     best[g] = self._compared(mode, again, given, float(best[g].noise))
                 term = self._term([mode], best[g])
-                best[g] = run_on(self.device, _refined, best[g], term)
+                best[g] = run_on(self.device, refine, best[g], term)
         numbered = [replace(state, mode=state.mode + g) for g, state in enumerate(best)]
         return modes, States.cat(numbered)
 
@@ -306,7 +313,7 @@ class Loop:
         states = given.first(seed, 0, noise)
         term = self._term([replace(mode, matches=mode.matches[some])], states[:1])
         term = replace(term, share=term.share * (count / len(some)))
-        return run_on(self.device, _most_probable, states, term)
+        return run_on(self.device, most_probable, states, term)
 
     def _warped(self, mode: Mode, seed: Seed, given: Explanations, best: States) -> States:
         """Return the fit of a camera that explains any warp of the image, if many more matches agree with it, or else ``best``.
@@ -321,7 +328,7 @@ class Loop:
         states = given.first(seed, 0, query.threshold / 2)
         state = states[(states.row == given.widest).nonzero()[:, 0]]
         term = self._term([replace(mode, matches=found)], best)
-        state = run_on(self.device, _graduated, state, term)
+        state = run_on(self.device, graduate, state, term)
         more = int(inliers(query, self.landmarks, found, state).sum())
         return state if more > MANY_MORE * agreeing else best
 
@@ -362,7 +369,7 @@ class Loop:
         problem, terms = self.problem, list[Term]([landmarks])
         for _ in range(REFITS):
             row = best.row
-            there, quadratic, best = run_on(self.device, _settled, best, landmarks, given)
+            there, quadratic, best = run_on(self.device, settle, best, landmarks, given)
             if torch.equal(best.row, row):
                 best = there
                 break
@@ -372,12 +379,12 @@ class Loop:
         if problem is not None and problem.surface is not None and problem.has_depth:
             points = Surface.of(problem.views, problem.depth_rays, problem.surface, self.seed)
         if points is not None:
-            noise, near, _ = run_on(self.device, _fitted_noise, points, found.chosen)
+            noise, near, _ = run_on(self.device, fit_noise, points, found.chosen)
             points = replace(points, noise=noise) if float(near) >= LEAST_ON_SURFACE else None
         if points is not None and found.mode == 0:
             terms.append(points)
             fused.append("depth")
-            best, quadratic = run_on(self.device, _fitted, best, terms, given, 5)
+            best, quadratic = run_on(self.device, fit, best, terms, given, 5)
             found = self._posterior(quadratic, landmarks, given)
         before = found  # rays about one camera's pose must not decide between cameras
         blurred = self._blur(found, landmarks) > RAYS_BEYOND
@@ -388,13 +395,13 @@ class Loop:
             # A number that changes from query to query is a tensor, so that they share a graph.
             rays = replace(rays, noise=here.noise.new_tensor(rays.noise))  # type: ignore[arg-type]
             best = States.cat([here, best[1:]])
-            quadratic, by_rays = run_on(self.device, _rendered, best, terms, rays, given)
+            quadratic, by_rays = run_on(self.device, fit_with_rays, best, terms, rays, given)
             quadratic = quadratic.with_first(by_rays)
             systematic = torch.zeros_like(quadratic.hessian)
             systematic[:1] = (FIELD_ERRORS - 1) * by_rays.hessian
             found = self._posterior(quadratic, landmarks, given, systematic)
         if points is not None:
-            near, both = run_on(self.device, _agreement, points, found.chosen)
+            near, both = run_on(self.device, agreement, points, found.chosen)
             others |= {"on_surface": float(near), "colour_inliers": float(both)}
         mass = min(self._mass(each, landmarks, given) for each in (found, before))
         answer = self._judged(found, mass, modes, landmarks, given, searched, others)
@@ -465,73 +472,3 @@ class Loop:
         if (record := current_record()) is not None:
             record.add(f"refined on {count} landmarks", found.pose())
         return Answer(modes, found, given, term, covariance, distance, evidence, verdict, contradicted)
-
-
-# Functions of tensors alone, each of which a GPU replays as one graph.
-
-
-def _most_probable(states: States, term: Landmarks) -> States:
-    """Return the most probable state, comparing them with the noise of each."""
-    states, _ = descend(states, [term], 4)
-    states, normal = descend(term.with_noise(states), [term], 3)
-    return states[log_evidence(states, normal).argmax()[None]]
-
-
-def _graduated(states: States, term: Landmarks) -> States:
-    for factor in GRADUATED:
-        states = replace(states, noise=torch.full_like(states.noise, factor * term.most_noise))
-        states, _ = descend(states, [term], 4)
-    return states
-
-
-def _refined(states: States, term: Landmarks) -> States:
-    return descend(term.with_noise(states), [term], 3)[0]
-
-
-def _weighted(states: States, term: Landmarks) -> tuple[States, Landmarks]:
-    states = term.with_noise(states)
-    return states, term.weighted_for(states)
-
-
-def _fitted(best: States, terms: Sequence[Term], given: Explanations, steps: int) -> tuple[States, Quadratic]:
-    best, _ = descend(best, terms, steps)
-    return best, _linearized(best, terms, given)
-
-
-def _linearized(best: States, terms: Sequence[Term], given: Explanations) -> Quadratic:
-    """Return the model of the sum of terms about each mode's state."""
-    free = best.under(*given.prior_of_all)
-    return Quadratic.of(total(free, terms) - prior(free), free)
-
-
-def _settled(best: States, term: Landmarks, given: Explanations) -> tuple[States, Quadratic, States]:
-    """Return the refined state of each mode (g), the model about it, and the explanation's state that is then the most probable."""
-    best, quadratic = _fitted(term.with_noise(best), [term], given, 4)
-    states, normal = quadratic.minimum(given.about(quadratic.here))
-    member = states.mode[None] == best.mode[:, None]
-    log = torch.where(member, log_evidence(states, normal)[None], -torch.inf)
-    return best, quadratic, states[log.argmax(-1)]
-
-
-def _rendered(
-    best: States, terms: Sequence[Term], rays: Rays, given: Explanations
-) -> tuple[Quadratic, Quadratic]:
-    """Refine the first state with rays, and return the models of the other terms, and that of rays about this state alone.
-
-    Rays are too expensive to be rendered for all hypotheses.
-    """
-    here, _ = descend(best[:1], [*terms, rays], 8)
-    quadratic = _linearized(States.cat([here, best[1:]]), terms, given)
-    return quadratic, Quadratic.of(rays(quadratic.here[:1]), quadratic.here[:1])
-
-
-def _agreement(points: Surface, state: States) -> tuple[Tensor, Tensor]:
-    """Return the fractions of the points on the surface, and on it with its colour."""
-    near, alike = points.inliers(state)
-    return near.mean(), (near * alike).mean()
-
-
-def _fitted_noise(points: Surface, state: States) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the noise of points at a state, and their agreement with it."""
-    fitted = points.fitted_noise(state)
-    return torch.as_tensor(fitted.noise), *_agreement(fitted, state)

@@ -1,0 +1,84 @@
+"""Steps of the loop that are functions of tensors alone, each of which a GPU replays as one graph."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from bidnerf_core.localization.explanations import Explanations
+from bidnerf_core.localization.terms.rays import Rays
+from bidnerf_core.localization.terms.surface import Surface
+from bidnerf_core.mapping import Landmarks, Quadratic, States, Term, descend, log_evidence, prior, total
+
+GRADUATED = (16.0, 8.0, 4.0, 2.0, 1.0)
+"""Noise of graduated fits, relative to that of usual ones."""
+
+
+def most_probable(states: States, term: Landmarks) -> States:
+    """Return the most probable state, comparing them with the noise of each."""
+    states, _ = descend(states, [term], 4)
+    states, normal = descend(term.with_noise(states), [term], 3)
+    return states[log_evidence(states, normal).argmax()[None]]
+
+
+def graduate(states: States, term: Landmarks) -> States:
+    for factor in GRADUATED:
+        states = replace(states, noise=torch.full_like(states.noise, factor * term.most_noise))
+        states, _ = descend(states, [term], 4)
+    return states
+
+
+def refine(states: States, term: Landmarks) -> States:
+    return descend(term.with_noise(states), [term], 3)[0]
+
+
+def weigh(states: States, term: Landmarks) -> tuple[States, Landmarks]:
+    states = term.with_noise(states)
+    return states, term.weighted_for(states)
+
+
+def fit(best: States, terms: Sequence[Term], given: Explanations, steps: int) -> tuple[States, Quadratic]:
+    best, _ = descend(best, terms, steps)
+    return best, linearize(best, terms, given)
+
+
+def linearize(best: States, terms: Sequence[Term], given: Explanations) -> Quadratic:
+    """Return the model of the sum of terms about each mode's state."""
+    free = best.under(*given.prior_of_all)
+    return Quadratic.of(total(free, terms) - prior(free), free)
+
+
+def settle(best: States, term: Landmarks, given: Explanations) -> tuple[States, Quadratic, States]:
+    """Return the refined state of each mode (g), the model about it, and the explanation's state that is then the most probable."""
+    best, quadratic = fit(term.with_noise(best), [term], given, 4)
+    states, normal = quadratic.minimum(given.about(quadratic.here))
+    member = states.mode[None] == best.mode[:, None]
+    log = torch.where(member, log_evidence(states, normal)[None], -torch.inf)
+    return best, quadratic, states[log.argmax(-1)]
+
+
+def fit_with_rays(
+    best: States, terms: Sequence[Term], rays: Rays, given: Explanations
+) -> tuple[Quadratic, Quadratic]:
+    """Refine the first state with rays, and return the models of the other terms, and that of rays about this state alone.
+
+    Rays are too expensive to be rendered for all hypotheses.
+    """
+    here, _ = descend(best[:1], [*terms, rays], 8)
+    quadratic = linearize(States.cat([here, best[1:]]), terms, given)
+    return quadratic, Quadratic.of(rays(quadratic.here[:1]), quadratic.here[:1])
+
+
+def agreement(points: Surface, state: States) -> tuple[Tensor, Tensor]:
+    """Return the fractions of the points on the surface, and on it with its colour."""
+    near, alike = points.inliers(state)
+    return near.mean(), (near * alike).mean()
+
+
+def fit_noise(points: Surface, state: States) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the noise of points at a state, and their agreement with it."""
+    fitted = points.fitted_noise(state)
+    return torch.as_tensor(fitted.noise), *agreement(fitted, state)
