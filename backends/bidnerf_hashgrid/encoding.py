@@ -25,6 +25,7 @@ from torch.autograd.function import once_differentiable
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.settings import Range, Settings
+from bidnerf_hashgrid import fused
 from bidnerf_hashgrid.levels import Level, LevelGroup, make_levels, one_by_one, together
 from bidnerf_hashgrid.threads import concurrently, slices, threads_for
 
@@ -288,5 +289,8 @@ class HashEncoding(nn.Module):
         want_slopes = torch.is_grad_enabled() and points.requires_grad
         tables = list(self.tables)[: len(levels)]
         smooth = self.config.interpolation == "smooth"
-        encoded: Tensor = _Encode.apply(points, levels, self.config.levels, smooth, want_slopes, *tables)
+        function = (
+            fused.Encode if fused.available(points.device) and points.dtype == torch.float32 else _Encode
+        )
+        encoded: Tensor = function.apply(points, levels, self.config.levels, smooth, want_slopes, *tables)
         return encoded

@@ -4,19 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields import Concentrated, FieldValues, RaySampler, SceneBounds, spherical_harmonics
+from bidnerf_core.fields import (
+    FieldDerivatives,
+    FieldValues,
+    RaySampler,
+    SceneBounds,
+    backward_derivatives,
+    spherical_harmonics,
+)
 from bidnerf_core.settings import Count, Layers, NotNegative, Range, Settings
+from bidnerf_hashgrid import fused
 from bidnerf_hashgrid.encoding import HashEncoding, HashEncodingConfig
 from bidnerf_hashgrid.networks import log_density_and_rgb
-from bidnerf_hashgrid.occupancy import GridDensity, OccupancyGrid
+from bidnerf_hashgrid.occupancy import ConcentratedInGrid, GridDensity, OccupancyGrid
 
 LARGEST_LOG_DENSITY = 12.0
 
@@ -74,6 +83,7 @@ class HashGridField(nn.Module):
         single = bounds.contracted and config.samples_per_ray > 0
         self.occupancy = OccupancyGrid(bounds, config.grid_resolution, steps_per_cell=1 if single else 2)
         self.coarse_sampler = OccupancyGrid(bounds, config.grid_resolution // 2)
+        self._packed: tuple[Any, fused.PackedNetworks | None] | None = None  # and the weights' versions
 
     @property
     def sampler(self) -> RaySampler:
@@ -101,17 +111,55 @@ class HashGridField(nn.Module):
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         return self.query_levels(positions, directions, None)
 
+    def jacobian(
+        self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]
+    ) -> FieldDerivatives:
+        return self.jacobian_of_levels(positions, directions, None)
+
     def query_levels(
         self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"], active: int | None
     ) -> FieldValues:
         """Return the values with the first ``active`` levels of the encoding only (None: all)."""
         shape = positions.shape[:-1]
-        encoded = self.encode(positions.reshape(-1, 3), active)
-        harmonics = spherical_harmonics(directions.reshape(-1, 3), 9)
-        log_density, rgb = log_density_and_rgb(self.geometry, self.colour, encoded, harmonics)
-        # Per side of the scene, so that an untrained field is equally thin in any unit of length.
-        density = log_density.clamp(max=LARGEST_LOG_DENSITY).exp() / self.side
+        points, along = positions.reshape(-1, 3), directions.reshape(-1, 3)
+        if (kernel := self._kernel(active)) is not None:
+            moving = torch.is_grad_enabled() and (points.requires_grad or along.requires_grad)
+            density, rgb = fused.Query.apply(points, along, moving, *kernel).split((1, 3), -1)
+        else:
+            harmonics = spherical_harmonics(along, 9)
+            encoded = self.encode(points, active)
+            log_density, rgb = log_density_and_rgb(self.geometry, self.colour, encoded, harmonics)
+            # Per side of the scene, so that an untrained field is equally thin in any unit of length.
+            density = log_density.clamp(max=LARGEST_LOG_DENSITY).exp() / self.side
         return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
+
+    def jacobian_of_levels(
+        self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"], wanted: Bool[Tensor, "p"] | None,
+        active: int | None,
+    ) -> FieldDerivatives:  # fmt: skip
+        """Return the values of ``query_levels`` and their derivatives."""
+        with torch.no_grad():
+            kernel = self._kernel(active)
+            if kernel is None:
+                return backward_derivatives(partial(self.query_levels, active=active), positions, directions)
+            values, by_both = fused.query(positions, directions, True, *kernel, wanted=wanted)
+        return FieldDerivatives(FieldValues(values[:, 0], values[:, 1:]), *by_both.split(3, -1))
+
+    def _kernel(self, active: int | None) -> tuple[Any, ...] | None:
+        """Return the arguments of ``fused.query`` if a kernel computes the field; it gives no gradients of the parameters."""
+        encoding, device = self.encoding, self.encoding.tables[0].device
+        levels = encoding.levels[:active]
+        if not (levels and fused.available(device) and encoding.tables[0].dtype == torch.float32):
+            return None
+        if torch.is_grad_enabled() and any(part.requires_grad for part in self.parameters()):
+            return None
+        parts = [*self.geometry.parameters(), *self.colour.parameters()]
+        version = [(part.data_ptr(), part._version) for part in parts]
+        if self._packed is None or self._packed[0] != version:
+            self._packed = version, fused.PackedNetworks.of(self.geometry, self.colour)
+        packed = self._packed[1]
+        smooth, limits = encoding.config.interpolation == "smooth", (self.bounds, LARGEST_LOG_DENSITY)
+        return packed and (packed, levels, list(encoding.tables)[: len(levels)], smooth, limits)
 
     def encode(self, positions: Float[Tensor, "p 3"], active: int | None) -> Float[Tensor, "p f"]:
         encoded: Tensor = self.encoding((self.bounds.normalized(positions) + 1) / 2, active)
@@ -140,7 +188,7 @@ def limited(grid: OccupancyGrid, count: int) -> RaySampler:
     With a count of 0, or if the grid has observed nothing, as in maps stored by earlier versions, it is the
     grid itself, which samples all occupied cells.
     """
-    return Concentrated(GridDensity(grid), count) if count and grid.observed else grid
+    return ConcentratedInGrid(GridDensity(grid), count) if count and grid.observed else grid
 
 
 @dataclass(frozen=True)
@@ -159,3 +207,8 @@ class CoarseField:
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         return self.fine.query_levels(positions, directions, self.fine.config.coarse_levels)
+
+    def jacobian(
+        self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]
+    ) -> FieldDerivatives:
+        return self.fine.jacobian_of_levels(positions, directions, self.fine.config.coarse_levels)

@@ -11,14 +11,21 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import pad
 
 from bidnerf_core.devices import may_wait
-from bidnerf_core.fields import FieldValues, Rays, RaySamples, RaySpacing, SceneBounds, VoxelGrid, rows_of
+from bidnerf_core.fields import (
+    Concentrated,
+    FieldValues,
+    Rays,
+    RaySamples,
+    RaySpacing,
+    SceneBounds,
+    VoxelGrid,
+    rows_of,
+)
+from bidnerf_hashgrid import fused
+from bidnerf_hashgrid.fused import MOST
 
 BLOCK = 8
 """Steps along a ray that are skipped together if no occupied cell is near."""
-
-MOST = 96
-"""Maximum number of samples per ray if the host must not wait to count them; the nearest ones in occupied
-cells are kept."""
 
 
 class OccupancyGrid(nn.Module):
@@ -86,9 +93,9 @@ class OccupancyGrid(nn.Module):
     @torch.no_grad()
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
         """Return the intervals of the rays in occupied cells, equally long in the coordinate of ``SceneBounds.spacing``."""
-        march = self._march(rays, jitter)
         if not may_wait(rays.near.device):
-            return self._of_known_shape(march).unflattened(rays.near.shape)
+            return self.of_known_shape(rays, MOST, jitter)
+        march = self._march(rays, jitter)
         place, ray = self._occupied_steps(march)
         return self._padded(march, place, _counts(ray, march)).unflattened(rays.near.shape)
 
@@ -108,10 +115,16 @@ class OccupancyGrid(nn.Module):
         rest = self._padded(march.rows(numbers), place[of_many], counts.index_select(0, numbers))
         return few.unflattened(rays.near.shape), numbers, rest
 
+    def of_known_shape(self, rays: Rays, count: int, jitter: Generator | None) -> RaySamples:
+        """Return the first ``MOST`` intervals in occupied cells or, on a GPU, at most ``count`` concentrated ones, without waiting."""
+        if fused.available(rays.near.device):
+            return fused.sampled(
+                _flat(rays), self.bounds, self.occupied, self.density, self.step, min(count, MOST), jitter
+            ).unflattened(rays.near.shape)
+        return self._of_known_shape(self._march(rays, jitter)).unflattened(rays.near.shape)
+
     def _march(self, rays: Rays, jitter: Generator | None) -> _March:
-        leading = rays.near.dim()
-        flat = Rays(*(part.detach().reshape(-1, *part.shape[leading:]) for part in
-                      (rays.origins, rays.directions, rays.near, rays.far)))  # fmt: skip
+        flat = _flat(rays)
         spacing = self.bounds.spacing(flat)
         near, far = spacing.place(torch.stack([flat.near, flat.far], dim=-1)).unbind(-1)
         offset = torch.full_like(near, 0.5)
@@ -135,7 +148,8 @@ class OccupancyGrid(nn.Module):
         box = self.grid.rays(march.rays.origins, march.rays.directions)
         # Steps are counted from ``near``, as everywhere, and those before the grid are skipped; contracted space has none.
         skipped = ((box.near - near) / self.step).floor().clamp(min=0) * (not self.bounds.contracted)
-        count = math.ceil(2 * self.bounds.side / self.step) + 1  # a cube's diagonal is shorter
+        # A cube's diagonal is shorter than twice its side; before contracted space, a camera may be as far away again.
+        count = math.ceil((4 if self.bounds.contracted else 2) * self.bounds.side / self.step) + 1
         steps = torch.arange(count, dtype=near.dtype, device=near.device)
         place = near[:, None] + (skipped[:, None] + steps + march.offset[:, None]) * self.step
         positions = march.rays.at(march.spacing.distance(place))
@@ -213,6 +227,12 @@ class _March:
         return _March(rows_of(self.rays, numbers), self.spacing.rows(numbers), near, far, offset)
 
 
+def _flat(rays: Rays) -> Rays:
+    leading = rays.near.dim()
+    parts = (rays.origins, rays.directions, rays.near, rays.far)
+    return Rays(*(part.detach().reshape(-1, *part.shape[leading:]) for part in parts))
+
+
 def _counts(ray: Int[Tensor, "n"], march: _March) -> Int[Tensor, "r"]:
     return torch.bincount(ray, minlength=len(march.near))
 
@@ -230,6 +250,18 @@ class GridDensity:
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         density = self.grid.grid.at(self.grid.density, positions)
         return FieldValues(density, torch.zeros_like(positions))
+
+
+@dataclass(frozen=True)
+class ConcentratedInGrid(Concentrated):
+    """Intervals concentrated by the densities that a grid has observed."""
+
+    guide: GridDensity
+
+    def _of_known_shape(self, rays: Rays, jitter: Generator | None) -> RaySamples:
+        if fused.available(rays.near.device):
+            return self.guide.grid.of_known_shape(rays, self.count, jitter)
+        return super()._of_known_shape(rays, jitter)
 
 
 def _at(

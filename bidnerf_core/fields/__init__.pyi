@@ -1,4 +1,6 @@
 from .contract import LARGEST_LENGTH as LARGEST_LENGTH
+from .contract import DifferentiatedField as DifferentiatedField
+from .contract import FieldDerivatives as FieldDerivatives
 from .contract import FieldValues as FieldValues
 from .contract import HitField as HitField
 from .contract import RadianceField as RadianceField
@@ -9,7 +11,9 @@ from .contract import RaySamples as RaySamples
 from .contract import SceneBounds as SceneBounds
 from .contract import SplatField as SplatField
 from .contract import Splats as Splats
+from .contract import backward_derivatives as backward_derivatives
 from .contract import crossed_box as crossed_box
+from .contract import derivatives_of as derivatives_of
 from .contract import device_of as device_of
 from .contract import levels as levels
 from .contract import widened as widened
@@ -32,6 +36,7 @@ from .rendering import render as render
 from .rendering import render_image as render_image
 from .rendering import render_picture as render_picture
 from .rendering import render_samples as render_samples
+from .rendering import render_values as render_values
 from .rendering import rendering_weights as rendering_weights
 from .residuals import DEPTH_RESIDUALS as DEPTH_RESIDUALS
 from .residuals import DepthResidual as DepthResidual
@@ -48,6 +53,9 @@ from .residuals import free_space_term as free_space_term
 from .residuals import masked_mean as masked_mean
 from .residuals import opacity_term as opacity_term
 from .residuals import truncated_depth_residual as truncated_depth_residual
+from .sampling import EVEN_SHARE as EVEN_SHARE
+from .sampling import LARGEST_THICKNESS as LARGEST_THICKNESS
+from .sampling import TAIL as TAIL
 from .sampling import Concentrated as Concentrated
 from .sampling import HierarchicalField as HierarchicalField
 from .sampling import Importance as Importance

@@ -226,8 +226,17 @@ def render_samples(
     background: tuple[float, float, float] | Float[Tensor, "*#r 3"] = (0.0, 0.0, 0.0),
 ) -> Rendering:
     """Render rays from given samples, see ``render``."""
-    values = query_samples(field, rays, samples)
-    return _over(background, values.rgb, rendering_weights(values.density, samples), samples, values.density)
+    return render_values(query_samples(field, rays, samples), samples, background)
+
+
+def render_values(
+    values: FieldValues,
+    samples: RaySamples,
+    background: tuple[float, float, float] | Float[Tensor, "*#r 3"] = (0.0, 0.0, 0.0),
+) -> Rendering:
+    """Render rays from a field's values at their samples (*r s), see ``render``."""
+    weights = rendering_weights(values.density, samples)
+    return _over(background, values.rgb, weights, samples, values.density)
 
 
 def render_hits(

@@ -12,6 +12,7 @@ from torch.nn.functional import max_pool1d, pad
 
 from bidnerf_core.devices import may_wait
 from bidnerf_core.fields.contract import (
+    FieldDerivatives,
     FieldValues,
     HitField,
     RadianceField,
@@ -22,6 +23,7 @@ from bidnerf_core.fields.contract import (
     SceneBounds,
     SplatField,
     Splats,
+    derivatives_of,
     levels,
 )
 from bidnerf_core.fields.rendering import query_samples, rendering_weights
@@ -370,6 +372,15 @@ class ScaledField(nn.Module):
         """Return density and colour at ``positions`` in the scaled world."""
         found = self.trained.query(positions / self.scale, directions)
         return replace(found, density=found.density / self.scale)
+
+    def jacobian(
+        self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"], wanted: Bool[Tensor, "p"] | None = None
+    ) -> FieldDerivatives:  # fmt: skip
+        found = derivatives_of(self.trained, positions / self.scale, directions, wanted)
+        unit = positions.new_full((4, 1), 1.0)
+        unit[0] /= self.scale
+        values = replace(found.values, density=found.values.density / self.scale)
+        return FieldDerivatives(values, found.by_position * unit / self.scale, found.by_direction * unit)
 
 
 class ScaledHitField(ScaledField):

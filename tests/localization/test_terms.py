@@ -133,7 +133,7 @@ def test_derivatives_of_rays_are_those_of_autograd_ray_by_ray(
     )
     origins = T0.translation.float() + 0.1 * torch.rand(directions.shape, generator=generator)
     rays = BOUNDS.rays(origins, directions)
-    found = differentiate(field, rays, BOUNDS.background, lambda seen, _: seen.rgb)
+    found = differentiate(field, rays, BOUNDS.background)
     o, d = origins.requires_grad_(), directions.requires_grad_()
     seen = render(field, replace(rays, origins=o, directions=d), BOUNDS.background).rgb
     torch.testing.assert_close(found.value, seen.detach())

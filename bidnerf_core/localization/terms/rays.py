@@ -7,16 +7,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, normalize, pad
 
 from bidnerf_core.devices import moved
-from bidnerf_core.fields import Observations, RadianceField, Rendering, SceneBounds, device_of, render
+from bidnerf_core.fields import Observations, RadianceField, SceneBounds, device_of, render
 from bidnerf_core.frames import Frame, View, continued
 from bidnerf_core.geometry import Robust
 from bidnerf_core.localization.terms.exposure import eliminate, fit_exposure
-from bidnerf_core.localization.terms.rendering import Derivatives, differentiate
+from bidnerf_core.localization.terms.rendering import channels, differentiate
 from bidnerf_core.localization.terms.surface import sights_of
 from bidnerf_core.mapping import MOTION, Normal, Sights, States, rays_by_camera, rays_through
 
@@ -111,7 +111,7 @@ class Rays:
             return ComparedRays(self, *self._residuals(states))
         *_, origins, directions = self._sent(states)
         rendering = render(self.field, self.bounds.rays(origins, directions), self.bounds.background)
-        seen = self._channels(rendering, torch.arange(len(origins), device=origins.device))
+        seen = channels(rendering, *self._distances(len(states)))
         value, _ = self._differences(seen.double().unflatten(0, (len(states), -1)))
         return ComparedRays(self, value, value[..., None], value)
 
@@ -169,18 +169,11 @@ class Rays:
         origins = states.T.translation[:, None] + away @ states.T.rotation.mT
         return rays, length, unit, origins.float().flatten(0, 1), directions.float().flatten(0, 1)
 
-    def _channels(self, rendering: Rendering, index: Int[Tensor, "k"]) -> Float[Tensor, "k c"]:
-        """Return rendered colours and depth differences; ``sum_i w_i (t_i - d) + (1 - sum_i w_i) miss``.
-
-        The fraction of a ray that passes through the scene counts as if it hit something ``miss`` too far away: a rendered
-        distance of 0 would jump at silhouettes, where its derivative is of no use.
-        """
+    def _distances(self, count: int) -> tuple[Float[Tensor, "r"] | None, float]:
+        """Return the measured distances of all rays from ``count`` states, and by how much a ray that hits nothing is off."""
         if self.depth_loss is None:
-            return rendering.rgb
-        measured = self.distance[index % len(self)].to(rendering.rgb)
-        miss = MISS * self.depth_loss.scale
-        off = rendering.distance - rendering.opacity * measured + (1 - rendering.opacity) * miss
-        return torch.cat([rendering.rgb, torch.where(measured > 0, off, 0)[:, None]], -1)
+            return None, 0.0
+        return self.distance.float().repeat(count), MISS * self.depth_loss.scale
 
     def _differences(
         self, seen: Float[Tensor, "h n c"]
@@ -209,8 +202,11 @@ class Rays:
     ) -> tuple[Float[Tensor, "h n c"], Float[Tensor, "h n c P"], Float[Tensor, "h n c"]]:
         """Return the residuals, their derivatives, and the norms of their gradients by the rays' origins."""
         rays, length, unit, origins, directions = self._sent(states)
-        found: Derivatives = differentiate(
-            self.field, self.bounds.rays(origins, directions), self.bounds.background, self._channels
+        found = differentiate(
+            self.field,
+            self.bounds.rays(origins, directions),
+            self.bounds.background,
+            *self._distances(len(states)),
         )
         seen, by_origin, by_direction = (
             part.double().unflatten(0, (len(states), -1))

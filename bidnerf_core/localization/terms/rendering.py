@@ -1,17 +1,16 @@
-"""Rendered rays and their derivatives, by one backward pass per channel, for any differentiable field.
+"""Rendered rays and their derivatives, from the derivatives of the field at the rays' samples.
 
-Rays are independent, so the gradient of a channel's sum over all rays, with respect to their origins and directions, contains the
-gradient of every single ray. Four passes give all derivatives of an RGB-D rendering; on a GPU, one pass over four copies of the
-rays suffices.
+With features f_i of the samples (colours, distances), weights w_i and a background b, a channel of a ray is
+``C = sum_i w_i f_i + (1 - sum_i w_i) b``. Its derivative by the density of a sample of length l_i needs no backward pass:
+``dC / dsigma_i = l_i (T_i+1 f_i - sum_j>i w_j f_j - T_end b)``, where T_i+1 is the share of the light that passes sample i.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.devices import may_wait
@@ -19,20 +18,15 @@ from bidnerf_core.fields import (
     HitField,
     RadianceField,
     Rays,
-    RaySamples,
     Rendering,
+    derivatives_of,
+    query_samples,
     render,
-    render_samples,
-    rows_of,
+    render_values,
 )
 
 LEAST_WEIGHT = 0.01
 """Rendering weight of a sample below which its derivatives are neglected: most samples lie in empty space."""
-MOST_AT_ONCE = 2**18
-"""Number of samples, including copies, up to which all channels are differentiated in one pass."""
-
-Channels = Callable[[Rendering, Int[Tensor, "k"]], Float[Tensor, "k c"]]
-"""Computes channels from the rendering of some of the rays, whose numbers are the second argument."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,68 +38,81 @@ class Derivatives:
     by_direction: Float[Tensor, "r c 3"]
 
 
+def channels(rendering: Rendering, measured: Float[Tensor, "r"] | None, miss: float) -> Float[Tensor, "r c"]:
+    """Return rendered colours and, with ``measured`` distances (metres; 0: none), ``sum_i w_i (t_i - d) + (1 - sum_i w_i) miss``.
+
+    The fraction of a ray that passes through the scene counts as if it hit something ``miss`` too far away: a rendered
+    distance of 0 would jump at silhouettes, where its derivative is of no use.
+    """
+    if measured is None:
+        return rendering.rgb
+    off = rendering.distance - rendering.opacity * measured + (1 - rendering.opacity) * miss
+    return torch.cat([rendering.rgb, torch.where(measured > 0, off, 0)[:, None]], -1)
+
+
 def differentiate(
-    field: RadianceField, rays: Rays, background: tuple[float, float, float], channels: Channels
-) -> Derivatives:
-    """Render rays (r), and differentiate the channels of each by its origin and its direction."""
-    every = torch.arange(len(rays.near), device=rays.near.device)
-    has_hits, leaves = isinstance(field, HitField), _leaves(rays)
-    # A field that computes hits is rendered once, since finding them takes nearly all of the time.
-    with torch.set_grad_enabled(has_hits):
-        rendering = render(field, _from(rays, leaves) if has_hits else rays, background)
-        moving = channels(rendering, every)
-    value, index, copies = moving.detach(), every, 1
-    count = value.shape[-1]
-    results = [leaf.new_zeros((len(every), count, 3)) for leaf in leaves]
-    if not has_hits:
-        kept = rendering.samples.valid & (rendering.weights > LEAST_WEIGHT)
-        if may_wait(kept.device):
-            index = kept.any(-1).nonzero()[:, 0]
-            if len(index) == 0:
-                return Derivatives(value, *results)
-            samples = _packed(rendering.samples, kept, index)
-        else:
-            samples = replace(rendering.samples, valid=kept)
-        # On a CPU, copies of the rays would only add computation. On a GPU, launches dominate the time of a pass unless
-        # there are many samples.
-        if kept.device.type != "cpu" and count * samples.valid.numel() <= MOST_AT_ONCE:
-            copies = count
-            samples = rows_of(samples, torch.arange(len(index), device=index.device).repeat(copies))
-        repeated = index.repeat(copies)
-        few = rows_of(rays, repeated)
-        leaves = _leaves(few)
-        with torch.enable_grad():
-            moving = channels(render_samples(field, _from(few, leaves), samples, background), repeated)
-    if not moving.requires_grad:  # no ray hits anything
-        return Derivatives(value, *results)
-    passes = [list(range(count))] if copies > 1 else [[channel] for channel in range(count)]
-    with torch.enable_grad():
-        parts = moving.unflatten(0, (copies, -1))
-    for number, wanted in enumerate(passes, start=1):
-        with torch.enable_grad():
-            total = torch.stack([parts[copy, :, channel].sum() for copy, channel in enumerate(wanted)]).sum()
-        gradients: tuple[Tensor | None, ...] = torch.autograd.grad(
-            total, leaves, retain_graph=number < len(passes), allow_unused=True
-        )
-        for result, gradient in zip(results, gradients, strict=True):
-            if gradient is not None:
-                for channel, part in zip(wanted, gradient.chunk(copies), strict=True):
-                    result[index, channel] = part
-    return Derivatives(value, *results)
-
-
-def _leaves(rays: Rays) -> list[Tensor]:
-    return [part.detach().requires_grad_() for part in (rays.origins, rays.directions)]
-
-
-def _from(rays: Rays, leaves: list[Tensor]) -> Rays:
-    return replace(rays, origins=leaves[0], directions=leaves[1])
-
-
-def _packed(samples: RaySamples, kept: Tensor, index: Int[Tensor, "k"]) -> RaySamples:
-    """Return the kept samples of some rays, packed into rows that are as short as possible."""
-    kept = kept[index]
-    order = (~kept).sort(dim=-1, stable=True).indices[:, : int(kept.sum(-1).amax())]
-    return RaySamples(
-        *(part.gather(-1, order) for part in (samples.starts[index], samples.ends[index], kept))
+    field: RadianceField, rays: Rays, background: tuple[float, float, float],
+    measured: Float[Tensor, "r"] | None = None, miss: float = 0.0,
+) -> Derivatives:  # fmt: skip
+    """Render rays (r), and differentiate their ``channels`` by their origins and directions."""
+    if isinstance(field, HitField):
+        return _differentiate_hits(field, rays, background, measured, miss)
+    samples = field.sampler(rays)
+    values = query_samples(field, rays, samples)
+    rendering = render_values(values, samples, background)
+    matters = (rendering.weights > LEAST_WEIGHT).reshape(-1)
+    every, r = not may_wait(matters.device), len(rays.near)
+    # Where the host must not wait to count them, all samples are passed on, with those that matter marked.
+    index = torch.arange(len(matters), device=matters.device) if every else matters.nonzero()[:, 0]
+    ray = index // max(samples.valid.shape[-1], 1)
+    middles, origins, directions = (
+        part.index_select(0, at)
+        for part, at in ((samples.middles.reshape(-1), index), (rays.origins, ray), (rays.directions, ray))
     )
+    positions = origins + middles[:, None] * directions
+    jacobian = derivatives_of(field, positions, directions, matters if every else None)
+    seen, weights, features = channels(rendering, measured, miss), rendering.weights, values.rgb
+    if measured is not None:
+        off = torch.where(measured[:, None] > 0, samples.middles - measured[:, None], 0)
+        features = torch.cat([features, off[..., None]], -1)
+    length = samples.ends - samples.starts
+    passed = torch.exp(-(torch.where(samples.valid, values.density * length, 0)).cumsum(-1))
+    behind = seen[:, None] - (weights[..., None] * features).cumsum(1)
+    steep = (length[..., None] * (passed[..., None] * features - behind)).flatten(0, 1).index_select(0, index)
+    share = weights.reshape(-1, 1, 1).index_select(0, index)
+    if every:
+        steep, share = torch.where(matters[:, None], steep, 0), torch.where(matters[:, None, None], share, 0)
+
+    def along(by: Float[Tensor, "k 4 3"]) -> Float[Tensor, "k c 3"]:
+        found = steep[..., None] * by[:, :1]
+        colours = found[:, :3] + share * by[:, 1:]
+        return colours if measured is None else torch.cat([colours, found[:, 3:]], 1)
+
+    by_position = along(jacobian.by_position)
+    by_direction = middles[:, None, None] * by_position + along(jacobian.by_direction)
+    if every:
+        sums = [part.unflatten(0, (r, -1)).sum(1) for part in (by_position, by_direction)]
+    else:
+        sums = [
+            part.new_zeros(r, *part.shape[1:]).index_add_(0, ray, part)
+            for part in (by_position, by_direction)
+        ]
+    return Derivatives(seen, *sums)
+
+
+def _differentiate_hits(
+    field: HitField, rays: Rays, background: tuple[float, float, float], measured: Float[Tensor, "r"] | None, miss: float
+) -> Derivatives:  # fmt: skip
+    """Differentiate by a backward pass for each channel: the gradient of its sum over rays has the gradients of all rays."""
+    leaves = [part.detach().requires_grad_() for part in (rays.origins, rays.directions)]
+    with torch.enable_grad():
+        rendering = render(field, replace(rays, origins=leaves[0], directions=leaves[1]), background)
+        value = channels(rendering, measured, miss)
+        sums = value.sum(0).unbind()
+    gradients = [
+        torch.autograd.grad(total, leaves, retain_graph=True, materialize_grads=True)
+        if total.requires_grad  # false if no ray hits anything
+        else [torch.zeros_like(leaf) for leaf in leaves]
+        for total in sums
+    ]
+    return Derivatives(value.detach(), *(torch.stack(parts, 1) for parts in zip(*gradients, strict=True)))

@@ -1,0 +1,242 @@
+"""The encoding, the whole field and its sampler in one kernel each, where torch brings Triton and the field is on a GPU."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Generator, Tensor, nn
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import pad
+
+from bidnerf_core.devices import constant
+from bidnerf_core.fields import EVEN_SHARE, LARGEST_THICKNESS, TAIL, Rays, RaySamples, SceneBounds
+from bidnerf_hashgrid.levels import Level
+
+MOST = 96
+"""Maximum number of samples per ray if the host must not wait to count them; the nearest ones in occupied cells are kept."""
+WIDEST = 128
+"""Units of a hidden layer up to which a field's tiles fit into the registers of a GPU."""
+POINTS, VALUE_POINTS, FIELD_POINTS, MARCHED = 64, 128, 64, 128
+"""Points of a tile of the encoding, of the field's values, and with derivatives; and steps of a ray that are looked up at once."""
+PRECISION = "tf32"
+"""Of the derivatives' products; those of the values are as exact as single precision."""
+
+
+@lru_cache(maxsize=1)
+def _has_triton() -> bool:
+    return find_spec("triton") is not None
+
+
+def available(device: torch.device) -> bool:
+    """Return whether the kernels run on ``device``: on a GPU and, for tests, by Triton's interpreter on a CPU."""
+    return (device.type == "cuda" or bool(os.environ.get("TRITON_INTERPRET"))) and _has_triton()
+
+
+@lru_cache(maxsize=1)
+def _kernels() -> Any:
+    """Return the module of kernels, which imports Triton."""
+    return import_module("bidnerf_hashgrid.kernels")
+
+
+def _power_of_two(size: int) -> int:
+    return max(16, 1 << (size - 1).bit_length())
+
+
+def _constants(levels: Sequence[Level], tables: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Return the numbers of the levels, and where their tables begin relative to the first one, in elements."""
+    columns = zip(*((a.resolution, a.entries, int(a.hashed), *a.strides[1:]) for a in levels), strict=True)
+    first, size = tables[0].data_ptr(), tables[0].element_size()
+    offsets = tuple((table.data_ptr() - first) // size for table in tables)
+    ints = torch.empty(0, dtype=torch.int32, device=tables[0].device)
+    return constant(tuple(number for row in columns for number in row), ints), constant(offsets, ints.long())
+
+
+def _blocks(count: int, size: int) -> tuple[int]:
+    return (max(1, -(-count // size)),)
+
+
+class Encode(torch.autograd.Function):
+    """The encoding of points (3 n) in the unit cube by some levels, with zeros for the others."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, points: Float[Tensor, "3 n"], levels: tuple[Level, ...], total: int, smooth: bool, want_slopes: bool,
+        *tables: Float[Tensor, "_ f"],
+    ) -> Float[Tensor, "n width"]:  # fmt: skip
+        n, features = points.shape[1], tables[0].shape[1]
+        width = total * features
+        values = points.new_empty(n, width)
+        slopes = points.new_empty((3, n, width) if want_slopes else (0,))
+        _kernels().encode_kernel[_blocks(n, POINTS)](
+            points, values, slopes, *_launched(levels, tables), n, width,
+            LEVELS=len(levels), F=features, C=_power_of_two(width), SMOOTH=smooth, SLOPES=want_slopes, BLOCK=POINTS,
+        )  # fmt: skip
+        ctx.save_for_backward(points, slopes)
+        ctx.levels, ctx.smooth, ctx.features = levels, smooth, features
+        return values
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Float[Tensor, "n width"]) -> tuple[Tensor | None, ...]:
+        points, slopes = ctx.saved_tensors
+        levels, needed = ctx.levels, ctx.needs_input_grad[5:]
+        to_points = (slopes * gradient).sum(-1) if ctx.needs_input_grad[0] else None
+        if not any(needed):
+            return to_points, None, None, None, None, *([None] * len(needed))
+        flat = points.new_zeros(sum(level.entries for level in levels), ctx.features)
+        parts = flat.split([level.entries for level in levels])
+        n, width = gradient.shape
+        _kernels().scatter_kernel[_blocks(n, POINTS)](
+            points, gradient.contiguous(), *_launched(levels, parts), n, width,
+            LEVELS=len(levels), F=ctx.features, C=_power_of_two(width), SMOOTH=ctx.smooth, BLOCK=POINTS,
+        )  # fmt: skip
+        found = [part if wanted else None for part, wanted in zip(parts, needed, strict=True)]
+        return to_points, None, None, None, None, *found
+
+
+def _launched(levels: Sequence[Level], tables: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    meta, offsets = _constants(levels, tables)
+    return meta, tables[0], offsets
+
+
+@dataclass(frozen=True, eq=False)
+class PackedNetworks:
+    """The weights of both networks as the field's kernel reads them: transposed, padded with zeros, in one tensor."""
+
+    first: Float[Tensor, "o i"]  # weights of the first layer, whose inputs depend on the level
+    rest: Float[Tensor, " w"]
+    biases: Float[Tensor, " b"]
+    width: int  # of hidden layers
+    features: int  # of the density network's results
+    hidden: int  # layers between hidden layers of the colour network
+    by_inputs: dict[int, Tensor]
+
+    @staticmethod
+    def of(geometry: nn.Sequential, colour: nn.Sequential) -> PackedNetworks | None:
+        """Return the packed networks; None if the kernel cannot compute them: it has one or two hidden layers of colour."""
+        first, out_of, into, *between, last = (
+            part for part in (*geometry, *colour) if isinstance(part, nn.Linear)
+        )
+        width, features = _power_of_two(first.out_features), _power_of_two(out_of.out_features)
+        if into is last or len(between) > 1 or max(width, features) > WIDEST:
+            return None
+        passed = out_of.out_features - 1
+        of_features = pad(into.weight[:, :passed].t(), (0, 0, 1, 0))  # none of the log density
+        parts = [
+            (out_of.weight.t(), width, features), (of_features, features, width), (into.weight[:, passed:].t(), 16, width),
+            *((layer.weight.t(), width, width) for layer in between), (last.weight.t(), width, 16),
+        ]  # fmt: skip
+        sizes, layers = (
+            (width, features, width, *([width] * len(between)), 16),
+            (first, out_of, into, *between, last),
+        )
+        biases = [
+            pad(layer.bias, (0, size - len(layer.bias))) for layer, size in zip(layers, sizes, strict=True)
+        ]
+        rest = torch.cat([_padded(part, rows, columns).flatten() for part, rows, columns in parts])
+        return PackedNetworks(first.weight, rest, torch.cat(biases), width, features, len(between), {})
+
+    def weights(self, inputs: int) -> Float[Tensor, " w"]:
+        """Return the weights of all layers, with the first ``inputs`` columns of the first."""
+        if inputs not in self.by_inputs:
+            into = _padded(self.first[:, :inputs].t(), _power_of_two(inputs), self.width)
+            self.by_inputs[inputs] = torch.cat([into.flatten(), self.rest])
+        return self.by_inputs[inputs]
+
+
+def _padded(matrix: Float[Tensor, "i o"], rows: int, columns: int) -> Float[Tensor, "r c"]:
+    return pad(matrix, (0, columns - matrix.shape[1], 0, rows - matrix.shape[0]))
+
+
+class Query(torch.autograd.Function):
+    """Density and colour (n 4) at points and directions (n 3); derivatives are carried forward with the values."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, positions: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], derivatives: bool, *field: Any
+    ) -> Float[Tensor, "n 4"]:  # fmt: skip
+        values, by_both = query(positions, directions, derivatives, *field)
+        ctx.save_for_backward(by_both)
+        return values
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Float[Tensor, "n 4"]) -> tuple[Tensor | None, ...]:
+        (by_both,) = ctx.saved_tensors
+        pull = (gradient[..., None] * by_both).sum(1)
+        return pull[:, :3], pull[:, 3:], *([None] * (len(ctx.needs_input_grad) - 2))
+
+
+def query(
+    positions: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], derivatives: bool, packed: PackedNetworks,
+    levels: tuple[Level, ...], tables: Sequence[Tensor], smooth: bool, limits: tuple[SceneBounds, float],
+    wanted: Bool[Tensor, "n"] | None = None,
+) -> tuple[Float[Tensor, "n 4"], Float[Tensor, "n 4 6"]]:  # fmt: skip
+    """Return density and colour at points (metres, world) along unit directions and, with ``derivatives``, theirs by both.
+
+    ``limits`` are the scene's bounds and the largest log density per side of the scene. At points that are not ``wanted``,
+    everything is 0.
+    """
+    n, features = len(positions), tables[0].shape[1]
+    bounds, largest = limits
+    new = positions.new_empty if wanted is None else positions.new_zeros
+    values, by_both = new((n, 4)), new((n, 4, 6) if derivatives else (0,))
+    box = constant((*bounds.centre, 2 / bounds.side, 1 / bounds.side), values)
+    inputs = len(levels) * features
+    index = count = torch.empty(0, dtype=torch.long, device=values.device)
+    if wanted is not None:  # their numbers in order, without waiting for how many there are
+        place = wanted.long().cumsum(0)
+        index, count = place.new_empty(n + 1), place[-1:]
+        index.scatter_(0, torch.where(wanted, place - 1, n), torch.arange(n, device=place.device))
+    block = FIELD_POINTS if derivatives else VALUE_POINTS
+    _kernels().field_kernel[_blocks(n, block)](
+        positions.contiguous(), directions.contiguous(), values, by_both, index, count, *_launched(levels, tables),
+        packed.weights(inputs), packed.biases, box, n,
+        LEVELS=len(levels), F=features, C=_power_of_two(inputs), WIDTH=packed.width, FEATURES=packed.features,
+        HIDDEN=packed.hidden, SMOOTH=smooth, CONTRACTED=bounds.contracted, LIMIT=largest, DERIVATIVES=derivatives,
+        SOME=wanted is not None, BLOCK=block, PRECISION=PRECISION,
+    )  # fmt: skip
+    return values, by_both
+
+
+def sampled(
+    rays: Rays, bounds: SceneBounds, occupied: Bool[Tensor, "n n n"], density: Float[Tensor, "n n n"], step: float,
+    count: int, jitter: Generator | None,
+) -> RaySamples:  # fmt: skip
+    """Return ``count`` intervals of each ray (r) that are concentrated where a grid of cells has its ``density``.
+
+    They divide the ray's first ``MOST`` steps in ``occupied`` cells; with a count of ``MOST`` they are these steps. The values are
+    those of ``OccupancyGrid`` and ``Concentrated``.
+    """
+    n, even = len(rays.near), max(2, round(EVEN_SHARE * (count + 1)))
+    packed = torch.cat([rays.origins.t(), rays.directions.t(), rays.near[None], rays.far[None]])
+    grid = constant((*bounds.centre, bounds.side / 2, step, float(len(occupied))), packed)
+    offset, shift = torch.full_like(rays.near, 0.5), packed.new_zeros(n, count + 1)
+    if jitter is not None:
+        draw = partial(torch.rand, generator=jitter, device=jitter.device)
+        offset = draw((n,)).to(offset)
+        by_weight, by_length = (draw((n, max(size - 2, 0))).to(shift) for size in (count + 1 - even, even))
+        shift[:, 1 : count - even] = (by_weight - 0.5) / (count - even)
+        shift[:, count + 2 - even : -1] = (by_length - 0.5) / (even - 1)
+    middles, counts = packed.new_empty(n, MOST), torch.empty(n, dtype=torch.int32, device=packed.device)
+    starts, ends = packed.new_empty(n, count), packed.new_empty(n, count)
+    valid = torch.empty(n, count, dtype=torch.bool, device=packed.device)
+    length = 2 * bounds.side  # a cube's diagonal, and contracted space, are not longer
+    _kernels().march_kernel[(n,)](
+        packed, grid, offset, occupied.view(torch.uint8), middles, counts, n,
+        STEPS=math.ceil(length / step) + 1, MOST=MOST, CONTRACTED=bounds.contracted, CHUNK=MARCHED,
+    )  # fmt: skip
+    _kernels().concentrate_kernel[(n,)](
+        packed, grid, middles, counts, density, shift, starts, ends, valid.view(torch.uint8), n, LARGEST_THICKNESS, TAIL,
+        COUNT=count, EVEN=even, MOST=MOST, S=_power_of_two(MOST), J=_power_of_two(count + 1), CONTRACTED=bounds.contracted,
+    )  # fmt: skip
+    return RaySamples(starts, ends, valid)
