@@ -148,7 +148,9 @@ def damped_solution(
     scaled = unit[..., None] * hessian * unit[..., None, :]
     eye = torch.eye(P, dtype=scaled.dtype, device=scaled.device)
     factor, info = torch.linalg.cholesky_ex(scaled + (damping[:, None, None] + 1e-9) * eye)
-    step = unit * torch.cholesky_solve((unit * gradient)[..., None], factor)[..., 0]
+    # Two triangular solves: cholesky_solve uses a library that cannot be captured in a CUDA graph.
+    half = torch.linalg.solve_triangular(factor, (unit * gradient)[..., None], upper=False)
+    step = unit * torch.linalg.solve_triangular(factor.mT, half, upper=True)[..., 0]
     step = torch.where(((info == 0) & step.isfinite().all(-1))[:, None], step, 0)
     return step if about is None else step @ about.mT
 
