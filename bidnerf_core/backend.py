@@ -14,6 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from bidnerf_core.fields import DEPTH_RESIDUALS as DEPTH_RESIDUALS
+from bidnerf_core.fields import DifferentiatedField as DifferentiatedField
+from bidnerf_core.fields import FieldDerivatives as FieldDerivatives
 from bidnerf_core.fields import FieldValues as FieldValues
 from bidnerf_core.fields import HitField as HitField
 from bidnerf_core.fields import Observations as Observations

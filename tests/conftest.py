@@ -12,6 +12,8 @@ from pathlib import Path
 from jaxtyping import install_import_hook
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the library does, which is imported after torch here
+if not os.path.exists("/dev/nvidia0"):
+    os.environ.setdefault("TRITON_INTERPRET", "1")  # read when Triton is imported, which torch may do
 
 SHAPES = "BIDNERF_SHAPES"
 """Set to 1, it turns on run-time checks of shapes and types, which take nearly half of the time of all tests."""

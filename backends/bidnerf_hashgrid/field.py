@@ -112,9 +112,9 @@ class HashGridField(nn.Module):
         return self.query_levels(positions, directions, None)
 
     def jacobian(
-        self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]
-    ) -> FieldDerivatives:
-        return self.jacobian_of_levels(positions, directions, None)
+        self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"], wanted: Bool[Tensor, "p"] | None = None
+    ) -> FieldDerivatives:  # fmt: skip
+        return self.jacobian_of_levels(positions, directions, wanted, None)
 
     def query_levels(
         self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"], active: int | None
@@ -209,6 +209,6 @@ class CoarseField:
         return self.fine.query_levels(positions, directions, self.fine.config.coarse_levels)
 
     def jacobian(
-        self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]
-    ) -> FieldDerivatives:
-        return self.fine.jacobian_of_levels(positions, directions, self.fine.config.coarse_levels)
+        self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"], wanted: Bool[Tensor, "p"] | None = None
+    ) -> FieldDerivatives:  # fmt: skip
+        return self.fine.jacobian_of_levels(positions, directions, wanted, self.fine.config.coarse_levels)

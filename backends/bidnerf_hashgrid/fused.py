@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -37,12 +36,12 @@ def _has_triton() -> bool:
 
 
 def available(device: torch.device) -> bool:
-    """Return whether the kernels run on ``device``: on a GPU and, for tests, by Triton's interpreter on a CPU."""
-    return (device.type == "cuda" or bool(os.environ.get("TRITON_INTERPRET"))) and _has_triton()
+    """Return whether the kernels run on ``device``."""
+    return device.type == "cuda" and _has_triton()
 
 
 @lru_cache(maxsize=1)
-def _kernels() -> Any:
+def kernels() -> Any:
     """Return the module of kernels, which imports Triton."""
     return import_module("bidnerf_hashgrid.kernels")
 
@@ -76,7 +75,7 @@ class Encode(torch.autograd.Function):
         width = total * features
         values = points.new_empty(n, width)
         slopes = points.new_empty((3, n, width) if want_slopes else (0,))
-        _kernels().encode_kernel[_blocks(n, POINTS)](
+        kernels().encode_kernel[_blocks(n, POINTS)](
             points, values, slopes, *_launched(levels, tables), n, width,
             LEVELS=len(levels), F=features, C=_power_of_two(width), SMOOTH=smooth, SLOPES=want_slopes, BLOCK=POINTS,
         )  # fmt: skip
@@ -95,7 +94,7 @@ class Encode(torch.autograd.Function):
         flat = points.new_zeros(sum(level.entries for level in levels), ctx.features)
         parts = flat.split([level.entries for level in levels])
         n, width = gradient.shape
-        _kernels().scatter_kernel[_blocks(n, POINTS)](
+        kernels().scatter_kernel[_blocks(n, POINTS)](
             points, gradient.contiguous(), *_launched(levels, parts), n, width,
             LEVELS=len(levels), F=ctx.features, C=_power_of_two(width), SMOOTH=ctx.smooth, BLOCK=POINTS,
         )  # fmt: skip
@@ -198,7 +197,7 @@ def query(
         index, count = place.new_empty(n + 1), place[-1:]
         index.scatter_(0, torch.where(wanted, place - 1, n), torch.arange(n, device=place.device))
     block = FIELD_POINTS if derivatives else VALUE_POINTS
-    _kernels().field_kernel[_blocks(n, block)](
+    kernels().field_kernel[_blocks(n, block)](
         positions.contiguous(), directions.contiguous(), values, by_both, index, count, *_launched(levels, tables),
         packed.weights(inputs), packed.biases, box, n,
         LEVELS=len(levels), F=features, C=_power_of_two(inputs), WIDTH=packed.width, FEATURES=packed.features,
@@ -231,11 +230,11 @@ def sampled(
     starts, ends = packed.new_empty(n, count), packed.new_empty(n, count)
     valid = torch.empty(n, count, dtype=torch.bool, device=packed.device)
     length = 2 * bounds.side  # a cube's diagonal, and contracted space, are not longer
-    _kernels().march_kernel[(n,)](
+    kernels().march_kernel[(n,)](
         packed, grid, offset, occupied.view(torch.uint8), middles, counts, n,
         STEPS=math.ceil(length / step) + 1, MOST=MOST, CONTRACTED=bounds.contracted, CHUNK=MARCHED,
     )  # fmt: skip
-    _kernels().concentrate_kernel[(n,)](
+    kernels().concentrate_kernel[(n,)](
         packed, grid, middles, counts, density, shift, starts, ends, valid.view(torch.uint8), n, LARGEST_THICKNESS, TAIL,
         COUNT=count, EVEN=even, MOST=MOST, S=_power_of_two(MOST), J=_power_of_two(count + 1), CONTRACTED=bounds.contracted,
     )  # fmt: skip

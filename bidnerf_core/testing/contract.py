@@ -101,6 +101,9 @@ class BackendContract(Subject):
     def test_query_is_differentiable_by_direction(self) -> None:
         self._each(lambda field: derivatives.check_direction_derivatives(*precise(field)))
 
+    def test_jacobian_is_the_derivative_of_query(self) -> None:
+        self._each(lambda field: derivatives.check_jacobian(*precise(field)))
+
     def test_query_follows_the_dtype(self) -> None:
         for field in self._fields():
             with calling(f"{type(field).__name__}.double()"):

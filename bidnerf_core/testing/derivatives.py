@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.fields import RadianceField, render
+from bidnerf_core.fields import DifferentiatedField, RadianceField, backward_derivatives, render
 from bidnerf_core.geometry import SE3
 from bidnerf_core.testing.faults import calling, query, require_that
 from bidnerf_core.testing.scene import SIDE, camera_rays, points, rgbd_views
@@ -43,6 +43,30 @@ def check_direction_derivatives(field: RadianceField, dtype: torch.dtype) -> Non
         return angle.cos() * directions + angle.sin() * along
 
     _check_by(field, "direction", lambda x: (positions, x), on_circle, along)
+
+
+def check_jacobian(field: RadianceField, dtype: torch.dtype) -> None:
+    """Check that the ``jacobian`` of a field that offers one has the values of ``query`` and their derivatives."""
+    if not isinstance(field, DifferentiatedField):
+        return
+    positions, directions = (x.to(dtype) for x in points(COUNT))
+    who = f"{type(field).__name__}.jacobian"
+    with calling(who):
+        found = field.jacobian(positions, directions)
+    expected = backward_derivatives(field.query, positions, directions)
+    across = (
+        torch.eye(3, dtype=dtype) - directions[:, :, None] * directions[:, None]
+    )  # directions are unit vectors
+    for what, ours, theirs in (
+        ("density", found.values.density, expected.values.density),
+        ("rgb", found.values.rgb, expected.values.rgb),
+        ("the derivative by position", found.by_position, expected.by_position),
+        ("the derivative by direction", found.by_direction @ across, expected.by_direction @ across),
+    ):
+        same = (
+            ours.shape == theirs.shape and float((ours - theirs).norm()) <= 1e-3 * float(theirs.norm()) + 1e-9
+        )
+        require_that(same, f"{who}: {what} differs from that of query")
 
 
 def _check_by(

@@ -16,12 +16,14 @@ from torch import Generator, Tensor, nn
 
 import tiny
 from bidnerf_core.fields import (
+    FieldDerivatives,
     FieldValues,
     RayHits,
     Rays,
     RaySamples,
     SceneBounds,
     Stratified,
+    backward_derivatives,
     device_of,
     render,
 )
@@ -249,6 +251,13 @@ def chosen_by_a_mask(values: FieldValues, positions: Tensor) -> FieldValues:
     return replace(values, rgb=torch.zeros_like(values.rgb).index_put((dense,), values.rgb[dense]))
 
 
+def steeper(
+    self: Any, positions: Tensor, directions: Tensor, wanted: Tensor | None = None
+) -> FieldDerivatives:
+    found = backward_derivatives(self.query, positions, directions)
+    return replace(found, by_position=1.01 * found.by_position)
+
+
 def one_axis(rays: Rays) -> Rays:
     parts = rays.origins, rays.directions, rays.near, rays.far
     return Rays(*(x.reshape(-1, *x.shape[rays.near.ndim :]) for x in parts))
@@ -408,6 +417,7 @@ BUILD, SHAPES, RANGES = (
     "test_query_is_finite_and_in_range",
 )
 POSITION, DIRECTION = "test_query_is_differentiable_by_position", "test_query_is_differentiable_by_direction"
+JACOBIAN = "test_jacobian_is_the_derivative_of_query"
 DTYPE, INTERVALS = "test_query_follows_the_dtype", "test_samples_are_sorted_disjoint_and_on_the_ray"
 REPEATABLE, ALONE = "test_samples_are_repeatable", "test_rays_do_not_depend_on_each_other"
 LEVELS, POSE, SAVED = (
@@ -456,6 +466,7 @@ BREAKS: list[tuple[str, Any, str]] = [
     (DIRECTION, asked(lambda p, d: (p, d.detach())), f"by direction {DIFFERENCES}"),
     (DIRECTION, with_field(query=with_no_grad), f"by direction {DIFFERENCES}"),
     (DIRECTION, asked(lambda p, d: (p, Doubling.apply(d))), f"by direction {DIFFERENCES}"),
+    (JACOBIAN, with_field(jacobian=steeper), "the derivative by position differs from that of query"),
     (DTYPE, answered(lambda v, p: FieldValues(v.density.float(), v.rgb.float())), "density is torch.float32, expected float64"),
     (DTYPE, answered(lambda v, p: FieldValues(v.density.double(), v.rgb.double())), "density is torch.float64 for points in float32"),
     (DTYPE, asked(lambda p, d: (p + (p.dtype == torch.float64), d)), "is another than in float32"),
