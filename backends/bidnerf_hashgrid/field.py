@@ -142,7 +142,7 @@ class HashGridField(nn.Module):
             kernel = self._kernel(active)
             if kernel is None:
                 return backward_derivatives(partial(self.query_levels, active=active), positions, directions)
-            values, by_both = fused.query(positions, directions, True, *kernel, wanted=wanted)
+            values, by_both = fused.query(positions, directions, True, *kernel, wanted)
         return FieldDerivatives(FieldValues(values[:, 0], values[:, 1:]), *by_both.split(3, -1))
 
     def _kernel(self, active: int | None) -> tuple[Any, ...] | None:
@@ -159,7 +159,9 @@ class HashGridField(nn.Module):
             self._packed = version, fused.PackedNetworks.of(self.geometry, self.colour)
         packed = self._packed[1]
         smooth, limits = encoding.config.interpolation == "smooth", (self.bounds, LARGEST_LOG_DENSITY)
-        return packed and (packed, levels, list(encoding.tables)[: len(levels)], smooth, limits)
+        if packed is None:
+            return None
+        return packed, levels, list(encoding.tables)[: len(levels)], smooth, limits
 
     def encode(self, positions: Float[Tensor, "p 3"], active: int | None) -> Float[Tensor, "p f"]:
         encoded: Tensor = self.encoding((self.bounds.normalized(positions) + 1) / 2, active)
