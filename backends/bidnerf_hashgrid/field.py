@@ -142,7 +142,7 @@ class HashGridField(nn.Module):
             kernel = self._kernel(active)
             if kernel is None:
                 return backward_derivatives(partial(self.query_levels, active=active), positions, directions)
-            values, by_both = fused.query(positions, directions, True, *kernel, wanted)
+            values, by_both = fused.query(positions, directions, True, wanted, *kernel)
         return FieldDerivatives(FieldValues(values[:, 0], values[:, 1:]), *by_both.split(3, -1))
 
     def _kernel(self, active: int | None) -> tuple[Any, ...] | None:

@@ -176,9 +176,8 @@ class Query(torch.autograd.Function):
 
 
 def query(
-    positions: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], derivatives: bool, packed: PackedNetworks,
-    levels: tuple[Level, ...], tables: Sequence[Tensor], smooth: bool, limits: tuple[SceneBounds, float],
-    wanted: Bool[Tensor, "n"] | None = None,
+    positions: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], derivatives: bool, wanted: Bool[Tensor, "n"] | None,
+    packed: PackedNetworks, levels: tuple[Level, ...], tables: Sequence[Tensor], smooth: bool, limits: tuple[SceneBounds, float],
 ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, "n 4 6"]]:  # fmt: skip
     """Return density and colour at points (metres, world) along unit directions and, with ``derivatives``, theirs by both.
 
