@@ -163,7 +163,7 @@ class Query(torch.autograd.Function):
     def forward(
         ctx: Any, positions: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], derivatives: bool, *field: Any
     ) -> Float[Tensor, "n 4"]:  # fmt: skip
-        values, by_both = query(positions, directions, derivatives, *field)
+        values, by_both = query(positions, directions, derivatives, None, *field)
         ctx.save_for_backward(by_both)
         return values
 
