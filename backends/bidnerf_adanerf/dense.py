@@ -58,5 +58,5 @@ def render_softly(
 
 def opacity(values: FieldValues, samples: RaySamples, which: Bool[Tensor, "r n"]) -> Float[Tensor, ""]:
     """Return the mean of ``1 - exp(-sigma dt)`` over the bins ``which``, without scores."""
-    absorbed = (values.density * (samples.ends - samples.starts))[which]
+    absorbed = torch.where(which, values.density * (samples.ends - samples.starts), 0)
     return -torch.expm1(-absorbed).sum() / which.sum().clamp(min=1)

@@ -7,7 +7,8 @@ from enum import Enum
 from functools import cache
 
 import torch
-from torch import Generator
+from jaxtyping import Float
+from torch import Generator, Tensor
 
 from bidnerf_adanerf.bins import ray_logits
 from bidnerf_adanerf.config import AdaNerfConfig
@@ -66,14 +67,22 @@ def train(field: AdaNerfField, views: Sequence[View], config: AdaNerfConfig, rep
         evaluations = 1 + float(samples.valid.sum()) / PROBE  # the oracle costs about as much as a sample
         return max(1, min(config.rays_at_most, int(config.samples_per_step / evaluations)))
 
+    weight = torch.zeros((), device=device_of(field))  # of the mean score, see ``sparsity``
+
+    def prepare(step: int) -> Phase:
+        weight.fill_(sparsity(step, config))
+        rays_per_step(phase_at(step, config) is Phase.SPARSE)
+        return phase_at(step, config)
+
     def outcome(step: int, generator: Generator) -> StepOutcome:
-        if phase_at(step, config) is Phase.SPARSE:  # as in localization; the oracle is no longer trained
+        phase = phase_at(step, config)
+        if phase is Phase.SPARSE:  # as in localization; the oracle is no longer trained
             return supervision.step(field, rays_per_step(True), generator)
         batch = supervision.draw(rays_per_step(False), generator)
-        return dense_step(field, supervision, batch, room, config, step, generator)
+        return dense_step(field, supervision, batch, room, phase, weight, generator)
 
     groups = [{"params": list(field.parameters()), "lr": config.learning_rate}]
-    supervision.fit(field, groups, outcome, config.steps, report, seed=config.seed)
+    supervision.fit(field, groups, outcome, config.steps, report, config.seed, prepare)
 
 
 def room_for_matter(views: Sequence[View], bounds: SceneBounds, resolution: int) -> OccupancyMask:
@@ -85,20 +94,23 @@ def room_for_matter(views: Sequence[View], bounds: SceneBounds, resolution: int)
 
 def dense_step(
     field: AdaNerfField, supervision: Supervision, batch: TrainingBatch, room: OccupancyMask | None,
-    config: AdaNerfConfig, step: int, generator: Generator,
+    phase: Phase, sparsity_weight: Float[Tensor, ""], generator: Generator,
 ) -> StepOutcome:  # fmt: skip
     """Return the loss with all bins shaded; they count in full or, in the soft phase, according to their scores."""
+    config = supervision.config
+    assert isinstance(config, AdaNerfConfig)
     samples, empty = dense_samples(field, batch.rays, room, generator)
     values = query_samples(field, batch.rays, samples)
     logits = ray_logits(field.oracle, field.bins, batch.rays)
     scores = logits.sigmoid()
-    soft = phase_at(step, config) is Phase.SOFT
-    counted = soft_weights(scores, config.threshold) if soft else torch.ones_like(scores)
+    counted = torch.ones_like(scores)
+    if phase is Phase.SOFT:
+        counted = soft_weights(scores, config.threshold)
     rendering = render_softly(values, samples, counted, batch.background)
     loss, mse = supervision.loss(rendering, batch)
     loss = loss + config.empty_weight * opacity(values, samples, empty)
     whole = rendering_weights(values.density, samples)
     loss = loss + config.oracle_weight * oracle_loss(logits, samples, whole, batch)
-    loss = loss + sparsity(step, config) * scores.mean()
+    loss = loss + sparsity_weight * scores.mean()
     shaded = (samples.valid & (scores > config.threshold)).sum() / len(scores)
-    return StepOutcome(loss, mse, float(shaded))
+    return StepOutcome(loss, mse, shaded)

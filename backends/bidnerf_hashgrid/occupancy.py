@@ -73,15 +73,23 @@ class OccupancyGrid(nn.Module):
         weights: Float[Tensor, "p"],
         density: Float[Tensor, "p"],
         fade: float,
+        valid: Bool[Tensor, "p"] | None = None,
     ) -> None:
-        """Update peaks and densities with the rendering weights and densities of a batch at ``positions`` (metres, world)."""
+        """Update peaks and densities with the rendering weights and densities of a batch at ``positions`` (metres, world).
+
+        Without ``valid``, all samples count.
+        """
         self.observed = True
         cells = self.grid.numbers(positions)
         for known, values in ((self.peak, weights), (self.density, density)):
             flat = known.view(-1)
-            flat.index_copy_(
-                0, cells, flat.index_select(0, cells) * fade
-            )  # once per step, however many samples lie in the cell
+            faded = flat.index_select(0, cells) * fade
+            # A cell fades once per step, however many samples lie in it.
+            if valid is None:
+                flat.index_copy_(0, cells, faded)
+            else:  # what does not count is no minimum and no maximum
+                flat.scatter_reduce_(0, cells, torch.where(valid, faded, torch.inf), "amin")
+                values = torch.where(valid, values, 0)
             flat.scatter_reduce_(0, cells, values.to(known), "amax")
 
     @torch.no_grad()

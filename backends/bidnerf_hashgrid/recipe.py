@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
-from torch import Generator
+import torch
+from torch import Generator, Tensor
 
 from bidnerf_core.carving import occupied_voxels
+from bidnerf_core.devices import may_wait
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields import Rendering, SceneBounds, device_of, render
+from bidnerf_core.fields import Rendering, SceneBounds, device_of, query_packed, query_samples, render_values
 from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, NotNegative, Positive, Range
 from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, TrainingBatch
 from bidnerf_hashgrid.field import CoarseField, FieldConfig, HashGridField
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 from bidnerf_hashgrid.threads import pools_only
+
+log = logging.getLogger("bidnerf")
+
+SETTLED = 10
+"""Step up to which the number of samples per ray changes so much that it is read in each step."""
+SPARE = 1.25
+"""Room for the samples of a step on a GPU, relative to their expected number: its standard deviation is a few per cent."""
 
 
 @dataclass(frozen=True)
@@ -82,20 +93,46 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
         },
     ]
 
-    def outcome(step: int, generator: Generator) -> StepOutcome:
-        coarse = config.coarse_every > 0 and step % config.coarse_every == config.coarse_every - 1
-        level: CoarseField | HashGridField = field.levels[0] if coarse else field
-        grid = level.occupancy
-        affordable = int(config.samples_per_step / float(grid.samples_per_ray.clamp(min=1)))
-        count = max(1, min(config.rays_at_most, affordable))
-        batch = supervision.draw(count, generator)
-        rendering = render(level, batch.rays, batch.background, generator)
-        _update(grid, batch, rendering, step, config)
-        loss, mse = supervision.loss(rendering, batch)
-        return StepOutcome(loss, mse, float(grid.samples_per_ray))
+    device, rays = device_of(field), dict[bool, int]()  # rays per step, by whether the step is coarse
+    lost = torch.zeros((), device=device)
 
-    with pools_only(device_of(field)):
-        supervision.fit(field, groups, outcome, config.steps, report, seed=config.seed)
+    def is_coarse(step: int) -> bool:
+        return config.coarse_every > 0 and step % config.coarse_every == config.coarse_every - 1
+
+    def prepare(step: int) -> tuple[bool, int] | None:
+        if step >= config.prune_from and step % config.prune_every == 0:
+            for grid in (field.occupancy, field.coarse_sampler):
+                grid.prune(config.prune_threshold, grow=step < config.grow_until * config.steps)
+        if device.type == "cpu" or step <= SETTLED or step % config.prune_every == 0 or not rays:
+            grids = field.occupancy, field.coarse_sampler
+            *counts, missed = torch.stack([*(grid.samples_per_ray for grid in grids), lost]).tolist()
+            for coarse, samples in zip((False, True), counts, strict=True):
+                affordable = config.samples_per_step / max(samples, 1.0)
+                if device.type != "cpu":  # few different numbers, as each is captured
+                    affordable = 2 ** (math.floor(2 * math.log2(max(affordable, 1.0))) / 2)
+                rays[coarse] = max(1, min(config.rays_at_most, int(affordable)))
+            if missed:
+                log.info(f"step {step}: {missed:.0f} samples did not fit into the steps since the last count")
+                lost.zero_()
+        return None if step <= SETTLED else (is_coarse(step), rays[is_coarse(step)])
+
+    def outcome(step: int, generator: Generator) -> StepOutcome:
+        level: CoarseField | HashGridField = field.levels[0] if is_coarse(step) else field
+        batch = supervision.draw(rays[is_coarse(step)], generator)
+        samples = level.sampler(batch.rays, generator)
+        if may_wait(device):
+            values = query_samples(level, batch.rays, samples)
+        else:
+            found, room = samples, round(SPARE * config.samples_per_step)
+            values, samples = query_packed(level, batch.rays, found, room)
+            lost.add_(found.valid.sum() - samples.valid.sum())
+        rendering = render_values(values, samples, batch.background)
+        _update(level.occupancy, batch, rendering, step, config)
+        loss, mse = supervision.loss(rendering, batch)
+        return StepOutcome(loss, mse, level.occupancy.samples_per_ray)
+
+    with pools_only(device):
+        supervision.fit(field, groups, outcome, config.steps, report, config.seed, prepare)
 
 
 def _update(
@@ -109,14 +146,20 @@ def _update(
     weights = (
         rendering.weights.detach() * grid.step / (place(samples.ends) - place(samples.starts)).clamp(min=1e-9)
     )
-    ray, slot = samples.valid.nonzero(as_tuple=True)
-    index = ray * samples.valid.shape[1] + slot
-    middles, weights, density = (
-        part.detach().reshape(-1).index_select(0, index) for part in (samples.middles, weights, density)
+    middles, valid, density = (
+        part.detach().reshape(-1) for part in (samples.middles, samples.valid, density)
     )
+    ray, weights = (
+        torch.arange(valid.numel(), device=valid.device) // samples.valid.shape[1],
+        weights.reshape(-1),
+    )
+    counted: Tensor | None = valid
+    if may_wait(valid.device):  # often most samples are not valid
+        index, counted = valid.nonzero()[:, 0], None
+        ray, middles, weights, density = (
+            part.index_select(0, index) for part in (ray, middles, weights, density)
+        )
     origins, directions = (part.index_select(0, ray) for part in (batch.rays.origins, batch.rays.directions))
     positions = origins + middles[:, None] * directions
-    grid.observe(positions, weights.clamp(max=1), density, config.prune_fade)
-    grid.samples_per_ray.lerp_(samples.valid.sum() / len(samples.valid), 0.1 if step > 10 else 1.0)
-    if step >= config.prune_from and step % config.prune_every in (0, config.coarse_every - 1):
-        grid.prune(config.prune_threshold, grow=step < config.grow_until * config.steps)
+    grid.observe(positions, weights.clamp(max=1), density, config.prune_fade, counted)
+    grid.samples_per_ray.lerp_(samples.valid.sum() / len(samples.valid), 0.1 if step > SETTLED else 1.0)

@@ -58,7 +58,7 @@ def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, rep
         return step_outcome(field, supervision, supervision.draw(rays_per_step, generator), generator)
 
     groups = [{"params": list(field.parameters()), "lr": config.learning_rate}]
-    supervision.fit(field, groups, outcome, config.steps, report, seed=config.seed)
+    supervision.fit(field, groups, outcome, config.steps, report, config.seed, lambda _: "all steps")
 
 
 def step_outcome(
@@ -68,7 +68,7 @@ def step_outcome(
     coarse, fine = (render(level, batch.rays, batch.background, generator) for level in field.levels)
     rough, _ = supervision.loss(coarse, batch)
     loss, mse = supervision.loss(fine, batch)
-    return StepOutcome(rough + loss, mse, float(fine.samples.valid.sum() / len(batch)))
+    return StepOutcome(rough + loss, mse, fine.samples.valid.sum() / len(batch))
 
 
 @torch.no_grad()

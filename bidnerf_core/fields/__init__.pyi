@@ -31,6 +31,7 @@ from .pieces import Meeting as Meeting
 from .rendering import Observations as Observations
 from .rendering import RenderedImage as RenderedImage
 from .rendering import Rendering as Rendering
+from .rendering import query_packed as query_packed
 from .rendering import query_samples as query_samples
 from .rendering import render as render
 from .rendering import render_image as render_image

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -196,6 +196,32 @@ def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> Fiel
     density = found.density.new_zeros(valid.numel()).index_copy(0, index, found.density)
     rgb = found.rgb.new_zeros((valid.numel(), 3)).index_copy(0, index, found.rgb)
     return FieldValues(density.reshape(valid.shape), rgb.reshape(*valid.shape, 3))
+
+
+def query_packed(
+    field: RadianceField, rays: Rays, samples: RaySamples, room: int
+) -> tuple[FieldValues, RaySamples]:
+    """Return the field's values at the first ``room`` valid samples (r s), and the samples with only these left valid.
+
+    The field is queried at ``room`` points whatever the number of valid samples is, so that the host need not wait for it.
+    """
+    valid, width = samples.valid.reshape(-1), samples.valid.shape[-1]
+    total, room = valid.numel(), min(room, valid.numel())
+    order = valid.cumsum(0)
+    kept = valid & (order <= room)
+    slot = torch.arange(room, device=valid.device)
+    # A slot that stays empty takes any sample: many gradients for the same point are added one after another.
+    index = torch.cat([slot, slot[:1]]).index_copy(
+        0, torch.where(kept, order - 1, room), torch.arange(total, device=valid.device)
+    )[:room]
+    origins, directions = (part.index_select(0, index // width) for part in (rays.origins, rays.directions))
+    middles = samples.middles.reshape(-1).index_select(0, index)
+    found = field.query(origins + middles[:, None] * directions, directions)
+    target = torch.where(slot < order[-1:], index, total)
+    density = found.density.new_zeros(total + 1).index_copy(0, target, found.density)[:-1]
+    rgb = found.rgb.new_zeros((total + 1, 3)).index_copy(0, target, found.rgb)[:-1]
+    values = FieldValues(density.view_as(samples.valid), rgb.view(*samples.valid.shape, 3))
+    return values, replace(samples, valid=kept.view_as(samples.valid))
 
 
 def rendering_weights(density: Float[Tensor, "*r s"], samples: RaySamples) -> Float[Tensor, "*r s"]:

@@ -98,19 +98,33 @@ class ImagePixels:
     default: float = 0.0  # the value of missing images
 
     @staticmethod
-    def of(images: Sequence[Tensor | None], channels: int, default: float = 0.0) -> ImagePixels:
-        """Build this from ``images``; None has the value ``default`` everywhere. Images that share few blocks
-        of memory are not copied.
+    def of(
+        images: Sequence[Tensor | None],
+        channels: int,
+        default: float = 0.0,
+        device: torch.device | str = "cpu",
+    ) -> ImagePixels:
+        """Build this on ``device`` from ``images``; None has the value ``default`` everywhere. On the CPU, images that share few
+        blocks of memory are not copied.
         """
-        present = {
-            i: image.detach().cpu().contiguous() for i, image in enumerate(images) if image is not None
-        }
+        device, present = torch.device(device), {i: x.detach() for i, x in enumerate(images) if x is not None}
+        block, start = torch.tensor([[-1], [0]]).repeat(1, len(images))
+        if device.type != "cpu":  # one block for each type
+            flat = []
+            for number, kind in enumerate({image.dtype for image in present.values()}):
+                own = {i: image for i, image in present.items() if image.dtype == kind}
+                flat.append(torch.empty(sum(map(Tensor.numel, own.values())), dtype=kind, device=device))
+                first = 0
+                for i, image in own.items():
+                    flat[number][first : first + image.numel()].copy_(image.reshape(-1))
+                    block[i], start[i], first = number, first, first + image.numel()
+            return ImagePixels(flat, block.to(device), start.to(device), channels, default)
+        present = {i: image.cpu().contiguous() for i, image in present.items()}
         if len({_block(image) for image in present.values()}) > MOST_BLOCKS:
             store = PixelStore(sum(image.nbytes + ALIGNMENT for image in present.values()))
             present = {i: store.copied(image) for i, image in present.items()}
         blocks = {_block(image): image for image in present.values()}
         numbers = {key: number for number, key in enumerate(blocks)}
-        block, start = torch.tensor([[-1], [0]]).repeat(1, len(images))
         for i, image in present.items():
             block[i], start[i] = numbers[_block(image)], image.storage_offset()
         flat = [torch.empty(0, dtype=image.dtype).set_(image.untyped_storage()) for image in blocks.values()]
@@ -118,14 +132,13 @@ class ImagePixels:
 
     def at(self, image: Int[Tensor, "p"], pixel: Int[Tensor, "p"]) -> Float[Tensor, "p c"]:
         """Return the values of pixels, each from the image with that index; bytes become floats in [0, 1]."""
-        block = self.block[image]
+        block = self.block[image][:, None]
         first = self.start[image] + pixel * self.channels
-        index = first[:, None] + torch.arange(self.channels)
-        values = torch.full(index.shape, self.default)
-        for number in block.unique().tolist():
-            if number >= 0:
-                own = block == number
-                values[own] = as_floats(self.blocks[number][index[own]]).float()
+        index = first[:, None] + torch.arange(self.channels, device=first.device)
+        values = torch.full(index.shape, self.default, device=first.device)
+        for number, flat in enumerate(self.blocks):
+            own = block == number
+            values = torch.where(own, as_floats(flat[torch.where(own, index, 0)]).float(), values)
         return values
 
 

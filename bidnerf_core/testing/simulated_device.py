@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from typing import Any
 
 import torch
@@ -25,6 +26,7 @@ DEVICE = torch.device("meta")
 """The simulated device."""
 
 _aten = torch.ops.aten
+_adam: Any = import_module("torch.optim.adam")
 READS = {
     "_local_scalar_dense": "reads a number",
     "is_nonzero": "reads a number",
@@ -102,11 +104,14 @@ class Elsewhere(TorchDispatchMode):
         devices.forget()
         self._generator = torch.Generator
         torch.Generator = _generator_of(torch.Generator)  # type: ignore[misc]
+        self._check = _adam._device_dtype_check_for_fused
+        _adam._device_dtype_check_for_fused = lambda *_, **__: None
         return super().__enter__()
 
     def __exit__(self, *exception: Any) -> None:
         super().__exit__(*exception)
         torch.Generator = self._generator  # type: ignore[misc]
+        _adam._device_dtype_check_for_fused = self._check
         devices.forget()
 
     @contextmanager

@@ -28,7 +28,8 @@ class ColourTransforms(nn.Module):
         """Transform the field's colours to those of each ray's image."""
         gain = (self.log_gain - self.log_gain.mean(dim=0)).exp()
         offset = self.offset - self.offset.mean(dim=0)
-        return rgb * gain[image] + offset[image]
+        # The derivative of an index in square brackets sorts the rays by image.
+        return rgb * gain.index_select(0, image) + offset.index_select(0, image)
 
     def penalty(self) -> Float[Tensor, ""]:
         """Return the mean square of the log gains and the offsets; it keeps those that the images do not

@@ -1,30 +1,42 @@
-"""The training loop: Adam with a schedule, checkpoints and resumption."""
+"""The training loop: Adam with a schedule, CUDA graphs, checkpoints and resumption."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
+from bidnerf_core.devices import without_waiting
 from bidnerf_core.errors import InputError
+from bidnerf_core.localization import captured
 from bidnerf_core.training.report import Report, TrainingState, TrainingStep, TrainingStopped
 
 BESIDE = "beside."
 """Prefix of the names under which a state holds parameters learned jointly with the field."""
 
 
+READ_EVERY = 16
+"""Steps after which the host reads the figures of a training on a GPU; in between, it never waits."""
+WARM_UP = 2
+"""Steps before a capture, which load kernels and create Adam's moments, as a capture does not allow this."""
+MOST_GRAPHS = 24
+"""Number of captured steps that are kept: each has memory of its own."""
+
+
 @dataclass(frozen=True, eq=False)
 class StepOutcome:
-    """The result of one step of a recipe."""
+    """The result of one step of a recipe; a number that is a tensor is read when the host next waits for the device."""
 
     loss: Float[Tensor, ""]
-    mse: float  # of the colours, for display
-    samples_per_ray: float = float("nan")
+    mse: float | Float[Tensor, ""]  # of the colours, for display
+    samples_per_ray: float | Float[Tensor, ""] = float("nan")
 
 
 def cosine(step: int, total: int, warmup: int = 100, last: float = 0.02) -> float:
@@ -42,43 +54,82 @@ def fit(
     outcome: Callable[[int, Generator], StepOutcome],
     steps: int,
     report: Report,
-    schedule: Callable[[int, int], float] = cosine,
     seed: int = 0,
     beside: nn.Module | None = None,
+    prepare: Callable[[int], Hashable] | None = None,
 ) -> None:
     """Minimize the loss of ``outcome(step, generator)`` over parameter ``groups`` (each with its ``lr``) by ``steps`` of Adam.
 
     ``beside`` holds parameters that are learned with the field but not stored with it; they are among the
     groups. Training resumes from ``report.resume()``, saves when ``report.due`` returns True and, when
     ``report.stopping`` is set, saves and raises ``TrainingStopped``. A resumed run computes what an
-    uninterrupted one would have; on a GPU, where sums have no fixed order, it does so up to rounding. The
-    generator is on the CPU regardless of the field's device, so that the same rays are drawn everywhere.
+    uninterrupted one would have; on a GPU, where sums have no fixed order, it does so up to rounding.
     Raises ``InputError`` if the loss is not finite.
+
+    ``prepare(step)`` is called before each step. It does what must not be part of a CUDA graph, such as reading numbers from the
+    device, and returns a key: steps with equal keys launch the same operations on tensors of the same shapes. On a GPU, each is
+    captured once and replayed, and the report receives steps in blocks of ``READ_EVERY``. ``outcome`` then runs
+    ``without_waiting``, and its step may be that of another call with this key. Steps with the key None are not captured. With
+    ``prepare``, the generator is on the field's device, otherwise on the CPU.
     """
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
     rates = [group["lr"] for group in optimizer.param_groups]
-    generator = torch.Generator().manual_seed(seed)
-    first = _restore(report.resume(), field, optimizer, generator, beside)
-    for step in range(first, steps):
-        for group, rate in zip(optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate * schedule(step, steps)
+    device = next(_parameters(optimizer)).device
+    ahead = prepare is not None and device.type != "cpu"  # of the device, by up to READ_EVERY steps
+    every = READ_EVERY if ahead else 1
+    generator = torch.Generator(device if ahead else "cpu").manual_seed(seed)
+    for group in optimizer.param_groups if ahead else []:
+        group.update(lr=torch.full((), group["lr"], device=device), capturable=True)
+    log, row = torch.zeros((every, 3), device=device), torch.zeros(1, dtype=torch.long, device=device)
+    first = reported = _restore(report.resume(), field, optimizer, generator, beside)
+    graphs, seen = dict[Hashable, Callable[[], None]](), Counter[Hashable]()
+
+    def take(step: int) -> None:
         optimizer.zero_grad(set_to_none=True)
         result = outcome(step, generator)
-        loss = float(result.loss.detach())
-        if not math.isfinite(loss):  # before it spreads to the weights, and from there to a checkpoint
-            raise InputError(
-                f"training diverged: loss {loss} at step {step + 1}; try a smaller learning rate"
-            )
+        if not ahead:
+            _check_finite(float(result.loss.detach()), step)  # before it spreads to the weights
         result.loss.backward()
         optimizer.step()
-        psnr = -10 * math.log10(max(result.mse, 1e-10))
-        report.step(TrainingStep(step + 1, steps, loss, psnr, result.samples_per_ray))
-        # Read it once: it may change at any time, and a training that stops must have saved its state.
-        stopping = report.stopping
+        figures = (result.loss, result.mse, result.samples_per_ray)
+        parts = [x.detach().to(log) if isinstance(x, Tensor) else log.new_full((), x) for x in figures]
+        log.index_copy_(0, row, torch.stack(parts)[None])
+
+    for step in range(first, steps):
+        key = None if prepare is None else prepare(step)
+        row.fill_(step % every)
+        for group, rate in zip(optimizer.param_groups, rates, strict=True):
+            factor = cosine(step, steps)
+            group["lr"] = group["lr"].fill_(rate * factor) if ahead else rate * factor
+        if key is None or not ahead:
+            take(step)
+        else:
+            with without_waiting():
+                seen[key] += 1
+                if seen[key] > WARM_UP and key not in graphs:
+                    if len(graphs) == MOST_GRAPHS:
+                        del graphs[next(iter(graphs))]
+                    graphs[key] = captured(partial(take, step), device, generator)
+                graphs.get(key, partial(take, step))()
+        if (step + 1) % every and step + 1 < steps:
+            continue
+        figures, stopping = log.tolist(), False
+        for number in range(reported, step + 1):
+            loss, mse, samples = figures[number % every]
+            _check_finite(loss, number)  # before it spreads to a checkpoint
+            report.step(TrainingStep(number + 1, steps, loss, -10 * math.log10(max(mse, 1e-10)), samples))
+            # Read it once: it may change at any time, and a training that stops must have saved its state.
+            stopping = report.stopping or stopping
+        reported = step + 1
         if stopping or report.due(step + 1):
             report.save(_state(step + 1, field, optimizer, generator, beside))
         if stopping and step + 1 < steps:
             raise TrainingStopped(step + 1)
+
+
+def _check_finite(loss: float, step: int) -> None:
+    if not math.isfinite(loss):
+        raise InputError(f"training diverged: loss {loss} at step {step + 1}; try a smaller learning rate")
 
 
 def _parameters(optimizer: torch.optim.Optimizer) -> Iterator[Tensor]:
@@ -107,7 +158,11 @@ def _restore(
     if state is None:
         return 0
     field.load_state_dict(state.field)
-    generator.set_state(state.optimizer["generator"])
+    stored = state.optimizer["generator"]
+    if stored.shape == generator.get_state().shape:
+        generator.set_state(stored)
+    else:  # that of another kind of device
+        generator.manual_seed(generator.initial_seed() + state.step)
     if beside is not None:
         found = {k.removeprefix(BESIDE): v for k, v in state.optimizer.items() if k.startswith(BESIDE)}
         beside.load_state_dict(found)

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.devices import may_wait
 from bidnerf_core.fields import Rendering
 from bidnerf_core.training.ray_bank import TrainingBatch
 
@@ -18,17 +19,18 @@ def supervised_loss(
     side: float,
     depth_weight: float,
     colour_weight: Float[Tensor, "r"] | None = None,
-) -> tuple[Float[Tensor, ""], float]:
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """Return the loss, and the unweighted mean squared error of colour for display.
 
     The loss is the mean squared error of colour plus ``depth_weight`` times the depth term (``ray_termination``) as a fraction
     of ``side``, the scene's longest side (metres). ``colour_weight`` is the weight of each ray's colour, 1 by default.
     """
     error = (rendering.rgb - batch.observed.rgb) ** 2
-    mse = float(error.detach().mean())
+    mse = error.detach().mean()
     if colour_weight is not None:
         error = error * colour_weight[:, None]
-    return error.mean() + depth_weight * ray_termination(rendering, batch) / side, mse
+    loss = error.mean()
+    return loss + depth_weight * ray_termination(rendering, batch) / side if depth_weight else loss, mse
 
 
 def ray_termination(rendering: Rendering, batch: TrainingBatch) -> Float[Tensor, ""]:
@@ -40,16 +42,16 @@ def ray_termination(rendering: Rendering, batch: TrainingBatch) -> Float[Tensor,
     ray lacks counts as if it were at the camera. For distances from landmarks, the mean is also taken over
     their normal distribution, so that weight within the standard deviation is hardly moved.
     """
-    # If no sensor measured depth, few rays have a landmark.
-    index = batch.observed.measured.nonzero()[:, 0]
-    distance, deviation = (part.index_select(0, index) for part in (batch.observed.distance, batch.deviation))
-    weights, middles, opacity = (
-        part.index_select(0, index)
-        for part in (rendering.weights, rendering.samples.middles, rendering.opacity)
-    )
+    measured, distance, deviation = batch.observed.measured, batch.observed.distance, batch.deviation
+    weights, middles, opacity = rendering.weights, rendering.samples.middles, rendering.opacity
+    if may_wait(measured.device):  # if no sensor measured depth, few rays have a landmark
+        index = measured.nonzero()[:, 0]
+        measured, distance, deviation, weights, middles, opacity = (
+            part.index_select(0, index) for part in (measured, distance, deviation, weights, middles, opacity)
+        )
     away = (weights * expected_distance(middles - distance[:, None], deviation[:, None])).sum(-1)
     missing = (1 - opacity) * distance
-    return (away + missing).sum() / max(len(index), 1)
+    return torch.where(measured, away + missing, 0).sum() / measured.sum().clamp(min=1)
 
 
 def expected_distance(offset: Float[Tensor, "*p"], deviation: Float[Tensor, "*#p"]) -> Float[Tensor, "*p"]:

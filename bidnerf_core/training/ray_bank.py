@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Generator, Tensor
+from torch.nn.functional import pad
 
 from bidnerf_core.camera import AT_REST, CameraBatch, Intrinsics, poses_of_rows
-from bidnerf_core.devices import moved
+from bidnerf_core.devices import constant, moved
 from bidnerf_core.fields import Observations, Rays, SceneBounds
-from bidnerf_core.frames import SPARSE, Frame, ImagePixels, View
+from bidnerf_core.frames import SPARSE, Frame, ImagePixels, View, bytes_of
 from bidnerf_core.geometry import SE3
+
+log = logging.getLogger("bidnerf")
 
 MEASURED_SHARE = 0.25
 """Fraction of a batch's rays drawn from pixels with depth, if these are so few that hardly any would be drawn
 otherwise (in DS-NeRF: half)."""
-REDRAWN = 64
-"""Number of attempts to redraw rays of hidden pixels before the visible pixels are listed."""
+HIDDEN_BLOCK = 16
+"""Number of pixels whose visible ones are counted together: half a byte per pixel."""
+LARGEST_SHARE = 0.5
+"""Largest fraction of a GPU's free memory that images may take; the rest is for the training itself."""
 LANDMARK_SHARE = 0.125
 """Fraction of a batch's rays drawn from pixels that show a landmark."""
 
@@ -41,11 +47,12 @@ class TrainingBatch:
 
 
 class RayBank:
-    """All pixels of the training views, from which batches are drawn. Pixels stay in host memory; batches are on ``device``.
+    """All pixels of the training views, from which batches are drawn; all tensors are on ``device``.
 
+    Images that take more than ``LARGEST_SHARE`` of the free memory of a GPU stay in the host's, and each batch is copied.
     If an image has an alpha channel, each batch replaces its background by random colours, so that a field
     cannot explain the background by matter of one colour (as in the code of Mueller et al. 2022). The images
-    are those of the views: they are not copied if they lie in few blocks of memory, as in a ``PixelStore``.
+    are those of the views: on the CPU, they are not copied if they lie in few blocks of memory, as in a ``PixelStore``.
     """
 
     def __init__(
@@ -53,37 +60,46 @@ class RayBank:
     ) -> None:
         self.bounds, self.device = bounds, torch.device(device)
         frames = [view.frame for view in views]
+        self.home = home = _home_of(frames, self.device)
         sizes = torch.tensor([frame.intrinsics.width * frame.intrinsics.height for frame in frames])
-        self.offsets = sizes.cumsum(0) - sizes
+        offsets = sizes.cumsum(0) - sizes
         self.count = int(sizes.sum())
         self.has_alpha = any(frame.alpha is not None for frame in frames)
         self.has_depth = any(frame.has_depth for frame in frames)
-        self._rgb = ImagePixels.of([frame.rgb_bytes for frame in frames], 3)
-        self._alpha = ImagePixels.of([frame.alpha for frame in frames], 1, default=1.0)
-        self._depth = ImagePixels.of([frame.depth for frame in frames], 1)
-        self._hidden = ImagePixels.of([frame.hidden for frame in frames], 1)
-        self._visible_counts = _visible_pixels(frames)
-        self._few = self._few_measured(frames)
-        self._landmarks = _landmark_pixels(views, self.offsets)
-        self._rotation = torch.stack([view.T_ref_camera.rotation for view in views]).float()
-        self._origin = torch.stack([view.T_ref_camera.translation for view in views]).float()
-        self._cameras = _PixelRays([frame.intrinsics for frame in frames])
-        self._motion = _motion_of(views)
+        self._rgb = ImagePixels.of([frame.rgb_bytes for frame in frames], 3, 0.0, home)
+        self._alpha = ImagePixels.of([frame.alpha for frame in frames], 1, 1.0, home)
+        self._depth = ImagePixels.of([frame.depth for frame in frames], 1, 0.0, home)
+        self._hidden = ImagePixels.of([frame.hidden for frame in frames], 1, 0.0, home)
+        visible = _visible_pixels(frames)
+        self._few = self._few_measured(frames, offsets).to(home)
+        self._landmarks = moved(_landmark_pixels(views, offsets), home)
+        self._cameras = _PixelRays([frame.intrinsics for frame in frames], home)
+        rotation = torch.stack([view.T_ref_camera.rotation for view in views]).float()
+        origin = torch.stack([view.T_ref_camera.translation for view in views]).float()
+        self.offsets, self._visible, self._rotation, self._origin, self._motion = moved(
+            (offsets, visible, rotation, origin, _motion_of(views)), home
+        )
+        self._drawn = self.count if visible is None else int(visible[-1])
+
+    @property
+    def has_distances(self) -> bool:
+        """Whether any ray has a measured distance."""
+        return self.has_depth or len(self._landmarks) > 0
 
     def draw(self, count: int, generator: Generator) -> TrainingBatch:
         """Return the rays of ``count`` pixels, drawn uniformly from all visible pixels of the views.
 
         If only few pixels have depth, a fixed fraction is drawn from these; another fraction is drawn from
-        those with landmarks.
+        those with landmarks. Nothing is copied between devices if the generator is on that of the images.
         """
-        index = self._visible(torch.randint(self.count, (count,), generator=generator), generator)
+        index = self._visible_pixel(self._random(self._drawn, count, generator))
         if len(self._few):
             some = round(MEASURED_SHARE * count)
-            index[:some] = self._few[torch.randint(len(self._few), (some,), generator=generator)]
-        deviation, seen = torch.zeros(count), torch.zeros(0)
+            index[:some] = self._few[self._random(len(self._few), some, generator)]
+        deviation, seen = torch.zeros(count, device=self.home), torch.zeros(0, device=self.home)
         if len(self._landmarks):
             some = round(LANDMARK_SHARE * count)
-            chosen = torch.randint(len(self._landmarks), (some,), generator=generator)
+            chosen = self._random(len(self._landmarks), some, generator)
             index[:some] = self._landmarks.pixel[chosen]
             seen, deviation[:some] = self._landmarks.distance[chosen], self._landmarks.deviation[chosen]
         view = torch.searchsorted(self.offsets, index, right=True) - 1
@@ -92,40 +108,29 @@ class RayBank:
         length = torch.linalg.vector_norm(ray, dim=-1)
         T = self._poses(view, pixel)
         directions = T.rotate(ray / length[:, None])
-        distance = self._depth.at(view, pixel)[:, 0] * length if self.has_depth else torch.zeros(count)
+        distance = self._depth.at(view, pixel)[:, 0] * length if self.has_depth else torch.zeros_like(length)
         distance[: len(seen)] = seen
         rgb, background = self._coloured(view, pixel, generator)
-        origins, coloured = T.translation, torch.ones(count, dtype=torch.bool)
+        origins, coloured = T.translation, torch.ones_like(index, dtype=torch.bool)
         observed = Observations(origins, directions, rgb, distance, coloured)
         rays = self.bounds.rays(origins, directions)
         return moved(TrainingBatch(rays, observed, background, view, deviation), self.device)
 
-    def _visible(self, index: Int[Tensor, "r"], generator: Generator) -> Int[Tensor, "r"]:
-        """Redraw the indices of hidden pixels."""
-        if self._visible_counts is None:
-            return index
-        for _ in range(REDRAWN):
-            again = self._is_hidden(index).nonzero()[:, 0]
-            if not len(again):
-                return index
-            index[again] = torch.randint(self.count, (len(again),), generator=generator)
-        again = self._is_hidden(index).nonzero()[:, 0]
-        chosen = torch.multinomial(
-            self._visible_counts, max(1, len(again)), replacement=True, generator=generator
-        )
-        for place, view in zip(again.tolist(), chosen.tolist(), strict=False):
-            index[place] = self._any_visible(view, generator)
-        return index
+    def _random(self, below: int, count: int, generator: Generator) -> Int[Tensor, "n"]:
+        return torch.randint(below, (count,), generator=generator, device=generator.device).to(self.home)
 
-    def _any_visible(self, view: int, generator: Generator) -> int:
-        """Return the index of one visible pixel of a view."""
-        first, last = [*self.offsets.tolist(), self.count][view : view + 2]
-        left = (~self._is_hidden(torch.arange(first, last))).nonzero()[:, 0]
-        return first + int(left[torch.randint(len(left), (1,), generator=generator)])
-
-    def _is_hidden(self, index: Int[Tensor, "r"]) -> Bool[Tensor, "r"]:
-        view = torch.searchsorted(self.offsets, index, right=True) - 1
-        return self._hidden.at(view, index - self.offsets[view])[:, 0] > 0
+    def _visible_pixel(self, rank: Int[Tensor, "r"]) -> Int[Tensor, "r"]:
+        """Return the indices of the visible pixels with these ranks among all visible pixels."""
+        if self._visible is None:
+            return rank
+        block = torch.searchsorted(self._visible, rank, right=True) - 1
+        index = block[:, None] * HIDDEN_BLOCK + torch.arange(HIDDEN_BLOCK, device=rank.device)
+        within = index.clamp(max=self.count - 1).reshape(-1)
+        view = torch.searchsorted(self.offsets, within, right=True) - 1
+        hidden = self._hidden.at(view, within - self.offsets[view])[:, 0].view(index.shape) > 0
+        # In a block, the pixel is preceded by as many visible ones as its rank exceeds that of the block.
+        passed = (~hidden).cumsum(1) <= (rank - self._visible[block])[:, None]
+        return block * HIDDEN_BLOCK + passed.sum(1)
 
     def _poses(self, view: Int[Tensor, "r"], pixel: Int[Tensor, "r"]) -> SE3:
         """Return the camera poses at the times at which pixels of the views were exposed."""
@@ -134,7 +139,7 @@ class RayBank:
             return T
         return T @ poses_of_rows(self._cameras.exposure_times(view, pixel), self._motion[view])
 
-    def _few_measured(self, frames: Sequence[Frame]) -> Int[Tensor, "m"]:
+    def _few_measured(self, frames: Sequence[Frame], offsets: Int[Tensor, "v"]) -> Int[Tensor, "m"]:
         """Return the indices of the pixels with depth if it is sparse (structure from motion); otherwise none."""
         none = torch.zeros(0, dtype=torch.long)
         measured = sum(int((frame.depth > 0).sum()) for frame in frames if frame.depth is not None)
@@ -142,7 +147,7 @@ class RayBank:
             return none
         parts = [
             first + (frame.depth.reshape(-1) > 0).nonzero()[:, 0].cpu()
-            for frame, first in zip(frames, self.offsets.tolist(), strict=True)
+            for frame, first in zip(frames, offsets.tolist(), strict=True)
             if frame.depth is not None
         ]
         return torch.cat([none, *parts])
@@ -151,11 +156,11 @@ class RayBank:
         self, view: Int[Tensor, "r"], pixel: Int[Tensor, "r"], generator: Generator
     ) -> tuple[Tensor, Tensor]:
         """Return the pixels' colours and the background colours over which they are composited."""
-        usual = torch.tensor(self.bounds.background).expand(len(view), 3)
         rgb = self._rgb.at(view, pixel)
+        usual = constant(self.bounds.background, rgb).expand(len(view), 3)
         if not self.has_alpha:
             return rgb, usual
-        background = torch.rand((len(view), 3), generator=generator)
+        background = torch.rand(rgb.shape, generator=generator, device=generator.device).to(rgb)
         return rgb + (1 - self._alpha.at(view, pixel)) * (background - usual), background
 
 
@@ -166,18 +171,17 @@ MOST_RAYS = 2**24
 class _PixelRays:
     """The rays of the pixels of many cameras, usually mostly equal ones; pixels are numbered row by row."""
 
-    def __init__(self, cameras: Sequence[Intrinsics]) -> None:
+    def __init__(self, cameras: Sequence[Intrinsics], device: torch.device) -> None:
         number = {kind: place for place, kind in enumerate(dict.fromkeys(cameras))}
         kinds = list(number)
-        self._kind = torch.tensor([number[camera] for camera in cameras])
-        self._size = torch.tensor([[kind.width, kind.height] for kind in kinds])
-        self._batch = CameraBatch.of(kinds)
-        sizes = self._size.prod(1)
-        self._start = sizes.cumsum(0) - sizes
-        self._grid = None
+        size = torch.tensor([[kind.width, kind.height] for kind in kinds])
+        sizes, grid = size.prod(1), None
         if int(sizes.sum()) <= MOST_RAYS:
-            grids = [kind.unproject(kind.pixel_centres()).reshape(-1, 3) for kind in kinds]
-            self._grid = torch.cat(grids)
+            grid = torch.cat([kind.unproject(kind.pixel_centres()).reshape(-1, 3) for kind in kinds])
+        kind = torch.tensor([number[camera] for camera in cameras])
+        self._kind, self._size, self._start, self._grid, self._batch = moved(
+            (kind, size, sizes.cumsum(0) - sizes, grid, CameraBatch.of(kinds)), device
+        )
 
     def rays(self, view: Int[Tensor, "r"], pixel: Int[Tensor, "r"]) -> Float[Tensor, "r 3"]:
         """Return the points on the plane z = 1 shown by pixels of the views' cameras."""
@@ -199,17 +203,31 @@ class _PixelRays:
         return torch.stack([pixel % width, pixel // width], dim=-1).double() + 0.5
 
 
-def _visible_pixels(frames: Sequence[Frame]) -> Float[Tensor, "v"] | None:
-    """Return how many pixels of each frame are visible; None if all are."""
+def _visible_pixels(frames: Sequence[Frame]) -> Int[Tensor, "b"] | None:
+    """Return how many of all pixels are visible before each block of ``HIDDEN_BLOCK``, and in total; None if all are."""
     if all(frame.hidden is None for frame in frames):
         return None
-    counts = [
-        frame.intrinsics.width * frame.intrinsics.height
-        if frame.hidden is None
-        else int((~frame.hidden).sum())
+    hidden = [
+        torch.zeros(frame.rgb_bytes.shape[:2], dtype=torch.bool) if frame.hidden is None else frame.hidden
         for frame in frames
     ]
-    return torch.tensor(counts, dtype=torch.float64)
+    visible = ~torch.cat([part.cpu().reshape(-1) for part in hidden])
+    counts = pad(visible, (0, -len(visible) % HIDDEN_BLOCK)).view(-1, HIDDEN_BLOCK).sum(1)
+    return pad(counts.cumsum(0), (1, 0))
+
+
+def _home_of(frames: Sequence[Frame], device: torch.device) -> torch.device:
+    """Return the device that holds the images: ``device``, or the CPU if they are too large for it."""
+    if device.type != "cuda":
+        return device
+    free, size = torch.cuda.mem_get_info(device)[0], sum(map(bytes_of, frames))
+    if size <= LARGEST_SHARE * free:
+        return device
+    log.info(
+        f"the images take {size / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free on {device}: they stay in the host's memory,"
+        " and training copies each batch"
+    )
+    return torch.device("cpu")
 
 
 def _motion_of(views: Sequence[View]) -> Float[Tensor, "v 6"] | None:

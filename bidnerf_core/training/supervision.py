@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from bidnerf_core.fields import RadianceField, Rendering, SceneBounds, render
 from bidnerf_core.frames import View
 from bidnerf_core.settings import NotNegative, Settings
 from bidnerf_core.training.colour_transform import ColourTransforms
-from bidnerf_core.training.loop import StepOutcome, cosine, fit
+from bidnerf_core.training.loop import StepOutcome, fit
 from bidnerf_core.training.loss import distortion, supervised_loss
 from bidnerf_core.training.ray_bank import RayBank, TrainingBatch
 from bidnerf_core.training.report import Report
@@ -65,32 +65,39 @@ class Supervision:
         outcome: Callable[[int, Generator], StepOutcome],
         steps: int,
         report: Report,
-        schedule: Callable[[int, int], float] = cosine,
         seed: int = 0,
+        prepare: Callable[[int], Hashable] | None = None,
     ) -> None:
         """Call ``training.fit`` so that it also learns the per-image parameters, and resumes them with the field."""
         learned: list[dict[str, Any]] = []
         if self.colours is not None:
             learned = [{"params": list(self.colours.parameters()), "lr": COLOUR_RATE}]
-        fit(field, [*groups, *learned], outcome, steps, report, schedule, seed, beside=self.colours)
+
+        def copied(step: int) -> None:
+            if prepare is not None:
+                prepare(step)
+
+        ready = prepare if self.bank.home == self.bank.device else copied
+        fit(field, [*groups, *learned], outcome, steps, report, seed, self.colours, ready)
 
     def step(self, field: RadianceField, count: int, generator: Generator) -> StepOutcome:
         """Render ``count`` rays drawn from the views, and return their loss."""
         batch = self.draw(count, generator)
         rendering = render(field, batch.rays, batch.background, generator)
         loss, mse = self.loss(rendering, batch)
-        return StepOutcome(loss, mse, float(rendering.samples.valid.sum() / len(batch)))
+        return StepOutcome(loss, mse, rendering.samples.valid.sum() / len(batch))
 
     def draw(self, count: int, generator: Generator) -> TrainingBatch:
         """Return a batch of ``count`` rays; see ``RayBank.draw``."""
         return self.bank.draw(count, generator)
 
-    def loss(self, rendering: Rendering, batch: TrainingBatch) -> tuple[Float[Tensor, ""], float]:
+    def loss(self, rendering: Rendering, batch: TrainingBatch) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """Return the loss of a rendering of the batch's rays, and its colour term alone for display."""
         if self.colours is not None:
             rendering = replace(rendering, rgb=self.colours(rendering.rgb, batch.image))
         weight = None if self.image_weight is None else self.image_weight[batch.image]
-        loss, mse = supervised_loss(rendering, batch, self.side, self.config.depth_weight, weight)
+        depth_weight = self.config.depth_weight if self.bank.has_distances else 0.0
+        loss, mse = supervised_loss(rendering, batch, self.side, depth_weight, weight)
         if self.colours is not None:
             loss = loss + COLOUR_PENALTY * self.colours.penalty()
         if self.config.distortion_weight:

@@ -1,0 +1,147 @@
+"""Training on a device: steps neither wait nor copy, and learn what they learn on a CPU."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+import tiny
+from bidnerf_core.carving import estimate_bounds
+from bidnerf_core.devices import moved
+from bidnerf_core.fields import RaySamples, query_packed, query_samples
+from bidnerf_core.frames import View
+from bidnerf_core.testing import DEVICE, Elsewhere
+from bidnerf_core.training import RayBank, TrainingStopped
+from bidnerf_hashgrid import recipe
+from test_supervision import BACKENDS, seen
+from test_training import Kept
+
+VIEWS = tiny.views(6)
+BOUNDS = estimate_bounds(VIEWS, tiny.BACKGROUND)
+# On a device, the sampler that concentrates samples draws random numbers for all rays.
+CHANGES: dict[str, dict[str, Any]] = {
+    "hashgrid": {"samples_per_ray": 0, "rays_at_most": 32, "prune_from": 24}
+}
+
+
+@contextmanager
+def elsewhere(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """Simulate a device on which a step that would be replayed as a graph must not wait; yields a list with an item for each."""
+    replays: list[int] = []
+    with Elsewhere() as mode:
+
+        def captured(step: Callable[[], None], device: torch.device, generator: Any) -> Callable[[], None]:
+            assert device == generator.device == DEVICE
+
+            def replay() -> None:
+                replays.append(1)
+                with mode.strict():
+                    step()
+
+            return replay
+
+        monkeypatch.setattr("bidnerf_core.training.loop.captured", captured)
+        yield replays
+
+
+def trained(
+    name: str, report: Kept, device: torch.device | str = "cpu", views: list[View] = VIEWS, **changes: Any
+) -> Any:
+    backend, config = BACKENDS[name]
+    config = replace(config, **({"steps": 40, "rays_at_most": 64} | CHANGES.get(name, {}) | changes))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        field: Any = backend.build(config, BOUNDS)
+    field = moved(field, device)
+    backend.train(field, views, config, report)
+    return field
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_steps_on_a_device_do_not_wait_and_are_those_of_the_cpu(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, there = Kept(), Kept()
+    trained(name, here)
+    with elsewhere(monkeypatch) as replays:
+        trained(name, there, DEVICE)
+    assert len(replays) > 20
+    assert [step.step for step in there.told] == list(range(1, 41))
+    for part in ("loss", "psnr", "samples_per_ray"):
+        found, expected = (torch.tensor([getattr(s, part) for s in r.told]) for r in (there, here))
+        torch.testing.assert_close(found, expected, rtol=2e-3, atol=1e-5)
+
+
+def test_masks_landmarks_motion_and_exposure_are_drawn_without_waiting(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    views = []
+    for number, view in enumerate(VIEWS):
+        hidden = torch.zeros_like(view.frame.rgb[..., 0], dtype=torch.bool)
+        hidden[number:, ::3] = True
+        changed = replace(seen(view, 7), motion=torch.full((6,), 0.01, dtype=torch.float64))
+        views.append(replace(changed, frame=replace(changed.frame, alpha=None, hidden=hidden)))
+    here, there = Kept(), Kept()
+    trained("vanilla", here, "cpu", views, distortion_weight=0.1)
+    with elsewhere(monkeypatch) as replays:
+        trained("vanilla", there, DEVICE, views, distortion_weight=0.1)
+    assert len(replays) == 38
+    found, expected = (torch.tensor([step.loss for step in report.told]) for report in (there, here))
+    torch.testing.assert_close(found, expected, rtol=2e-3, atol=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore:.*to a meta parameter")
+def test_a_training_on_a_device_resumes_there_and_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    halves = []
+    for device in ("cpu", DEVICE):
+        half = Kept(stop=20)
+        with elsewhere(monkeypatch), pytest.raises(TrainingStopped):
+            trained("hashgrid", half, device)
+        halves.append(half.saved[0])
+    assert [half.step for half in halves] == [20, 32]  # where the host next reads from the device
+    whole = Kept()
+    with elsewhere(monkeypatch):
+        trained("hashgrid", whole, DEVICE)
+        for half in halves:
+            rest = Kept(begin=half)
+            trained("hashgrid", rest, DEVICE)
+            assert [step.step for step in rest.told] == list(range(half.step + 1, 41))
+            found, expected = ([s.loss for s in r.told][-8:] for r in (rest, whole))
+            assert found == pytest.approx(expected, rel=1e-4)
+
+
+def test_samples_that_do_not_fit_are_reported(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(recipe, "SPARE", 0.01)
+    with elsewhere(monkeypatch), caplog.at_level(logging.INFO, "bidnerf"):
+        trained("hashgrid", Kept(), DEVICE)
+    assert "samples did not fit" in caplog.text
+
+
+@pytest.mark.parametrize("room", [1, 40, 1000])
+def test_packed_samples_have_the_values_of_the_others(room: int, generator: torch.Generator) -> None:
+    field = BACKENDS["hashgrid"][0].build(tiny.config(), BOUNDS)
+    rays = RayBank(VIEWS, BOUNDS).draw(12, generator).rays
+    borders = torch.linspace(2, 4, 9).expand(12, -1)
+    samples = RaySamples(borders[:, :-1], borders[:, 1:], torch.rand((12, 8), generator=generator) < 0.5)
+    expected, (values, kept) = query_samples(field, rays, samples), query_packed(field, rays, samples, room)
+    assert int(kept.valid.sum()) == min(room, int(samples.valid.sum()))
+    assert torch.equal(
+        kept.valid.reshape(-1), samples.valid.reshape(-1) & (samples.valid.reshape(-1).cumsum(0) <= room)
+    )
+    for found, part in ((values.density, expected.density), (values.rgb, expected.rgb)):
+        torch.testing.assert_close(found[kept.valid], part[kept.valid])
+        assert not bool(found[~kept.valid].any())
+    weights = torch.rand(12, 8, generator=generator) * kept.valid
+    slopes = [
+        torch.autograd.grad((v.density * weights).sum(), field.encoding.tables[0])[0]
+        for v in (values, expected)
+    ]
+    torch.testing.assert_close(*slopes)
