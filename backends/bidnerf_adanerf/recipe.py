@@ -26,7 +26,7 @@ from bidnerf_core.fields import (
     rendering_weights,
 )
 from bidnerf_core.frames import View
-from bidnerf_core.training import Report, StepOutcome, Supervision, TrainingBatch
+from bidnerf_core.training import Replayable, Report, StepOutcome, Supervision, TrainingBatch
 
 PROBE = 4096
 """Number of rays from which the mean number of samples per ray is estimated."""
@@ -82,7 +82,7 @@ def train(field: AdaNerfField, views: Sequence[View], config: AdaNerfConfig, rep
         return dense_step(field, supervision, batch, room, phase, weight, generator)
 
     groups = [{"params": list(field.parameters()), "lr": config.learning_rate}]
-    supervision.fit(field, groups, outcome, config.steps, report, config.seed, prepare)
+    supervision.fit(field, groups, Replayable(prepare, outcome), config.steps, report, seed=config.seed)
 
 
 def room_for_matter(views: Sequence[View], bounds: SceneBounds, resolution: int) -> OccupancyMask:

@@ -17,7 +17,14 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields import Rendering, SceneBounds, device_of, query_packed, query_samples, render_values
 from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, NotNegative, Positive, Range
-from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, TrainingBatch
+from bidnerf_core.training import (
+    Replayable,
+    Report,
+    StepOutcome,
+    Supervision,
+    SupervisionConfig,
+    TrainingBatch,
+)
 from bidnerf_hashgrid.field import CoarseField, FieldConfig, HashGridField
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 from bidnerf_hashgrid.threads import pools_only
@@ -132,7 +139,7 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
         return StepOutcome(loss, mse, level.occupancy.samples_per_ray)
 
     with pools_only(device):
-        supervision.fit(field, groups, outcome, config.steps, report, config.seed, prepare)
+        supervision.fit(field, groups, Replayable(prepare, outcome), config.steps, report, seed=config.seed)
 
 
 def _update(

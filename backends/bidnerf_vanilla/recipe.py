@@ -14,7 +14,14 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields import device_of, render
 from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, Positive, Range
-from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, TrainingBatch
+from bidnerf_core.training import (
+    Replayable,
+    Report,
+    StepOutcome,
+    Supervision,
+    SupervisionConfig,
+    TrainingBatch,
+)
 from bidnerf_vanilla.field import FieldConfig, VanillaField
 
 PROBE = 4096
@@ -58,7 +65,8 @@ def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, rep
         return step_outcome(field, supervision, supervision.draw(rays_per_step, generator), generator)
 
     groups = [{"params": list(field.parameters()), "lr": config.learning_rate}]
-    supervision.fit(field, groups, outcome, config.steps, report, config.seed, lambda _: "all steps")
+    steps = Replayable(lambda step: "all steps are alike", outcome)
+    supervision.fit(field, groups, steps, config.steps, report, seed=config.seed)
 
 
 def step_outcome(

@@ -1,5 +1,6 @@
 from .colour_transform import ColourTransforms as ColourTransforms
 from .colour_transform import fitted_colours as fitted_colours
+from .loop import Replayable as Replayable
 from .loop import StepOutcome as StepOutcome
 from .loop import cosine as cosine
 from .loop import fit as fit

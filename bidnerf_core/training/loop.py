@@ -13,9 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
-from bidnerf_core.devices import without_waiting
+from bidnerf_core.devices import captured, without_waiting
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization import captured
 from bidnerf_core.training.report import Report, TrainingState, TrainingStep, TrainingStopped
 
 BESIDE = "beside."
@@ -39,6 +38,25 @@ class StepOutcome:
     samples_per_ray: float | Float[Tensor, ""] = float("nan")
 
 
+@dataclass(frozen=True)
+class Replayable:
+    """An outcome of steps that a GPU may replay as CUDA graphs, see ``fit``.
+
+    ``prepare(step)`` is called before each step. It does what must not be part of a graph, such as reading numbers from the
+    device, and returns a key: steps with equal keys launch the same operations on tensors of the same shapes, with the same
+    numbers. Steps with the key None are not captured. ``outcome(step, generator)`` draws from a generator on the field's device;
+    unless the key is None, it must not wait for the device (see ``without_waiting``), and may run for another step of its key.
+    """
+
+    prepare: Callable[[int], Hashable]
+    outcome: Callable[[int, Generator], StepOutcome]
+
+    def __call__(self, step: int, generator: Generator) -> StepOutcome:
+        """Return the outcome of a step that is neither captured nor replayed."""
+        self.prepare(step)
+        return self.outcome(step, generator)
+
+
 def cosine(step: int, total: int, warmup: int = 100, last: float = 0.02) -> float:
     """Return the factor on the learning rate: a linear warm-up, then half a cosine down to ``last``."""
     warmup = min(warmup, total // 10)
@@ -54,9 +72,9 @@ def fit(
     outcome: Callable[[int, Generator], StepOutcome],
     steps: int,
     report: Report,
+    schedule: Callable[[int, int], float] = cosine,
     seed: int = 0,
     beside: nn.Module | None = None,
-    prepare: Callable[[int], Hashable] | None = None,
 ) -> None:
     """Minimize the loss of ``outcome(step, generator)`` over parameter ``groups`` (each with its ``lr``) by ``steps`` of Adam.
 
@@ -66,16 +84,14 @@ def fit(
     uninterrupted one would have; on a GPU, where sums have no fixed order, it does so up to rounding.
     Raises ``InputError`` if the loss is not finite.
 
-    ``prepare(step)`` is called before each step. It does what must not be part of a CUDA graph, such as reading numbers from the
-    device, and returns a key: steps with equal keys launch the same operations on tensors of the same shapes. On a GPU, each is
-    captured once and replayed, and the report receives steps in blocks of ``READ_EVERY``. ``outcome`` then runs
-    ``without_waiting``, and its step may be that of another call with this key. Steps with the key None are not captured. With
-    ``prepare``, the generator is on the field's device, otherwise on the CPU.
+    The generator is on the CPU regardless of the field's device, so that the same rays are drawn everywhere, unless ``outcome``
+    is ``Replayable`` and the field on a GPU: then each step is a CUDA graph, and the report receives ``READ_EVERY`` steps at once.
     """
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
     rates = [group["lr"] for group in optimizer.param_groups]
     device = next(_parameters(optimizer)).device
-    ahead = prepare is not None and device.type != "cpu"  # of the device, by up to READ_EVERY steps
+    replayable = outcome if isinstance(outcome, Replayable) and device.type != "cpu" else None
+    ahead = replayable is not None  # of the device, by up to READ_EVERY steps
     every = READ_EVERY if ahead else 1
     generator = torch.Generator(device if ahead else "cpu").manual_seed(seed)
     for group in optimizer.param_groups if ahead else []:
@@ -86,7 +102,7 @@ def fit(
 
     def take(step: int) -> None:
         optimizer.zero_grad(set_to_none=True)
-        result = outcome(step, generator)
+        result = (outcome if replayable is None else replayable.outcome)(step, generator)
         if not ahead:
             _check_finite(float(result.loss.detach()), step)  # before it spreads to the weights
         result.loss.backward()
@@ -96,12 +112,12 @@ def fit(
         log.index_copy_(0, row, torch.stack(parts)[None])
 
     for step in range(first, steps):
-        key = None if prepare is None else prepare(step)
+        key = None if replayable is None else replayable.prepare(step)
         row.fill_(step % every)
         for group, rate in zip(optimizer.param_groups, rates, strict=True):
-            factor = cosine(step, steps)
+            factor = schedule(step, steps)
             group["lr"] = group["lr"].fill_(rate * factor) if ahead else rate * factor
-        if key is None or not ahead:
+        if key is None:
             take(step)
         else:
             with without_waiting():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from bidnerf_core.fields import RadianceField, Rendering, SceneBounds, render
 from bidnerf_core.frames import View
 from bidnerf_core.settings import NotNegative, Settings
 from bidnerf_core.training.colour_transform import ColourTransforms
-from bidnerf_core.training.loop import StepOutcome, fit
+from bidnerf_core.training.loop import StepOutcome, cosine, fit
 from bidnerf_core.training.loss import distortion, supervised_loss
 from bidnerf_core.training.ray_bank import RayBank, TrainingBatch
 from bidnerf_core.training.report import Report
@@ -65,20 +65,16 @@ class Supervision:
         outcome: Callable[[int, Generator], StepOutcome],
         steps: int,
         report: Report,
+        schedule: Callable[[int, int], float] = cosine,
         seed: int = 0,
-        prepare: Callable[[int], Hashable] | None = None,
     ) -> None:
         """Call ``training.fit`` so that it also learns the per-image parameters, and resumes them with the field."""
         learned: list[dict[str, Any]] = []
         if self.colours is not None:
             learned = [{"params": list(self.colours.parameters()), "lr": COLOUR_RATE}]
-
-        def copied(step: int) -> None:
-            if prepare is not None:
-                prepare(step)
-
-        ready = prepare if self.bank.home == self.bank.device else copied
-        fit(field, [*groups, *learned], outcome, steps, report, seed, self.colours, ready)
+        if self.bank.home != self.bank.device:  # batches are copied, which cannot be replayed
+            outcome = outcome.__call__
+        fit(field, [*groups, *learned], outcome, steps, report, schedule, seed, beside=self.colours)
 
     def step(self, field: RadianceField, count: int, generator: Generator) -> StepOutcome:
         """Render ``count`` rays drawn from the views, and return their loss."""

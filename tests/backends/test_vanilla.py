@@ -251,14 +251,14 @@ def test_what_is_compared_with_measured_depth() -> None:
     assert count > 10
     assert float(ray_termination(rendering, batch)) == pytest.approx(total / count, rel=1e-4)
     loss, mse = supervised_loss(rendering, batch, SIDE, 0.5)
-    assert mse == pytest.approx(float(((rendering.rgb - batch.observed.rgb) ** 2).mean()))
-    assert float(loss) == pytest.approx(mse + 0.5 * total / count / SIDE, rel=1e-4)
+    assert float(mse) == pytest.approx(float(((rendering.rgb - batch.observed.rgb) ** 2).mean()))
+    assert float(loss) == pytest.approx(float(mse) + 0.5 * total / count / SIDE, rel=1e-4)
 
 
 def test_without_depth_only_colour_is_compared() -> None:
     batch = RayBank(rgb_views(), BOUNDS).draw(50, torch.Generator().manual_seed(0))
     loss, mse = supervised_loss(render(built(), batch.rays, batch.background), batch, SIDE, 0.5)
-    assert float(loss.detach()) == pytest.approx(mse)
+    assert float(loss.detach()) == pytest.approx(float(mse))
 
 
 def test_both_levels_learn_from_a_step() -> None:

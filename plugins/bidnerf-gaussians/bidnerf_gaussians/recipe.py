@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 from bidnerf_core.fields import device_of, render
 from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, NotNegative, Positive, Range
-from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig
+from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, cosine
 from bidnerf_gaussians.field import FieldConfig, GaussiansField
 from bidnerf_gaussians.placing import first_gaussians
 from bidnerf_gaussians.relocation import relocate
@@ -68,7 +68,7 @@ def train(field: GaussiansField, views: Sequence[View], config: GaussiansConfig,
         loss = loss + config.opacity_weight * field.logits.sigmoid().mean()
         return StepOutcome(loss, mse, float(rendering.samples.valid.sum() / len(batch)))
 
-    supervision.fit(field, _groups(field, config, unit), outcome, config.steps, report, config.seed)
+    supervision.fit(field, _groups(field, config, unit), outcome, config.steps, report, cosine, config.seed)
 
 
 def _unit(field: GaussiansField) -> float:

@@ -14,7 +14,7 @@ from torch import Generator, Tensor
 from bidnerf_core.fields import SceneBounds, device_of, render
 from bidnerf_core.frames import View, draw, uniform
 from bidnerf_core.settings import Count, NotNegative, Range
-from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig
+from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, cosine
 from bidnerf_scan.field import FieldConfig, ScanField
 from bidnerf_scan.pieces import Pieces, cloud_pieces, thinned
 
@@ -66,7 +66,7 @@ def train(field: ScanField, views: Sequence[View], config: ScanConfig, report: R
         {"params": [field.logits], "lr": config.opacity_rate},
         {"params": [field.rgb], "lr": config.colour_rate},
     ]
-    supervision.fit(field, groups, outcome, config.steps, report, config.seed)
+    supervision.fit(field, groups, outcome, config.steps, report, cosine, config.seed)
 
 
 def first_pieces(field: ScanField, views: Sequence[View], generator: Generator) -> Pieces:
