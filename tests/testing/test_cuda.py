@@ -124,15 +124,23 @@ class LossRecorder(Silent):
         self.losses.append(progress.loss)
 
 
-class Interrupted(Silent):
-    """A report that stops a training at a step and keeps its state, or begins with such a state."""
+class Continued(LossRecorder):
+    """A report that begins with the state of another training."""
 
-    def __init__(self, stop: int = 0, begin: TrainingState | None = None) -> None:
-        self.stop, self.begin, self.stopping = stop, begin, False
-        self.saved: TrainingState | None = None
+    def __init__(self, begin: TrainingState | None) -> None:
+        super().__init__()
+        self.begin = begin
 
     def resume(self) -> TrainingState | None:
         return self.begin
+
+
+class Interrupted(Silent):
+    """A report that stops a training at a step and keeps its state."""
+
+    def __init__(self, stop: int) -> None:
+        self.stop, self.stopping = stop, False
+        self.saved: TrainingState | None = None
 
     def step(self, progress: TrainingStep) -> None:
         self.stopping = progress.step == self.stop
@@ -145,33 +153,48 @@ class Interrupted(Silent):
 
 
 @pytest.mark.parametrize("name", BUNDLED)
-def test_training_on_a_gpu_learns_what_it_learns_on_a_cpu(name: str) -> None:
-    backend, losses = load_backend(name), []
+def test_training_on_a_gpu_replays_its_steps_and_learns_what_it_learns_on_a_cpu(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backend, losses, replayed = load_backend(name), [], list[bool]()
     config = replace(quick_config(backend), steps=60)
-    for device in ("cpu", "cuda"):
+
+    def noted(step: Any, *rest: Any) -> Any:
+        replay = captured(step, *rest)
+        replayed.append(replay is not step)
+        return replay
+
+    def launched(step: Any, *_: Any) -> Any:
+        return step
+
+    for device, capture in (("cpu", launched), ("cuda", launched), ("cuda", noted)):
+        monkeypatch.setattr("bidnerf_core.training.loop.captured", capture)
+        torch.manual_seed(0)
         field: Any = backend.build(config, BOUNDS)
         report = LossRecorder()
         backend.train(field.to(device), rgbd_views(), config, report)
         losses.append(torch.tensor(report.losses))
-    on_cpu, on_gpu = losses
-    torch.testing.assert_close(on_gpu[:5], on_cpu[:5], rtol=1e-3, atol=1e-5)
-    assert float(on_gpu[-5:].mean()) < 1.1 * float(on_cpu[-5:].mean())
+    assert replayed
+    assert all(replayed)
+    on_cpu, one_by_one, as_graphs = losses
+    torch.testing.assert_close(as_graphs[:30], one_by_one[:30], rtol=1e-2, atol=1e-5)
+    assert float(as_graphs[-5:].mean()) < 1.1 * float(on_cpu[-5:].mean())
 
 
 def test_a_training_goes_on_on_another_device() -> None:
+    """With other random numbers, as those of a CPU are not those of a GPU."""
     backend = load_backend("hashgrid")
-    config, views = replace(quick_config(backend), steps=12), rgbd_views()
-    finished = []
-    for second in ("cpu", "cuda"):
-        half = Interrupted(stop=6)
-        with pytest.raises(TrainingStopped):
-            backend.train(backend.build(config, BOUNDS), views, config, half)  # on the CPU
+    config, views = replace(quick_config(backend), steps=48), rgbd_views()
+    half, losses = Interrupted(stop=24), []
+    with pytest.raises(TrainingStopped):
+        backend.train(backend.build(config, BOUNDS), views, config, half)  # on the CPU
+    for device in ("cpu", "cuda"):
         field: Any = backend.build(config, BOUNDS)
-        backend.train(field.to(second), views, config, Interrupted(begin=half.saved))
-        finished.append(field.cpu().state_dict())
-    for name, value in finished[0].items():
-        if value.is_floating_point() and not name.endswith(("peak", "density")):
-            torch.testing.assert_close(finished[1][name], value, rtol=0, atol=2e-3)
+        rest = Continued(half.saved)
+        backend.train(field.to(device), views, config, rest)
+        assert len(rest.losses) == 24
+        losses.append(sum(rest.losses) / 24)
+    assert losses[1] == pytest.approx(losses[0], rel=0.2)
 
 
 def test_a_map_that_was_made_on_a_gpu_serves_on_a_cpu(tmp_path: Path) -> None:
