@@ -15,7 +15,7 @@ from bidnerf_core.fields import RadianceField, Rendering, SceneBounds, render
 from bidnerf_core.frames import View
 from bidnerf_core.settings import NotNegative, Settings
 from bidnerf_core.training.colour_transform import ColourTransforms
-from bidnerf_core.training.loop import StepOutcome, cosine, fit
+from bidnerf_core.training.loop import Replayable, StepOutcome, cosine, fit
 from bidnerf_core.training.loss import distortion, supervised_loss
 from bidnerf_core.training.ray_bank import RayBank, TrainingBatch
 from bidnerf_core.training.report import Report
@@ -72,8 +72,8 @@ class Supervision:
         learned: list[dict[str, Any]] = []
         if self.colours is not None:
             learned = [{"params": list(self.colours.parameters()), "lr": COLOUR_RATE}]
-        if self.bank.home != self.bank.device:  # batches are copied, which cannot be replayed
-            outcome = outcome.__call__
+        if isinstance(outcome, Replayable) and self.bank.home != self.bank.device:
+            outcome = outcome.__call__  # batches are copied, which cannot be replayed
         fit(field, [*groups, *learned], outcome, steps, report, schedule, seed, beside=self.colours)
 
     def step(self, field: RadianceField, count: int, generator: Generator) -> StepOutcome:

@@ -17,7 +17,9 @@ from bidnerf_core.devices import moved
 from bidnerf_core.fields import RaySamples, query_packed, query_samples
 from bidnerf_core.frames import View
 from bidnerf_core.testing import DEVICE, Elsewhere
-from bidnerf_core.training import RayBank, TrainingStopped
+from bidnerf_core.training import RayBank, TrainingStopped, ray_bank
+
+# Inside: steps without room for their samples
 from bidnerf_hashgrid import recipe
 from test_supervision import BACKENDS, seen
 from test_training import Kept
@@ -94,6 +96,17 @@ def test_masks_landmarks_motion_and_exposure_are_drawn_without_waiting(
     assert len(replays) == 38
     found, expected = (torch.tensor([step.loss for step in report.told]) for report in (there, here))
     torch.testing.assert_close(found, expected, rtol=2e-3, atol=1e-5)
+
+
+def test_images_that_are_too_large_for_a_device_stay_on_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    here, there = Kept(), Kept()
+    trained("vanilla", here, steps=20)
+    monkeypatch.setattr(ray_bank, "_home_of", lambda *_: torch.device("cpu"))
+    with elsewhere(monkeypatch) as replays:
+        trained("vanilla", there, DEVICE, steps=20)
+    assert not replays
+    found, expected = ([step.loss for step in report.told] for report in (there, here))
+    assert found == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.filterwarnings("ignore:.*to a meta parameter")
