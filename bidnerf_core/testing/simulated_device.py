@@ -11,9 +11,9 @@ these are counted.
 from __future__ import annotations
 
 from collections import Counter
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from typing import Any
 
 import torch
@@ -26,7 +26,7 @@ DEVICE = torch.device("meta")
 """The simulated device."""
 
 _aten = torch.ops.aten
-_adam: Any = import_module("torch.optim.adam")
+_adam: Any = sys.modules[torch.optim.Adam.__module__]
 READS = {
     "_local_scalar_dense": "reads a number",
     "is_nonzero": "reads a number",
