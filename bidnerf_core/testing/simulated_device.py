@@ -10,8 +10,8 @@ these are counted.
 
 from __future__ import annotations
 
-from collections import Counter
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
