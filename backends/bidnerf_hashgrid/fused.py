@@ -208,11 +208,11 @@ def query(
 
 def sampled(
     rays: Rays, bounds: SceneBounds, occupied: Bool[Tensor, "n n n"], density: Float[Tensor, "n n n"], step: float,
-    count: int, jitter: Generator | None,
+    count: int, most: int, jitter: Generator | None,
 ) -> RaySamples:  # fmt: skip
     """Return ``count`` intervals of each ray (r) that are concentrated where a grid of cells has its ``density``.
 
-    They divide the ray's first ``MOST`` steps in ``occupied`` cells; with a count of ``MOST`` they are these steps. The values are
+    They divide the ray's first ``most`` steps in ``occupied`` cells; with a count of ``most`` they are these steps. The values are
     those of ``OccupancyGrid`` and ``Concentrated``.
     """
     n, even = len(rays.near), max(2, round(EVEN_SHARE * (count + 1)))
@@ -225,16 +225,18 @@ def sampled(
         by_weight, by_length = (draw((n, max(size - 2, 0))).to(shift) for size in (count + 1 - even, even))
         shift[:, 1 : count - even] = (by_weight - 0.5) / (count - even)
         shift[:, count + 2 - even : -1] = (by_length - 0.5) / (even - 1)
-    middles, counts = packed.new_empty(n, MOST), torch.empty(n, dtype=torch.int32, device=packed.device)
+    middles, counts = packed.new_empty(n, most), torch.empty(n, dtype=torch.int32, device=packed.device)
     starts, ends = packed.new_empty(n, count), packed.new_empty(n, count)
     valid = torch.empty(n, count, dtype=torch.bool, device=packed.device)
     length = 2 * bounds.side  # a cube's diagonal, and contracted space, are not longer
     kernels().march_kernel[(n,)](
         packed, grid, offset, occupied.view(torch.uint8), middles, counts, n,
-        STEPS=math.ceil(length / step) + 1, MOST=MOST, CONTRACTED=bounds.contracted, CHUNK=MARCHED,
+        STEPS=math.ceil(length / step) + 1, MOST=most, CONTRACTED=bounds.contracted, CHUNK=MARCHED,
     )  # fmt: skip
+    steps = _power_of_two(most)
     kernels().concentrate_kernel[(n,)](
         packed, grid, middles, counts, density, shift, starts, ends, valid.view(torch.uint8), n, LARGEST_THICKNESS, TAIL,
-        COUNT=count, EVEN=even, MOST=MOST, S=_power_of_two(MOST), J=_power_of_two(count + 1), CONTRACTED=bounds.contracted,
+        COUNT=count, EVEN=even, MOST=most, S=steps, J=_power_of_two(count + 1), CONTRACTED=bounds.contracted,
+        num_warps=max(4, steps // 32),
     )  # fmt: skip
     return RaySamples(starts, ends, valid)

@@ -102,7 +102,7 @@ class OccupancyGrid(nn.Module):
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
         """Return the intervals of the rays in occupied cells, equally long in the coordinate of ``SceneBounds.spacing``."""
         if not may_wait(rays.near.device):
-            return self.of_known_shape(rays, MOST, jitter)
+            return self.of_known_shape(rays, self._most, jitter)
         march = self._march(rays, jitter)
         place, ray = self._occupied_steps(march)
         return self._padded(march, place, _counts(ray, march)).unflattened(rays.near.shape)
@@ -124,12 +124,28 @@ class OccupancyGrid(nn.Module):
         return few.unflattened(rays.near.shape), numbers, rest
 
     def of_known_shape(self, rays: Rays, count: int, jitter: Generator | None) -> RaySamples:
-        """Return the first ``MOST`` intervals in occupied cells or, on a GPU, at most ``count`` concentrated ones, without waiting."""
-        if fused.available(rays.near.device):
+        """Return the intervals in occupied cells or, on a GPU, at most ``count`` concentrated ones, without waiting.
+
+        Only the first ``MOST`` of a ray count, except in training, when cells that are empty are still occupied.
+        """
+        if fused.available(rays.near.device) and count <= MOST:
             return fused.sampled(
-                _flat(rays), self.bounds, self.occupied, self.density, self.step, min(count, MOST), jitter
+                _flat(rays), self.bounds, self.occupied, self.density, self.step, count, self._most, jitter
             ).unflattened(rays.near.shape)
         return self._of_known_shape(self._march(rays, jitter)).unflattened(rays.near.shape)
+
+    @property
+    def _steps(self) -> int:
+        """The largest number of steps along a ray in the grid.
+
+        They fit into a cube's diagonal; before contracted space, a camera may be as far away again.
+        """
+        sides = 4 if self.bounds.contracted else math.sqrt(3)
+        return math.ceil(sides * self.bounds.side / self.step) + 1
+
+    @property
+    def _most(self) -> int:
+        return self._steps if self.training else MOST
 
     def _march(self, rays: Rays, jitter: Generator | None) -> _March:
         flat = _flat(rays)
@@ -151,22 +167,20 @@ class OccupancyGrid(nn.Module):
         return place.view(-1).index_select(0, block * BLOCK + step), ray.index_select(0, block)
 
     def _of_known_shape(self, march: _March) -> RaySamples:
-        """Return the first ``MOST`` intervals of each ray in occupied cells, without waiting for the device."""
+        """Return the first intervals of each ray in occupied cells, without waiting for the device."""
         near, far = march.near, march.far
         box = self.grid.rays(march.rays.origins, march.rays.directions)
         # Steps are counted from ``near``, as everywhere, and those before the grid are skipped; contracted space has none.
         skipped = ((box.near - near) / self.step).floor().clamp(min=0) * (not self.bounds.contracted)
-        # A cube's diagonal is shorter than twice its side; before contracted space, a camera may be as far away again.
-        count = math.ceil((4 if self.bounds.contracted else 2) * self.bounds.side / self.step) + 1
-        steps = torch.arange(count, dtype=near.dtype, device=near.device)
+        steps, most = torch.arange(self._steps, dtype=near.dtype, device=near.device), self._most
         place = near[:, None] + (skipped[:, None] + steps + march.offset[:, None]) * self.step
         positions = march.rays.at(march.spacing.distance(place))
         kept = self._occupied_at(positions) & (place < far[:, None])
-        order = (~kept).sort(dim=-1, stable=True).indices[:, :MOST]
+        order = (~kept).sort(dim=-1, stable=True).indices[:, :most]
         place, kept = place.gather(-1, order), kept.gather(-1, order)
         middles = torch.where(kept, place, far[:, None])
-        if middles.shape[-1] < MOST:
-            missing = MOST - middles.shape[-1]
+        if middles.shape[-1] < most:
+            missing = most - middles.shape[-1]
             middles = torch.cat([middles, far[:, None].expand(-1, missing)], dim=-1)
             kept = pad(kept, (0, missing))
         return self._intervals(march, middles, kept, kept.sum(-1))

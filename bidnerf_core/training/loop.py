@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
+from torch.autograd.graph import increment_version
 
 from bidnerf_core.devices import captured, without_waiting
 from bidnerf_core.errors import InputError
@@ -130,6 +131,8 @@ def fit(
         if (step + 1) % every and step + 1 < steps:
             continue
         figures, stopping = log.tolist(), False
+        for parameter in _parameters(optimizer):  # whose version a replay leaves as it is
+            increment_version(parameter)
         for number in range(reported, step + 1):
             loss, mse, samples = figures[number % every]
             _check_finite(loss, number)  # before it spreads to a checkpoint

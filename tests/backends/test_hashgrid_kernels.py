@@ -134,17 +134,25 @@ def test_the_encoding_and_its_gradients_are_those_of_torch(
 
 
 @pytest.mark.parametrize("contracted", [False, True])
-@pytest.mark.parametrize(("count", "seed"), [(8, None), (8, 1), (32, None), (MOST, 1)])
+@pytest.mark.parametrize(
+    ("count", "seed", "training"),
+    [(8, None, False), (8, 1, True), (32, None, False), (32, 1, True), (MOST, 1, False)],
+)
 @pytest.mark.filterwarnings("ignore:invalid value encountered in subtract")
 def test_samples_are_those_of_torch(
-    monkeypatch: pytest.MonkeyPatch, generator: Generator, contracted: bool, count: int, seed: int | None
+    monkeypatch: pytest.MonkeyPatch,
+    generator: Generator,
+    contracted: bool,
+    count: int,
+    seed: int | None,
+    training: bool,
 ) -> None:
     """Rounding may move a step across a cell's border, which changes the samples of a few rays."""
     grid = OccupancyGrid(bounds(contracted), 24, steps_per_cell=1 if contracted else 2)
     grid.peak.copy_(torch.rand(grid.peak.shape, generator=generator))
     grid.density.copy_(3 * torch.rand(grid.peak.shape, generator=generator))
     grid.prune(0.8, grow=False)
-    grid.to(DEVICE)
+    grid.to(DEVICE).train(training)
     origins = 4 * normalize(torch.randn((RAYS, 3), generator=generator), dim=-1)
     aims = 0.7 * torch.randn((RAYS, 3), generator=generator)
     rays = grid.bounds.rays(origins.to(DEVICE), normalize(aims - origins, dim=-1).to(DEVICE))
