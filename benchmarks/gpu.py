@@ -1,13 +1,17 @@
-"""Performance on a GPU: time and profile of a step by backend, localization without a start, the paper's tables.
+"""Performance on a GPU: a step, a search, queries one by one and many at once, training, and the paper's tables.
 
-    python benchmarks/gpu.py DATA --map MAP [--map MAP ...] --out FOLDER [--part training steps no_start tables]
+    python benchmarks/gpu.py DATA --map MAP [--map MAP ...] --out FOLDER [--part kernel steps search queries training tables]
 
-- ``training``: ``map_quality.py`` on the device, for each backend that ``--train`` names: time, quality, memory;
+- ``kernel``: the hash grid with its derivatives at 2^19 points, as a share of what its memory accesses and products
+  take at the rates that the device reaches in plain gathers and plain products;
 - ``steps``: milliseconds of a step of ``bid`` with 2048 rays at each level of each map, timed with device events after a
   warm-up: launched one operation at a time, under PyTorch's check that the host never waits, and as a CUDA graph, as in
   ``bid``; with the number of operations and those that take most of the time;
-- ``no_start``: method ``auto`` on RGB-D and on RGB test frames: median time and success;
-- ``tables``: ``paper_tables.py`` with preset ``paper`` and with ``paper-scene``, on the device.
+- ``search``: 5 Gauss-Newton steps of 64 poses with 256 rays each, and of one pose with 2048, as CUDA graphs;
+- ``queries``: method ``auto`` without a start on RGB and RGB-D test frames, one by one and 64 with ``Localizer.many``, and
+  how the answers compare with the CPU's;
+- ``training``: seconds of training until unseen images reach 31 dB;
+- ``tables``: ``paper_tables.py`` with preset ``paper-scene``, on the device.
 
 Finished rows are kept in FOLDER and survive a kill at any moment: the same command resumes where it stopped. When everything is
 done, the record ``gpu.json`` is written there. Without a GPU the script prints a message and ends with status 0.
@@ -16,11 +20,14 @@ done, the record ``gpu.json`` is written there. Without a GPU the script prints 
 from __future__ import annotations
 
 import json
+import math
 import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -30,25 +37,39 @@ import _lab
 import torch
 from paper_tables import test_frames
 
-from bidnerf_core import Localizer
-from bidnerf_core.devices import captured, without_waiting
+from bidnerf_core import Localizer, View
+from bidnerf_core.backend import SceneBounds, load_backend
+from bidnerf_core.devices import captured, moved, without_waiting
 from bidnerf_core.evaluation import RowStore, opened, perturb
-from bidnerf_core.fields import levels
+from bidnerf_core.fields import RadianceField, derivatives_of, levels, render_image, trained_field
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import from_plain
 from bidnerf_core.localization import (
     METHODS,
     AdamSettings,
     AdamSteps,
+    ColourSettings,
+    DepthLossSettings,
     DescentSettings,
+    RayTerms,
     ReachSettings,
     SampledLoss,
     objective_of,
     pivot,
     rig,
+    states_at,
 )
+from bidnerf_core.mapping import descend
+from bidnerf_core.training import Silent, TrainingStep, TrainingStopped
 
 TIMED_RAYS, WARM_UP, TIMED, PROFILED = 2048, 30, 200, 20
-FRAMES = 40
-"""Maximum number of frames that are localized without a start."""
+POINTS, SIDE = 2**19, 4096
+"""Points at which the field is timed, and the side of the matrices whose product shows what the device can do."""
+SEARCH_STEPS = 5
+FRAMES, WARM_UP_FRAMES, MANY = 24, 12, 64
+"""Frames that are localized one by one, those before that are not timed, and how many are localized together."""
+ENOUGH, EVERY = 31.0, 0.5
+"""Quality of unseen images (dB) at which training ends, and seconds of training from one check to the next."""
 
 
 def made_steps(
@@ -142,43 +163,138 @@ def step_rows(folder: str, data: str, device: torch.device) -> dict[str, Any]:
     return found
 
 
-def trained(backend: str, data: str, out: Path, device: torch.device) -> dict[str, Any]:
-    """Train a map with the defaults of a backend, and return its quality and the cost of training."""
-    script, name = Path(__file__).with_name("map_quality.py"), f"map_gpu_{backend}"
-    subprocess.run(
-        [sys.executable, str(script), data, "--out", str(out / f"{backend}_map"), "--name", name,
-         "--results", str(out), "--device", str(device), "--", "--backend", backend, "--device", str(device)],
-        check=True,
-    )  # fmt: skip
-    record = json.loads((out / f"{name}.json").read_text())
-    return {"record": name, "training": record["results"]["training"], "levels": record["results"]["levels"]}
+def kernel_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
+    """Return the time of the field with its derivatives at many points, and what its accesses and products take alone."""
+    stored = opened(folder, data, str(device))[0]
+    lower, upper = (
+        torch.tensor(corner, device=device) for corner in (stored.bounds.lower, stored.bounds.upper)
+    )
+    at = lower + (upper - lower) * torch.rand(POINTS, 3, device=device)
+    along = torch.nn.functional.normalize(torch.randn(POINTS, 3, device=device), dim=-1)
+    field: Any = trained_field(stored.field)
+    own = timed(lambda: derivatives_of(stored.field, at, along), 20)[0]
+    # An access reads at least a sector of 32 bytes: eight corners of each level. A sixteenth of them fits into memory.
+    table = torch.cat(list(field.encoding.tables))
+    index = torch.randint(len(table), (len(field.encoding.levels) * POINTS // 2,), device=device)
+    reads = 16 * timed(lambda: table.index_select(0, index), 20)[0]
+    # The values, three derivatives of the density network, and six of the colour network, in the precision of the kernel.
+    geometry, colour = (
+        sum(part.numel() for part in net.parameters()) for net in (field.geometry, field.colour)
+    )
+    matrix = torch.randn(SIDE, SIDE, device=device)
+    usual = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    product = timed(lambda: matrix @ matrix, 20)[0] / SIDE**3
+    torch.set_float32_matmul_precision(usual)
+    floors = {"reads": reads, "products": POINTS * (4 * geometry + 7 * colour) * product}
+    return {"points": POINTS, "ms": own, "bounds_ms": floors, "share": max(floors.values()) / own}
 
 
-def no_start_rows(folder: str, data: str, device: torch.device) -> dict[str, Any]:
-    """Return the median time (ms) and the success of ``auto`` on frames with and without depth."""
+def search_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
+    """Return the time of Gauss-Newton steps on rendered rays as a CUDA graph, and the memory that they take."""
     stored, dataset = opened(folder, data, str(device))
-    views = dataset.views("test", test_frames(folder, data, tuning=False)[:FRAMES])
-    localizer, found = Localizer(stored), {}
-    for name, shown in _lab.modes(views).items():
-        localizer(shown[0].frame)  # warm-up
-        rows, times = [], []
-        for view in shown:
-            began = time.perf_counter()
-            rows.append(_lab.answer(partial(localizer, view.frame), view))
-            times.append(1000 * (time.perf_counter() - began))
-        right = sum(map(_lab.within, rows))
-        found[name] = {"ms": statistics.median(times), "within 5 degrees, 0.05": right, "frames": len(views)}
+    view, found = dataset.views("test", test_frames(folder, data, tuning=False)[:1])[0], {}
+    problem = rig(stored, [view], None)
+    pivot_of_scene = torch.tensor([0.0, 0.0, 3.5], dtype=torch.float64, device=device)
+    for poses, rays in ((64, 256), (1, TIMED_RAYS)):
+        term = RayTerms(ColourSettings(), DepthLossSettings()).term(problem, rays, 0)
+        starts = SE3.stack([perturb(view.T_ref_camera, 0.05, 2.0, seed) for seed in range(poses)])
+        states = moved(states_at(starts), device)
+        step = partial(descend, states, [term], SEARCH_STEPS, pivot_of_scene)
+        with torch.no_grad(), without_waiting():
+            for _ in range(3):
+                step()
+            torch.cuda.reset_peak_memory_stats()
+            replay = captured(step, device)
+            milliseconds = timed(replay, 50)[0]
+        found[f"{poses} poses, {rays} rays"] = {
+            "ms": milliseconds, "is_graph": replay is not step, "memory_bytes": torch.cuda.max_memory_allocated(),
+        }  # fmt: skip
     return found
 
 
-def table_rows(
-    folder: str, data: str, out: Path, preset: str, device: torch.device, workers: int
-) -> dict[str, Any]:
+def query_rows(folder: str, data: str, device: torch.device) -> dict[str, Any]:
+    """Return the times of ``auto`` on frames with and without depth, and how the answers compare with the CPU's."""
+    stored, dataset = opened(folder, data)
+    views = dataset.views("test", test_frames(folder, data, tuning=False)[:FRAMES])
+    here, there, found = Localizer(stored), Localizer(stored, device=device), {}
+    for name, shown in _lab.modes(views).items():
+        for view in shown[:WARM_UP_FRAMES]:
+            there(view.frame)
+        rows, times = [], []
+        for view in shown:
+            began = time.perf_counter()
+            rows.append(_lab.answer(partial(there, view.frame), view))
+            times.append(1000 * (time.perf_counter() - began))
+        many = (shown * (MANY // len(shown) + 1))[:MANY]
+        list(there.many([view.frame for view in many]))
+        began = time.perf_counter()
+        list(there.many([view.frame for view in many]))
+        seconds = time.perf_counter() - began
+        expected = [_lab.answer(partial(here, view.frame), view) for view in shown]
+        found[name] = {
+            "ms": statistics.median(times), "ms_most": max(times), "frames": len(shown), "many_per_second": MANY / seconds,
+            "right": sum(map(_lab.within, rows)), "right_on_cpu": sum(map(_lab.within, expected)),
+            "same_outcomes": sum(a["outcome"] == b["outcome"] for a, b in zip(rows, expected, strict=True)),
+        }  # fmt: skip
+    return found
+
+
+class UntilSharp(Silent):
+    """Ends a training once unseen images are rendered well enough; rendering them does not count as training."""
+
+    def __init__(self, field: RadianceField, bounds: SceneBounds, views: Sequence[View]) -> None:
+        self._field, self._bounds, self._views = field, bounds, views
+        self.began, self.seconds, self.steps, self.reached = time.perf_counter(), 0.0, 0, 0.0
+
+    def step(self, progress: TrainingStep) -> None:
+        torch.cuda.synchronize()
+        trained = self.seconds + time.perf_counter() - self.began
+        if trained < EVERY * (self._checks + 1):
+            return
+        self._checks += 1
+        self.seconds, self.steps = trained, progress.step
+        self.reached = statistics.mean(map(self._quality, self._views))
+        self.stopping = self.reached >= ENOUGH
+        torch.cuda.synchronize()
+        self.began = time.perf_counter()
+
+    def _quality(self, view: View) -> float:
+        found = render_image(self._field, view.frame.intrinsics, view.T_ref_camera, self._bounds)
+        return -10 * math.log10(float((found.rgb.cpu() - view.frame.rgb).square().mean()))
+
+    stopping = False
+    _checks = 0
+
+
+def training_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
+    """Return how long a field like the map's takes to train until unseen images reach ``ENOUGH`` decibels."""
+    stored, dataset = opened(folder, data)
+    backend, bounds = load_backend(stored.info.backend), stored.bounds
+    config = from_plain(backend.config_type, stored.info.config, "the map's settings")
+    train = [view.over(bounds.background) for view in dataset.views("train", dataset.frame_names("train"))]
+    unseen = [
+        view.over(bounds.background)
+        for view in dataset.views("test", test_frames(folder, data, tuning=False)[:6])
+    ]
+    config = replace(config, steps=backend.config_type().steps)
+    field = backend.build(config, bounds).to(device)
+    torch.cuda.reset_peak_memory_stats()
+    report = UntilSharp(field, bounds, unseen)
+    with suppress(TrainingStopped):
+        backend.train(field, train, config, report)
+    return {
+        "psnr": report.reached, "seconds": report.seconds, "steps": report.steps, "ms_a_step": 1000 * report.seconds / report.steps,
+        "memory_bytes": torch.cuda.max_memory_allocated(),
+    }  # fmt: skip
+
+
+def table_rows(folder: str, data: str, device: torch.device, out: Path, workers: int) -> dict[str, Any]:
     """Run the paper's tables in a process of their own, which resumes where it stopped."""
     script = Path(__file__).with_name("paper_tables.py")
-    began, tables = time.perf_counter(), out / preset
+    began, tables = time.perf_counter(), out / "tables"
     subprocess.run(
-        [sys.executable, str(script), data, "--map", folder, "--out", str(tables), "--preset", preset,
+        [sys.executable, str(script), data, "--map", folder, "--out", str(tables), "--preset", "paper-scene",
          "--device", str(device), "--workers", str(workers)],
         check=True,
     )  # fmt: skip
@@ -199,11 +315,12 @@ def main() -> None:
     parser.add_argument("data")
     parser.add_argument("--map", action="append", required=True, help="a folder; may be given again")
     parser.add_argument("--out", type=Path, default=_lab.RESULTS)
-    parts = ("training", "steps", "no_start", "tables")
-    parser.add_argument("--part", nargs="+", choices=parts, default=list(parts))
-    parser.add_argument(
-        "--train", nargs="*", default=[], help="backends to train on DATA with their defaults"
-    )
+    rows: dict[str, Callable[..., dict[str, Any]]] = {
+        "kernel": kernel_row, "steps": step_rows, "search": search_row, "queries": query_rows, "training": training_row,
+        "tables": table_rows,
+    }  # fmt: skip
+    parser.add_argument("--part", nargs="+", choices=list(rows), default=list(rows))
+    parser.add_argument("--name", default="gpu", help="of the record (default: %(default)s)")
     parser.add_argument(
         "--workers", type=int, default=4, help="processes that share the device for the tables"
     )
@@ -213,31 +330,17 @@ def main() -> None:
         return
     device, gpu = torch.device("cuda"), torch.cuda.get_device_name()
     given.out.mkdir(parents=True, exist_ok=True)
+    rows["tables"] = partial(table_rows, out=given.out, workers=given.workers)
     results: dict[str, Any] = {"gpu": gpu, "rays": TIMED_RAYS}
-    with RowStore(given.out / "gpu.rows.jsonl") as store:
-        for backend in given.train if "training" in given.part else []:
-            make = partial(trained, backend, given.data, given.out, device)
-            results.setdefault("training", {})[backend] = store.get(
-                [gpu, backend, "training"], partial(attempted, f"{backend}: training", make)
-            )
+    with RowStore(given.out / f"{given.name}.rows.jsonl") as store:
         for folder in given.map:
             name = Path(folder).name
-            rows: dict[str, Callable[[], Any]] = {
-                "steps": partial(step_rows, folder, given.data, device),
-                "no_start": partial(no_start_rows, folder, given.data, device),
-            } | {
-                f"tables {preset}": partial(
-                    table_rows, folder, given.data, given.out, preset, device, given.workers
-                )
-                for preset in ("paper", "paper-scene")
-            }
-            for row, make in rows.items():
-                if row.partition(" ")[0] in given.part:
-                    key = [gpu, name, row]
-                    results.setdefault(row, {})[name] = store.get(
-                        key, partial(attempted, f"{name}: {row}", make)
-                    )
-    _lab.record("gpu", results, folder=given.out)
+            for row in given.part:
+                make = partial(rows[row], folder, given.data, device)
+                found = store.get([gpu, name, row], partial(attempted, f"{name}: {row}", make))
+                print(json.dumps(found), flush=True)
+                results.setdefault(row, {})[name] = found
+    _lab.record(given.name, results, folder=given.out)
 
 
 if __name__ == "__main__":
