@@ -156,7 +156,7 @@ def operations(steps: AdamSteps) -> dict[str, Any]:
 def step_rows(folder: str, data: str, device: torch.device) -> dict[str, Any]:
     """Return the times of a step at each level of a map."""
     found = {}
-    for level in range(len(levels(opened(folder, data, str(device))[0].field))):
+    for level in range(len(levels(opened(folder, data)[0].field))):
         generator = torch.Generator(device).manual_seed(0)
         steps = made_steps(folder, data, level, device, generator=generator)
         found[f"level {level}"] = timed_steps(steps, device, generator)
@@ -165,7 +165,7 @@ def step_rows(folder: str, data: str, device: torch.device) -> dict[str, Any]:
 
 def kernel_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
     """Return the time of the field with its derivatives at many points, and what its accesses and products take alone."""
-    stored = opened(folder, data, str(device))[0]
+    stored = opened(folder, data)[0].to(device)
     lower, upper = (
         torch.tensor(corner, device=device) for corner in (stored.bounds.lower, stored.bounds.upper)
     )
@@ -192,9 +192,9 @@ def kernel_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
 
 def search_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
     """Return the time of Gauss-Newton steps on rendered rays as a CUDA graph, and the memory that they take."""
-    stored, dataset = opened(folder, data, str(device))
+    stored, dataset = opened(folder, data)
     view, found = dataset.views("test", test_frames(folder, data, tuning=False)[:1])[0], {}
-    problem = rig(stored, [view], None)
+    problem = rig(stored.to(device), [view], None)
     pivot_of_scene = torch.tensor([0.0, 0.0, 3.5], dtype=torch.float64, device=device)
     for poses, rays in ((64, 256), (1, TIMED_RAYS)):
         term = RayTerms(ColourSettings(), DepthLossSettings()).term(problem, rays, 0)
