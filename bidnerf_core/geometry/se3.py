@@ -62,15 +62,29 @@ class SE3:
         """Return the exponential map (Sola et al., eq. 172): ``[exp(phi), V(phi) rho]``."""
         rho, phi = tangent[..., :3], tangent[..., 3:]
         squared, small, angle = _guarded_angle(phi)
-        a = torch.where(small, 1 - squared / 6 + squared**2 / 120, angle.sin() / angle)
         b = torch.where(small, 0.5 - squared / 24 + squared**2 / 720, (1 - angle.cos()) / angle**2)
         c = torch.where(small, 1 / 6 - squared / 120 + squared**2 / 5040, (angle - angle.sin()) / angle**3)
-        return SE3(_polynomial(phi, a, b), _matvec(_polynomial(phi, b, c), rho))
+        once = torch.linalg.cross(phi, rho)
+        twice = torch.linalg.cross(phi, once)
+        a = 1 - c * squared  # sin(t) / t
+        return SE3(_polynomial(phi, a, b), rho + b[..., None] * once + c[..., None] * twice)
 
     def log(self) -> Float[Tensor, "*b 6"]:
         """Return the inverse of ``exp``, with the rotation angle in [0, pi] (eq. 173)."""
         phi = rotation_matrix_to_axis_angle(self.rotation)
         return torch.cat([_matvec(so3_left_jacobian_inverse(phi), self.translation), phi], dim=-1)
+
+    def update_to(self, other: SE3) -> Float[Tensor, "*b 6"]:
+        """Return ``(self.inverse() @ other).log()`` in fewer operations, for rotations that differ by clearly less than half a turn."""
+        back, least = self.rotation.mT, 1e-150  # keeps 0 / 0 from being NaN without changing any other ratio
+        R, off = back @ other.rotation, _matvec(back, other.translation - self.translation)
+        twice = torch.stack([R[..., i, j] - R[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1)
+        sine = twice.square().sum(-1).sqrt() / 2 + least
+        angle = torch.atan2(sine, (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2) + least
+        phi = (angle / (2 * sine))[..., None] * twice
+        c = (1 - angle / 2 / (angle / 2).tan()) / angle.square()
+        once = torch.linalg.cross(phi, off)
+        return torch.cat([off - once / 2 + c[..., None] * torch.linalg.cross(phi, once), phi], -1)
 
     def matrix(self) -> Float[Tensor, "*b 4 4"]:
         top = torch.cat([self.rotation, self.translation[..., None]], dim=-1)

@@ -252,11 +252,14 @@ class Loop:
             variance = point_variance(self.landmarks, found.landmark, here, focal)
             of_sights = sights.image, sights.times, sights.rotation, sights.translation
             parts.append((points, *of_sights, (index < count).double(), variance, focal))
-        points, *seen, valid, variance, focal = (torch.stack(x) for x in zip(*parts, strict=True))
+        points, image, times, R, t, valid, variance, focal = (
+            torch.stack(x) for x in zip(*parts, strict=True)
+        )
         counts = [self.landmarks.correlation_of(len(mode.matches)) for mode in modes]
         correlation, query = torch.tensor(counts, dtype=torch.float64), modes[0].query
+        sights = Sights(image, times, R, t, query.sights.single)
         return Landmarks(
-            points, Sights(*seen), valid, variance, focal, correlation, 1 / correlation, query.area, query.threshold / 2
+            points, sights, valid, variance, focal, correlation, 1 / correlation, query.area, query.threshold / 2
         )  # fmt: skip
 
     def _modes(
@@ -377,7 +380,8 @@ class Loop:
         points, fused = None, list[str]()
         others: dict[str, float | None] = {}
         if problem is not None and problem.surface is not None and problem.has_depth:
-            points = Surface.of(problem.views, problem.depth_rays, problem.surface, self.seed)
+            place = "cpu" if problem.surface.device == self.device else None  # ``run_on`` sends them
+            points = Surface.of(problem.views, problem.depth_rays, problem.surface, self.seed, device=place)
         if points is not None:
             noise, near, _ = run_on(self.device, fit_noise, points, found.chosen)
             points = replace(points, noise=noise) if float(near) >= LEAST_ON_SURFACE else None

@@ -14,15 +14,16 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bidnerf_core.camera import exposure_times
-from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.query import Query
 from bidnerf_core.mapping import (
     BLOCK,
+    NORM,
     Features,
     FoundOnce,
     LandmarkMap,
     States,
+    byte_of_zero,
     detected,
     find_features,
     imaged,
@@ -34,6 +35,10 @@ from bidnerf_core.mapping import (
 
 EXHAUSTIVE = 4_000
 """The number of landmarks up to which the search is exhaustive, without cells."""
+SPARE = 4
+"""Number of further landmarks that are looked up by products in half precision, and then compared exactly."""
+PRODUCTS = 2**26
+"""Number of products of descriptors at a time on an accelerator, which bounds the memory."""
 COMPARISONS = 4_000_000
 """The number of keypoint-landmark pairs up to which comparing all of them is faster than searching cells."""
 USUAL_IN_CELL = 500
@@ -59,7 +64,8 @@ class LandmarkMatcher:
     maps), and only the cells nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). Threads may share
     a matcher. It also prepares ``LandmarkMap.cells`` for guided matching.
 
-    Descriptors are compared on the device of those of ``landmarks``; all other computations with landmarks run on the CPU.
+    Descriptors are compared on the device of those of ``landmarks``; all other computations with landmarks run on the CPU. On an
+    accelerator the search is always exhaustive.
     """
 
     def __init__(self, landmarks: LandmarkMap, seed: int = 0) -> None:
@@ -67,8 +73,11 @@ class LandmarkMatcher:
         _ = self.landmarks.cells
         self._descriptors = landmarks.descriptors
         self._cells: _Cells | None = None
+        self._products: _Products | None = None
         self._found_once: FoundOnce | None = None
-        if len(landmarks) > EXHAUSTIVE:
+        if self.device.type != "cpu":
+            self._products = _Products(landmarks.descriptors)
+        elif len(landmarks) > EXHAUSTIVE:
             self._cells = _Cells(landmarks.descriptors, seed)
 
     @property
@@ -105,15 +114,43 @@ class LandmarkMatcher:
                 f"the map's descriptors have {channels} channels, those of the image {descriptors.shape[1]}; "
                 "use the detector with which the map was baked, or bake it again"
             )
-        there = descriptors.to(self._descriptors.device)
         if self._cells is not None and len(descriptors) * len(self.landmarks) > COMPARISONS:
-            return moved(self._cells.nearest(there, count), "cpu")
+            return self._cells.nearest(descriptors, count)
         distances = torch.full((len(descriptors), count), torch.inf)
         index = torch.zeros(distances.shape, dtype=torch.long)
         if len(self.landmarks):
-            found = moved(_smallest(squared_distances(there, self._descriptors), count), "cpu")
+            if self._products is None:
+                found = _smallest(squared_distances(descriptors, self._descriptors), count)
+            else:
+                found = self._products.nearest(descriptors.to(self.device), count)
             distances[:, : found[0].shape[1]], index[:, : found[0].shape[1]] = found
         return distances, index
+
+
+class _Products:
+    """Descriptors in half precision, which represents bytes exactly; products of unit vectors are rounded by a thousandth."""
+
+    def __init__(self, descriptors: UInt8[Tensor, "n d"]) -> None:
+        self._zero, self._descriptors = byte_of_zero(descriptors.cpu()), descriptors
+        self._half = self._unit(descriptors)
+        self._squares = torch.cat([part.float().square().sum(-1) for part in self._half.split(BLOCK)])
+
+    def _unit(self, descriptors: UInt8[Tensor, "q d"]) -> Float[Tensor, "q d"]:
+        return (descriptors.half() - self._zero) / NORM
+
+    def nearest(
+        self, descriptors: UInt8[Tensor, "q d"], count: int
+    ) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
+        """Return squared distances, which are exact, and indices of the nearest; on the CPU."""
+        found, n = [], len(self._half)
+        for part in descriptors.split(max(1, PRODUCTS // n)):
+            alike = 2 * (self._unit(part) @ self._half.T).float() - self._squares
+            index = alike.topk(min(count + SPARE, n)).indices
+            exact = (part[:, None].float() - self._descriptors[index].float()).square().sum(-1)
+            distance, best = exact.topk(min(count, n), largest=False)
+            found.append(torch.stack([distance.long(), index.gather(1, best)]))
+        distances, indices = torch.cat(found, 1).cpu()
+        return distances.float(), indices
 
 
 class _Cells:

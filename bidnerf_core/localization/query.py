@@ -51,7 +51,7 @@ class Query:
         )
         rays = torch.cat([image.rays for image in images])[:, :2]
         focal = torch.tensor([image.focal for image in images], dtype=torch.float64)[view]
-        sights = Sights(rays, times, T.rotation, T.translation)
+        sights = Sights(rays, times, T.rotation, T.translation, single=len(images) == 1)
         return Query(
             images,
             Keypoints(*joined),

@@ -16,6 +16,7 @@ from .landmarks.building import tracked_views as tracked_views
 from .landmarks.building import update_scatter as update_scatter
 from .landmarks.features import FEATURES as FEATURES
 from .landmarks.features import FIRST_CENTRE as FIRST_CENTRE
+from .landmarks.features import NORM as NORM
 from .landmarks.features import SIFT as SIFT
 from .landmarks.features import USUAL_FEATURES as USUAL_FEATURES
 from .landmarks.features import Features as Features

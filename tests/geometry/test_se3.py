@@ -99,6 +99,16 @@ def test_derivative_of_log_is_the_inverse_right_jacobian() -> None:
     torch.testing.assert_close(found, torch.linalg.inv(se3_right_jacobian(xi)), atol=1e-8, rtol=1e-8)
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-12, 1e-5, 0.1, 1.0])
+def test_an_update_leads_to_the_other_transform(size: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    start, xi = (torch.randn((50, 6), generator=generator, dtype=torch.float64) for _ in range(2))
+    T = SE3.exp(start)
+    xi = size * xi / xi[:, 3:].norm(dim=-1, keepdim=True)
+    found = T.update_to(T.retract(xi))
+    torch.testing.assert_close(found, xi, rtol=1e-8, atol=1e-14)
+
+
 def test_batches_broadcast_against_leading_axes() -> None:
     T = SE3.exp(torch.stack([tangent(s) for s in (0.1, 1.0, 2.0)]))
     points = torch.randn(5, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))

@@ -94,15 +94,16 @@ def test_auto_by_landmarks(depth: bool) -> None:
     assert ("fused with depth and rendering" if depth else "fused with rendering") in here.reason
 
 
-@pytest.mark.parametrize(("depth", "most"), [(False, 18), (True, 40)])
+@pytest.mark.parametrize(("depth", "most"), [(False, 16), (True, 24)])
 def test_the_host_waits_a_handful_of_times_for_a_query(depth: bool, most: int) -> None:
     """It uploads and reads once for the matches, for each round of matching by projection, and for each measurement."""
     frame = unseen().frame if depth else without_depth(unseen().frame)
     with Elsewhere() as mode:
         localizer = Localizer(ground(), config=AutoConfig(fused_rays=0), device=DEVICE)
+        localizer(frame)
         mode.waits.clear()
         assert localizer(frame).converged
-    assert 10 <= mode.waits.total() <= most, mode.waits
+    assert 0 < sum(mode.waits.values()) <= most, mode.waits
 
 
 @pytest.mark.parametrize("landmarks", [True, False])

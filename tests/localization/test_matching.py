@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, Frame, Intrinsics, View
+from bidnerf_core.devices import moved
 from bidnerf_core.localization import LandmarkMatcher
 
 # Inside: the matches, of which answers show only the number
@@ -21,7 +22,7 @@ from bidnerf_core.localization.matching import (
 )
 from bidnerf_core.localization.query import Query
 from bidnerf_core.mapping import LandmarkMap, Sift, States, build_landmarks, squared_distances
-from bidnerf_core.testing import unseen
+from bidnerf_core.testing import DEVICE, Elsewhere, unseen
 from conditions import COPY, PINHOLE, point_landmarks, point_view, points, twice
 from landmark_scene import Points, looking_in, ring
 from refusals import refused
@@ -79,6 +80,22 @@ def test_many_landmarks_are_found_by_their_cells() -> None:
     exact = squared_distances(queries, landmarks.descriptors)
     assert torch.equal(exact.gather(1, index), distances)
     assert float((exact.topk(2, largest=False).values == distances).float().mean()) > 0.9
+
+
+def test_products_in_half_precision_find_the_nearest_but_for_near_ties() -> None:
+    """The host waits once, and distances are exact."""
+    landmarks = many(600)
+    queries = (landmarks.descriptors[::2].int() + 3).clamp(max=255).byte()
+    expected = LandmarkMatcher(landmarks).nearest(queries, 3)
+    with Elsewhere() as mode:
+        matcher = LandmarkMatcher(moved(landmarks, DEVICE))
+        mode.waits.clear()
+        distances, index = matcher.nearest(queries, 3)
+        assert mode.waits == {"_to_copy": 2}
+    exact = squared_distances(queries, landmarks.descriptors)
+    assert torch.equal(exact.gather(1, index), distances)
+    assert float((distances == expected[0]).float().mean()) > 0.99
+    assert torch.equal(index[:, 0], expected[1][:, 0])
 
 
 def test_fewer_landmarks_than_wanted_are_filled_up_with_infinity() -> None:

@@ -64,7 +64,7 @@ def sights_of(
 class Surface:
     """Distances of measured points from the planes of the nearest surfels, metres, and differences from their colours.
 
-    All tensors are on the surface's device.
+    All tensors are on the surface's device when it is evaluated.
     """
 
     surface: SurfaceMap
@@ -79,9 +79,13 @@ class Surface:
 
     @staticmethod
     def of(
-        views: Sequence[View], rays: Observations | None, surface: SurfaceMap, seed: int, count: int = POINTS
-    ) -> Surface | None:
-        """Draw measured points of ``views``, whose poses are relative to the last, in random order; None if there are too few."""
+        views: Sequence[View], rays: Observations | None, surface: SurfaceMap, seed: int, count: int = POINTS,
+        device: torch.device | str | None = None,
+    ) -> Surface | None:  # fmt: skip
+        """Draw measured points of ``views``, whose poses are relative to the last, in random order; None if there are too few.
+
+        They are put on ``device``, by default the surface's.
+        """
         generator, parts = torch.Generator().manual_seed(seed), []
         for view in views:
             frame = view.frame
@@ -114,8 +118,8 @@ class Surface:
         image, times, R, t, z, fixed, rgb, coloured = (
             torch.cat(part)[order] for part in zip(*parts, strict=True)
         )
-        term = Surface(surface, Sights(image, times, R, t), z, fixed, rgb, coloured, 2 * surface.cell)
-        return moved(term, surface.device)
+        measured = moved((Sights(image, times, R, t), z, fixed, rgb, coloured), device or surface.device)
+        return Surface(surface, *measured, noise=2 * surface.cell)
 
     def __len__(self) -> int:
         return len(self.z)

@@ -139,7 +139,7 @@ class Fit:
         zero, one = torch.zeros((1, count, 3), dtype=torch.float64), torch.ones(count, dtype=torch.float64)
         sights = Sights(
             image[None], exposure_times(points.pixels, camera)[None],
-            torch.eye(3, dtype=torch.float64).expand(1, count, 3, 3), zero,
+            torch.eye(3, dtype=torch.float64).expand(1, count, 3, 3), zero, single=True,
         )  # fmt: skip
         variance = point_variance(points, torch.arange(count), states, focal * one)
         correlated = torch.tensor([correlation], dtype=torch.float64)

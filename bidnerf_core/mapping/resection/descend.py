@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
+from bidnerf_core.devices import constant
 from bidnerf_core.geometry import SE3, skew
 from bidnerf_core.mapping.resection.states import P, States
 
@@ -45,11 +47,8 @@ Term = Callable[[States], Normal]
 def prior(states: States) -> Normal:
     """Return the standard normal prior of the nuisances; that of the pose is flat."""
     z = states.z
-    eye = torch.eye(P, dtype=z.dtype, device=z.device)
-    eye[:6] = 0
-    return Normal(
-        0.5 * z.square().sum(-1), torch.cat([z.new_zeros(len(z), 6), z], -1), eye.expand(len(z), P, P)
-    )
+    free = constant((0.0,) * 6 + (1.0,) * (P - 6), z).diag_embed()
+    return Normal(0.5 * z.square().sum(-1), pad(z, (6, 0)), free.expand(len(z), P, P))
 
 
 def total(states: States, terms: Sequence[Term]) -> Normal:
@@ -108,7 +107,7 @@ class Quadratic:
 
     def __call__(self, states: States) -> Normal:
         g = states.mode
-        update = (self.here.T[g].inverse() @ states.T).log()
+        update = self.here.T[g].update_to(states.T)
         off = torch.cat([update, states.nuisances - self.here.nuisances[g]], -1)
         scale = 1 / states.unit
         pull = self.gradient[g] + (self.hessian[g] @ off[..., None])[..., 0]
@@ -146,8 +145,8 @@ def damped_solution(
     # Scaled to a unit diagonal, whatever the units; along directions of no information the step is 0.
     unit = diagonal.rsqrt()
     scaled = unit[..., None] * hessian * unit[..., None, :]
-    eye = torch.eye(P, dtype=scaled.dtype, device=scaled.device)
-    factor, info = torch.linalg.cholesky_ex(scaled + (damping[:, None, None] + 1e-9) * eye)
+    scaled.diagonal(dim1=-2, dim2=-1).add_(damping[:, None] + 1e-9)
+    factor, info = torch.linalg.cholesky_ex(scaled)
     # Two triangular solves: cholesky_solve uses a library that cannot be captured in a CUDA graph.
     half = torch.linalg.solve_triangular(factor, (unit * gradient)[..., None], upper=False)
     step = unit * torch.linalg.solve_triangular(factor.mT, half, upper=True)[..., 0]

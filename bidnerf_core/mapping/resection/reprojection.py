@@ -44,7 +44,7 @@ class Landmarks:
 
     def __call__(self, states: States) -> Normal:
         cost, rows, pull = self._weighted(states)
-        return Normal(cost, (rows.mT @ pull[..., None])[..., 0], rows.mT @ rows)
+        return Normal(cost, (rows @ pull[..., None])[..., 0], rows @ rows.mT)
 
     def sandwich(
         self, states: States
@@ -57,9 +57,9 @@ class Landmarks:
         """
         _, rows, pull = self._weighted(states)
         share, independent = self.share[states.mode], 1 / self.correlation[states.mode]
-        scores = (rows * pull[..., None]).unflatten(1, (-1, 2)).sum(2) / share[:, None, None]
-        hessian = rows.mT @ rows * (independent / share)[:, None, None]
-        scatter = scores.mT @ scores * independent[:, None, None]
+        scores = (rows * pull[:, None]).unflatten(-1, (-1, 2)).sum(-1) / share[:, None, None]
+        hessian = rows @ rows.mT * (independent / share)[:, None, None]
+        scatter = scores @ scores.mT * independent[:, None, None]
         curvature = hessian - 2 / SCALE**2 * scatter
         traces = [
             x.diagonal(dim1=-2, dim2=-1)[:, :6] / hessian.diagonal(dim1=-2, dim2=-1)[:, :6].clamp(min=1e-300)
@@ -73,34 +73,43 @@ class Landmarks:
 
     def _weighted(
         self, states: States
-    ) -> tuple[Float[Tensor, "h"], Float[Tensor, "h r P"], Float[Tensor, "h r"]]:
-        """Return the cost, and the weighted rows and residuals of its least-squares problem."""
-        g, sights = states.mode, self.sights[states.mode]
-        seen = project(states, self.points[g], sights)
-        squared, off, deviation = self.residuals(states, seen)
-        u, odds = 1 + squared / SCALE**2, self._odds(states)
-        inlier = odds / (odds + u.square())  # probability
-        share = self.share[g][:, None] * self.valid[g]
-        cost = -(share * torch.where(seen.front, torch.log1p(odds / u.square()), 0)).sum(-1)
-        weight = (share * seen.front * inlier / u).sqrt()
-        rows = jacobian(states, seen, sights) * (self.focal[g] * weight / deviation)[..., None, None]
-        return cost, rows.flatten(1, 2), (off * (weight / deviation)[..., None]).flatten(1, 2)
+    ) -> tuple[Float[Tensor, "h"], Float[Tensor, "h P r"], Float[Tensor, "h r"]]:
+        """Return the cost, and the weighted rows (transposed) and residuals of its least-squares problem."""
+        own = self._of(states)
+        seen = project(states, own.points, own.sights)
+        squared, off, variance = own._residuals(states, seen)
+        u, odds = 1 + squared / SCALE**2, own._odds(variance)
+        square = u.square()
+        share = own.share[:, None] * own.valid
+        cost = -(share * torch.where(seen.front, torch.log1p(odds / square), 0)).sum(-1)
+        inlier = odds / (odds + square)  # probability
+        scale = (share * seen.front * inlier / (u * variance)).sqrt()
+        rows = jacobian(states, seen, own.sights) * (own.focal * scale)[:, None, :, None]
+        return cost, rows.flatten(2), (off * scale[..., None]).flatten(1)
+
+    def _of(self, states: States) -> Landmarks:
+        """Return the term with the matches of each state's mode; one mode's are broadcast."""
+        if len(self.points) == 1:
+            return self
+        names, g = ("points", "sights", "valid", "variance", "focal", "correlation", "share"), states.mode
+        return replace(self, **{name: getattr(self, name)[g] for name in names})
 
     def evidence(self, states: States) -> Float[Tensor, "h"]:
         """Return the log likelihood relative to that of outliers alone, by the largest noise of any state and without weights, so
         that it counts matches.
         """
         states = replace(states, noise=states.noise.amax().expand_as(states.noise))
-        squared, _, _ = self.residuals(states)
-        gain = torch.log1p(self._odds(states) / (1 + squared / SCALE**2).square())
-        return (self.valid[states.mode] * gain).sum(-1)
+        own = self._of(states)
+        squared, _, variance = own._residuals(states)
+        gain = torch.log1p(own._odds(variance) / (1 + squared / SCALE**2).square())
+        return (own.valid * gain).sum(-1)
 
     def with_noise(self, states: States) -> States:
         """Return the states with the noise that follows from their residuals."""
-        _, off, _ = self.residuals(states)
-        valid = self.valid[states.mode] > 0
+        own = self._of(states)
+        off, valid = own._residuals(states)[1], own.valid > 0
         sizes = torch.where(valid[..., None], off.abs(), torch.nan).flatten(1)
-        by_points = torch.where(valid, self.variance[states.mode], torch.nan).nanmedian(-1).values
+        by_points = torch.where(valid, own.variance, torch.nan).nanmedian(-1).values
         spread = (MAD * sizes.nanmedian(-1).values).square()
         noise = (spread - by_points).clamp(LEAST_NOISE**2, self.most_noise**2).nan_to_num(1.0).sqrt()
         return replace(states, noise=noise)
@@ -110,8 +119,7 @@ class Landmarks:
 
         The efficiency is the ratio of the information of an M-estimator to its reweighted Hessian (Huber 1981, 6.3).
         """
-        squared, _, _ = self.residuals(best)
-        valid = self.valid[best.mode]
+        squared, valid = self.residuals(best)[0], self.valid[best.mode]
         weight = 1 / (1 + squared / SCALE**2)
         count = valid.sum(-1).clamp(min=1)
         scatter = 0.5 * (valid * weight.square() * squared).sum(-1) / count
@@ -127,22 +135,24 @@ class Landmarks:
         away = (self.points[g] - states.T.translation[0]).norm(dim=-1)
         return float(away[self.valid[g] > 0].median())
 
-    def _odds(self, states: States) -> Float[Tensor, "h m"]:
-        """Return the density of the residual 0, relative to that of an outlier."""
-        return self.area / (
-            math.pi * SCALE**2 * (states.noise[:, None].square() + self.variance[states.mode])
-        )
-
-    def residuals(self, states: States, seen: Projections | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the squared residuals in units of their variance (h m), projection minus observation (h m 2) and its
-        standard deviation (h m), pixels.
+    def residuals(self, states: States) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the squared residuals in units of their variance (h m), projection minus observation (h m 2) and its variance (h m),
+        pixels.
         """
-        g = states.mode
-        seen = project(states, self.points[g], self.sights[g]) if seen is None else seen
-        deviation = (states.noise[:, None].square() + self.variance[g]).sqrt()
-        off = (seen.image - self.sights.image[g]) * self.focal[g][..., None]
-        squared = torch.where(seen.front, off.square().sum(-1) / deviation.square(), 1e6)
-        return squared, off, deviation
+        return self._of(states)._residuals(states)
+
+    def _odds(self, variance: Float[Tensor, "h m"]) -> Float[Tensor, "h m"]:
+        """Return the density of the residual 0, relative to that of an outlier."""
+        return self.area / (math.pi * SCALE**2) / variance
+
+    def _residuals(
+        self, states: States, seen: Projections | None = None
+    ) -> tuple[Float[Tensor, "h m"], Float[Tensor, "h m 2"], Float[Tensor, "h m"]]:
+        """Return what ``residuals`` does, of matches that are those of the states' modes."""
+        seen = project(states, self.points, self.sights) if seen is None else seen
+        variance = states.noise[:, None].square() + self.variance
+        off = (seen.image - self.sights.image) * self.focal[..., None]
+        return torch.where(seen.front, off.square().sum(-1) / variance, 1e6), off, variance
 
 
 @runtime_checkable

@@ -53,9 +53,8 @@ def resections(
         own = order[(first[some, None] + number).clamp(max=len(order) - 1)]  # ends with those of other images
         valid = (number < count[some, None]).double()
         rotation = torch.eye(3, dtype=torch.float64).expand(b, m, 3, 3)
-        sights = Sights(
-            sightings.image[own], sightings.exposure_times[own], rotation, torch.zeros_like(local[own])
-        )
+        times = sightings.exposure_times[own]
+        sights = Sights(sightings.image[own], times, rotation, torch.zeros_like(local[own]), single=True)
         correlated, focal = torch.full((b,), correlation, dtype=torch.float64), sightings.focal[own]
         area = (
             float(focal.max()) ** 2

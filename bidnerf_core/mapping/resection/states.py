@@ -13,6 +13,7 @@ from functools import cached_property
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.devices import constant
@@ -106,9 +107,11 @@ class Sights:
     times: Float[Tensor, "*h m"]  # of exposure, as fractions of the readout (-0.5 to 0.5)
     rotation: Float[Tensor, "*h m 3 3"]  # T_camera_rig
     translation: Float[Tensor, "*h m 3"]
+    single: bool = False  # whether that is the identity for all points, and need not be applied
 
     def __getitem__(self, index: Tensor | slice) -> Sights:
-        return Sights(self.image[index], self.times[index], self.rotation[index], self.translation[index])
+        rotation, translation = self.rotation[index], self.translation[index]
+        return Sights(self.image[index], self.times[index], rotation, translation, self.single)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,48 +122,69 @@ class Projections:
     local: Float[Tensor, "h m 3"]  # metres, in the frame of the camera when the point's row was exposed
     flat: Float[Tensor, "h m 2"]  # of the ideal camera
     front: Bool[Tensor, "h m"]
+    depth: Float[Tensor, "h m"]  # metres; 1 behind the camera
+    square: Float[Tensor, "h m 1"]  # of the radius of ``flat``
+    bend: Float[Tensor, "h m 1"]  # the factor by which the lens distorts ``flat``
+    linear: Float[Tensor, "h 2 2"]  # see ``linear``
 
 
 def project(states: States, points: Float[Tensor, "*h m 3"], sights: Sights) -> Projections:
     """Project world points."""
     local = (points - states.T.translation[:, None]) @ states.T.rotation
-    local = (sights.rotation @ local[..., None])[..., 0] + sights.translation
+    if not sights.single:
+        local = (sights.rotation @ local[..., None])[..., 0] + sights.translation
     return imaged(states, local, sights.times)
 
 
 def imaged(states: States, local: Float[Tensor, "h m 3"], times: Float[Tensor, "*h m"]) -> Projections:
     """Project points in the frame of the camera at the middle row."""
-    nuisances, times = states.nuisances, times[..., None]
-    v, w = nuisances[:, None, 6:9], nuisances[:, None, 9:12].expand_as(local)
-    speed = v + torch.linalg.cross(w, local)  # the camera moves by exp(time * motion), to second order
-    local = local - times * speed + 0.5 * times**2 * torch.linalg.cross(w, speed)
-    flat, _, front = pinhole(local)
-    bent = flat * (1 + nuisances[:, None, 3:4] * flat.square().sum(-1, keepdim=True))
-    return Projections(bent @ linear(states).mT + nuisances[:, None, 1:3], local, flat, front)
-
-
-def jacobian(states: States, seen: Projections, sights: Sights) -> Float[Tensor, "h m 2 P"]:
-    """Return the derivative of ``seen.image`` with respect to the unknowns."""
-    flat, k1, A = seen.flat, states.nuisances[:, None, 3:4], linear(states)[:, None]
+    nuisances, times = states.nuisances[:, None], times[..., None]
+    w = nuisances[..., 9:12]
+    speed = torch.linalg.cross(w, local) + nuisances[..., 6:9]
+    # The camera moves by exp(time * motion), to second order.
+    local = local.addcmul(times, speed, value=-1)
+    local = local.addcmul(times.square(), torch.linalg.cross(w, speed), value=0.5)
+    flat, depth, front = pinhole(local)
     square = flat.square().sum(-1, keepdim=True)
-    eye = torch.eye(2, dtype=flat.dtype, device=flat.device)
-    bent = flat * (1 + k1 * square)
-    lens = A @ (
-        eye * (1 + k1 * square)[..., None] + 2 * k1[..., None] * flat[..., :, None] * flat[..., None, :]
-    )
-    by_point = lens @ by_camera_point(flat, pinhole(seen.local)[1])
-    by_row = by_update(by_point, seen.local)  # of the camera of the row
-    rig = (sights.rotation.mT @ (seen.local - sights.translation)[..., None])[..., 0]
-    by_pose = by_update(by_point @ sights.rotation, rig)
-    across, down = A[..., 0] * bent[..., :1], A[..., 1] * bent[..., 1:]
-    skewed = torch.cat([bent[..., 1:], torch.zeros_like(bent[..., 1:])], -1)
+    bend, A = 1 + nuisances[..., 3:4] * square, linear(states)
+    image = torch.baddbmm(nuisances[..., 1:3], flat * bend, A.mT)
+    return Projections(image, local, flat, front, depth, square, bend, A)
+
+
+def jacobian(states: States, seen: Projections, sights: Sights) -> Float[Tensor, "h P m 2"]:
+    """Return the derivative of ``seen.image`` with respect to the unknowns.
+
+    ``image = A bend flat``, where ``bend = 1 + k1 flat^2`` and A is ``seen.linear``, plus the principal point.
+    """
+    flat, A = seen.flat, seen.linear.mT
+    lens = flat.mT[..., None] * (2 * states.nuisances[:, None, 3:4] * flat)[:, None]
+    lens.diagonal(dim1=1, dim2=3).add_(seen.bend)  # of bend flat, by flat (h 2 m 2)
+    radial = flat * (2 - 3 * seen.bend)
+    by_point = torch.cat([lens, radial[:, None]], 1) / seen.depth[:, None, :, None]
+    by_point = (by_point.flatten(1, 2) @ A).view(by_point.shape)
+    by_row = _by_update(by_point, seen.local)  # of the camera of the row
+    by_pose = by_row
+    if not sights.single:
+        back = sights.rotation.mT
+        rig = (back @ (seen.local - sights.translation)[..., None])[..., 0]
+        by_pose = _by_update((back @ by_point.transpose(1, 2)).transpose(1, 2), rig)
+    bent, zero = flat * seen.bend, torch.zeros_like(flat)
+    scaled = bent * seen.linear.diagonal(dim1=-2, dim2=-1)[:, None]
     by_camera = torch.stack([
-        across + down - states.nuisances[:, None, 5:6] * skewed, *(e.expand_as(flat) for e in eye),
-        (A @ (flat * square)[..., None])[..., 0], 0.5 * (across - down + states.nuisances[:, None, 5:6] * skewed), skewed,
-    ], -1)  # fmt: skip
-    by_motion = by_row * sights.times[..., None, None]
-    by_nuisance = torch.cat([by_camera, by_motion, torch.zeros_like(by_motion[..., :1])], -1)
-    return torch.cat([by_pose, by_nuisance * states.deviation[:, None, None]], -1)
+        scaled, *(constant(e, flat).expand_as(flat) for e in ((1.0, 0.0), (0.0, 1.0))), (flat * seen.square) @ A,
+        scaled * constant((0.5, -0.5), flat), pad(bent[..., 1:], (0, 1)),
+    ], 1)  # fmt: skip
+    by_motion = by_row * sights.times[..., None, :, None]
+    found = torch.cat([by_pose, by_camera, by_motion, zero[:, None]], 1)
+    found[:, 6:] *= states.deviation[:, :, None, None]
+    return found
+
+
+def _by_update(
+    by_point: Float[Tensor, "h 3 m k"], points: Float[Tensor, "h m 3"]
+) -> Float[Tensor, "h 6 m k"]:
+    """Return what ``by_update`` does, with the axes in this order."""
+    return torch.cat([-by_point, torch.linalg.cross(by_point, points.mT[..., None], dim=1)], 1)
 
 
 def pinhole(
@@ -191,9 +215,9 @@ def by_update(by_point: Float[Tensor, "*m k 3"], points: Float[Tensor, "*m 3"]) 
 
 def linear(states: States) -> Float[Tensor, "h 2 2"]:
     """Return the map from the plane z = 1 of the true camera to that of the stated one, without the shift: ``[[a, s], [0, b]]``."""
-    log_focal, half, skew = (states.nuisances[:, i] for i in (0, 4, 5))
-    a, b = (log_focal + half / 2).exp(), (log_focal - half / 2).exp()
-    return torch.stack([a, skew, torch.zeros_like(a), b], -1).unflatten(-1, (2, 2))
+    nuisances = states.nuisances
+    a, b = (nuisances[:, 0:1] + nuisances[:, 4:5] * constant((0.5, -0.5), nuisances)).exp().unbind(-1)
+    return torch.stack([a, nuisances[:, 5], torch.zeros_like(a), b], -1).unflatten(-1, (2, 2))
 
 
 def true_intrinsics(stated: Intrinsics, camera: Float[Tensor, "6"]) -> Intrinsics:
