@@ -51,7 +51,9 @@ class Query:
         )
         rays = torch.cat([image.rays for image in images])[:, :2]
         focal = torch.tensor([image.focal for image in images], dtype=torch.float64)[view]
-        sights = Sights(rays, times, T.rotation, T.translation, single=len(images) == 1)
+        last = images[-1].T_ref_camera.matrix()
+        single = len(images) == 1 and torch.allclose(last, torch.eye(4, dtype=last.dtype), rtol=0, atol=1e-9)
+        sights = Sights(rays, times, T.rotation, T.translation, single)
         return Query(
             images,
             Keypoints(*joined),
