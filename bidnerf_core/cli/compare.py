@@ -34,7 +34,7 @@ class Compare:
     out: Annotated[Path | None, Option("DIR", "write compare.json, compare.png and compare.svg there")] = None
     protocol: Annotated[
         str, Option("NAME", "how starts are chosen: bid, bid-hard, inerf, parallel, perturb or none")
-    ] = "bid"
+    ] = "none"
     size: Annotated[
         str | None,
         Option("SIZE", "error of the start: e_t, or METRES:DEGREES for perturb", "the protocol's first"),

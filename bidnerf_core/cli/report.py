@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from urllib.parse import quote
 
 from bidnerf_core.cli.folders import check_folder
-from bidnerf_core.cli.options import wrong_usage
+from bidnerf_core.cli.options import Names, wrong_usage
 from bidnerf_core.cli.output import console, show
 from bidnerf_core.cli.parser import Option, parse
 from bidnerf_core.errors import InputError, UsageError
@@ -34,6 +34,9 @@ def report(
     view: Annotated[
         Path | None, Option("PAGE.html", "page of 'bidnerf view --results', whose frames the report links to", "")
     ] = None,
+    data: Annotated[
+        Names, Option("DATA...", "datasets of the results, from which the worst frames are shown", "no pictures")
+    ] = (),
 ) -> None:  # fmt: skip
     """Write tables, figures and statistical tests of results as one page that works offline.
 
@@ -53,10 +56,14 @@ def report(
         raise InputError(
             "no such page", where=view, expected="one written by 'bidnerf view MAP --results ... --save'"
         )
-    check_folder(out, results)
+    if missing := [folder for folder in data if not Path(folder).is_dir()]:
+        raise InputError("no such folder", where=missing[0], expected="a dataset that the results are of")
+    check_folder(out, (*results, *data))
     runs = [(path.name, read_runs(path)) for path in results]
     with console.status("drawing"):
-        page = write_report(table, out, title, chosen, runs, None if view is None else link_to(view, out))
+        page = write_report(
+            table, out, title, chosen, runs, None if view is None else link_to(view, out), data
+        )
     for line in str(table).split("\n"):
         show(line)
     show(f"look at {page}")

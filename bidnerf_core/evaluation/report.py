@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import base64
+import io
 import itertools
+import os
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
+from PIL import Image
 
+from bidnerf_core.datasets import Capture
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.evaluation.plots import Figure, Figures
 from bidnerf_core.evaluation.provenance import Provenance
@@ -27,9 +32,10 @@ from bidnerf_core.evaluation.summary import (
     succeeded,
     usual_criterion,
 )
-from bidnerf_core.evaluation.trial import TrialResult
+from bidnerf_core.evaluation.trial import TrialResult, trial_views
 from bidnerf_core.io import is_temporary, open_binary, output_folder, write_file
-from bidnerf_core.results import CRITERIA, CRITERION_NAMES, require_matplotlib
+from bidnerf_core.results import CRITERIA, CRITERION_NAMES, as_picture, require_matplotlib
+from bidnerf_core.scenes import is_closed_form
 
 MARK = '<meta name="generator" content="bidnerf report">'
 """Marks a page as a report, which a later report may replace."""
@@ -37,8 +43,10 @@ UNFINISHED = (
     f"<!doctype html>{MARK}<title>Unfinished report</title><p>This report was interrupted; the same command"
     " rewrites it.</p>\n"
 )
-LISTED_FRAMES = 100
-"""Number of frames that a report lists."""
+LISTED_FRAMES = 24
+"""Number of trials that a report lists."""
+THUMBNAIL = 240
+"""Pixels of the longer side of the picture of a trial."""
 LENGTH_OF_HEAD = 4096  # bytes at the beginning of a page that contain the mark of a report
 
 
@@ -49,13 +57,15 @@ def write_report(
     criterion: str | None = None,
     runs: Sequence[tuple[str, Sequence[Provenance]]] = (),
     view: str | None = None,
+    data: Sequence[str | Path] = (),
 ) -> Path:
     """Write ``index.html``, and its figures as PNG and SVG, to ``folder``, and return the path of the page.
 
     ``criterion`` is the one of ``CRITERIA`` used where only one is shown. ``runs`` has the name of each
     results file and the runs that made it. ``view`` is the address of a page of ``bidnerf view --results``,
-    to whose frames the report links. An earlier report in the folder is replaced. Raises ``InputError``
-    without results or matplotlib, and for a folder that holds anything but a report.
+    to whose frames the report links. ``data`` has folders of datasets, from which the images of the listed trials are
+    shown. An earlier report in the folder is replaced. Raises ``InputError`` without results or matplotlib, for a folder
+    that holds anything but a report, and for a dataset that cannot be read.
     """
     if not table.rows:
         raise InputError("no finished trial, nothing to report")
@@ -71,12 +81,13 @@ def write_report(
         raise InputError(
             "holds something other than a bidnerf report; name another --out or remove it", where=folder
         )
+    shown = thumbnails(worst(table.rows)[:LISTED_FRAMES], data)
     path = folder / "index.html"
     with output_folder(folder, overwrite=True):
         if not path.exists():  # so that an interrupted report is recognized as one
             write_file(path, UNFINISHED.encode())
         figures = Figures(table.groups, folder, chosen).all()
-        write_file(path, page(title, table, figures, chosen, runs, view).encode())
+        write_file(path, page(title, table, figures, chosen, runs, view, shown).encode())
     return path
 
 
@@ -101,8 +112,9 @@ def page(
     criterion: str,
     runs: Sequence[tuple[str, Sequence[Provenance]]] = (),
     view: str | None = None,
+    pictures: Sequence[str | None] = (),
 ) -> str:
-    """Return a report as HTML."""
+    """Return a report as HTML; ``pictures`` has the JPEG (base64) of each of the worst trials, or None."""
     environment = Environment(
         autoescape=True, finalize=_printed, undefined=StrictUndefined, keep_trailing_newline=True
     )
@@ -133,7 +145,10 @@ def page(
         pairs=[(start, found) for start, found in pairs if found],
         count=sum(len(found) for _, found in pairs),
         view=view,
-        frames=doubtful(table.rows)[:LISTED_FRAMES],
+        frames=list(itertools.zip_longest(worst(table.rows)[:LISTED_FRAMES], pictures)),
+        succeeded=succeeded,
+        wrong=sum(row.converged and not succeeded(row) for row in table.rows),
+        refused=sum(not row.converged for row in table.rows),
         criterion=CRITERION_NAMES[criterion],
         runs=[
             (name, _facts(name, known), list(dict.fromkeys(r.command for r in known))) for name, known in runs
@@ -141,13 +156,35 @@ def page(
     )
 
 
-def doubtful(rows: Sequence[TrialResult]) -> list[TrialResult]:
-    """Return the trials that were accepted although wrong (beyond 5 degrees or 0.05 units), then the refused, worst first."""
+def worst(rows: Sequence[TrialResult]) -> list[TrialResult]:
+    """Return the trials accepted although wrong (beyond 5 degrees or 0.05 units), then the refused, then the others, by error."""
 
-    def rank(row: TrialResult) -> tuple[bool, float]:
-        return not row.converged, -(row.error.translation if row.error else float("inf"))
+    def rank(row: TrialResult) -> tuple[bool, bool, float]:
+        error = float("inf") if row.error is None else row.error.translation
+        return row.converged and succeeded(row), not row.converged, -error
 
-    return sorted((row for row in rows if not (row.converged and succeeded(row))), key=rank)
+    return sorted(rows, key=rank)
+
+
+def thumbnails(rows: Sequence[TrialResult], data: Sequence[str | Path]) -> list[str | None]:
+    """Return the image of each trial, with its faults, as a JPEG in base64; None for one whose dataset is not in ``data``."""
+    folders = {Path(os.path.realpath(folder)).name: str(folder) for folder in data}
+    opened: dict[tuple[str, str], Capture] = {}
+    pictures: list[str | None] = []
+    for trial in (row.trial for row in rows):
+        name = trial.data if is_closed_form(trial.data) else folders.get(trial.data)
+        if name is None:
+            pictures.append(None)
+            continue
+        if (name, trial.split) not in opened:  # results hold names of other files, not paths
+            setup = replace(trial.reading, masks=None, camera=None, register_depth=None)
+            opened[name, trial.split] = setup.open(name)
+        view, content = trial_views(trial, opened[name, trial.split])[-1], io.BytesIO()
+        image = Image.fromarray(as_picture(view.frame.rgb))
+        image.thumbnail((THUMBNAIL, THUMBNAIL))
+        image.save(content, "JPEG", quality=80)
+        pictures.append(base64.b64encode(content.getvalue()).decode())
+    return pictures
 
 
 def _printed(value: Any) -> Any:

@@ -17,7 +17,9 @@ import imageio.v3 as iio
 import pytest
 from scipy.stats import mannwhitneyu
 
+import tiny
 from bidnerf_core.cli import main
+from bidnerf_core.datasets import write_transforms
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import (
     NEVER,
@@ -456,7 +458,7 @@ def test_warnings_of_other_libraries_cannot_control_the_terminal(
     assert harmless(said)
 
 
-def test_a_report_links_to_the_frames_that_are_wrong_or_refused(tmp_path: Path) -> None:
+def test_a_report_links_to_the_frames_from_the_worst_to_the_best(tmp_path: Path) -> None:
     first = ResultTable.load(Path(__file__).with_name("earlier_results.jsonl")).rows[0]
     near, far, hostile = ScalarPoseError(0.01, 1.0), ScalarPoseError(0.3, 1.0), "<script>alert(1)</script>"
     rows = [
@@ -472,7 +474,28 @@ def test_a_report_links_to_the_frames_that_are_wrong_or_refused(tmp_path: Path) 
     assert main([*report, "--view", str(tmp_path / "my map.html")]) == 0
     found = (tmp_path / "out" / "index.html").read_text()
     linked = re.findall(r'href="\.\./my%20map\.html#frame=([^"]*)"', found)
-    assert linked == ["wrong%20%231", "%3Cscript%3Ealert%281%29%3C/script%3E"]
+    assert linked == ["wrong%20%231", "%3Cscript%3Ealert%281%29%3C/script%3E", "right"]
     assert hostile not in found
     assert main(report) == 0
     assert "my%20map.html" not in (tmp_path / "out" / "index.html").read_text()
+
+
+def test_the_worst_frames_are_shown_as_the_method_received_them(tmp_path: Path) -> None:
+    """With their faults; results name a dataset, of which the reader may have a copy anywhere."""
+    views = tiny.views(2)
+    write_transforms(tmp_path / "photos", {"train": views, "test": views}, tiny.BACKGROUND)
+    names = [view.frame.name for view in views]
+    rows = [
+        trial_result(Trial("house", data, (name,), fault=fault), [0.01 * n], start_error=None)
+        for n, (data, name, fault) in enumerate(
+            [("elsewhere", "x", "none"), ("photos", names[0], "exposure:0"), ("photos", names[1], "none")]
+        )
+    ]
+    file = write(tmp_path / "r.jsonl", *rows)
+    assert main(["report", str(file), "--out", str(tmp_path / "a"), "--data", str(tmp_path / "photos")]) == 0
+    found = re.findall(r"data:image/jpeg;base64,([^\"]*)", (tmp_path / "a" / "index.html").read_text())
+    bright, black = (iio.imread(base64.b64decode(picture), extension=".jpg") for picture in found)
+    assert black.max() < 8 < bright.max()  # the last row is the worst
+    assert main(["report", str(file), "--out", str(tmp_path / "b"), "--data", str(tmp_path / "photo")]) == 1
+    assert main(["report", str(file), "--out", str(tmp_path / "c")]) == 0
+    assert "image/jpeg" not in (tmp_path / "c" / "index.html").read_text()
