@@ -26,13 +26,14 @@ from __future__ import annotations
 import statistics
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from _lab import BOUND, RESULTS, Row, answer, cpu_seconds, modes, one_thread, parser, record
 
-from bidnerf_core import SE3, Intrinsics, Localizer, View, load_map
+from bidnerf_core import SE3, Intrinsics, Localizer, load_map
 from bidnerf_core.datasets import Capture, Shot, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import RowStore, views_digest
@@ -173,25 +174,21 @@ def main() -> None:
                 name = f"{folder.name}, {truth}"
                 place = given.maps / f"{folder.parent.name}_{folder.name}_{truth}"
                 if not place.exists():
-                    partial = place.with_name(f"{place.name}.partial")
-                    train(spread(scene, "train", given.every), out=partial, config=config)
-                    partial.rename(place)
+                    unfinished = place.with_name(f"{place.name}.partial")
+                    train(spread(scene, "train", given.every), out=unfinished, config=config)
+                    unfinished.rename(place)
                 found = load_map(place)
-                localizer = Localizer(found)
+                localizer, rows = Localizer(found), dict[str, list[Row]]()
                 queries = spread(scene, "test", most=given.queries)
-                rows: dict[str, list[Row]] = {}
                 for view in (queries.view(shot) for shot in queries.shots):
                     for mode, (one,) in modes([view]).items():
                         key = [name, mode, found.info.weights, view.frame.name, views_digest([one])]
-                        rows.setdefault(mode, []).append(store.get(key, lambda v=one: answered(localizer, v)))
+                        ask = partial(answer, partial(localizer, one.frame), one)
+                        rows.setdefault(mode, []).append(store.get(key, ask))
                 results[name] = {mode: summary(some, right) for mode, some in rows.items()}
                 for mode, one in results[name].items():
                     print(f"{name:28} {mode:6} {line(one)}", flush=True)
     record(given.name, results)
-
-
-def answered(localizer: Localizer, view: View) -> Row:
-    return answer(lambda: localizer(view.frame), view)
 
 
 def line(found: dict[str, Any]) -> str:

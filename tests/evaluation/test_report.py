@@ -488,7 +488,7 @@ def test_the_worst_frames_are_shown_as_the_method_received_them(tmp_path: Path) 
     rows = [
         trial_result(Trial("house", data, (name,), fault=fault), [0.01 * n], start_error=None)
         for n, (data, name, fault) in enumerate(
-            [("elsewhere", "x", "none"), ("photos", names[0], "exposure:0"), ("photos", names[1], "none")]
+            [("elsewhere", "x", "none"), ("photos", names[0], "exposure:0.01"), ("photos", names[1], "none")]
         )
     ]
     file = write(tmp_path / "r.jsonl", *rows)
