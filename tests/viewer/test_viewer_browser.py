@@ -58,6 +58,7 @@ FARTHEST = """() => {
 LAPTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
 LOOKED_AT = """() => page.space.controls.target.distanceTo(new THREE.Vector3(page.pose[3], page.pose[7], page.pose[11]))"""
 """How far the middle of the view is from the pose that the page tells of."""
+IDLE = "document.getElementById('progress').hidden"
 WAIT = 120_000  # ms
 
 
@@ -138,14 +139,18 @@ def test_a_photo_is_chosen_and_localized_live(browser: Any, room: Map, tmp_path:
         serving(room, camera=CameraSource(hfov=61.5)) as client,
         opened(browser, f"http://127.0.0.1:{client.port}/", LAPTOP) as page,
     ):
-        assert page.title().startswith("room")
+        assert page.title().startswith("map")
         assert value(page, "#hfov") == "61.5"
         page.fill("#hfov", "")
         page.evaluate("document.activeElement.blur()")
         assert page.locator("#query option").count() == 2  # one asks to choose
+        assert page.is_visible("#answer .lead")  # the panel says what to do, and shows the map's images
+        page.click("#gallery button >> nth=2")
+        where = "page.space.camera.position.distanceTo(new THREE.Vector3(...[3, 7, 11].map((i) => page.map.cameras[2].pose[i])))"
+        assert page.evaluate(where) < 1e-6
         page.set_input_files("#photo", photo)
         page.wait_for_selector(".outcome.good")
-        until(page, "document.getElementById('note').textContent === ''")
+        until(page, IDLE)
         assert page.text_content("#verdict .name") == "a <b>photo.png"
         assert page.evaluate("page.space.layers.answer.getObjectByName('ellipsoid') !== undefined")
         page.keyboard.press("v")
@@ -153,14 +158,14 @@ def test_a_photo_is_chosen_and_localized_live(browser: Any, room: Map, tmp_path:
         assert page.evaluate("document.getElementById('field').naturalWidth") > 0
         page.keyboard.press("v")
         page.keyboard.press("p")  # the image that the viewer was started with
-        until(page, "page.answers.length === 2 && document.getElementById('note').textContent === ''")
+        until(page, "page.answers.length === 2 && " + IDLE)
         assert page.text_content("#verdict .name") == "photo"
         page.evaluate(DROP, [base64.b64encode(photo.read_bytes()).decode(), "dropped.png"])
-        until(page, "page.answers.length === 3 && document.getElementById('note').textContent === ''")
+        until(page, "page.answers.length === 3 && " + IDLE)
         assert page.text_content("#verdict .name") == "dropped.png"
         page.fill("#hfov", "58.19")
         page.evaluate(DROP, [base64.b64encode(photo.read_bytes()).decode(), "with field of view.png"])
-        until(page, "page.answers.length === 4 && document.getElementById('note').textContent === ''")
+        until(page, "page.answers.length === 4 && " + IDLE)
         assert "horizontal field of view 58.19 deg" in page.evaluate("page.answer.camera")
         page.fill("#hfov", "200")
         page.evaluate(DROP, [base64.b64encode(photo.read_bytes()).decode(), "no camera.png"])
@@ -193,7 +198,7 @@ def test_a_saved_page_works_from_disk_without_a_network(browser: Any, saved: Pat
 
 def test_a_refused_photo_tells_why_and_names_stay_text(browser: Any, saved: Path) -> None:
     with opened(browser, f"{saved.as_uri()}#frame={quote(viewed.HOSTILE)}", LAPTOP, offline=True) as page:
-        assert page.title().startswith("room")  # no script of a name has run
+        assert page.title().startswith("map")  # no script of a name has run
         assert page.text_content("#verdict .name") == viewed.HOSTILE
         assert page.text_content(".outcome b").startswith("Refused")
         assert page.locator("#figures tr.failed").count() > 0
@@ -219,11 +224,9 @@ def test_a_refused_photo_tells_why_and_names_stay_text(browser: Any, saved: Path
             page.click("#runner")
         assert "runner-up" in page.text_content(".pictures .tag.right")
         assert "You are looking at the runner-up" in page.text_content(".banner")
-        page.click("#about summary")
-        page.wait_for_selector("#facts dt")
+        assert page.is_visible("#facts dt")
         page.keyboard.press("?")
         page.wait_for_selector("#words dt")
-        assert not page.is_visible("#facts")
         keys = page.locator("#keys kbd").all_text_contents()
         assert "r" in keys
         assert "v" not in keys  # of the live viewer
@@ -231,6 +234,25 @@ def test_a_refused_photo_tells_why_and_names_stay_text(browser: Any, saved: Path
         assert f"1 … {modes}" in keys
         page.click("#space", position={"x": 200, "y": 500})
         assert not page.is_visible("#words")
+
+
+def test_two_points_measure_the_scale(browser: Any, saved: Path) -> None:
+    with opened(browser, saved.as_uri(), LAPTOP, offline=True) as page:
+        page.click("#measure")
+        for x in (300, 420):
+            page.mouse.click(x, 420)
+        ends = page.evaluate("page.measured")
+        assert len(ends) == 2
+        seen = page.evaluate(
+            "page.measured.map((place) => { const v = new THREE.Vector3(...place).project(page.space.camera);"
+            " return [(v.x + 1) / 2 * page.space.canvas.clientWidth, (1 - v.y) / 2 * page.space.canvas.clientHeight + 44]; })"
+        )
+        assert all(abs(x - at) < 7 and abs(y - 420) < 8 for (x, y), at in zip(seen, (300, 420), strict=True))
+        length = sum((a - b) ** 2 for a, b in zip(*ends, strict=True)) ** 0.5
+        page.fill("#note input", f"{2.5 * length}")
+        assert page.text_content("#note code") == "bidnerf scale MAP --factor 2.5"
+        page.keyboard.press("Escape")  # from the input
+        assert page.evaluate("page.measured") is None
 
 
 def test_a_descent_can_be_replayed(browser: Any, room: Map, tmp_path: Path) -> None:

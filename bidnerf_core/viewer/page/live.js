@@ -63,7 +63,8 @@ export class Live {
 
   async ask(path, name, body = null) {
     this.waiting = name;
-    this.page.note(`${name}: waiting`);
+    this.page.note("");
+    this.page.progress(`${name}: waiting`);
     try {
       const reply = await fetch(path, { method: "POST", body, headers: body ? { "Content-Type": "application/octet-stream" } : {} });
       const said = await reply.json();
@@ -72,6 +73,7 @@ export class Live {
     } catch (error) {
       this.page.note(`${name}: ${error.message}`);
     }
+    this.page.progress("");
     if (this.waiting === name) this.waiting = null;
   }
 
@@ -86,10 +88,9 @@ export class Live {
       known = job.state;
       const seconds = `${((performance.now() - began) / 1000).toFixed(0)} s`;
       const doing = { waiting: "waiting", searching: job.caption || "searching", rendering: "rendering the field" }[job.state];
-      this.page.note(`${name}: ${doing} (${seconds})`);
+      this.page.progress(`${name}: ${doing} (${seconds})`);
       await new Promise((resolve) => setTimeout(resolve, 200));
     }
-    this.page.note("");
   }
 
   toggleField() {

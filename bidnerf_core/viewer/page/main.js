@@ -16,7 +16,7 @@ const WORDS = [["accepted, refused", "whether the pose passed all tests; a refus
   ["confidence", "probability that the pose is right", (a) => a.figures.some(({ name }) => name === "confidence")],
   ["ellipsoid", "where the camera is: two standard deviations of the position", (a) => a.ellipsoid]];
 const SWATCHES = { landmarks: "var(--landmark)", cameras: "var(--soft)" };  // colours in which layers are drawn
-const ENLARGED = [1, 10, 100, 1000];
+const ENLARGED = [1, 10, 100, 1000], GALLERY = 24;  // sizes of the ellipsoid, and most images of the map that are shown
 
 const placeOf = (pose) => [pose[3], pose[7], pose[11]];
 const between = (one, other) => Math.hypot(...one.map((x, i) => x - other[i]));
@@ -42,6 +42,7 @@ class Page {
     this.results = state.results.length ? new Results(this, state.results) : null;
     if (this.answers.length) this.select(0, false);
     else this.empty();
+    this.gallery();
     this.follow();
     this.offerViews();
   }
@@ -52,7 +53,7 @@ class Page {
     const layers = LAYERS.filter(([name]) => find(`show-${name}`)?.hidden === false), ways = this.answer ? this.comparison.available().length : 0;
     const keys = [[any((a) => a.steps.length > 1), "← →", "step of the search"], [any((a) => a.steps.length > 1), "space", "play the search"],
       [this.answers.length > 1 || this.live?.queries.length > 1, "n p", "next, previous image"], [ways > 1, `1 … ${ways}`, "way of comparing"], [compared, "w W", "wipe"],
-      [this.space, "f", "whole map"], [pose, "g", "go to the pose"], [pose, "o", "from the photo"], [any((a) => a.runner_up), "r", "runner-up"],
+      [this.space, "f", "whole map"], [this.space, "m", "measure a distance"], [pose, "g", "go to the pose"], [pose, "o", "from the photo"], [any((a) => a.runner_up), "r", "runner-up"],
       [layers.length, layers.map(([, , key]) => key).join(" "), layers.map(([, label]) => label.toLowerCase()).join(", ")], [this.live, "v", "field from here"]];
     const outcomes = new Map(this.answers.filter((a) => a.meaning).map((a) => [a.outcome, a.meaning]));
     const methods = new Map(this.answers.filter((a) => a.method_summary).map((a) => [`method ${a.method}`, a.method_summary]));
@@ -95,12 +96,54 @@ class Page {
     this.offerViews();
   }
 
-  note(text) { find("note").textContent = text; }
+  note(...parts) { find("note").replaceChildren(...parts); }
+
+  // What is being done at the moment; nothing if the text is empty.
+  progress(text) { find("doing").textContent = text; find("progress").hidden = !text; }
 
   empty() {
-    find("answer").replaceChildren(
-      element("p", { class: "empty" }, this.state.live ? "Choose a photo or drop it on the map to find where it was taken."
-        : this.track || this.results ? "" : "The page holds no localization."));
+    find("answer").replaceChildren(...(this.state.live ? [element("p", { class: "lead" }, "Where was a photo taken?"),
+      element("p", {}, "Drop it anywhere on this page, or ", element("label", { class: "button", for: "photo" }, "choose a photo"), " to find its pose in this map, with the reason why it is accepted or refused.")]
+      : this.track || this.results ? [] : [element("p", { class: "empty" }, "The page holds no localization.")]));
+  }
+
+  // Images of the map, spread over all, from whose cameras one can look.
+  gallery() {
+    const known = this.map.cameras.map((camera, i) => [camera, i, camera.thumbnail?.url ?? this.live?.thumbnail(i)]).filter(([, , url]) => url);
+    const every = Math.max(1, Math.ceil(known.length / GALLERY));
+    find("seen").hidden = !known.length;
+    find("gallery").replaceChildren(...known.filter((_, i) => i % every === 0).map(([{ name }, i, url]) =>
+      element("button", { title: name, onclick: () => this.lookFrom(i) }, element("img", { src: url, alt: name, loading: "lazy" }))));
+  }
+
+  lookFrom(number) {
+    const { name, pose, shape } = this.map.cameras[number];
+    this.space?.from(pose, shape);
+    this.note(`The map from the camera of ${name}`);
+  }
+
+  // Two points to pick, whose distance tells the scale of the map.
+  measure() {
+    this.measured = this.measured ? null : [];
+    this.space?.clear("measure");
+    find("measure").setAttribute("aria-pressed", String(Boolean(this.measured)));
+    find("stage").classList.toggle("measuring", Boolean(this.measured));
+    this.note(this.measured ? "Click two points of the surface whose distance you know." : "");
+  }
+
+  pick(x, y) {
+    const place = this.space.pointAt(x, y), colour = colourOf("--accent");
+    if (!place) { this.note("There is no point of the map; click on its surface."); return; }
+    this.measured = [...(this.measured.length > 1 ? [] : this.measured), place];
+    this.space.clear("measure");
+    this.space.dots("measure", this.measured, this.measured.map(() => [0.12, 0.37, 0.75]), 0.05 * this.space.size);
+    if (this.measured.length < 2) { this.note("Now the second point."); return; }
+    const length = between(...this.measured), command = element("code"), real = element("input", { type: "number", min: "0", step: "any", "aria-label": "True distance in metres" });
+    this.space.lines("measure", this.measured, colour);
+    this.space.label("measure", this.measured[1], lengthText(length, this.map.unit), colour);
+    const say = () => { command.textContent = real.value > 0 ? `bidnerf scale MAP --factor ${Number((real.value / length).toPrecision(5))}` : ""; };
+    real.addEventListener("input", say);
+    this.note(`${lengthText(length, this.map.unit)}. In truth it is `, real, " m: ", command);
   }
 
   buttons() {
@@ -110,7 +153,8 @@ class Page {
       .map((each) => toggle(...each)));
     find("views").append(element("button", { id: "fit", title: "Whole map (f)", onclick: () => this.fit() }, "Whole map"),
       element("button", { id: "go", title: "Go to the pose (g)", onclick: () => this.go() }, "Pose"),
-      element("button", { id: "from", title: "From the photo (o)", onclick: () => this.from() }, "From the photo"));
+      element("button", { id: "from", title: "From the photo (o)", onclick: () => this.from() }, "From the photo"),
+      element("button", { id: "measure", title: "Measure a distance (m)", "aria-pressed": "false", onclick: () => this.measure() }, "Measure"));
   }
 
   toggle(name) {
@@ -124,7 +168,7 @@ class Page {
 
   get pose() { return this.runner && this.answer?.runner_up ? this.answer.runner_up.pose : this.answer?.pose; }
 
-  fit() { this.look = "fit"; this.space?.fit(); }
+  fit() { this.look = "fit"; this.note(""); this.space?.fit(); }
 
   go() { if (this.pose) { this.look = "go"; this.space?.near(this.pose); } }
 
@@ -149,13 +193,22 @@ class Page {
     find("step").addEventListener("input", (event) => this.showStep(Number(event.target.value)));
     find("play").addEventListener("click", () => this.play());
     find("space").addEventListener("pointermove", (event) => this.hover(event));
-    find("space").addEventListener("pointerdown", (event) => this.hover(event));
+    find("space").addEventListener("pointerdown", (event) => { this.down = [event.clientX, event.clientY]; this.hover(event); });
+    find("space").addEventListener("pointerup", (event) => this.click(event));
     find("space").addEventListener("pointerleave", () => { find("card").hidden = true; });
     addEventListener("keydown", (event) => this.key(event));
     addEventListener("hashchange", () => this.follow());
     find("help").addEventListener("toggle", () => this.fillHelp());
-    addEventListener("pointerdown", ({ target }) => { for (const id of ["about", "help"]) if (!find(id).contains(target)) find(id).open = false; });
+    addEventListener("pointerdown", ({ target }) => { if (!find("help").contains(target)) find("help").open = false; });
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { this.drawAnswer(); if (this.answer) this.showStep(this.step); });
+  }
+
+  // A click picks a point to measure, or looks from the camera under it; a drag does neither.
+  click(event) {
+    const box = event.target.getBoundingClientRect(), x = event.clientX - box.left, y = event.clientY - box.top;
+    if (!this.space || Math.hypot(event.clientX - this.down?.[0], event.clientY - this.down?.[1]) > 4) return;
+    const number = this.measured ? -1 : this.space.cameraAt(x, y);
+    if (this.measured) this.pick(x, y); else if (number >= 0) this.lookFrom(number);
   }
 
   // Show what the camera of the map under the pointer sees.
@@ -177,8 +230,8 @@ class Page {
     const actions = {
       ArrowLeft: () => this.showStep(this.step - 1), ArrowRight: () => this.showStep(this.step + 1), " ": () => this.play(),
       n: () => this.turn(1), p: () => this.turn(-1), f: () => this.fit(), g: () => this.go(), o: () => this.from(), r: () => this.toggleRunner(),
-      w: () => move(5), W: () => move(-5), v: () => this.live?.toggleField(), "?": () => { find("about").open = false; find("help").open = !find("help").open; },
-      Escape: () => { find("help").open = find("about").open = false; },
+      w: () => move(5), W: () => move(-5), v: () => this.live?.toggleField(), m: () => this.measure(), "?": () => { find("help").open = !find("help").open; },
+      Escape: () => { find("help").open = false; if (this.measured) this.measure(); },
     };
     for (const [name, , key] of LAYERS) actions[key] = () => this.toggle(name);
     if (/^[1-6]$/.test(event.key)) this.comparison.choose(this.answer && this.comparison.available()[event.key - 1]);

@@ -1,6 +1,9 @@
 // What is said about an answer: outcome, uncertainty, figures, contests of explanations.
 import { element, lengthText, percent, withCode } from "./data.js";
 
+// Outcomes whose name says less than what they mean.
+const PLAINLY = { "too few matches": "probably another scene", undetermined: "the photo shows too little", "bad input": "this file cannot be used" };
+
 export function outcomeOf(answer) {
   const facts = [];
   if (answer.accepted && answer.confidence !== null) facts.push(`${percent(answer.confidence)} likely to be right`);
@@ -9,7 +12,7 @@ export function outcomeOf(answer) {
   const lines = [
     element("p", { class: "name" }, answer.name),
     element("p", { class: `outcome ${answer.accepted ? "good" : "bad"}` },
-      element("b", {}, answer.accepted ? "Accepted" : `Refused: ${answer.outcome}`), element("span", { title: answer.method_summary }, facts.join(" · "))),
+      element("b", {}, answer.accepted ? "Accepted" : `Refused: ${PLAINLY[answer.outcome] ?? answer.outcome}`), element("span", { title: answer.method_summary }, facts.join(" · "))),
     element("p", { class: "reason" }, answer.reason),
   ];
   if (answer.advice) {

@@ -4,6 +4,7 @@ import { colourOf, numbers } from "./data.js";
 const FOV = 55;
 const SPREAD = 2.2;  // radius of a point of the surface over that of its surfel, which closes gaps
 const SAMPLE = 2000, REACH = 3;  // points that a view is fitted to, and how far from the middle, in extents, what else it shows may be
+const SHARED = 0.7, LEAST_OBJECT = 0.05;  // share of the images that show a point of an object, and of the points that are such
 const SLOW = 45, REST = 180, LEAST_SHARE = 0.08;  // ms of a frame, ms without motion, share of the points
 
 const VERTEX = `
@@ -50,7 +51,7 @@ export class Space {
     this.camera = new THREE.PerspectiveCamera(FOV, 1, map.extent / 2000, map.extent * 60);
     this.layers = {};
     this.size = 0.05 * map.extent;  // depth of a pyramid that is drawn for a camera
-    for (const name of ["surface", "landmarks", "splats", "cameras", "search", "answer", "runner", "matches", "track"]) {
+    for (const name of ["surface", "landmarks", "splats", "cameras", "search", "answer", "runner", "matches", "track", "measure"]) {
       this.layers[name] = new THREE.Group();
       this.scene.add(this.layers[name]);
     }
@@ -113,9 +114,11 @@ export class Space {
     this.moved();
   }
 
+  // Look at what most images show, or, if there is nothing of the kind or the whole is wanted, at the map with its cameras.
   overview() {
     const { extent } = this.map, up = new THREE.Vector3(...this.map.up).normalize();
-    const centre = new THREE.Vector3(...this.map.centre);
+    const object = this.whole ? null : this.object, centre = new THREE.Vector3(...this.map.centre);
+    if (object) object.reduce((sum, point) => sum.add(point), centre.set(0, 0, 0)).divideScalar(object.length);
     const level = new THREE.Vector3(Math.abs(up.x) < 0.8 ? 1 : 0, Math.abs(up.x) < 0.8 ? 0 : 1, 0);
     level.addScaledVector(up, -level.dot(up)).normalize();
     const behind = new THREE.Vector3(), middle = new THREE.Vector3();
@@ -127,27 +130,27 @@ export class Space {
     if (behind.length() > 0.25 * this.map.cameras.length) level.copy(behind.normalize());
     this.camera.fov = FOV;
     this.camera.updateProjectionMatrix();
-    const { target, distance, back } = this.fitted(centre, level.multiplyScalar(1.25).addScaledVector(up, 0.8).normalize(), up);
+    const { target, distance, back } = this.fitted(object, centre, level.multiplyScalar(1.25).addScaledVector(up, 0.8).normalize(), up);
     this.camera.position.copy(target).addScaledVector(back, distance);
     this.control(up, target);
   }
 
-  // From where, along a direction, the map but for a few points, its cameras and the places to see fill the window.
-  fitted(centre, back, up) {
+  // From where, along a direction, an object, or the map but for a few points and its cameras, and the places to see fill the window.
+  fitted(object, centre, back, up) {
     const right = up.clone().cross(back).normalize(), above = back.clone().cross(right);
     const seen = (points) => points.map((point) => { const v = point.clone().sub(centre); return [v.dot(right), v.dot(above), v.dot(back)]; });
     const cameras = this.map.cameras.map(({ pose }) => new THREE.Vector3(pose[3], pose[7], pose[11]));
     const near = this.places.map((place) => new THREE.Vector3(...place)).filter((place) => place.distanceTo(centre) < REACH * this.map.extent);
     const around = near.flatMap((place) => [right, above].flatMap((axis) => [-1, 1].map((sign) => place.clone().addScaledVector(axis, sign * this.size))));
-    const groups = [[seen(this.sample), 0.01], [seen(cameras), 0.1], [seen(around), 0]].filter(([points]) => points.length);
+    const groups = [[seen(object ?? this.sample), 0.01], [object ? [] : seen(cameras), 0.1], [seen(around), 0]].filter(([points]) => points.length);
     const span = (values, beyond) => { const sorted = values.sort((a, b) => a - b), last = sorted.length - 1; return [sorted[Math.ceil(beyond * last)], sorted[Math.floor((1 - beyond) * last)]]; };
     const middle = [0, 1].map((i) => {
       const ends = groups.map(([points, beyond]) => span(points.map((point) => point[i]), beyond));
       return groups.length ? (Math.min(...ends.map(([low]) => low)) + Math.max(...ends.map(([, high]) => high))) / 2 : 0;
     });
-    const tall = Math.tan(FOV * Math.PI / 360), slopes = [tall * this.camera.aspect * 0.92, tall * 0.82];
+    const tall = Math.tan(FOV * Math.PI / 360), margin = object ? 0.85 : 1, slopes = [tall * this.camera.aspect * 0.92 * margin, tall * 0.82 * margin];
     const needed = ([x, y, z]) => z + Math.max(Math.abs(x - middle[0]) / slopes[0], Math.abs(y - middle[1]) / slopes[1]);
-    const distance = Math.max(0.1 * this.map.extent, ...groups.map(([points, beyond]) => span(points.map(needed), beyond)[1]));
+    const distance = Math.max(0.02 * this.map.extent, ...groups.map(([points, beyond]) => span(points.map(needed), beyond)[1]));
     return { target: centre.clone().addScaledVector(right, middle[0]).addScaledVector(above, middle[1]), distance, back };
   }
 
@@ -159,6 +162,7 @@ export class Space {
 
   fit() {
     this.touched = false;
+    this.whole = true;
     this.faint(false);
     const from = this.where();
     this.overview();
@@ -312,24 +316,28 @@ export class Space {
       if (part.normals) geometry.setAttribute("facing", new THREE.BufferAttribute(numbers(part.normals), 3, true));
       const made = this.points(name, geometry, SPREAD * part.radius, least);
       if (name === "surface") this.surface = made;
+      this.cloud ??= geometry;
     }
-    this.size = Math.min(this.size, 0.25 * this.usualDepth());
+    this.size = Math.min(this.size, 0.25 * this.survey());
     const places = [];
     for (const { pose, shape } of this.map.cameras) places.push(...this.moved3(pyramid(shape, 0.35 * this.size).lines, pose));
     const drawn = places.length ? this.lines("cameras", places, colourOf("--soft"), { opacity: 0.8 }) : null;
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { drawn?.material.color.set(colourOf("--soft")); this.changed(); });
   }
 
-  // How deep the points lie in the map's images, the median over points and images.
-  usualDepth() {
-    const { cameras } = this.map, v = new THREE.Vector3(), depths = [];
-    for (let i = 0; i < cameras.length; i += Math.ceil(cameras.length / 40)) {
+  // Find the points that most images show, an object if there is one; return how deep points lie in images, the median.
+  survey() {
+    const { cameras } = this.map, v = new THREE.Vector3(), depths = [], shown = this.sample.map(() => 0);
+    let images = 0;
+    for (let i = 0; i < cameras.length; i += Math.ceil(cameras.length / 40), images++) {
       const { pose, shape: s } = cameras[i], toCamera = matrixOf(pose).invert();
-      for (const point of this.sample) {
+      this.sample.forEach((point, j) => {
         const { x, y, z } = v.copy(point).applyMatrix4(toCamera);
-        if (z > 0 && x > s.left * z && x < s.right * z && y > s.top * z && y < s.bottom * z) depths.push(z);
-      }
+        if (z > 0 && x > s.left * z && x < s.right * z && y > s.top * z && y < s.bottom * z) { depths.push(z); shown[j]++; }
+      });
     }
+    const object = this.sample.filter((_, j) => images > 2 && shown[j] >= SHARED * images);
+    this.object = object.length > LEAST_OBJECT * this.sample.length ? object : null;
     return depths.length ? depths.sort((a, b) => a - b)[depths.length >> 1] : Infinity;
   }
 
@@ -408,6 +416,20 @@ export class Space {
       if (v.z < 1 && off < least) { least = off; best = i; }
     });
     return best;
+  }
+
+  // The point of the map that is drawn at a place on the canvas: of those within a few pixels, the nearest that faces the eye.
+  pointAt(x, y, reach = 6) {
+    const box = this.canvas.getBoundingClientRect(), eye = this.camera.position, v = new THREE.Vector3(), n = new THREE.Vector3();
+    const { position, facing } = this.cloud?.attributes ?? {};
+    let best = null, least = Infinity;
+    for (let i = 0; i < (position?.count ?? 0); i++) {
+      const away = v.fromBufferAttribute(position, i).distanceTo(eye);
+      if (away > least || (facing && n.fromBufferAttribute(facing, i).dot(v.clone().sub(eye)) > 0)) continue;
+      v.project(this.camera);
+      if (v.z < 1 && Math.hypot((v.x + 1) / 2 * box.width - x, (1 - v.y) / 2 * box.height - y) < reach) { least = away; best = i; }
+    }
+    return best === null ? null : v.fromBufferAttribute(position, best).toArray();
   }
 
   // Coloured dots.
