@@ -1,6 +1,6 @@
 """MkDocs hook: what the documentation takes from the code and the README, so that it cannot contradict them.
 
-The first page of the site is the README. In a page, ``<!-- settings of METHOD -->`` becomes the table of that method's settings,
+The first page of the site is the README, and the page of all measurements is that of ``benchmarks/results``. In a page, ``<!-- settings of METHOD -->`` becomes the table of that method's settings,
 and ``<!-- names of bidnerf_core -->`` the reference of all names that can be imported from ``bidnerf_core`` itself.
 """
 
@@ -28,24 +28,28 @@ from bidnerf_core.settings import Above, OneOf, Range, is_expert
 SETTINGS = re.compile(r"^<!-- settings of ([a-z-]+) -->$", re.MULTILINE)
 NAMES = "<!-- names of bidnerf_core -->"
 HEAD = "| setting | default | values | meaning |\n| --- | --- | --- | --- |\n"
-README = Path(__file__).parents[1] / "README.md"
+ROOT = Path(__file__).parents[1]
 LINK = re.compile(r"\[([^\]]+)\]\((?!https?:)([^)]+)\)")
 
 
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
-    """Add the README as the first page."""
-    files.append(File.generated(config, "index.md", content=index_page(README.read_text(encoding="utf-8"))))
+    """Add the README as the first page, and the measurements that are kept beside the records."""
+    for name, file in {"index.md": "README.md", "measurements.md": "benchmarks/results/README.md"}.items():
+        files.append(
+            File.generated(config, name, content=page_of_site((ROOT / file).read_text(encoding="utf-8")))
+        )
     return files
 
 
-def index_page(readme: str) -> str:
-    """Return the README as a page of the site; links to files that are not in the site lose their target."""
+def page_of_site(text: str) -> str:
+    """Return a file from outside of the documentation as a page of the site; links to what is not in the site lose their target."""
 
     def link(found: re.Match[str]) -> str:
         text, target = found.groups()
-        return f"[{text}]({target.removeprefix('docs/')})" if target.startswith("docs/") else text
+        inside = target.removeprefix("../../").removeprefix("docs/")
+        return f"[{text}]({inside})" if "docs/" in target else text
 
-    return LINK.sub(link, readme)
+    return LINK.sub(link, text)
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:

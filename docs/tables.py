@@ -1,7 +1,7 @@
 """Tables of results, made from the records in ``benchmarks/results``, so that no figure in the documentation is typed by hand.
 
-A page holds a table between ``<!-- generated: NAME -->`` and ``<!-- end -->``. ``python docs/tables.py`` rewrites all of them;
-a test compares the pages with the records.
+A page holds a table between ``<!-- generated: NAME -->`` and ``<!-- end -->``. ``python docs/tables.py`` rewrites all of them, and
+the page of all measurements beside the records; a test compares the pages with the records.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import json
 import re
 import textwrap
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,8 @@ from bidnerf_core.registry import list_plugins
 
 ROOT = Path(__file__).parents[1]
 RECORDS = ROOT / "benchmarks" / "results"
-PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+MEASUREMENTS = RECORDS / "README.md"
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), MEASUREMENTS)
 BLOCK = re.compile(r"(<!-- generated: ([a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 SCENES = {
@@ -29,6 +29,7 @@ SCENES = {
     "tum_fr1_xyz": "TUM",
     "iphone_corridor": "corridor",
     "phone_doll": "doll",
+    "blender_mic": "microphone",
 }
 """What the scenes of the records are called in the tables."""
 
@@ -51,23 +52,23 @@ class Records:
 
     def caption(self) -> str:
         """Return a line with the name, date, commit and hardware of each record that was read."""
-        groups: dict[tuple[str, str], list[str]] = {}
+        groups: dict[str, list[str]] = {}
         for name, record in self.used.items():
-            groups.setdefault((_when(record), _hardware(record)), []).append(f"`{name}`")
-        parts = [f"{', '.join(names)} ({when}; {machine})" for (when, machine), names in groups.items()]
+            groups.setdefault(origin(record), []).append(f"`{name}`")
+        parts = [f"{', '.join(names)} ({made})" for made, names in groups.items()]
         return f"*Records: {'; '.join(parts)}.*\n"
 
 
-def _when(record: Record) -> str:
+def origin(record: Record) -> str:
+    """Return the date, the commit and the hardware of a record."""
     date = datetime.fromisoformat(record["date"])
-    return f"{date.day} {date:%B %Y}, {record['commit'][:7]}"
-
-
-def _hardware(record: Record) -> str:
-    if record.get("gpu"):
-        return " ".join(str(record["gpu"]).split()[:2])
     cpu = re.sub(r"\(R\)| Processor| @.*", "", record["cpu"])
-    return f"{record['cores']} cores of an {cpu}"
+    machine = (
+        " ".join(str(record["gpu"]).split()[:2])
+        if record.get("gpu")
+        else f"{record['cores']} cores of an {cpu}"
+    )
+    return f"{date.day} {date:%B %Y}, {record['commit'][:7]}; {machine}"
 
 
 TABLES: dict[str, Callable[[Records], str]] = {}
@@ -102,6 +103,141 @@ def _lines(head: Row, rows: Iterable[Row]) -> str:
     return f"{first}|{'---|' * len(head)}\n{''.join(others)}"
 
 
+# One renderer of all records: each part of a record that has some of these measures is a row.
+
+MEASURES = {
+    "images": ("n", "frames", "trials", "tried", "photos", "images", "test", "requests", "pairs"),
+    "right": ("5deg 0.05", "right", "right.5deg 0.05", "criteria.5deg 0.05", "within 5 degrees, 0.05", "5 cm, 5 deg"),
+    "within 1°, 0.02": ("1deg 0.02", "strict", "right.1deg 0.02", "criteria.1deg 0.02"),
+    "within 2 cm, 2°": ("2 cm, 2 deg",),
+    "to 10 % of the start": ("criteria.10%", "10%"),
+    "accepted": ("accepted", "converged", "believed"),
+    "of these wrong": ("silent", "accepted_but_wrong", "converged_but_wrong", "wrong_of_accepted", "accepted_wrong", "wrong"),
+    "right but refused": ("right_but_rejected", "right_but_not_converged", "right_lost"),
+    "inside the 95 % bound": ("inside", "inside_95_of_converged", "inside_95_of_accepted", "inside_95"),
+    "median error": ("median_translation", "translation_median", "errors.raw.translation_median", "translation", "translation.median"),
+    "and angle": ("median_rotation_deg", "rotation_deg_median", "errors.raw.rotation_deg_median", "rotation_deg", "rotation_deg.median"),
+    "calibration error": ("expected_calibration_error",),
+    "refused": ("refused",),
+    "damaged": ("damaged",),
+    "named": ("named",),
+    "landmarks": ("landmarks",),
+    "surfels": ("surfels",),
+    "PSNR, dB": ("psnr_mean_dB", "psnr"),
+    "depth error": ("depth_error_median",),
+    "steps": ("steps",),
+    "identical": ("identical",),
+    "kills": ("kills",),
+    "CPU time, s": ("median_cpu_seconds", "median_s", "cpu_seconds", "matching_cpu_seconds", "index_cpu_seconds"),
+    "slowest, s": ("slowest_cpu_seconds", "slowest_s", "slowest_seconds", "latency_seconds.p95"),
+    "time, s": ("seconds", "training.seconds", "train_seconds", "median.first_picture_seconds", "seconds undisturbed"),
+    "frames a second": ("median.frames_a_second", "per_second"),
+    "time, ms": ("cpu_ms.median", "graph_ms", "ms", "milliseconds_per_step"),
+    "as launched, ms": ("launched_ms",),
+    "memory": ("peak_resident_GiB", "training.peak_resident_GiB", "resident_MB", "megabytes"),
+}  # fmt: skip
+"""The columns of the page of all measurements, and the names that records have for each."""
+INNER = {
+    "cells", "scenes", "counts", "peers", "methods", "maps", "variants", "measurements", "starts", "summary", "extend", "levels",
+    "load", "localized", "answers", "from_starts", "held_out", "problems", "by_scene", "wrong", "rows", "sizes",
+}  # fmt: skip
+"""Names in records that say nothing of what was measured."""
+ASIDE = {
+    "settings", "common_settings", "config", "versions", "map", "localization_map", "run", "pairs", "rounds", "paper_percent",
+    "right", "criteria", "errors", "median",
+}  # fmt: skip
+"""Parts of records that hold no measurements."""
+NAMES = ("scene", "start", "condition", "clients", "title", "level")
+"""What tells the elements of a list apart."""
+
+
+@table
+def measurements(records: Records) -> str:
+    """All records, by the script that made them."""
+    shows = dict(
+        re.findall(
+            r"^\| `(\w+)` \| (.*?) \|",
+            (RECORDS.parent / "README.md").read_text(encoding="utf-8"),
+            re.MULTILINE,
+        )
+    )
+    text = ""
+    for path in sorted(records.folder.glob("*.json")):
+        records[path.stem]
+        record = records.used.pop(path.stem)
+        script = re.sub(r".*?(\w+)\.py.*", r"\1", record["command"])
+        rows = list(_measured(record["results"], ()))
+        columns = [name for name in MEASURES if any(name in cells for _, cells in rows)]
+        what = f"{shows[script][0].upper()}{shows[script][1:]}.\n" if script in shows else ""
+        text += f"\n## {path.stem}\n\n{what}{'' if not what else chr(10)}*{origin(record)}: `{record['command']}`*\n"
+        if columns:
+            text += "\n" + _lines(
+                ("", *columns), ((name, *(cells.get(c, "") for c in columns)) for name, cells in rows)
+            )
+    return text.lstrip("\n")
+
+
+def _measured(node: Any, path: tuple[str, ...]) -> Iterator[tuple[str, dict[str, str]]]:
+    """Yield the name and the measures of each part of a record that has any two of them."""
+    if isinstance(node, list):
+        for number, child in enumerate(node):
+            if isinstance(child, dict):
+                own = [
+                    f"{child[k]} {k}" if k == "clients" else _named(str(child[k]))
+                    for k in NAMES
+                    if isinstance(child.get(k), (str, int))
+                ]
+                yield from _measured(child, (*path, ", ".join(own) or str(number + 1)))
+        return
+    cells = {}
+    for column, keys in MEASURES.items():
+        values = (_inside(node, key) for key in keys)
+        if shown := next((text for value in values if (text := _shown_value(value))), ""):
+            cells[column] = shown
+    if len(cells) > 1:
+        yield ", ".join(path), cells
+    for key, child in node.items():
+        if isinstance(child, (dict, list)) and key not in ASIDE and not _shown_value(child):
+            yield from _measured(child, path if key in INNER else (*path, _shown(_named(key))))
+
+
+def _named(key: str) -> str:
+    """Return the name of a part of a record in words."""
+    for name, title in SCENES.items():
+        key = key.replace(name, title)
+    return key.replace("_", " ")
+
+
+def _inside(node: Any, path: str) -> Any:
+    """Return what is at a path within a part of a record; None if there is nothing. Keys may hold dots: the whole path comes first."""
+    if not isinstance(node, dict):
+        return None
+    if path in node:
+        return node[path]
+    first, _, rest = path.partition(".")
+    return _inside(node.get(first), rest) if rest else None
+
+
+def _shown_value(value: Any) -> str:
+    """Return a number, a rate or a count of a record as text; empty for anything else."""
+    if isinstance(value, bool) or value is None:
+        return ""
+    if isinstance(value, int):
+        return f"{value:,}"
+    if isinstance(value, float):
+        return f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"
+    if isinstance(value, str):
+        return value if re.fullmatch(r"\d+ of \d+", value) else ""
+    counts = isinstance(value, list) and len(value) == 2 and all(isinstance(x, int) for x in value)
+    if counts or (isinstance(value, dict) and ("rate" in value or {"successes", "trials"} <= value.keys())):
+        return _of(value)
+    return (
+        str(len(value))
+        if isinstance(value, list) and all(isinstance(x, str) for x in value) and value
+        else ""
+    )
+
+
 def _seconds(value: float) -> str:
     return f"{value:.2g} s"
 
@@ -110,181 +246,12 @@ def _length(value: float) -> str:
     return f"{value:.4f}" if value < 0.01 else f"{value:.3f}"
 
 
-# Localization without a start, and with faults
-
-
-@dataclass(frozen=True)
-class Counts:
-    """How the answers to some images turned out."""
-
-    n: int = 0
-    right: int = 0  # within 5 degrees and 0.05
-    strict: int = 0  # within 1 degree and 0.02
-    accepted: int = 0
-    silent: int = 0  # accepted but wrong
-    rejected: int = 0  # right but rejected
-    inside: int = 0  # accepted, and the truth within the 95 % bound of the covariance
-    bounded: int = 0  # accepted, with a covariance
-
-    @classmethod
-    def of(cls, cell: Record) -> Counts:
-        """Return the counts of a cell of a record of ``benchmarks/faults.py``."""
-        inside, bounded = cell["inside_95_of_converged"]
-        return cls(
-            n=cell["n"],
-            right=cell["right"],
-            strict=cell["strict"],
-            accepted=cell["converged"],
-            silent=cell["silent"],
-            rejected=cell["right_but_rejected"],
-            inside=inside,
-            bounded=bounded,
-        )
-
-    def __add__(self, other: Counts) -> Counts:
-        return Counts(*(a + b for a, b in zip(vars(self).values(), vars(other).values(), strict=True)))
-
-
-def _total(counts: Iterable[Counts]) -> Counts:
-    return sum(counts, Counts())
-
-
-FAULTED = {"RGB": ("faults_rgb", "faults_rgb_tum"), "RGB-D": ("faults_rgbd", "faults_rgbd_tum")}
-"""Records of method ``auto`` under faults: of all scenes, and of TUM on the map that knows how its camera moved."""
-
-
-def _cells(records: Records, sensor: str) -> dict[str, dict[str, Record]]:
-    """Return the cells of each scene and fault for a sensor."""
-    every, tum = FAULTED[sensor]
-    return {
-        scene: records[tum if scene == "tum_fr1_xyz" else every]["cells"][scene][sensor]
-        for scene in SCENES
-        if scene in records[every]["cells"]
-    }
-
-
-CLEAN = {"RGB": "no_start_rgb", "RGB-D": "no_start_rgbd"}
-"""Records of method ``auto`` on images without faults."""
-
-
-@table
-def no_start(records: Records) -> str:
-    """Unchanged images, localized by ``auto`` without a start."""
-    head = (
-        "scene", "input", "images", "within 5°, 0.05", "within 1°, 0.02", "accepted", "of these wrong",
-        "inside the 95 % bound", "median CPU time",
-    )  # fmt: skip
-    rows = []
-    for scene, title in SCENES.items():
-        for sensor, record in CLEAN.items():
-            if cell := records[record]["cells"].get(scene, {}).get(sensor, {}).get("none"):
-                c = Counts.of(cell)
-                inside = f"{c.inside} of {c.bounded}"
-                time = _seconds(cell["median_cpu_seconds"])
-                rows.append((title, sensor, c.n, c.right, c.strict, c.accepted, c.silent, inside, time))
-    return _table(head, rows, records)
-
-
-@table
-def headline(records: Records) -> str:
-    """README's sentence about localization without a start."""
-    found, times = {}, []
-    for sensor, record in CLEAN.items():
-        clean = [cells[sensor]["none"] for cells in records[record]["cells"].values()]
-        found[sensor] = (_total(map(Counts.of, clean)), len(clean))
-        times += [cell["median_cpu_seconds"] for cell in clean]
-    rgb, rgbd = found["RGB"], found["RGB-D"]
-    wrong = rgb[0].silent + rgbd[0].silent
-    accepted = rgb[0].accepted + rgbd[0].accepted
-    text = (
-        f"Without a start, it localizes {rgb[0].right} of {rgb[0].n} held-out RGB images of {rgb[1]} scenes and "
-        f"{rgbd[0].right} of {rgbd[0].n} RGB-D images of {rgbd[1]} scenes to within 5 degrees and 0.05 units. It accepts "
-        f"{accepted} of these poses, of which {wrong or 'none'} {'is' if wrong < 2 else 'are'} wrong. An image takes {min(times):.1f} to {max(times):.1f} seconds of "
-        f"CPU time (median of a scene). [Results](docs/results.md) has all tables."
-    )
-    return f"{textwrap.fill(text, 118)}\n\n{records.caption()}"
-
-
-@table
-def peers(records: Records) -> str:
-    """Method ``auto`` beside SIFT with PnP, on RGB images."""
-    names = {
-        "auto": "`auto`",
-        "sift + pnp (pycolmap)": "SIFT, PnP (pycolmap)",
-    }
-    rows = []
-    for scene, sensors in records["landmark_peers"]["scenes"].items():
-        for name, title in names.items():
-            p = sensors["RGB"]["peers"][name]
-            rows.append(
-                (SCENES[scene], title, p["n"], p["5deg 0.05"]["successes"], p["1deg 0.02"]["successes"],
-                 _length(p["median_translation"]), p["accepted"], p["silent"], _seconds(p["median_cpu_seconds"]))
-            )  # fmt: skip
-    head = (
-        "scene", "method", "images", "within 5°, 0.05", "within 1°, 0.02", "median error", "accepted",
-        "of these wrong", "median CPU time",
-    )  # fmt: skip
-    return _table(head, rows, records)
-
-
-@table
-def registration(records: Records) -> str:
-    """The surface search of ``auto`` beside registration of point clouds, on RGB-D images."""
-    names = {
-        "auto": "`auto`, surface only",
-        "open3d icp": "RANSAC, ICP (Open3D)",
-        "gicp": "GICP from a start 0.5 away",
-    }
-    rows = []
-    for record, scene in {"lego": "blender_lego", "room": "room_living", "tum": "tum_fr1_xyz"}.items():
-        methods = records[f"registration_{record}"]["methods"]
-        for name, title in names.items():
-            m = methods[name]
-            rows.append(
-                (SCENES[scene], title, m["n"], m["5deg 0.05"]["successes"], m["1deg 0.02"]["successes"],
-                 _length(m["median_translation"]), f"{m['cpu_seconds_against_auto']:.2g}")
-            )  # fmt: skip
-    head = (
-        "scene", "method", "images", "within 5°, 0.05", "within 1°, 0.02", "median error",
-        "CPU time over that of `auto`",
-    )  # fmt: skip
-    return _table(head, rows, records)
-
-
-def _by_fault(records: Records) -> dict[str, dict[str, Counts]]:
-    """Return the counts of each fault and sensor, over all scenes."""
-    found: dict[str, dict[str, Counts]] = {}
-
-    def add(sensor: str, cells: dict[str, Record]) -> None:
-        for fault, cell in cells.items():
-            by_sensor = found.setdefault(fault, {})
-            by_sensor[sensor] = by_sensor.get(sensor, Counts()) + Counts.of(cell)
-
-    for sensor in FAULTED:
-        for cells in _cells(records, sensor).values():
-            add(sensor, cells)
-    for name in ("faults_camera", "faults_nominal"):
-        for sensors in records[name]["cells"].values():
-            add("RGB", sensors["RGB"])
-    return found
-
-
-@table
-def faults(records: Records) -> str:
-    """Method ``auto`` without a start, under each fault."""
-    found, outcomes = _by_fault(records), ("right", "accepted but wrong", "right but rejected")
-    head = ["fault"]
-    for sensor in FAULTED:
-        n = max(counts[sensor].n for counts in found.values() if sensor in counts)
-        head += [f"{sensor}, of {n}: right", *(f"{sensor}: {outcome}" for outcome in outcomes[1:])]
-    rows = []
-    for fault, counts in sorted(found.items(), key=_fault_order):
-        row: list[object] = [f"`{_shown(fault)}`"]
-        for sensor in FAULTED:
-            c = counts.get(sensor)
-            row += [c.right, c.silent, c.rejected] if c else ["", "", ""]
-        rows.append(row)
-    return _table(head, rows, records)
+def _of(rate: Any) -> str:
+    """Return a count of a record, ``[successes, trials]`` or with intervals and steps, as "successes of trials"."""
+    if isinstance(rate, list):
+        return f"{rate[0]} of {rate[1]}"
+    rate = rate.get("rate", rate)
+    return f"{rate['successes']} of {rate['trials']}"
 
 
 def _shown(name: str) -> str:
@@ -296,10 +263,178 @@ def _shown(name: str) -> str:
     )
 
 
-def _fault_order(item: tuple[str, Any]) -> tuple[object, ...]:
-    name, _, size = item[0].partition(":")
-    number = re.match(r"[\d.]+", size)
-    return (item[0] != "none", "+" in item[0], name, float(number[0]) if number else 0.0, item[0])
+# The README and the page of results
+
+CLEAN = {"RGB": "no_start_rgb", "RGB-D": "no_start_rgbd"}
+"""Records of method ``auto`` on images without faults."""
+
+
+@table
+def headline(records: Records) -> str:
+    """README's sentence about localization without a start."""
+    cells = {
+        sensor: [scene[sensor]["none"] for scene in records[name]["cells"].values()]
+        for sensor, name in CLEAN.items()
+    }
+    every = [cell for some in cells.values() for cell in some]
+    counts = {
+        sensor: [sum(cell[key] for cell in some) for key in ("right", "n")] for sensor, some in cells.items()
+    }
+    accepted, wrong = (sum(cell[key] for cell in every) for key in ("converged", "silent"))
+    times = [cell["median_cpu_seconds"] for cell in every]
+    (a, b), (c, d) = counts.values()
+    text = (
+        f"Without a start, it localizes {a} of {b} held-out RGB images of {len(cells['RGB'])} scenes and {c} of {d} RGB-D images of"
+        f" {len(cells['RGB-D'])} scenes to within 5 degrees and 0.05 units. It accepts {accepted} of these poses, of which"
+        f" {wrong or 'none'} {'is' if wrong < 2 else 'are'} wrong. An image takes {min(times):.1f} to {max(times):.1f} seconds of"
+        " CPU time (median of a scene)."
+    )
+    return f"{textwrap.fill(text, 118)}\n\n{records.caption()}"
+
+
+@table
+def peers(records: Records) -> str:
+    """Method ``auto`` beside SIFT with PnP, on RGB images."""
+    names = {"auto": "`auto`", "sift + pnp (pycolmap)": "SIFT, PnP (pycolmap)"}
+    rows = []
+    for scene, sensors in records["landmark_peers"]["scenes"].items():
+        for name, title in names.items():
+            p = sensors["RGB"]["peers"][name]
+            rows.append(
+                (SCENES[scene], title, _of(p["5deg 0.05"]), _of(p["1deg 0.02"]), _length(p["median_translation"]),
+                 f"{p['accepted']}, {p['silent']} wrong", _seconds(p["median_cpu_seconds"]))
+            )  # fmt: skip
+    head = ("scene", "method", "within 5°, 0.05", "within 1°, 0.02", "median error", "accepted", "CPU time")
+    return _table(head, rows, records)
+
+
+@table
+def field_helps(records: Records) -> str:
+    """Landmarks alone beside all terms, on RGB images, by scene."""
+    rows = []
+    for scene, found in records["auto_terms"].items():
+        ways = [found["variants"][f"RGB, {way}"] for way in ("landmarks alone", "all")]
+        pairs = [(_of(w["5deg 0.05"]), _of(w["1deg 0.02"]), _length(w["median_translation"])) for w in ways]
+        rows.append((SCENES[scene], *(" / ".join(pair) for pair in zip(*pairs, strict=True))))
+    return _table(("scene", "within 5°, 0.05", "within 1°, 0.02", "median error"), rows, records)
+
+
+@table
+def training_times(records: Records) -> str:
+    """README's sentence about what ``bidnerf train`` takes with default settings."""
+    names = (
+        "map_phone_doll",
+        "map_blender_lego",
+        "map_room_living",
+        "map_tum_fr1_xyz",
+        "map_iphone_corridor",
+    )
+    taken = [records[name]["training"] for name in names]
+    times = sorted(round(each["seconds"] / 60) for each in taken)
+    memory = sorted(each["peak_resident_GiB"] for each in taken)
+    text = (
+        f"With default settings, `train` took {times[0]} to {times[-1]} minutes and {memory[0]:.1f} to {memory[-1]:.1f} GiB for each of five"
+        " scenes of 85 to 436 images, on two cores without a GPU."
+    )
+    return f"{textwrap.fill(text, 118)}\n\n{records.caption()}"
+
+
+@table
+def other_answers(records: Records) -> str:
+    """Answers to images, in maps, that no bound and no confidence was fitted to; both inputs of a scene together."""
+    keys, sums = ("n", "right", "strict", "accepted", "silent"), dict[str, list[int]]()
+    for name, some in records["answers_other_frames"]["counts"].items():
+        scene, _, sensor = name.partition(", ")
+        if (cell := some.get("all")) is not None and name != "all, all":
+            title = f"all, {sensor}" if scene == "all" else SCENES[scene]
+            known = sums.get(title, [0] * (len(keys) + 2))
+            sums[title] = [
+                a + b for a, b in zip(known, (*(cell[key] for key in keys), *cell["inside"]), strict=True)
+            ]
+    rows = [(name, *counts[:-2], f"{counts[-2]}/{counts[-1]}") for name, counts in sums.items()]
+    head = (
+        "scene",
+        "answers",
+        "right",
+        "within 1°, 0.02",
+        "accepted",
+        "of these wrong",
+        "inside the 95 % bound",
+    )
+    return _table(head, rows, records)
+
+
+@table
+def unknown(records: Records) -> str:
+    """Images to which no answer is right, or more than one."""
+    rows = []
+    for sensor, name in {"RGB": "faults_foreign", "RGB-D": "faults_foreign_rgbd"}.items():
+        c = records[name]["all"]
+        rows.append((f"{sensor} images of another scene", c["n"], c["converged"], c["silent"]))
+    for query, title in {
+        "RGB": "RGB, scene present twice",
+        "RGB-D": "RGB-D, scene present twice",
+        "RGB, start": "RGB, scene present twice, with a start near one copy",
+    }.items():
+        parts = [records[name]["all"][query] for name in ("repeated_scene", "repeated_scene_lego")]
+        n, accepted, right = (
+            sum(part[key] for part in parts) for key in ("n", "believed", "believed and right")
+        )
+        rows.append((title, n, accepted, accepted - right))
+    return _table(("images", "number", "accepted", "of these wrong"), rows, records)
+
+
+@table
+def tracking(records: Records) -> str:
+    """The tracker on two sequences, beside generalised ICP."""
+    rows = []
+    for record, scene in {"tracking": "tum_fr1_xyz", "tracking_corridor": "iphone_corridor"}.items():
+        runs = records[record][scene]
+        for name in ("RGB, in order", "RGB-D, in order", "RGB-D, GICP from the last pose"):
+            if (run := runs.get(name)) is not None:
+                raw, way = (
+                    run["errors"]["raw"],
+                    "GICP from the last pose (small_gicp)" if "GICP" in name else "tracker",
+                )
+                rows.append(
+                    (f"{SCENES[scene]}, {name.partition(',')[0]}", way, f"{run['accepted']} of {run['frames']}", run["accepted_but_wrong"],
+                     f"{_length(raw['translation_median'])} m, {raw['rotation_deg_median']:.2f}°", f"{run['cpu_ms']['median']:.0f} ms")
+                )  # fmt: skip
+    return _table(
+        ("sequence", "method", "accepted", "of these wrong", "median error", "CPU per frame"), rows, records
+    )
+
+
+@table
+def standard_layouts(records: Records) -> str:
+    """The standard benchmarks, tried on scenes of ours that were written in their layouts."""
+    rows = []
+    for name, sensors in records["standard_layouts"].items():
+        for sensor, c in sensors.items():
+            shares = [f"{c[share]:.0%}" for share in ("5 cm, 5 deg", "2 cm, 2 deg")]
+            median = f"{100 * c['median_translation']:.1f} cm, {c['median_rotation_deg']:.2f}°"
+            rows.append(
+                (
+                    name,
+                    sensor,
+                    median,
+                    *shares,
+                    f"{c['accepted']} of {c['n']}",
+                    c["wrong_of_accepted"],
+                    f"{c['inside_95_of_accepted']} of {c['accepted']}",
+                )
+            )
+    head = (
+        "scene, ground truth",
+        "input",
+        "median error",
+        "5 cm, 5°",
+        "2 cm, 2°",
+        "accepted",
+        "of these wrong",
+        "inside the 95 % bound",
+    )
+    return _table(head, rows, records)
 
 
 @table
@@ -315,47 +450,6 @@ def catalogue(_: Records) -> str:
             neutral = "all"
         rows.append((f"`{name}`", fault.summary, unit, "" if fault.is_switch else neutral, sizes))
     return _lines(("name", "fault", "size", "neutral size", "sizes tried"), rows)
-
-
-@table
-def unknown(records: Records) -> str:
-    """Images to which no answer is right, or more than one."""
-    rows = []
-    for sensor, name in {"RGB": "faults_foreign", "RGB-D": "faults_foreign_rgbd"}.items():
-        c = Counts.of(records[name]["all"])
-        rows.append((f"{sensor} images of another scene", c.n, c.accepted, c.silent))
-    for query, title in {
-        "RGB": "RGB, scene present twice",
-        "RGB-D": "RGB-D, scene present twice",
-        "RGB, start": "RGB, scene present twice, with a start near one copy",
-    }.items():
-        parts = [records[name]["all"][query] for name in ("repeated_scene", "repeated_scene_lego")]
-        n, accepted, right = (
-            sum(part[key] for part in parts) for key in ("n", "believed", "believed and right")
-        )
-        rows.append((title, n, accepted, accepted - right))
-    return _table(("images", "number", "accepted", "of these wrong"), rows, records)
-
-
-@table
-def covariance(records: Records) -> str:
-    """How honest the acceptance and the covariance are, over all faults."""
-    rows = []
-    for sensor, confidence in {"RGB": "faults_rgb", "RGB-D": "faults_rgbd"}.items():
-        by_scene = {
-            scene: _total(map(Counts.of, cells.values())) for scene, cells in _cells(records, sensor).items()
-        }
-        for scene, c in [*by_scene.items(), ("all", _total(by_scene.values()))]:
-            error = records["reliability"][confidence]["right"][scene]["expected_calibration_error"]
-            rows.append(
-                (SCENES.get(scene, "all"), sensor, c.n, c.accepted, c.silent, c.rejected,
-                 f"{c.inside} of {c.bounded}", f"{error:.3f}")
-            )  # fmt: skip
-    head = (
-        "scene", "input", "answers", "accepted", "of these wrong", "right but rejected", "inside the 95 % bound",
-        "calibration error of `confidence`",
-    )  # fmt: skip
-    return _table(head, rows, records)
 
 
 @table
@@ -386,240 +480,6 @@ def risk(records: Records) -> str:
 
 
 @table
-def answers(records: Records) -> str:
-    """Answers to the same images in the same maps, before and after the localizer became one loop."""
-    before, now = records["answers_before"]["counts"], records["answers"]["counts"]
-    rows = []
-    for name in (name for name, some in now.items() if "all" in some):
-        cells = [counts[name]["all"] for counts in (before, now)]
-        row: list[object] = [*name.split(", "), cells[0]["n"]]
-        row += [
-            " / ".join(str(cell[column]) for cell in cells)
-            for column in ("right", "strict", "accepted", "silent")
-        ]
-        row.append(" / ".join(_seconds(cell["median_s"]) for cell in cells))
-        rows.append(row)
-    head = (
-        "scene",
-        "input",
-        "answers",
-        "right",
-        "within 1°, 0.02",
-        "accepted",
-        "accepted but wrong",
-        "median CPU time",
-    )
-    return _table(head, rows, records)
-
-
-@table
-def other_answers(records: Records) -> str:
-    """Answers to images, in maps, that no bound and no confidence was fitted to."""
-    rows = []
-    for name, some in records["answers_other_frames"]["counts"].items():
-        if (cell := some.get("all")) is not None:
-            counts = [cell[column] for column in ("n", "right", "strict", "accepted", "silent")]
-            times = [_seconds(cell[column]) for column in ("median_s", "slowest_s")]
-            rows.append((*name.split(", "), *counts, " of ".join(map(str, cell["inside"])), *times))
-    return _table(
-        ("scene", "input", "answers", "right", "within 1°, 0.02", "accepted", "accepted but wrong", "inside the 95 % bound",
-         "median CPU time", "slowest"),
-        rows, records,
-    )  # fmt: skip
-
-
-@table
-def conditions(records: Records) -> str:
-    """Queries that differ from the images of the map."""
-    titles = {
-        "as it is": "unchanged",
-        "half resolution": "half the resolution",
-        "double resolution": "twice the resolution",
-        "focal length 2 % longer": "another camera, focal length 2 % longer",
-        "focal length 4 % longer": "another camera, focal length 4 % longer",
-        "focal length 43 % longer": "another camera, focal length 43 % longer",
-        "rig of three frames": "a rig of three frames",
-    }
-    scenes = ("phone_doll", "iphone_corridor")
-    rows = []
-    for condition, title in titles.items():
-        row: list[object] = [title]
-        for scene in scenes:
-            c = records["query_conditions"][scene][condition]
-            row += [_of(c["5deg 0.05"]), c["accepted_but_wrong"]]
-        rows.append(row)
-    columns = ("right", "accepted but wrong")
-    head = ("query", *(f"{scene.split('_')[1]}: {column}" for scene in scenes for column in columns))
-    return _table(head, rows, records)
-
-
-@table
-def detectors(records: Records) -> str:
-    """Poses by landmarks of each detector, from maps of few photos and under other conditions."""
-    scenes, names = ("phone_doll", "iphone_corridor"), ("sift", "xfeat", "sift-xfeat")
-    rows = []
-    for condition, title in {
-        "every 2, as it is": "every 2nd photo in the map",
-        **{
-            f"every 2, {name}": f"the same, {name}"
-            for name in ("half resolution", "double resolution", "night")
-        },
-        **{f"every {k}, as it is": f"every {k}th photo in the map" for k in (4, 8, 16)},
-    }.items():
-        row: list[object] = [title]
-        for scene in scenes:
-            cells = records["detectors"][scene][condition]
-            row += [f"{cells[name]['right']} of {cells[name]['n']}" for name in names]
-        rows.append(row)
-    times = [
-        records["detectors"][scene]["every 2, as it is"][name]["times_slower"]
-        for scene in scenes
-        for name in names
-    ]
-    rows.append(["time of a query, of SIFT's", *(f"{time:.1f}" for time in times)])
-    head = ("queries right", *(f"{SCENES[scene]}: `{name}`" for scene in scenes for name in names))
-    return _table(head, rows, records)
-
-
-@table
-def rolling_shutter(records: Records) -> str:
-    """Poses by landmarks, with and without the motion during the readout."""
-    rows = []
-    for scene, title in SCENES.items():
-        for fault, name in {"0": "unchanged", "0.5": "0.5°", "2": "2°"}.items():
-            if fault != "2" and scene != "tum_fr1_xyz":
-                continue
-            cells = records["rolling_shutter"][scene][fault]
-            row: list[object] = [title, name]
-            for key in ("with motion", "taken as still"):
-                c, bound = cells[key], cells[key]["inside_95"]
-                row += [f"{_length(c['median_translation'])}, {c['median_rotation_deg']:.2f}°",
-                        f"{bound['successes']} of {bound['trials']}"]  # fmt: skip
-            rows.append((*row, cells["with motion"]["show_a_motion"]))
-    head = (
-        "scene", "turn during the readout", "median error with motion", "inside the 95 % bound",
-        "median error without motion", "inside the 95 % bound", "images in which a motion is detected",
-    )  # fmt: skip
-    return _table(head, rows, records)
-
-
-# Tracking
-
-
-SEQUENCES = {
-    "in order": "in order",
-    "every 4th": "every fourth frame",
-    "backwards": "backwards",
-    "covered for 15 frames": "covered for 15 frames",
-    "carried 100 frames on": "100 frames left out",
-    "plain wall for 30 frames": "a plain wall for 30 frames",
-    "half the image covered": "half of the image covered",
-    "depth stops": "depth stops",
-    "no time stamps": "no time stamps",
-}
-
-
-@table
-def tracking(records: Records) -> str:
-    """The tracker on two sequences, unchanged and with faults."""
-    rows = []
-    for record, scene in {"tracking": "tum_fr1_xyz", "tracking_corridor": "iphone_corridor"}.items():
-        runs = records[record][scene]
-        for sequence, name in SEQUENCES.items():
-            if f"RGB, {sequence}" in runs:
-                both = (runs[f"{sensor}, {sequence}"] for sensor in FAULTED)
-                rows.append((f"{SCENES[scene]}, {name}", *(value for run in both for value in _tracked(run))))
-    columns = ("accepted", "of these wrong", "median error, m", "inside the 95 % bound")
-    head = ("sequence", *(f"{sensor}: {column}" for sensor in FAULTED for column in columns))
-    return _table(head, rows, records)
-
-
-def _tracked(run: Record) -> Iterator[object]:
-    yield f"{run['accepted']} of {run['frames']}"
-    yield run["accepted_but_wrong"]
-    yield _length(run["errors"]["raw"]["translation_median"])
-    yield f"{100 * run['inside_95']:.0f} %"
-
-
-@table
-def tracking_baseline(records: Records) -> str:
-    """The tracker beside generalised ICP, on the same frames of TUM."""
-    runs = records["tracking"]["tum_fr1_xyz"]
-    rows = []
-    for name, title in {
-        "RGB-D, in order": "tracker",
-        "RGB-D, GICP from the last pose": "generalised ICP from the last pose (small_gicp)",
-    }.items():
-        run = runs[name]
-        raw = run["errors"]["raw"]
-        rows.append(
-            (title, f"{run['accepted']} of {run['frames']}", run["accepted_but_wrong"],
-             f"{_length(raw['translation_median'])}, {raw['rotation_deg_median']:.2f}°",
-             _length(raw["translation_p95"]), f"{run['cpu_ms']['median']:.0f} ms")
-        )  # fmt: skip
-    head = ("method", "accepted", "of these wrong", "median error", "95 % quantile, m", "CPU per frame")
-    return _table(head, rows, records)
-
-
-# Maps and backends
-
-
-@table
-def maps(records: Records) -> str:
-    """What ``bidnerf train`` makes of the scenes with default settings."""
-    maps = {
-        "map_blender_lego": "Lego",
-        "map_room_living": "room",
-        "map_room_living_rgb": "room, depth withheld",
-        "map_tum_fr1_xyz": "TUM",
-        "map_tum_without_motions": "TUM, motion during the readout ignored",
-        "map_iphone_corridor": "corridor",
-        "map_phone_doll": "doll",
-    }
-    rows = [(title, *_map_quality(records[name])) for name, title in maps.items()]
-    return _table(("scene", *MAP_COLUMNS), rows, records)
-
-
-MAP_COLUMNS = (
-    "PSNR", "after a gain and an offset", "at poses by landmarks", "median depth error", "time", "CPU time", "memory",
-)  # fmt: skip
-
-
-def _map_quality(result: Record) -> Iterator[str]:
-    full, training = result["levels"][-1], result.get("training") or {}
-    at_landmarks = (result.get("at_landmark_poses") or {}).get("refined") or {}
-    yield _decibels(full.get("psnr_mean_dB"))
-    yield _decibels(full.get("psnr_fitted_mean_dB"))
-    yield _decibels(at_landmarks.get("psnr_mean_dB"))
-    yield _length(full["depth_error_median"]) if full.get("depth_error_median") else "-"
-    yield f"{training['seconds'] / 60:.1f} min" if training else "-"
-    yield f"{training['cpu_seconds'] / 60:.1f} min" if "cpu_seconds" in training else "-"
-    yield f"{training['peak_resident_GiB']:.1f} GiB" if training else "-"
-
-
-def _decibels(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f} dB"
-
-
-@table
-def backends(records: Records) -> str:
-    """Backends with their default settings on the same data."""
-    trained = {
-        "map_blender_lego": "hashgrid",
-        "map_lego_vanilla": "vanilla",
-        "map_lego_adanerf": "adanerf",
-    }
-    rows = []
-    for name, backend in trained.items():
-        result = records[name]
-        quality, minutes = result["levels"][-1], result["training"]["seconds"] / 60
-        error = _length(quality["depth_error_median"])
-        rows.append((f"`{backend}`", _decibels(quality["psnr_mean_dB"]), error, f"{minutes:.0f} min"))
-    head = ("backend", "PSNR", "median depth error", "training")
-    return _table(head, rows, records)
-
-
-@table
 def steps(records: Records) -> str:
     """A step of ``bid`` with 2048 rays on a GPU."""
     names = {"blender_lego": "hashgrid"}
@@ -644,14 +504,6 @@ def _successes(
     cells = records[name]["cells"]
     (cell,) = [c for c in cells if c["condition"] == condition and c["start"] == start]
     return _of(cell["criteria"][within])
-
-
-def _of(rate: Any) -> str:
-    """Return a count of a record, ``[successes, trials]`` or with intervals and steps, as "successes of trials"."""
-    if isinstance(rate, list):
-        return f"{rate[0]} of {rate[1]}"
-    rate = rate.get("rate", rate)
-    return f"{rate['successes']} of {rate['trials']}"
 
 
 TABLE_1 = {
@@ -756,226 +608,6 @@ def basin(records: Records) -> str:
         )
     head = ("settings", *(f"start {size} away" for size in sizes), "all sizes, within 1°, 0.02")
     return _table(head, rows, records)
-
-
-@table
-def imported(records: Records) -> str:
-    """A map of weights that others trained."""
-    result = records["imported_weights_lego"]
-    quality = result["image_quality"]
-    rows = []
-    for name, cell in result["cells"].items():
-        level, sensor = name.split()
-        found = (_of(cell[c]) for c in ("5deg 0.05", "1deg 0.02"))
-        rows.append((level, sensor, _decibels(quality[level]["psnr_mean_dB"]), *found))
-    head = ("level", "input", "PSNR of the level", "within 5°, 0.05", "within 1°, 0.02")
-    return _table(head, rows, records)
-
-
-@table
-def photos(records: Records) -> str:
-    """Maps from photos whose poses are unknown, beside maps from the poses of the datasets."""
-    names = {"photos_doll": "doll", "photos_tum_video": "TUM, as a video", "photos_corridor": "corridor"}
-    rows = []
-    for name, title in names.items():
-        result = records[name]
-        poses, found, given = result["poses"], result["localized"]["found"], result["localized"]["given"]
-        errors = f"{_length(poses['translation']['median'])}, {poses['rotation_deg']['median']:.2f}°"
-        placed = f"{result['placed']} of {result['photos']}"
-        rows.append(
-            (title, placed, errors, *(_of(found[c]) for c in LIMITS), *(_of(given[c]) for c in LIMITS))
-        )
-    ways = [f"{whose} poses: {limits}" for whose in ("found", "given") for limits in LIMITS.values()]
-    return _table(("scene", "placed", "median error of found poses", *ways), rows, records)
-
-
-LIMITS = {"5deg 0.05": "within 5°, 0.05", "1deg 0.02": "within 1°, 0.02"}
-
-
-@table
-def service(records: Records) -> str:
-    """The service under load, and while its workers are killed."""
-    result = records["service"]
-    records.used["service"] |= result["load"].get("run", {})  # its parts may have run on different commits
-    levels = {f"{level['clients']} clients": level for level in result["load"]["levels"]}
-    levels["1 client"] = levels.pop("1 clients")
-    levels["4 clients, while workers are killed"] = result["kills"]
-    rows = []
-    for title, level in sorted(levels.items(), key=lambda item: (item[1]["clients"], item[0])):
-        taken = (f"{level['latency_seconds'][of]:.2f} s" for of in ("p50", "p95", "p99"))
-        memory = level.get("memory_MiB")
-        grown = "" if memory is None else f"{memory['after'] - memory['before']:+.0f} MiB"
-        rows.append((title, str(level["requests"]), str(level["identical"]), *taken, grown))
-    head = ("load", "requests", "answered as by `localize`", "p50", "p95", "p99", "memory")
-    return _table(head, rows, records)
-
-
-@table
-def viewer(records: Records) -> str:
-    """How soon the viewer draws maps, and how quickly it answers while photos are localized."""
-    maps = {
-        "viewer_demo": "demo",
-        "viewer_lego": "Lego",
-        "viewer": "room",
-        "viewer_tum": "TUM",
-        "viewer_corridor": "corridor",
-    }
-    rows = []
-    for name, title in maps.items():
-        result = records[name]
-        usual, longest = result["median"], max(each["largest_ms"] for each in result["rounds"])
-        rows.append(
-            (
-                title,
-                f"{result['surfels']:,}",
-                f"{usual['first_picture_seconds']:.1f} s",
-                f"{usual['frames_a_second']:.0f}",
-                f"{usual['median_ms']:.1f} / {longest:.0f} ms",
-                f"{result['server_mebibytes_added']:.0f} / {usual['page_mebibytes']:.0f} MiB",
-            )
-        )
-    head = (
-        "map",
-        "surfels",
-        "first picture",
-        "frames a second",
-        "answers, median / longest",
-        "memory, server / page",
-    )
-    return _table(head, rows, records)
-
-
-@table
-def masks(records: Records) -> str:
-    """A person in half of the images, with and without masks."""
-    result = records["masks"]
-    rows = []
-    for scene, ways in result.items():
-        if isinstance(ways, dict):
-            rows += [(scene, way, *_with_person(found)) for way, found in ways.items()]
-    head = (
-        "scene",
-        "training images",
-        "PSNR",
-        "landmarks",
-        "of these on the person",
-        "right",
-        "right, queries with the person",
-    )
-    return _table(head, rows, records)
-
-
-def _with_person(found: Record) -> Iterator[str]:
-    yield _decibels(found["psnr"])
-    yield str(found["landmarks"])
-    yield str(found["on_person"])
-    yield _of(found["as they are"]["5deg 0.05"])
-    yield _of(found["with person"]["5deg 0.05"])
-
-
-@table
-def scans(records: Records) -> str:
-    """Fused depth as a map, beside registration with the same cloud."""
-    names = {"room_living": "room", "tum_fr1_xyz": "TUM"}
-    rows = []
-    for scene, ways in records["scans"]["scenes"].items():
-        for way, cell in ways.items():
-            accepted = "-" if cell["accepted"] is None else f"{cell['accepted']}, wrong {cell['silent']}"
-            seconds = _seconds(cell["median_cpu_seconds"])
-            rows.append((names[scene], way, *(_of(cell[c]) for c in LIMITS), accepted, seconds))
-    return _table(("scene", "method", *LIMITS.values(), "accepted", "CPU time"), rows, records)
-
-
-@table
-def splats(records: Records) -> str:
-    """Splats that were trained here, beside hash grids."""
-    rows = []
-    for scene, found in records["splats"]["scenes"].items():
-        times = found["step_of_2048_rays"]["median_ms"]
-        for name, measured in found["maps"].items():
-            right = (_of(ways[name]["5deg 0.05"]) for ways in found["answers"].values())
-            silent = sum(ways[name]["silent"] for ways in found["answers"].values())
-            quality = (measured["steps"], _decibels(measured["psnr_mean_dB"]))
-            size = f"{measured['weights_MB']:.1f} MB"
-            rows.append((SCENES[scene], f"`{name}`", *quality, size, f"{times[name]:.0f} ms", *right, silent))
-    head = (
-        "scene",
-        "backend",
-        "steps",
-        "PSNR",
-        "weights",
-        "a step of 2048 rays",
-        "RGB: right",
-        "RGB-D: right",
-    )
-    return _table((*head, "accepted but wrong"), rows, records)
-
-
-@table
-def splats_from_starts(records: Records) -> str:
-    """Methods that need a start, in splats and in hash grids."""
-    rows = []
-    for scene, found in records["splats"]["scenes"].items():
-        for method, ways in found.get("from_starts", {}).items():
-            for mode in MODES:
-                for name, cell in ways[mode].items():
-                    accepted = f"{cell['converged']}, wrong {cell['silent']}"
-                    seconds = _seconds(cell["median_cpu_seconds"])
-                    right = (_of(cell[c]) for c in LIMITS)
-                    rows.append((SCENES[scene], f"`{method}`", mode, f"`{name}`", *right, accepted, seconds))
-    head = ("scene", "method", "input", "backend", *LIMITS.values(), "accepted", "CPU time")
-    return _table(head, rows, records)
-
-
-MODES = ("RGB", "RGB-D")
-
-
-@table
-def round_trips(records: Records) -> str:
-    """Maps beside those that come from their exports."""
-    rows = []
-    for scene, modes in records["round_trips"]["scenes"].items():
-        for mode, ways in modes.items():
-            for way, cell in ways.items():
-                accepted = f"{cell['converged']}, wrong {cell['silent']}"
-                seconds = _seconds(cell["median_cpu_seconds"])
-                rows.append((SCENES[scene], mode, way, *(_of(cell[c]) for c in LIMITS), accepted, seconds))
-    return _table(("scene", "input", "map", *LIMITS.values(), "accepted", "CPU time"), rows, records)
-
-
-@table
-def capture_size(records: Records) -> str:
-    """Memory of captures of many photos of twelve megapixels."""
-    sizes = records["capture_size"]["measurements"]
-    counts = sorted({int(name.split()[1]) for name in sizes})
-    rows = [
-        (n, *(f"{sizes[f'{command} {n}'][kind] / 1000:.1f} GB" for command in COMMANDS for kind in MEMORY))
-        for n in counts
-    ]
-    head = ("photos", *(f"`{command}`{what}" for command in COMMANDS for what in MEMORY.values()))
-    return _table(head, rows, records)
-
-
-COMMANDS = ("train", "bake", "localize")
-MEMORY = {"resident_MB": "", "anonymous_MB": ", without files"}
-
-
-@table
-def living_maps(records: Records) -> str:
-    """A map of 50 photos that is extended by 35 others, beside one of all."""
-    ways = {
-        "first": "first photos alone",
-        "extended": "extended, first photos no longer there",
-        "extended_with_data": "extended, first photos there",
-        "all": "all at once",
-    }
-    rows = []
-    for scene in records["living_maps"]["extend"].values():
-        for way, title in ways.items():
-            found = scene["maps"][way]
-            right = (f"{found['right'][limits]} of {found['test']}" for limits in LIMITS)
-            rows.append((title, found["images"], found["landmarks"], _decibels(found["psnr"]), *right))
-    return _table(("map", "photos", "landmarks", "PSNR", *LIMITS.values()), rows, records)
 
 
 def main() -> None:

@@ -140,14 +140,14 @@ def given(page: Path) -> dict[str, Any]:
     return {"sensor": moments, "camera": tiny.CAMERA}
 
 
-def executed(page: Path) -> dict[str, Any]:
-    """Run the page's Python blocks one after the other in one namespace, and return it."""
+def executed(page: Path, containing: str = "") -> dict[str, Any]:
+    """Run the page's Python blocks, or those that contain a text, one after the other in one namespace, and return it."""
     module = ModuleType(f"docs_{page.stem.replace('-', '_')}")
     sys.modules[module.__name__] = module  # where dataclasses look for the names of annotations
     namespace = vars(module)
     namespace.update(given(page))
     for block in blocks(page, "python"):
-        if (page.name, block.text.splitlines()[0]) not in NOT_RUN:
+        if (page.name, block.text.splitlines()[0]) not in NOT_RUN and containing in block.text:
             padded = "\n" * (block.line - 1) + block.text  # errors then name the line of the page
             exec(compile(padded, str(page), "exec"), namespace)
     return namespace
@@ -231,8 +231,13 @@ def extras(arguments: list[str]) -> set[str]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_auto")
-def test_the_backend_of_the_readme_trains_and_localizes(inside: Path) -> None:
-    namespace = executed(ROOT / "README.md")
+def test_the_backend_of_the_documentation_trains_and_localizes(inside: Path) -> None:
+    namespace = executed(ROOT / "docs" / "extend.md", "backend = Fog()")
+    field = next(block for block in blocks(ROOT / "README.md", "python") if "FogField" in block.text)
+    assert (
+        field.text.partition("def query")[2].split("\n", 1)[1].strip()
+        in (ROOT / "docs" / "extend.md").read_text()
+    )
     backend, scene, views = namespace["backend"], demo_object(), tiny.views(16)
     config = namespace["FogConfig"](cells=24, steps=120)
     field = backend.build(config, scene.bounds)
@@ -255,10 +260,11 @@ def test_readme_is_short() -> None:
     assert len(program.splitlines()) <= 8
 
 
-def test_links_of_the_readme_lead_somewhere() -> None:
-    targets = re.findall(r"\]\(([^)#]+)", (ROOT / "README.md").read_text())
+@each([ROOT / "README.md", ROOT / "benchmarks" / "results" / "README.md"])
+def test_links_of_pages_outside_of_the_site_lead_somewhere(page: Path) -> None:
+    targets = re.findall(r"\]\(([^)#]+)", page.read_text())
     assert targets
-    assert [target for target in targets if not (ROOT / target).exists()] == []
+    assert [target for target in targets if not (page.parent / target).exists()] == []
 
 
 def test_every_outcome_has_advice_in_the_words_of_the_code() -> None:
@@ -289,13 +295,21 @@ def tables() -> Any:
 
 
 def test_tables_are_those_of_the_records(tables: Any) -> None:
-    outdated = [page.name for page in PAGES if tables.rendered(page.read_text()) != page.read_text()]
+    outdated = [page.name for page in tables.PAGES if tables.rendered(page.read_text()) != page.read_text()]
     assert outdated == [], "run python docs/tables.py"
 
 
 def test_every_table_is_on_a_page(tables: Any) -> None:
-    shown = {found[2] for page in PAGES for found in tables.BLOCK.finditer(page.read_text())}
+    shown = {found[2] for page in tables.PAGES for found in tables.BLOCK.finditer(page.read_text())}
     assert shown == set(tables.TABLES)
+
+
+def test_every_record_is_among_all_measurements(tables: Any) -> None:
+    page = tables.MEASUREMENTS.read_text()
+    assert {path.stem for path in tables.RECORDS.glob("*.json")} == {
+        *re.findall(r"^## (\w+)$", page, re.MULTILINE)
+    }
+    assert "| Lego, RGB, none | 40 |" in page.partition("## no_start_rgb\n")[2].partition("\n## ")[0]
 
 
 def test_tables_follow_their_records(tables: Any, tmp_path: Path) -> None:
