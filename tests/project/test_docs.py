@@ -226,7 +226,7 @@ def exists(command: list[str], targets: set[str]) -> bool:
 
 
 def extras(arguments: list[str]) -> set[str]:
-    return {name for word in arguments for name in re.findall(r"\[([\w,]+)\]", word)}
+    return {name for word in arguments for names in re.findall(r"\[([\w,]+)\]", word) for name in names.split(",")}
 
 
 @pytest.mark.slow
