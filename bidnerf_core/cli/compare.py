@@ -33,8 +33,13 @@ class Compare:
     ] = ()
     out: Annotated[Path | None, Option("DIR", "write compare.json, compare.png and compare.svg there")] = None
     protocol: Annotated[
-        str, Option("NAME", "how starts are chosen: bid, bid-hard, inerf, parallel, perturb or none")
-    ] = "none"
+        str | None,
+        Option(
+            "NAME",
+            "how starts are chosen: bid, bid-hard, inerf, parallel, perturb or none",
+            "none; bid for methods that need a start",
+        ),
+    ] = None
     size: Annotated[
         str | None,
         Option("SIZE", "error of the start: e_t, or METRES:DEGREES for perturb", "the protocol's first"),
@@ -50,6 +55,7 @@ class Compare:
     def run(self) -> None:
         from bidnerf_core.evaluation import Plan, compare, comparison_figure
         from bidnerf_core.io import output_folder, to_plain
+        from bidnerf_core.localization import find_method
 
         if len(self.folders) < 2:
             raise UsageError(
@@ -60,8 +66,9 @@ class Compare:
         _ = self.reading.mask_folder  # rejects anything but a folder of masks
         with wrong_usage():
             sizes = read_sizes([] if self.size is None else [self.size]) or None
+            usual = "bid" if find_method(self.method.method).needs_start else "none"
             plan = Plan(
-                protocol=self.protocol, sizes=sizes, method=self.method.method, config=self.method.config,
+                protocol=self.protocol or usual, sizes=sizes, method=self.method.method, config=self.method.config,
                 trials=self.trials, seed=self.seed, frames=self.frame or None, **stated_reading(self.reading),
             )  # fmt: skip
         if self.out is None:
