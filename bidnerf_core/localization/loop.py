@@ -33,6 +33,7 @@ from bidnerf_core.localization.propose import CONVINCING, LEAST_AGREEING, best_c
 from bidnerf_core.localization.query import Query
 from bidnerf_core.localization.recording import current_record
 from bidnerf_core.localization.refinement import (
+    Minima,
     agreement,
     fit,
     fit_noise,
@@ -51,7 +52,6 @@ from bidnerf_core.mapping import (
     Features,
     LandmarkMap,
     Landmarks,
-    Quadratic,
     Sights,
     States,
     Term,
@@ -372,11 +372,11 @@ class Loop:
         problem, terms = self.problem, list[Term]([landmarks])
         for _ in range(REFITS):
             row = best.row
-            there, quadratic, best = run_on(self.device, settle, best, landmarks, given)
+            there, minima, best = run_on(self.device, settle, best, landmarks, given)
             if torch.equal(best.row, row):
                 best = there
                 break
-        found = self._posterior(quadratic, landmarks, given)
+        found = self._posterior(minima, landmarks)
         points, fused = None, list[str]()
         others: dict[str, float | None] = {}
         if problem is not None and problem.surface is not None and problem.has_depth:
@@ -388,8 +388,8 @@ class Loop:
         if points is not None and found.mode == 0:
             terms.append(points)
             fused.append("depth")
-            best, quadratic = run_on(self.device, fit, best, terms, given, 5)
-            found = self._posterior(quadratic, landmarks, given)
+            best, minima = run_on(self.device, fit, best, terms, given, 5)
+            found = self._posterior(minima, landmarks)
         before = found  # rays about one camera's pose must not decide between cameras
         blurred = self._blur(found, landmarks) > RAYS_BEYOND
         if problem is not None and self.rays and found.mode == 0 and blurred:
@@ -399,11 +399,10 @@ class Loop:
             # A number that changes from query to query is a tensor, so that they share a graph.
             rays = replace(rays, noise=here.noise.new_tensor(rays.noise))  # type: ignore[arg-type]
             best = States.cat([here, best[1:]])
-            quadratic, by_rays = run_on(self.device, fit_with_rays, best, terms, rays, given)
-            quadratic = quadratic.with_first(by_rays)
-            systematic = torch.zeros_like(quadratic.hessian)
+            minima, by_rays = run_on(self.device, fit_with_rays, best, terms, rays, given)
+            systematic = torch.zeros_like(minima[0].hessian)
             systematic[:1] = (FIELD_ERRORS - 1) * by_rays.hessian
-            found = self._posterior(quadratic, landmarks, given, systematic)
+            found = self._posterior(minima, landmarks, systematic)
         if points is not None:
             near, both = run_on(self.device, agreement, points, found.chosen)
             others |= {"on_surface": float(near), "colour_inliers": float(both)}
@@ -416,21 +415,16 @@ class Loop:
         credible, shared = given.credible[found.states.row], self.landmarks.pose_covariance
         return found.mass(term.distance(found.chosen), shared, TOLERANCE, ANGLE, credible)
 
-    def _posterior(
-        self,
-        quadratic: Quadratic,
-        landmarks: Landmarks,
-        given: Explanations,
-        systematic: Tensor | float = 0.0,
-    ) -> Posterior:
-        states, log_odds = given.about(quadratic.here), torch.zeros(len(quadratic.here), dtype=torch.float64)
+    def _posterior(self, minima: Minima, landmarks: Landmarks, systematic: Tensor | float = 0.0) -> Posterior:
+        quadratic, states, normal = minima
+        log_odds = torch.zeros(len(quadratic.here), dtype=torch.float64)
         if self.problem is not None and (start := self.problem.start) is not None:
             # Of two places that look the same, the one nearer to the start is the likelier.
             update = (start.inverse() @ quadratic.here.T).log()
             away = update[:, :3].norm(dim=-1) + self._distance(start) * update[:, 3:].norm(dim=-1)
             log_odds = -FROM_START * away.clamp(min=1e-9).log()
         scatter = self.landmarks.calibration_scatter.double()
-        return Posterior.of(states, quadratic, landmarks, scatter, systematic, log_odds)
+        return Posterior.of(states, normal, quadratic, landmarks, scatter, systematic, log_odds, self.device)
 
     def _blur(self, found: Posterior, term: Landmarks) -> float:
         """Return the standard deviation of the scene's projection at the best pose, pixels."""

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bidnerf_core.devices import run_on
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import CAMERA, Landmarks, Normal, P, Quadratic, States, log_evidence
 
@@ -21,6 +22,7 @@ LEAST_DOUBT = 0.005
 """Standard deviation of a camera's parameters that no photo rules out: lenses move with focus and image stabilisers."""
 LEAST_CURVATURE = 0.2
 """Smallest curvature, relative to the reweighted Hessian."""
+CPU = torch.device("cpu")
 DRAWS = 256
 """Draws of the pose from each explanation's Gaussian, with which the probability mass within a tolerance is integrated."""
 
@@ -40,27 +42,27 @@ class Posterior:
     @staticmethod
     def of(
         states: States,
+        normal: Normal,
         terms: Quadratic,
         landmarks: Landmarks,
         scatter: Float[Tensor, "4"],
         systematic: Float[Tensor, "g P P"] | float = 0.0,
         log_odds: Float[Tensor, "g"] | float = 0.0,
+        device: torch.device = CPU,
     ) -> Posterior:
         """Compare explanations within a mode by their cost, and modes by the evidence of landmarks and their prior ``log_odds``.
 
-        ``terms`` are the models of all terms, and ``systematic`` is the scatter of their gradient (in its units) in addition to that
-        of independent errors.
+        ``terms`` are the models of all terms, whose minima are ``states`` and ``normal``, and ``systematic`` is the scatter of their
+        gradient (in its units) in addition to that of independent errors. Most is computed on ``device``.
         """
-        states, normal = terms.minimum(states)
+        by_mode, information = run_on(device, _information, states, normal, terms, landmarks, systematic)
         log = log_evidence(states, normal)
-        member = states.mode[None] == torch.arange(len(terms.here), device=log.device)[:, None]
+        member = states.mode[None] == torch.arange(len(terms.here))[:, None]
         norm = torch.where(member, log[None], -torch.inf).logsumexp(-1)
-        by_mode = landmarks.evidence(terms.here)
         log = log + (log_odds + BY_SHARE * by_mode.clamp(min=LEAST_EVIDENCE).log() - norm)[states.mode]
         probability = log.nan_to_num(-torch.inf).softmax(0)
-        best = int(probability.argmax())  # host
-        covariance = robust_covariance(states, normal, terms, landmarks, systematic)
-        states, covariance = _true_cameras(states, normal, covariance, scatter)
+        best = int(probability.argmax())
+        states, covariance = _true_cameras(states, normal, _robust_covariance(*information), scatter)
         anchor = states.T[best]
         return Posterior(
             states, normal, probability, covariance, (anchor.inverse() @ states.T).log(), by_mode, best
@@ -138,14 +140,10 @@ def normal_draws() -> Float[Tensor, "d 6"]:
     return torch.distributions.Normal(0.0, 1.0).icdf(even.clamp(1e-6, 1 - 1e-6))
 
 
-def robust_covariance(
-    states: States,
-    normal: Normal,
-    terms: Quadratic,
-    landmarks: Landmarks,
-    systematic: Float[Tensor, "g P P"] | float,
-) -> Float[Tensor, "h P P"]:
-    """Return the covariance of the unknowns: that of an M-estimator for landmarks, and of a Gaussian likelihood for all else."""
+def _information(
+    states: States, normal: Normal, terms: Quadratic, landmarks: Landmarks, systematic: Tensor | float
+) -> tuple[Float[Tensor, "g"], tuple[Tensor, ...]]:
+    """Return the evidence of landmarks for each mode, and the arguments of ``_robust_covariance``."""
     unit, scale, g = terms.here.unit, 1 / states.unit, states.mode
     parts = [unit[:, :, None] * part * unit[:, None] for part in landmarks.sandwich(terms.here)]
     parts = [parts[0], parts[1], parts[2] + systematic]
@@ -159,7 +157,23 @@ def robust_covariance(
         hessian + 1e-12 * torch.eye(P, dtype=hessian.dtype, device=hessian.device)
     )
     half = torch.linalg.solve_triangular(factor, curvature, upper=False)
-    values, vectors = torch.linalg.eigh(torch.linalg.solve_triangular(factor, half.mT, upper=False))
+    curvature = torch.linalg.solve_triangular(factor, half.mT, upper=False)
+    return landmarks.evidence(terms.here), (curvature, scatter, factor, unit, info == 0)
+
+
+def _robust_covariance(
+    curvature: Float[Tensor, "h P P"],
+    scatter: Float[Tensor, "h P P"],
+    factor: Float[Tensor, "h P P"],
+    unit: Float[Tensor, "h P"],
+    sound: Bool[Tensor, "h"],
+) -> Float[Tensor, "h P P"]:
+    """Return the covariance of the unknowns: that of an M-estimator for landmarks, and of a Gaussian likelihood for all else.
+
+    With the Cholesky ``factor`` of the Hessian in ``unit``, its curvature is ``factor curvature factor^T``; it is infinite where there
+    is no ``sound`` factor.
+    """
+    values, vectors = torch.linalg.eigh(curvature)
     # With few matches the curvature may be indefinite; well-behaved residuals keep it near the Hessian.
     basis = (
         torch.linalg.solve_triangular(factor.mT, vectors, upper=True)
@@ -167,7 +181,7 @@ def robust_covariance(
     )
     bread = basis @ torch.linalg.solve_triangular(factor.mT, vectors, upper=True).mT
     found = unit[..., None] * (bread @ scatter @ bread.mT) * unit[..., None, :]
-    return torch.where((info == 0)[:, None, None], found, torch.inf)
+    return torch.where(sound[:, None, None], found, torch.inf)
 
 
 def _true_cameras(

@@ -11,7 +11,17 @@ from torch import Tensor
 from bidnerf_core.localization.explanations import Explanations
 from bidnerf_core.localization.terms.rays import Rays
 from bidnerf_core.localization.terms.surface import Surface
-from bidnerf_core.mapping import Landmarks, Quadratic, States, Term, descend, log_evidence, prior, total
+from bidnerf_core.mapping import (
+    Landmarks,
+    Normal,
+    Quadratic,
+    States,
+    Term,
+    descend,
+    log_evidence,
+    prior,
+    total,
+)
 
 GRADUATED = (16.0, 8.0, 4.0, 2.0, 1.0)
 """Noise of graduated fits, relative to that of usual ones."""
@@ -40,36 +50,42 @@ def weigh(states: States, term: Landmarks) -> tuple[States, Landmarks]:
     return states, term.weighted_for(states)
 
 
-def fit(best: States, terms: Sequence[Term], given: Explanations, steps: int) -> tuple[States, Quadratic]:
+Minima = tuple[Quadratic, States, Normal]
+"""The model of all terms about the state of each mode, and its minimum under each explanation of the mode."""
+
+
+def fit(best: States, terms: Sequence[Term], given: Explanations, steps: int) -> tuple[States, Minima]:
+    """Return the refined state of each mode (g), and the minima about it."""
     best, _ = descend(best, terms, steps)
-    return best, linearize(best, terms, given)
+    quadratic = linearize(best, terms, given)
+    return best, (quadratic, *quadratic.minimum(given.about(quadratic.here)))
 
 
 def linearize(best: States, terms: Sequence[Term], given: Explanations) -> Quadratic:
-    """Return the model of the sum of terms about each mode's state."""
     free = best.under(*given.prior_of_all)
     return Quadratic.of(total(free, terms) - prior(free), free)
 
 
-def settle(best: States, term: Landmarks, given: Explanations) -> tuple[States, Quadratic, States]:
-    """Return the refined state of each mode (g), the model about it, and the explanation's state that is then the most probable."""
-    best, quadratic = fit(term.with_noise(best), [term], given, 4)
-    states, normal = quadratic.minimum(given.about(quadratic.here))
+def settle(best: States, term: Landmarks, given: Explanations) -> tuple[States, Minima, States]:
+    """Return what ``fit`` does, and the state of each mode that is then the most probable."""
+    best, (quadratic, states, normal) = fit(term.with_noise(best), [term], given, 4)
     member = states.mode[None] == best.mode[:, None]
     log = torch.where(member, log_evidence(states, normal)[None], -torch.inf)
-    return best, quadratic, states[log.argmax(-1)]
+    return best, (quadratic, states, normal), states[log.argmax(-1)]
 
 
 def fit_with_rays(
     best: States, terms: Sequence[Term], rays: Rays, given: Explanations
-) -> tuple[Quadratic, Quadratic]:
-    """Refine the first state with rays, and return the models of the other terms, and that of rays about this state alone.
+) -> tuple[Minima, Quadratic]:
+    """Refine the first state with rays, and return the minima, and the model of rays about this state alone.
 
     Rays are too expensive to be rendered for all hypotheses.
     """
     here, _ = descend(best[:1], [*terms, rays], 8)
     quadratic = linearize(States.cat([here, best[1:]]), terms, given)
-    return quadratic, Quadratic.of(rays(quadratic.here[:1]), quadratic.here[:1])
+    by_rays = Quadratic.of(rays(quadratic.here[:1]), quadratic.here[:1])
+    quadratic = quadratic.with_first(by_rays)
+    return (quadratic, *quadratic.minimum(given.about(quadratic.here))), by_rays
 
 
 def agreement(points: Surface, state: States) -> tuple[Tensor, Tensor]:

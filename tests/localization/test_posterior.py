@@ -73,7 +73,8 @@ def solved(
     quadratic = Quadratic.of(total(wider, [term]) - prior(wider), wider)
     given = free if explained is None else explained
     index = torch.zeros(len(given), dtype=torch.long)
-    return Posterior.of(replace(given, T=found.T[index], noise=found.noise[index]), quadratic, term, scatter)
+    minimum = quadratic.minimum(replace(given, T=found.T[index], noise=found.noise[index]))
+    return Posterior.of(*minimum, quadratic, term, scatter)
 
 
 def squared_errors(posteriors: list[Posterior]) -> Tensor:
@@ -183,7 +184,8 @@ def test_prior_odds_and_evidence_of_landmarks_decide_between_places() -> None:
         modes, _ = descend(modes, [given], 8)
         quadratic = Quadratic.of(total(modes, [given]) - prior(modes), modes)
         log_odds = torch.tensor([0.0, odds], dtype=torch.float64)
-        found = Posterior.of(modes, quadratic, given, NO_SCATTER, log_odds=log_odds)
+        minimum = quadratic.minimum(modes)
+        found = Posterior.of(*minimum, quadratic, given, NO_SCATTER, log_odds=log_odds)
         probability[name] = float(found.probability[found.states.mode == 1].sum())
         assert bool((found.place(1).translation - modes.T[1].translation).norm() < 0.05)
     assert probability["alike"] == pytest.approx(0.5, abs=1e-3)

@@ -274,7 +274,7 @@ class Measurer:
                 deviation=deviation,
                 log_prior=log_prior,
             )
-            mixture = Posterior.of(both, whole, term, scatter).mixture()
+            mixture = Posterior.of(*whole.minimum(both), whole, term, scatter).mixture()
             excess, axes = torch.linalg.eigh(mixture - covariance)
             doubt, covariance = (axes * excess.clamp(min=0)) @ axes.T, mixture
         else:
