@@ -12,6 +12,9 @@ from .colmap import SparseChoice as SparseChoice
 from .colmap import SparsePoints as SparsePoints
 from .colmap_files import read_model as read_model
 from .colmap_files import read_posed_images as read_posed_images
+from .colmap_keypoints import stored_keypoints as stored_keypoints
+from .formats.colmap import ColmapReader as ColmapReader
+from .formats.colmap import shot_of as shot_of
 from .formats.transforms_json import read_frames as read_frames
 from .lidar import LidarDepth as LidarDepth
 from .names import in_other_split as in_other_split

@@ -51,7 +51,12 @@ class ModelImage:
     name: str  # path below the folder of images
     camera: int  # id of its camera
     T_camera_model: SE3  # in units of the model
-    points: Int[Tensor, "n"]  # ids of the observed points
+    observed: Int[Tensor, "k"]  # id of the point that each keypoint of the image observes; negative for none
+
+    @property
+    def points(self) -> Int[Tensor, "n"]:
+        """The ids of the observed points, sorted."""
+        return self.observed[self.observed >= 0].unique()
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,4 +264,4 @@ def _image(where: str, name: str, camera: int, pose: Sequence[float], points: np
         raise InputError(f"image {name!r} has an invalid pose", where=where, expected="a unit quaternion")
     rotation = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix()
     T = SE3(torch.from_numpy(rotation), torch.tensor(pose[4:], dtype=torch.float64))
-    return ModelImage(name, camera, T, torch.from_numpy(np.unique(points[points >= 0])))
+    return ModelImage(name, camera, T, torch.from_numpy(points.astype(np.int64)))

@@ -1,3 +1,5 @@
+from .absent import NoField as NoField
+from .absent import has_field as has_field
 from .contract import LARGEST_LENGTH as LARGEST_LENGTH
 from .contract import DifferentiatedField as DifferentiatedField
 from .contract import FieldDerivatives as FieldDerivatives

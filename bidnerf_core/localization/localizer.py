@@ -21,7 +21,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.depth import DepthSensorModel, find_depth_sensor
 from bidnerf_core.devices import constant, set_threads_here
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields import Observations, device_of, render
+from bidnerf_core.fields import Observations, device_of, has_field, render
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.io import LARGEST_INTEGER
@@ -206,8 +206,9 @@ class Localizer:
         """Render some rays and fill the caches of the surface, so that lazy initialisation does not delay the first call."""
         bounds, field = self.scene.bounds, self.scene.field
         directions = torch.eye(3, device=device_of(field))
-        middle = constant(bounds.centre, directions)
-        render(field, bounds.rays(middle - directions * bounds.near, directions), bounds.background)
+        if has_field(field):
+            middle = constant(bounds.centre, directions)
+            render(field, bounds.rays(middle - directions * bounds.near, directions), bounds.background)
         if self.scene.surface is not None:
             self.scene.surface.warm_up()
 

@@ -13,6 +13,7 @@ from .extending import extend as extend
 from .importers import IMPORTERS as IMPORTERS
 from .importers import UNMOVED as UNMOVED
 from .importers import ImportedField as ImportedField
+from .importers import Structure as Structure
 from .importers import bounds_about as bounds_about
 from .importers import importer_of as importer_of
 from .importing import import_map as import_map

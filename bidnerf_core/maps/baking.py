@@ -81,25 +81,21 @@ def bake_landmarks(
     views: Sequence[View],
     where: str,
     tracked: TrackedViews | None = None,
-    up: UpDirection | None = None,
-) -> tuple[MapInfo, LandmarkMap | None, CaptureReport | None]:
+) -> tuple[MapInfo, LandmarkMap | None, TrackedViews]:
     """Build landmarks from ``views`` or, without any, from images that ``field`` renders at the map's cameras.
 
     Returns them, None if the images show too little texture (localization then relies on the surface alone), the description of
-    the map with what was learned meanwhile, and the capture record, None for rendered images. ``tracked`` holds the views'
-    keypoints if they were tracked already. ``where`` begins log messages, and ``up`` is the upward direction of the scene if
-    known.
+    the map with what was learned meanwhile, and the keypoints they were built from. ``tracked`` holds these keypoints if they
+    were tracked already. ``where`` begins log messages.
     """
     began = time.monotonic()
     source: LandmarkSource = "photos" if views else "rendered images"
-    # Only photos show how well the field renders; it has no error against its own images.
-    noise = colour_noise(field, info.bounds, views) if views else info.colour_noise
     images = views or rendered_views(field, info.bounds, cameras_of(info))
     if tracked is None:
         tracked = tracked_views(images, info.landmark_features)
     if views and not info.distances:
         tracked = tracked.at_distance(info.bounds.side / 2)  # the directions are still informative
-    trial, landmarks = HeldOutTrial(), None
+    landmarks = None
     try:
         landmarks = tried_landmarks(tracked, images, report=log.info)
     except InputError as error:
@@ -113,16 +109,22 @@ def bake_landmarks(
             landmarks = with_tracks_in(info, landmarks, [view.frame.name for view in views])
         else:
             landmarks = replace(landmarks, tracks=None)  # in rendered images, which are not stored
-        trial = landmarks.trial
-        info = replace(info, colour_noise=noise, landmark_source=source, landmark_features=landmarks.features)
+        info = replace(info, landmark_source=source, landmark_features=landmarks.features)
         log.info(
             f"{where}: {len(landmarks)} landmarks ({landmarks.megabytes:.1f} MB) from {len(images)} {source},"
             f" {time.monotonic() - began:.1f} s"
         )
-    capture = surveyed(tracked, views, trial=trial, up=up) if views else None
-    for line in [] if capture is None else summary(capture):
+    return info, landmarks, tracked
+
+
+def surveyed_photos(
+    tracked: TrackedViews, views: Sequence[View], trial: HeldOutTrial, up: UpDirection | None
+) -> CaptureReport:
+    """Return the capture record of photos whose keypoints were ``tracked``, and log its summary."""
+    capture = surveyed(tracked, views, trial=trial, up=up)
+    for line in summary(capture):
         log.info(line)
-    return info, landmarks, capture
+    return capture
 
 
 def with_tracks_in(info: MapInfo, landmarks: LandmarkMap, names: Sequence[str]) -> LandmarkMap:

@@ -65,7 +65,7 @@ class Checkpoints:
         if self.folder is not None:
             if info.weights:  # the first save may replace another map, whose anchor does not count
                 info = replace(info, anchor=load_info(self.folder).anchor)
-            info = write_parts(self.folder, info, state)
+            info = write_parts(self.folder, info, state, keep=True)
         self.info = info
         self._saved = time.monotonic()
 

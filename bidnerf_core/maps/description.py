@@ -43,10 +43,10 @@ class FieldFrame:
 class MapInfo:
     """The content of ``map.json``."""
 
-    backend: str
+    backend: str  # of the field; empty if it has none and none was begun
     config: dict[str, Any]
     bounds: SceneBounds
-    step: int  # training steps done
+    step: int  # training steps done; 0 in a map of landmarks alone, which has no field
     complete: bool  # whether training has finished
     data: str = ""  # name of the dataset's folder
     seconds: float = 0.0  # of training
@@ -82,6 +82,8 @@ class MapInfo:
         """A clause about the interrupted training, if it is not complete."""
         if self.complete:
             return None
+        if not self.step:
+            return "the training of its field has not begun; 'bidnerf train' with --resume begins it"
         return f"its training stopped at step {self.step}; 'bidnerf train' with --resume continues it"
 
     def scaled(self, factor: float, unit: LengthUnit) -> MapInfo:

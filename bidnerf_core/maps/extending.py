@@ -108,6 +108,10 @@ def extend(
         scene = scene if isinstance(scene, Map) else load_map(scene)
         if scene.info.interruption is not None:
             raise InputError(f"cannot be extended: {scene.info.interruption}", where=scene.name)
+        if not scene.has_field:
+            raise InputError(
+                "has no radiance field to extend; 'bidnerf train DATA --out MAP' adds one", where=scene.name
+            )
         new = locate(scene, *_frames(photos, scene, split))
         if not new:
             log.info(f"{scene.name}: was built from these photos already; nothing to add")
@@ -261,8 +265,9 @@ def _extended(
         grown = replace(grown, surface=surface)
     check_cancelled("extending")
     if complete:
-        info, landmarks, record = bake_landmarks(info, grown.field, seeing, where, tracked, grown.up)
-        grown = replace(grown, info=info, record=record)
+        info, landmarks, tracked = bake_landmarks(info, grown.field, seeing, where, tracked)
+        grown = replace(grown, info=info, landmarks=landmarks).with_survey(seeing, tracked)
+        info = grown.info
     else:
         landmarks = _more_landmarks(info, scene.landmarks, tracked, [view.frame.name for view in new])
     grown = grown.with_parts(None, landmarks or scene.landmarks)

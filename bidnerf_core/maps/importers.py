@@ -8,18 +8,32 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from bidnerf_core.captures import StoredCamera
+from bidnerf_core.datasets import Capture
 from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import SE3, Similarity
 from bidnerf_core.io import open_binary
+from bidnerf_core.mapping import Keypoints
 from bidnerf_core.registry import Plugins, interface_defects
 
 UNMOVED = Similarity(1.0, SE3.identity())
 """The identity placement: the field stays in its file's coordinates."""
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """Images with poses and the points that they observe, as structure from motion finds them."""
+
+    capture: Capture  # the images, all with poses and named; without a file, if their keypoints are known
+    positions: Float[Tensor, "p 3"]  # metres, world, float64
+    observed: tuple[
+        Int[Tensor, "k"], ...
+    ]  # number of the point that each keypoint of an image observes; -1: none
+    keypoints: tuple[Keypoints, ...] = ()  # of the images as stored; empty: to be detected in them
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +60,9 @@ class ImportedField:
         None  # dataset of its training images, with poses in the world; unused if others are given
     )
     is_solid: bool = False  # whether matter encloses no free space, so that the scene is viewed from outside
+    structure: Structure | None = (
+        None  # from which landmarks are made; the field is then none (``NoField``), its backend ""
+    )
 
 
 @runtime_checkable
@@ -91,7 +108,7 @@ def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
     Raises ``InputError`` if there is no such file, if it is unreadable or a pointer of Git LFS, and if none or several recognize it.
     """
     if not path.exists():
-        raise InputError("no such file or folder", where=path, expected="a trained field")
+        raise InputError("no such file or folder", where=path, expected="a trained field or a COLMAP model")
     if name is not None:
         return name, IMPORTERS.load(name)
     if path.is_file():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
+import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,24 +14,36 @@ from typing import Any
 
 import torch
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import StoredCamera, stored_cameras
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.devices import working_device
 from bidnerf_core.errors import InputError, InputWarning, amount
-from bidnerf_core.fields import RadianceField, SceneBounds, device_of, render
-from bidnerf_core.frames import View, draw, uniform
+from bidnerf_core.fields import NoField, RadianceField, SceneBounds, device_of, render
+from bidnerf_core.frames import BLACK, Frame, View, draw, uniform
 from bidnerf_core.geometry import SE3, LengthUnit, Similarity
 from bidnerf_core.io import from_plain, to_plain
-from bidnerf_core.mapping import BakeConfig, surface_of_points
+from bidnerf_core.mapping import (
+    BakeConfig,
+    ImageKeypoints,
+    Keypoints,
+    TrackedKeypoints,
+    TrackedViews,
+    detected,
+    find_features,
+    matches_of_points,
+    surface_of_points,
+    tracked_views,
+)
 from bidnerf_core.maps.baking import bake_surface, check_alike
 from bidnerf_core.maps.description import MapInfo, cameras_of
-from bidnerf_core.maps.importers import ImportedField, importer_of, robust_box
+from bidnerf_core.maps.importers import ImportedField, Structure, bounds_about, importer_of, robust_box
 from bidnerf_core.maps.map import Map, frozen_field
 from bidnerf_core.maps.options import ImportOptions
 from bidnerf_core.maps.store import map_folder, write_parts
 from bidnerf_core.maps.training import bake_settings, baked_if_possible
 from bidnerf_core.maps.viewpoints import viewpoints
-from bidnerf_core.maps.views import Images, ReadViews, chosen_origin, read_views
+from bidnerf_core.maps.views import USEFUL_SIDE, Images, Origin, ReadViews, chosen_origin, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, job_context
 from bidnerf_core.training import TrainingState
 
@@ -42,6 +55,8 @@ RAYS_WITH_DEPTH = 4096
 SAME_LENGTH = 0.03
 """Relative difference between rendered and measured depth that is not worth reporting."""
 FEWEST_COMPARED = 200
+USUAL_COUNT = 2000
+"""Keypoints of an image that are used, beyond which only those that observe a point are: as many as SIFT finds in a query."""
 OPAQUE = 0.5
 """Opacity of a ray above which its rendered depth is meaningful."""
 AS_IN_THE_FILE = ImportOptions()
@@ -89,6 +104,10 @@ def import_map(
         found = chosen.read(path, settings, Similarity(scale, T))
         for line in found.found:
             log.info(f"{where}: {line}")
+        if found.structure is not None:
+            if photos is not None:
+                raise InputError("is a model with photos of its own; leave out the photos", where=where)
+            return _of_structure(found, found.structure, options, place, baking is not None)
         images = _own_photos(found, where) if photos is None else photos
         read = None if images is None else read_views(images, options.images).about(origin)
         views: list[View] = [] if read is None else read.views
@@ -119,6 +138,100 @@ def import_map(
         if baking is None:
             return scene
         return baked_if_possible(scene, lambda scene: _baked(scene, found, views, baking))
+
+
+def _of_structure(
+    found: ImportedField, structure: Structure, options: ImportOptions, place: Path | None, bake: bool
+) -> Map:
+    """Return a map of landmarks alone, from the points that posed images observe."""
+    capture, features = structure.capture, options.features
+    T_world_camera = SE3.stack([shot.T_world_camera for shot in capture.shots if shot.T_world_camera])
+    origin = chosen_origin(T_world_camera.translation)
+    offset = -torch.tensor(origin, dtype=torch.float64)
+    unit: LengthUnit = "metres" if options.scale != 1 else "units"
+    if structure.keypoints:
+        read, tracked = _described(structure, features, origin)
+    else:
+        read = read_views(capture, replace(options.images, split="all")).about(origin)
+        points = [of_image[of_image >= 0].unique() for of_image in structure.observed]
+        positions = structure.positions + offset
+        tracked = tracked_views(
+            read.views, features, known=lambda images: matches_of_points(images, points, positions)
+        )
+    bounds = bounds_about(structure.positions[structure.positions.isfinite().all(-1)] + offset)
+    _report_extent(found, str(capture.path), unit)
+    info = MapInfo(
+        "", {}, bounds, 0, True, capture.path.name, cameras=read.with_files(stored_cameras(read.views)),
+        landmark_features=features, unit=unit, origin=origin,
+    )  # fmt: skip
+    scene = Map(info, NoField()).to(working_device(options.device))
+    if place is not None:
+        scene = replace(scene, info=write_parts(place, info, TrainingState(0, {}, {})), folder=place)
+    if not bake:
+        return scene
+    scene, _ = scene.with_landmarks(read.views, tracked=tracked)
+    if scene.landmarks is None:
+        raise InputError("its images give no landmarks", where=capture.path)
+    # Of keypoints alone, nothing is known about the photos.
+    return scene if structure.keypoints else scene.with_survey(read.views, tracked)
+
+
+def _described(structure: Structure, features: str, origin: Origin) -> tuple[ReadViews, TrackedViews]:
+    """Return blank views, and the keypoints that are known of them, in tracks by the points they observe.
+
+    Raises ``InputError`` if the descriptors are not those of the detector ``features``.
+    """
+    capture, blank = structure.capture, dict[tuple[int, int], torch.Tensor]()
+    probe = detected(
+        find_features(features), torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0))
+    )
+    channels = structure.keypoints[0].descriptors.shape[1]
+    if probe.descriptors.shape[1] != channels:
+        raise InputError(
+            f"its descriptors have {channels} channels, those of {features!r} {probe.descriptors.shape[1]}",
+            where=capture.path, expected="the detector that made them (--landmark-features)",
+        )  # fmt: skip
+    views, images, labels, free = (
+        list[View](),
+        list[ImageKeypoints](),
+        list[torch.Tensor](),
+        len(structure.positions),
+    )
+    for shot, keypoints, observed in zip(capture.shots, structure.keypoints, structure.observed, strict=True):
+        stored, T = shot.camera, shot.T_world_camera
+        assert isinstance(stored, Intrinsics)  # as the importer promises
+        assert T is not None
+        camera = stored.at_most(USEFUL_SIDE)
+        size = camera.height, camera.width
+        blank.setdefault(size, torch.zeros((*size, 3), dtype=torch.uint8))
+        order = (observed < 0).long().argsort(stable=True)
+        order = order[: max(int((observed >= 0).sum()), USUAL_COUNT)]
+        scale = torch.tensor([camera.width / stored.width, camera.height / stored.height])
+        chosen = Keypoints(
+            keypoints.pixels[order] * scale,
+            keypoints.sizes[order] * scale.mean(),
+            keypoints.descriptors[order],
+        )
+        there = observed[order]
+        labels.append(torch.where(there >= 0, there, free + torch.arange(len(order))))
+        free += len(order)
+        views.append(View(Frame(shot.name, blank[size], camera), T))
+        images.append(
+            ImageKeypoints(
+                chosen,
+                camera.unproject(chosen.pixels.double()),
+                torch.zeros(len(order), dtype=torch.float64),
+                camera,
+                T,
+            )
+        )
+    files = {shot.name: os.path.relpath(shot.file, capture.path) for shot in capture.shots if shot.file}
+    read = ReadViews(views, capture.path.name, str(capture.path), BLACK, files=files).about(origin)
+    images = [
+        replace(image, T_ref_camera=view.T_ref_camera) for image, view in zip(images, read.views, strict=True)
+    ]
+    label = torch.cat(labels)
+    return read, TrackedViews(TrackedKeypoints(images, label, torch.arange(len(label))), features)
 
 
 def _own_photos(found: ImportedField, where: str) -> Capture | None:

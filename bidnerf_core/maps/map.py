@@ -27,9 +27,11 @@ from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.fields import (
     LARGEST_LENGTH,
+    NoField,
     RadianceField,
     RenderedImage,
     SceneBounds,
+    has_field,
     levels,
     render_image,
     trained_field,
@@ -38,9 +40,17 @@ from bidnerf_core.frames import View
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import from_plain, locked
 from bidnerf_core.localization import on_device, origin_of
-from bidnerf_core.mapping import BakeConfig, LandmarkMap, SurfaceMap, TrackedViews, find_features
+from bidnerf_core.mapping import (
+    BakeConfig,
+    HeldOutTrial,
+    LandmarkMap,
+    SurfaceMap,
+    TrackedViews,
+    colour_noise,
+    find_features,
+)
 from bidnerf_core.maps.anchor import Anchor
-from bidnerf_core.maps.baking import bake_landmarks, bake_surface, check_same_scene
+from bidnerf_core.maps.baking import bake_landmarks, bake_surface, check_same_scene, surveyed_photos
 from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info
 from bidnerf_core.maps.store import (
     checked_weights,
@@ -81,10 +91,19 @@ class Map:
     def __repr__(self) -> str:
         """A one-line description without tensors or cameras; ``describe`` gives the details."""
         info = self.info
-        trained = f"{info.backend}, {amount(info.step, 'step')}{'' if info.complete else ' (not complete)'}"
+        trained = "no field"
+        if self.has_field:
+            trained = (
+                f"{info.backend}, {amount(info.step, 'step')}{'' if info.complete else ' (not complete)'}"
+            )
         surfels = amount(0 if self.surface is None else len(self.surface.surfels), "surfel")
         landmarks = amount(0 if self.landmarks is None else len(self.landmarks), "landmark")
         return f"<Map {self.name}: {trained}, {surfels}, {landmarks}>"
+
+    @property
+    def has_field(self) -> bool:
+        """Whether the map has a radiance field; one of landmarks alone has none, and localizes images by these."""
+        return has_field(self.field)
 
     @property
     def bounds(self) -> SceneBounds:
@@ -279,9 +298,19 @@ class Map:
 
         ``tracked`` holds the views' keypoints if they were tracked already, ``surface`` the surface if known.
         """
-        check_cancelled("baking")
-        scene = self.with_parts(surface or bake_surface(self.info, self.field, views, config, self.name))
-        if not views and not rendered_landmarks and self.info.landmark_source != "rendered images":
+        scene, tracked = self.with_landmarks(views, rendered_landmarks, tracked)
+        return scene.with_surface(views, config, surface).with_survey(views, tracked)
+
+    def with_landmarks(
+        self, views: Sequence[View], rendered: bool = False, tracked: TrackedViews | None = None
+    ) -> tuple[Map, TrackedViews | None]:
+        """Return the map with new landmarks, and their keypoints; they need no field unless its images are ``rendered``.
+
+        Those from photos are kept, without keypoints, where neither views nor renderings replace them. As for ``with_parts``,
+        the caller holds the lock of the folder.
+        """
+        check_cancelled("landmarks")
+        if not views and not rendered and self.info.landmark_source != "rendered images":
             photos = self.landmarks
             if photos is None and self.folder is not None:
                 try:
@@ -292,11 +321,37 @@ class Map:
                 log.info(
                     f"{self.name}: its landmarks from photos are kept; --rendered-landmarks replaces them"
                 )
-                return replace(scene, landmarks=photos)
-        check_cancelled("baking")
-        info, landmarks, record = bake_landmarks(self.info, self.field, views, self.name, tracked, scene.up)
-        info = replace(info, surface=scene.info.surface)
-        return replace(scene, info=info).with_parts(None, landmarks, record)
+                return replace(self, landmarks=photos), None
+        info, landmarks, tracked = bake_landmarks(self.info, self.field, views, self.name, tracked)
+        return replace(self, info=info).with_parts(None, landmarks), tracked
+
+    def with_surface(
+        self, views: Sequence[View], config: BakeConfig, surface: SurfaceMap | None = None
+    ) -> Map:
+        """Return the map with a new surface: the given one, or one of the views' measured or the field's rendered depth."""
+        check_cancelled("surface")
+        return self.with_parts(surface or bake_surface(self.info, self.field, views, config, self.name))
+
+    def completed(self) -> Map:
+        """Return the map with its training ended as it stands, and its folder without what resuming it would need."""
+        info, field = replace(self.info, complete=True), trained_field(self.field)
+        if self.folder is not None:
+            state = TrainingState(info.step, cast(nn.Module, field).state_dict(), {})
+            info = write_parts(self.folder, info, state, keep=True)
+        return replace(self, info=info)
+
+    def with_survey(self, views: Sequence[View], tracked: TrackedViews | None) -> Map:
+        """Return the map with the capture record of photos, whose keypoints were ``tracked``, and the field's error on them.
+
+        It is the map itself without photos, or without their keypoints.
+        """
+        if not views or tracked is None:
+            return self
+        check_cancelled("survey")
+        noise = colour_noise(self.field, self.bounds, views) if self.has_field else None
+        scene = replace(self, info=replace(self.info, colour_noise=noise))
+        trial = HeldOutTrial() if self.landmarks is None else self.landmarks.trial
+        return scene.with_parts(None, None, surveyed_photos(tracked, views, trial, self.up))
 
     def with_parts(
         self,
@@ -338,7 +393,7 @@ class Map:
                 expected="an nn.Module of a backend",
             )
         state = TrainingState(self.info.step, field.state_dict(), {})
-        if not self.info.complete and self.folder is not None:
+        if self.info.training is not None and self.folder is not None:
             state = load_state(self.folder, self.info, self.field)
         whole = self.whole()
         here = whole.to("cpu")
@@ -379,6 +434,8 @@ def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None 
     """
     where = str(DESCRIPTION if folder is None else folder / DESCRIPTION)
     path = Path(info.weights) if folder is None else folder / info.weights
+    if not info.step:
+        return info.in_map_unit(NoField())
     backend, outline = load_backend(info.backend, "" if folder is None else str(folder)), None
     try:  # only the shapes, before memory is allocated for a field of whatever size map.json describes
         with torch.device("meta"):

@@ -65,13 +65,14 @@ def write_parts(
     surface: SurfaceMap | None = None,
     landmarks: LandmarkMap | None = None,
     capture: CaptureReport | None = None,
+    keep: bool = False,
 ) -> MapInfo:
     """Write parts of the map that ``info`` describes, and return its description with their names.
 
     With ``state``, this is a whole map, which replaces the one in the folder: parts that are not given, such as a surface that
-    was baked from earlier weights, are dropped. Without, the parts are added to the map in the folder, in place of those that
-    it has; what ``info`` says about landmarks (their source, the field's errors on their images) is written with these. The
-    caller holds the lock of the folder.
+    was baked from earlier weights, are dropped, but with ``keep`` the landmarks that ``info`` names stay: they do not depend on
+    the weights. Without, the parts are added to the map in the folder, in place of those that it has; what ``info`` says about
+    landmarks (their source) and their images (the field's errors there) is written with these. The caller holds the lock of the folder.
 
     Raises ``InputError`` for landmarks whose detector has no name by which a query could find it, and if the map was retrained
     while a part was built.
@@ -94,7 +95,7 @@ def write_parts(
         for part in parts
     }
     if state is not None:
-        names = dict.fromkeys(PART_NAMES) | names
+        names = dict.fromkeys(PART_NAMES) | ({"landmarks": info.landmarks} if keep else {}) | names
     else:
         stored = load_info(folder)
         if stored.weights != info.weights:
@@ -103,12 +104,10 @@ def write_parts(
             )
         info, given = stored, info
         if landmarks is not None:
-            names |= {
-                "landmark_features": landmarks.features,
-                "landmark_source": given.landmark_source,
-                "colour_noise": given.colour_noise,
-            }
-    if state is not None and landmarks is None:
+            names |= {"landmark_features": landmarks.features, "landmark_source": given.landmark_source}
+        if landmarks is not None or capture is not None:
+            names |= {"colour_noise": given.colour_noise}
+    if state is not None and names["landmarks"] is None:
         names |= {"landmark_source": None, "colour_noise": None}
     info = replace(info, **names)
     description = _json(info)

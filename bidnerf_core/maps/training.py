@@ -1,4 +1,7 @@
-"""Building maps: training a field on posed images, baking what localization needs, and resuming interrupted work."""
+"""Building maps: landmarks, a trained field and a surface from posed images, and resuming interrupted work.
+
+The landmarks come first, since they localize images without a field, and stay when the rest is interrupted.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +16,14 @@ from typing import Any, cast
 import torch
 from torch import nn
 
-from bidnerf_core.backend import Backend, load_backend
+from bidnerf_core.backend import Backend, load_backend, quick_config
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import as_given, at_stored_poses, located, prepared, stored_cameras
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.datasets import HOLD_OUT_EVERY, DatasetOptions
 from bidnerf_core.devices import moved, working_device
-from bidnerf_core.errors import Cancelled, InputError, amount
-from bidnerf_core.fields import device_of
+from bidnerf_core.errors import Cancelled, InputError, amount, enumeration
+from bidnerf_core.fields import NoField, RadianceField, device_of
 from bidnerf_core.frames import View
 from bidnerf_core.io import from_plain, packed, to_plain
 from bidnerf_core.mapping import BakeConfig, TrackedViews
@@ -28,16 +31,18 @@ from bidnerf_core.maps.checkpoints import Checkpoints
 from bidnerf_core.maps.description import MapInfo, load_info, longest_side
 from bidnerf_core.maps.map import USUAL_BAKE, Map, build_field, frozen_field, load_map
 from bidnerf_core.maps.options import TrainOptions
-from bidnerf_core.maps.store import load_state, map_folder
+from bidnerf_core.maps.store import load_state, map_folder, write_parts
 from bidnerf_core.maps.views import Images, ReadViews, chosen_origin, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, job_context
 from bidnerf_core.registry import PluginError
 from bidnerf_core.structure import lacks_poses
-from bidnerf_core.training import TrainingStopped
+from bidnerf_core.training import TrainingState, TrainingStopped
 
 log = logging.getLogger("bidnerf")
 
 USUAL = TrainOptions()
+QUICK = "quick"
+"""Stands for the settings of a backend's short training."""
 
 
 class OtherSettings(InputError):
@@ -60,12 +65,13 @@ def train(
     ``data`` is a dataset, the path to one, or views whose reference frame is the world; ``options.images`` says how it
     is read, such as which split. The path may also be a folder of photos without poses, or a video: ``find_poses`` then
     finds the poses first, in the folder OUT-poses next to the map. ``backend`` is the name of an installed backend, and
-    ``config`` holds its settings: an object of its ``config_type``, or a dict of those that differ from the defaults.
-    The map is stored in folder ``out`` during training, or only kept in memory if that is None. ``bake`` may hold the
-    settings of baking.
+    ``config`` holds its settings: an object of its ``config_type``, a dict of those that differ from the defaults, or
+    "quick" for those of its short training. The map is stored in folder ``out`` during training, or only kept in memory if
+    that is None. ``bake`` may hold the settings of baking. If ``out`` holds a map of landmarks alone, such as an imported
+    one, that map gets a field and a surface, and keeps its landmarks, cameras and poses.
 
     ``progress`` receives each step, and remarks go to the logger "bidnerf". Once ``cancel`` returns True,
-    ``Cancelled`` is raised; a map in a folder whose training has begun is saved first, and ``resume``
+    ``Cancelled`` is raised; a map in a folder has then what was finished, landmarks first, and ``resume``
     continues it. An exception raised by ``progress`` ends the training as well; the map in the folder is then
     that of the last checkpoint, at most ``options.checkpoint_seconds`` old.
 
@@ -77,18 +83,37 @@ def train(
     unless ``options.trust_poses`` is set; the folder must be empty unless ``options.overwrite`` is set.
     """
     chosen, settings = load_backend(backend), config
-    if config is None or isinstance(config, dict):
+    if config == QUICK:
+        settings = quick_config(chosen)
+    elif config is None or isinstance(config, dict):
         settings = from_plain(chosen.config_type, config or {}, f"settings of backend {backend!r}")
     elif not isinstance(config, chosen.config_type):
         found, expected = type(config).__name__, chosen.config_type.__name__
-        raise InputError(f"config is a {found}", expected=f"a {expected} or a dict of its settings")
-    baking, device = bake_settings(bake), working_device(options.device)
+        raise InputError(
+            f"config is a {found}", expected=f"a {expected} or a dict of its settings, or {QUICK!r}"
+        )
+    baking = bake_settings(bake)
+    working_device(options.device)  # rejected before anything is read
     place = None if out is None else Path(out)
+    known = None if options.overwrite or place is None else landmarks_alone(place)
     with (
         job_context(progress, cancel),
-        contextlib.nullcontext() if place is None else map_folder(place, options.overwrite),
+        finished_parts(place),
+        contextlib.nullcontext()
+        if place is None
+        else map_folder(place, options.overwrite or known is not None),
         posed_images(data, options.images, place, options.overwrite) as (posed, images),
     ):
+        if known is not None:
+            return _with_field(
+                known,
+                posed,
+                images,
+                chosen,
+                replace(known.info, backend=backend, config=to_plain(settings, "config")),
+                options,
+                baking,
+            )
         read = read_views(posed, images, options.depth_points, options.point_choice, place)
         origin = chosen_origin(torch.stack([view.T_ref_camera.translation.cpu() for view in read.views]))
         if any(origin):
@@ -127,8 +152,66 @@ def train(
             origin=origin,
             gravity_up=read.gravity_up,
         )
-        report = Checkpoints(info, place, None, options.checkpoint_seconds)
-        return _baked(_trained(chosen, taken.views, report, device), taken.views, taken.tracked, baking)
+        built = build_field(chosen, info, str(place or read.place))
+        scene, tracked = Map(info, NoField()), taken.tracked
+        if place is not None:
+            scene = replace(scene, info=write_parts(place, info, TrainingState(0, {}, {})), folder=place)
+        if baking is not None:
+            scene, tracked = scene.with_landmarks(taken.views, tracked=tracked)
+        return _baked(_trained(chosen, built, taken.views, scene, options), taken.views, tracked, baking)
+
+
+def landmarks_alone(folder: Path) -> Map | None:
+    """Return the map in a folder if it is complete without a field, as an imported one may be; None for anything else there."""
+    try:
+        info = load_info(folder)
+    except InputError:
+        return None
+    return load_map(folder) if info.complete and not info.step else None
+
+
+def _with_field(
+    scene: Map, data: Images, images: DatasetOptions, backend: Backend, info: MapInfo, options: TrainOptions, config: BakeConfig | None
+) -> Map:  # fmt: skip
+    """Train a field, as ``info`` describes it, for a map of landmarks, which it keeps with its cameras and their poses."""
+    images = replace(images, largest=longest_side(info))
+    read = read_views(data, images, options.depth_points, options.point_choice, scene.folder).about(
+        info.origin
+    )
+    own = {camera.name: camera for camera in info.cameras}
+    strangers = [view.frame.name for view in read.views if view.frame.name not in own]
+    if strangers:
+        raise InputError(
+            f"image {strangers[0]!r} is none of those of {scene.name}",
+            where=read.place,
+            expected="images of that map",
+        )
+    tracked, views = located(
+        at_stored_poses(read.views, info.cameras), info.landmark_features, True, read.depth_unit
+    )
+    bounds = estimate_bounds(views, read.background)
+    info = replace(info, bounds=bounds, complete=False, hidden=read.hidden, sparse_depth=read.sparse_depth)
+    scene = replace(scene, info=info)
+    built = build_field(backend, info, str(scene.folder))
+    return _baked(_trained(backend, built, views, scene, options), views, tracked, config)
+
+
+@contextlib.contextmanager
+def finished_parts(folder: Path | None) -> Iterator[None]:
+    """Say what of a map is in its folder if the work in the context is cancelled."""
+    try:
+        yield
+    except Cancelled as stopped:
+        try:
+            info = None if folder is None else load_info(folder)
+        except InputError:
+            info = None
+        if info is None or isinstance(stopped.__cause__, TrainingStopped):
+            raise
+        there = {"landmarks": info.landmarks, "field": info.step, "surface": info.surface}
+        parts = enumeration([part for part, found in there.items() if found]) or "nothing"
+        advice = "--resume continues, --finish ends it as it is"
+        raise Cancelled(f"{folder}: {stopped}; the map has its {parts} so far; {advice}") from stopped
 
 
 def resume(
@@ -136,13 +219,15 @@ def resume(
     data: Images,
     *,
     bake: bool | BakeConfig = True,
+    finish: bool = False,
     options: TrainOptions = USUAL,
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Map:
     """Resume the interrupted training of the map in ``folder``, with the same result as an uninterrupted run.
 
-    A map that is trained but not baked is baked. Backend, settings and poses are those of the original run; ``data`` and
+    A map that is trained but not baked is baked. With ``finish``, training ends with the steps done so far, and the map is
+    baked as it stands; without any steps, it is a map of landmarks alone. Backend, settings and poses are those of the original run; ``data`` and
     those ``options`` that concern reading must give the same views. The other arguments and the errors are as for
     ``train``. Raises ``InputError`` if nothing is left to do.
     """
@@ -150,6 +235,7 @@ def resume(
     interrupted(out, baking is not None)
     with (
         job_context(progress, cancel),
+        finished_parts(out),
         map_folder(out, overwrite=True),
         posed_images(data, options.images, out) as (posed, images),
     ):
@@ -160,21 +246,26 @@ def resume(
         read = read_views(posed, images, options.depth_points, options.point_choice, out).about(info.origin)
         _check_same_views(out, info, read, images.split)
         views = at_stored_poses(read.views, info.cameras)
-        if info.complete:  # interrupted between training and baking
-            log.info(f"{out}: training is complete ({amount(info.step, 'step')}); baking its surface")
-            return load_map(out, device, baked=False).with_baked_parts(views, baking or USUAL_BAKE)
-        tracked, views = located(
-            views, features=info.landmark_features, trust_poses=True, depth_unit=read.depth_unit
-        )  # the same as when training began
+        tracked = None
+        if not info.complete or info.landmarks is None:
+            tracked, views = located(
+                views, features=info.landmark_features, trust_poses=True, depth_unit=read.depth_unit
+            )  # the same as when training began
+        scene = load_map(out, device)
+        if finish and not info.complete:
+            log.info(f"{out}: ends with the {amount(info.step, 'step')} done so far")
+            scene = scene.completed()
+        if scene.landmarks is None and baking is not None:
+            scene, tracked = scene.with_landmarks(views, tracked=tracked)
+        if scene.info.complete:
+            return _baked(scene, views, tracked, baking) if scene.has_field else scene
         backend = load_backend(info.backend, str(out))
-        field, _ = build_field(backend, info, str(out))
+        built = build_field(backend, info, str(out))
         state = None
         if info.step:
-            state = load_state(out, info, field)
+            state = load_state(out, info, built[0])
             log.info(f"{out}: resuming from step {info.step}")
-        report = Checkpoints(info, out, state, options.checkpoint_seconds)
-        del state, field  # the report frees the state once training resumes from it
-        return _baked(_trained(backend, views, report, device), views, tracked, baking)
+        return _baked(_trained(backend, built, views, scene, options, state), views, tracked, baking)
 
 
 def interrupted(folder: Path, baking: bool = True) -> MapInfo:
@@ -268,12 +359,16 @@ def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> 
         )
 
 
-def _trained(backend: Backend, views: Sequence[View], report: Checkpoints, device: torch.device) -> Map:
-    """Train from the state that the report holds to the end."""
-    info, out = report.info, report.folder
-    where = str(out or info.data or "map in memory")
-    built, config = build_field(backend, info, where)
-    field = moved(built, device)
+def _trained(
+    backend: Backend, built: tuple[RadianceField, Any], views: Sequence[View], scene: Map, options: TrainOptions,
+    state: TrainingState | None = None,
+) -> Map:  # fmt: skip
+    """Train the field of a map, ``built`` with its config, from a ``state``, or from the beginning, to the end."""
+    out, device = scene.folder, working_device(options.device)
+    report = Checkpoints(scene.info, out, state, options.checkpoint_seconds)
+    del state  # the report frees it once training resumes from it
+    config, where = built[1], str(out or scene.info.data or "map in memory")
+    field = moved(built[0], device)
     try:
         backend.train(field, views, config, report)
     except TrainingStopped as stopped:
@@ -283,13 +378,14 @@ def _trained(backend: Backend, views: Sequence[View], report: Checkpoints, devic
         raise Cancelled(f"{where}: {kept} after step {stopped.step}{advice}") from stopped
     report.finish(field)
     weights = packed(cast(nn.Module, field).state_dict())
-    del field, built
-    return Map(report.info, frozen_field(report.info, weights, out), folder=out).to(device)
+    trained = frozen_field(report.info, weights, out)
+    return Map(report.info, trained, None, scene.landmarks, out, scene.record).to(device)
 
 
 def _baked(scene: Map, views: Sequence[View], tracked: TrackedViews | None, config: BakeConfig | None) -> Map:
     if config is not None:
-        scene = baked_if_possible(scene, lambda whole: whole.with_baked_parts(views, config, tracked=tracked))
+        scene = baked_if_possible(scene, lambda whole: whole.with_surface(views, config))
+        scene = scene.with_survey(views, tracked)
     if scene.folder is not None:
         size = sum(file.stat().st_size for file in scene.folder.iterdir()) / 2**20
         log.info(f"{scene.folder}: map of {scene.info.data or 'views in memory'}, {size:.1f} MiB")

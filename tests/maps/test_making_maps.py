@@ -334,14 +334,15 @@ def test_a_backend_whose_module_is_no_field_is_refused_before_training(
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_a_broken_detector_ends_training_with_an_error_and_the_map_in_its_folder(
+def test_a_broken_detector_is_reported_before_the_field_is_trained(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr("bidnerf_core.registry.registered", {("features", "blind"): lambda rgb: None})
     with refused(where="detector", found="returned a NoneType", expected="Keypoints", error=PluginError):
         options = bn.TrainOptions(images=IMAGES, features="blind", refine_poses="never")
         trained(tmp_path / "map", options=options, bake=BAKE)
-    assert load_info(tmp_path / "map").complete
+    info = load_info(tmp_path / "map")
+    assert (info.step, info.complete) == (0, False)
 
 
 def test_photos_to_map_to_pose_to_overlay(tmp_path: Path) -> None:

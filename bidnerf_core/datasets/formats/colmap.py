@@ -66,19 +66,7 @@ class ColmapReader(Reader):
 
     def read(self, path: Path, options: DatasetOptions) -> Capture:
         """Read the model. Raises ``InputError`` if it is damaged or has no registered image."""
-        model = _largest(path, _models(path))
-        images, cameras = read_posed_images(model)
-        folder, files = _image_folder(path, model, images)
-        own = _models_at(folder.parent / "sparse")
-        if files and own and model.resolve() not in [each.resolve() for each in own]:
-            # such as dense/0, whose images are undistorted, while those of sparse/0 lie elsewhere
-            text = f"{folder.relative_to(path)} has a model of its own, which is used instead of {model.relative_to(path)}"
-            remark(path, text)
-            model = _largest(path, own)
-            images, cameras = read_posed_images(model)
-            folder, files = _image_folder(path, model, images)
-        if not images:
-            raise InputError("has no registered image", where=model, expected="at least one")
+        model, folder, images, cameras, files = self.project(path)
         if options.masks is None and any((place / "masks").is_dir() for place in (path, folder.parent)):
             remark(
                 path,
@@ -94,13 +82,33 @@ class ColmapReader(Reader):
             ),
         )
         _remark_unregistered(path, folder, files)
-        there.sort(key=lambda image: natural_order(str(posix_name(image.name))))
-        for image, following in pairwise(there):
+        shots = [shot_of(model, image, files[image.name], cameras) for image in there]
+        return Capture(path, shots, options.colour)
+
+    def project(self, path: Path) -> tuple[Path, Path, list[ModelImage], dict[int, Camera], dict[str, Path]]:
+        """Return the model that is used, the folder of its images, its images in natural order of names, its cameras by id, and
+        the image files that are there, by the images' names.
+
+        Raises ``InputError`` if the model is damaged or has no registered image.
+        """
+        model = _largest(path, _models(path))
+        images, cameras = read_posed_images(model)
+        folder, files = _image_folder(path, model, images)
+        own = _models_at(folder.parent / "sparse")
+        if files and own and model.resolve() not in [each.resolve() for each in own]:
+            # such as dense/0, whose images are undistorted, while those of sparse/0 lie elsewhere
+            text = f"{folder.relative_to(path)} has a model of its own, which is used instead of {model.relative_to(path)}"
+            remark(path, text)
+            model = _largest(path, own)
+            images, cameras = read_posed_images(model)
+            folder, files = _image_folder(path, model, images)
+        if not images:
+            raise InputError("has no registered image", where=model, expected="at least one")
+        images.sort(key=lambda image: natural_order(str(posix_name(image.name))))
+        for image, following in pairwise(images):
             if posix_name(image.name) == posix_name(following.name):
                 raise InputError(f"image {image.name} is registered twice", where=model, expected="once")
-        return Capture(
-            path, [_shot(model, image, files[image.name], cameras) for image in there], options.colour
-        )
+        return model, folder, images, cameras, files
 
 
 def _models(path: Path) -> list[Path]:
@@ -165,7 +173,8 @@ def _remark_unregistered(path: Path, folder: Path, files: dict[str, Path]) -> No
         remark(folder, f"{text}, first: {others[0].relative_to(folder)}")
 
 
-def _shot(model: Path, image: ModelImage, file: Path, cameras: dict[int, Camera]) -> Shot:
+def shot_of(model: Path, image: ModelImage, file: Path | None, cameras: dict[int, Camera]) -> Shot:
+    """Return an image of a model as a shot, without pixels if it has no file. Raises ``InputError`` if its camera is missing."""
     if image.camera not in cameras:
         found = f"image {image.name!r} has the camera {image.camera}, which is missing from cameras"
         raise InputError(found, where=model)

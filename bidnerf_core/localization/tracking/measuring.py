@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.depth import DepthSensorModel
+from bidnerf_core.fields import has_field
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import CORNERS_PER_INDEPENDENT, SE3, skew, update_between
 from bidnerf_core.localization.accept import Evidence, judge
@@ -354,7 +355,7 @@ class Measurer:
             if surface is None
             else Surface.of([view], None, surface, state.frames, self.config.depth_points)
         )
-        if points is None and image is None:
+        if points is None and (image is None or not has_field(self.scene.field)):
             return None
         off = math.sqrt(float((covariance.diagonal() * torch.tensor([1.0] * 3 + [reach**2] * 3)).sum() / 3))
         if image is None and off > VAGUE * reach:

@@ -35,6 +35,7 @@ from bidnerf_core.mapping.landmarks.image_keypoints import ImageKeypoints, image
 from bidnerf_core.mapping.landmarks.keypoint_depth import keypoint_depth_noise, placed
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, concatenated
 from bidnerf_core.mapping.landmarks.tracks import (
+    Matches,
     TrackedKeypoints,
     epipolar_matches,
     fused_landmarks,
@@ -231,8 +232,11 @@ def tracked_views(
     views: Sequence[View],
     features: str | Features = USUAL_FEATURES,
     config: LandmarkConfig = DEFAULT_LANDMARKS,
+    known: Callable[[Sequence[ImageKeypoints]], list[tuple[int, int, Matches]]] = lambda images: [],
 ) -> TrackedViews:
     """Detect the keypoints of ``views``, match those of likely neighbours, and join the matches into tracks.
+
+    ``known`` returns further matches of the keypoints, which take precedence where they contradict.
 
     ``features`` is a detector or its name, which is stored with the landmarks so that queries use the same detector. Raises
     ``InputError`` if there are no views, for an unknown name, and for unusable keypoints.
@@ -249,7 +253,7 @@ def tracked_views(
             f"descriptors have {enumeration([*map(str, lengths)])} channels in different images",
             expected="the same number",
         )
-    return TrackedViews(_joined(images, pairs, steps), features)
+    return TrackedViews(_joined(images, pairs, steps, known(images)), features)
 
 
 def _pairs(poses: Sequence[SE3], config: LandmarkConfig) -> list[list[int]]:
@@ -260,11 +264,16 @@ def _pairs(poses: Sequence[SE3], config: LandmarkConfig) -> list[list[int]]:
     return pairs
 
 
-def _joined(images: Sequence[ImageKeypoints], pairs: list[list[int]], steps: _Steps) -> TrackedKeypoints:
-    """Match the keypoints of the pairs of images, and join the matches into tracks."""
+def _joined(
+    images: Sequence[ImageKeypoints],
+    pairs: list[list[int]],
+    steps: _Steps,
+    known: Sequence[tuple[int, int, Matches]] = (),
+) -> TrackedKeypoints:
+    """Match the keypoints of the pairs of images, and join the matches into tracks, ``known`` ones of ambiguity 0 first."""
     matches = steps.over(_mapped(lambda ij: epipolar_matches(images[ij[0]], images[ij[1]]), pairs))
     found = [(i, j, m) for (i, j), m in zip(pairs, matches, strict=True)]
-    label = joined_tracks(found, [len(image.keypoints) for image in images])
+    label = joined_tracks([*known, *found], [len(image.keypoints) for image in images])
     return TrackedKeypoints(images, label, torch.arange(len(label)))
 
 

@@ -109,6 +109,43 @@ def epipolar_matches(a: ImageKeypoints, b: ImageKeypoints) -> Matches:
     return Matches(torch.stack([rows, partner], dim=-1)[good], ambiguity[good])
 
 
+def matches_of_points(
+    images: Sequence[ImageKeypoints], observed: Sequence[Int[Tensor, "k"]], positions: Float[Tensor, "p 3"]
+) -> list[tuple[int, int, Matches]]:
+    """Return matches between keypoints at the projections of the same known point, without ambiguity.
+
+    ``observed`` holds the numbers of the points (metres, world) that each image shows. A keypoint belongs to a point if each
+    is the other's nearest, and they are as near as a match to its epipolar line.
+    """
+    rows = list[Int[Tensor, "m 3"]]()  # point, image, keypoint
+    for number, (image, points) in enumerate(zip(images, observed, strict=True)):
+        if not (len(points) and len(image.keypoints)):
+            continue
+        local = image.T_ref_camera.inverse().apply(positions[points])
+        pixels = image.intrinsics.project(local).nan_to_num(torch.inf)
+        distance = torch.cdist(pixels.float(), image.keypoints.pixels)
+        best, partner = distance.min(dim=1)
+        mutual = distance.argmin(dim=0)[partner] == torch.arange(len(points))
+        kept = (mutual & (best <= EPIPOLAR_BAND)).nonzero()[:, 0]
+        rows.append(torch.stack([points[kept], torch.full_like(kept, number), partner[kept]], dim=-1))
+    if not rows:
+        return []
+    found = torch.cat(rows)
+    found = found[found[:, 0].argsort(stable=True)]  # images of a point in turn
+    first, second = found[:-1], found[1:]
+    same = first[:, 0] == second[:, 0]
+    i, j, ends = first[same, 1], second[same, 1], torch.stack([first[same, 2], second[same, 2]], dim=-1)
+    pairs, pair = (i * len(images) + j).unique(return_inverse=True)
+    return [
+        (
+            int(code) // len(images),
+            int(code) % len(images),
+            Matches(ends[pair == n], torch.zeros(int((pair == n).sum()))),
+        )
+        for n, code in enumerate(pairs)
+    ]
+
+
 def _on_line(a: ImageKeypoints, b: ImageKeypoints) -> Bool[Tensor, "n m"]:
     """Return whether each keypoint of ``b`` lies near the epipolar half-line of each keypoint of ``a``.
 

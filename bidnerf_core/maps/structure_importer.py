@@ -1,0 +1,125 @@
+"""Import of an existing COLMAP model: its images, poses, points and tracks, from which a map of landmarks is made.
+
+The files of the model are only read. Its names, cameras and world stay those of the map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import Capture, ColmapReader, read_model, shot_of, stored_keypoints, unique_names
+from bidnerf_core.errors import InputError, amount
+from bidnerf_core.geometry import SE3, Similarity
+from bidnerf_core.mapping import Keypoints
+from bidnerf_core.maps.importers import ImportedField, Structure, bounds_about
+from bidnerf_core.settings import Settings
+
+LEAST_OBSERVED = 6
+"""Number of points from which an image adds to the landmarks: fewer do not even determine its own pose by consensus."""
+
+
+@dataclass(frozen=True)
+class StructureSettings(Settings):
+    """Where the keypoints are from."""
+
+    # file of the keypoints of which the model was made, with their descriptors: a database of COLMAP (.db), or features of hloc
+    # (.h5), which need their detector (--landmark-features) and h5py; "": a database.db beside the model, or else the photos;
+    # photos: the photos
+    keypoints: str = ""
+
+
+class StructureImporter:
+    """Reads COLMAP projects, with a database of SIFT keypoints, with hloc's features, or with photos."""
+
+    summary = "COLMAP models (cameras, images, points3D) with their database or photos: landmarks, to which 'train' adds a field"
+    config_type = StructureSettings
+    reader = ColmapReader()
+
+    def recognises(self, path: Path) -> bool:
+        """Return whether a folder is a COLMAP project, or has a model in it."""
+        return path.is_dir() and self.reader.recognises(path)
+
+    def read(self, path: Path, config: StructureSettings, placement: Similarity) -> ImportedField:
+        """Read the model in a folder, see ``Importer``."""
+        model, folder, images, cameras, files = self.reader.project(path)
+        _, points = read_model(model)
+        found = [f"{model}: {amount(len(images), 'image')}, {amount(len(points.ids), 'point')}"]
+        shots = [shot_of(model, image, files.get(image.name), cameras) for image in images]
+        sound, positions = points.positions.isfinite().all(-1), placement.apply(points.positions)
+        observed = [_numbers(image.observed, points.ids, sound) for image in images]
+        known: Mapping[str, Keypoints] = {}
+        given = None if config.keypoints in ("", "photos") else Path(config.keypoints)
+        if config.keypoints != "photos":
+            beside = (folder / "database.db" for folder in (model, model.parent, model.parent.parent))
+            source = given or next((file for file in beside if file.is_file()), None)
+            known = {} if source is None else dict(stored_keypoints(source))
+            why = None
+            if source is not None:
+                why = _misfit(known, {i.name: len(i.observed) for i in images}, [s.camera for s in shots])
+                found.append(
+                    f"{source}: "
+                    + ("the keypoints and their descriptors" if why is None else f"not used: {why}")
+                )
+            if why is not None and given is not None:
+                raise InputError(why, where=given, expected=f"the keypoints of {model}")
+            known = {} if why is not None else known
+        left_out, kept = list[str](), list[int]()
+        for number, image in enumerate(images):
+            if known and image.name not in known:
+                left_out.append(f"{image.name}: it has no keypoints in the file of them")
+            elif not known and image.name not in files:
+                left_out.append(f"{image.name}: no such photo in {folder}")
+            elif int((observed[number] >= 0).sum()) < LEAST_OBSERVED:
+                left_out.append(f"{image.name}: it observes fewer than {LEAST_OBSERVED} points")
+            else:
+                kept.append(number)
+        if not kept:
+            raise InputError(
+                f"none of its {amount(len(images), 'image')} can be used, such as {left_out[0]}", where=model
+            )
+        found += [f"left out: {line}" for line in left_out]
+        names = unique_names([shots[number].parts for number in kept])
+        posed = [
+            replace(shots[number], name=name, T_world_camera=_placed(images[number].T_camera_model.inverse(), placement), splits=("train",))
+            for number, name in zip(kept, names, strict=True)
+        ]  # fmt: skip
+        structure = Structure(
+            Capture(path, posed), positions, tuple(observed[number] for number in kept),
+            tuple(known[images[number].name] for number in kept) if known else (),
+        )  # fmt: skip
+        bounds = bounds_about(positions[sound])
+        return ImportedField("", None, {}, bounds, found=tuple(found), steps=0, structure=structure)
+
+
+def _numbers(observed: Tensor, ids: Tensor, sound: Tensor) -> Tensor:
+    """Return the numbers of observed points for their ids; -1 for those that are unknown or not finite."""
+    if not len(ids):
+        return torch.full_like(observed, -1)
+    place = torch.searchsorted(ids, observed).clamp(max=len(ids) - 1)
+    return torch.where((ids[place] == observed) & sound[place], place, -1)
+
+
+def _placed(T: SE3, placement: Similarity) -> SE3:
+    return placement.T_target_source @ SE3(T.rotation, placement.scale * T.translation)
+
+
+def _misfit(known: Mapping[str, Keypoints], counts: Mapping[str, int], cameras: list[object]) -> str | None:
+    """Return why keypoints do not belong to images with these ``counts`` of keypoints, or cannot be used; None if they can."""
+    named = [name for name in counts if name in known]
+    if not named:
+        return "it has no keypoints of any image of the model"
+    for name in named:
+        if counts[name] != len(known[name]):
+            return f"it has {len(known[name])} keypoints of {name}, the model {counts[name]}"
+    if not all(isinstance(camera, Intrinsics) for camera in cameras):
+        return "its keypoints are those of lenses whose images are undistorted"
+    return None
+
+
+importer = StructureImporter()
