@@ -13,10 +13,10 @@ from .frames import View as View
 from .geometry import SE3 as SE3
 from .localization import Corrector as Corrector
 from .localization import Localization as Localization
-from .localization import Localizer as Localizer
 from .localization import Outcome as Outcome
 from .localization import Tracker as Tracker
 from .maps import ImportOptions as ImportOptions
+from .maps import Localizer as Localizer
 from .maps import Map as Map
 from .maps import MapCollection as MapCollection
 from .maps import TrainOptions as TrainOptions

@@ -33,6 +33,7 @@ from bidnerf_core.mapping import (
     posed_keypoints,
     tracked_views,
 )
+from bidnerf_core.progress import counter
 
 log = logging.getLogger("bidnerf")
 
@@ -140,6 +141,7 @@ def _tracked(
     The unit is checked last: under wrong poses, triangulated distances say nothing about it.
     """
     tracked = tracked_views(views, features)
+    counter("checking poses", "stage")(0, 1)
     if not trust_poses:
         _check_poses(tracked.observations.images)
     check_depth_unit(tracked, depth_unit)

@@ -35,14 +35,20 @@ def _importer_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
 
 @dataclass(frozen=True)
 class Import:
-    """Build a map from a field that was trained elsewhere.
+    """Build a map from a field that was trained elsewhere, or from an existing COLMAP model.
 
     The installed importer that recognizes the file reads it. The command reports what it found: counts, what was left out, and
     the extent, since most files store no unit. With --photos, landmarks are built from photos, as in 'train'; otherwise from
     images rendered by the field, which match photos less well.
+
+    The points and tracks of a COLMAP model (a project folder or the model in it) become the landmarks, and answers are in its
+    world; its files are not changed. Such a map localizes photos without a field, which 'bidnerf train FILE --out MAP' adds.
     """
 
-    file: Annotated[Path, Option("FILE", "file or folder of a trained field", positional=True)]
+    file: Annotated[
+        Path,
+        Option("FILE", "file or folder of a trained field, or folder of a COLMAP project", positional=True),
+    ]
     out: Annotated[Path, Option("MAP", "folder for the map")]
     as_: Annotated[
         str | None, Option("NAME", "one of 'bidnerf plugins importers'", "the one that recognizes the file")

@@ -22,13 +22,14 @@ USUAL_FEATURES = "sift"
 
 def _backend_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
     """Return the default settings of the backend: the one named, or that of the map to resume."""
-    from bidnerf_core.backend import load_backend
+    from bidnerf_core.backend import load_backend, quick_config
 
     name, out = values["backend"], values["out"]
-    resumed = _resumed(out) if values["resume"] and name is None else None
-    if resumed is not None:
+    resumed = _resumed(out) if (values["resume"] or values["finish"]) and name is None else None
+    if resumed is not None and resumed.backend:
         return load_backend(resumed.backend, str(out)).config_type()
-    return load_backend(name or DEFAULT_BACKEND).config_type()
+    backend = load_backend(name or DEFAULT_BACKEND)
+    return quick_config(backend) if values["quick"] else backend.config_type()
 
 
 def _resumed(out: Any) -> MapInfo | None:
@@ -45,9 +46,11 @@ def _resumed(out: Any) -> MapInfo | None:
 class Train:
     """Build a map from a dataset, or from photos without poses.
 
-    Poses that photos or video frames lack are found first, as by 'bidnerf poses', and kept in the folder MAP-poses. Ctrl-C stops
-    after a step and saves the map; --resume continues from there, or from the last checkpoint if the program was killed, with
-    the same result as an uninterrupted training. It also bakes a map that is trained but not baked.
+    Poses that photos or video frames lack are found first, as by 'bidnerf poses', and kept in the folder MAP-poses. The landmarks
+    come next, since they localize photos on their own, then the field and the surface. Ctrl-C stops after a step and saves
+    the map; --resume continues from there, or from the last checkpoint if the program was killed, with the same result as an
+    uninterrupted training, and --finish ends it as it stands. If --out holds a map of landmarks alone, as 'bidnerf import' makes
+    of a COLMAP model, it gets a field and a surface.
     """
 
     data: Annotated[
@@ -56,6 +59,12 @@ class Train:
     out: Annotated[Path, Option("MAP", "folder for the map")]
     backend: Annotated[str | None, Option("NAME", "one of 'bidnerf backends'", DEFAULT_BACKEND)] = None
     resume: Annotated[Flag, Option(None, "continue the interrupted training in --out")] = False
+    finish: Annotated[
+        Flag, Option(None, "end the interrupted training in --out now, with the steps done so far")
+    ] = False
+    quick: Annotated[Flag, Option(None, "train a short time: settings of the backend for a first map")] = (
+        False
+    )
     overwrite: Annotated[Flag, Option(None, "replace the map in --out")] = False
     device: Device = "cpu"
     no_bake: Annotated[Flag, Option(None, "leave the surface and landmarks to 'bidnerf bake'")] = False
@@ -85,10 +94,14 @@ class Train:
 
     def __post_init__(self) -> None:
         require("--checkpoint-every", self.checkpoint_every, 0)
-        if self.resume and self.overwrite:
+        continuing = "--resume" if self.resume else "--finish"
+        if (self.resume or self.finish) and (self.overwrite or self.quick):
+            other = "--overwrite" if self.overwrite else "--quick"
             raise UsageError(
-                "--resume continues a map, --overwrite starts a new one; expected only one of them"
+                f"{continuing} continues a map, {other} starts a new one; expected only one of them"
             )
+        if self.finish and self.no_bake:
+            raise UsageError("--finish bakes the map, --no-bake does not; expected only one of them")
         if self.images.largest is not None:
             require("--largest", self.images.largest, 1)
 
@@ -114,7 +127,7 @@ class Train:
                 f"{self.data}: photos without poses; find them with 'bidnerf poses', then train with --masks"
             )
         # What was interrupted during pose estimation resumes by itself.
-        resumed = self.resume and not (photos and not (out / DESCRIPTION).exists())
+        resumed = (self.resume or self.finish) and not (photos and not (out / DESCRIPTION).exists())
         if resumed:
             info = self._interrupted()
             images = replace(images, background=images.background or info.bounds.background)
@@ -129,7 +142,7 @@ class Train:
                 )  # fmt: skip
                 return
             try:
-                resume(out, self.data, bake=not self.no_bake, options=options)
+                resume(out, self.data, bake=not self.no_bake, finish=self.finish, options=options)
             except OtherSettings as error:
                 raise UsageError(error) from error
 

@@ -243,6 +243,14 @@ class Capture:
         if not all(shot.name for shot in self.shots):
             object.__setattr__(self, "shots", _named(self.shots))
 
+    def __repr__(self) -> str:
+        """A one-line description, for which no image is opened."""
+        posed = sum(shot.T_world_camera is not None for shot in self.shots)
+        splits = ", ".join(
+            f"{name} {sum(name in shot.splits for shot in self.shots)}" for name in self.splits
+        )
+        return f"<Capture {self.path}: {amount(len(self), 'image')}, {posed} with poses{f' ({splits})' if splits else ''}>"
+
     @cached_property
     def splits(self) -> tuple[str, ...]:
         """The names of the splits; "train" comes first if it exists. Empty if no image has a pose."""

@@ -12,6 +12,7 @@ from .by_rays import RayTerms as RayTerms
 from .by_surface import is_blank as is_blank
 from .corrector import Corrector as Corrector
 from .explanations import MOVING as MOVING
+from .localizer import LOADERS as LOADERS
 from .localizer import Localizer as Localizer
 from .localizer import Start as Start
 from .localizer import checked_map as checked_map
@@ -34,6 +35,7 @@ from .methods import matches_landmarks as matches_landmarks
 from .methods import require_start as require_start
 from .methods import require_use_of_depth as require_use_of_depth
 from .methods import settings_of as settings_of
+from .picture import picture_at as picture_at
 from .pivots import Pivot as Pivot
 from .pivots import pivot as pivot
 from .posterior import Posterior as Posterior

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from numbers import Integral
@@ -33,6 +33,7 @@ from bidnerf_core.localization.methods import (
     require_use_of_depth,
     settings_of,
 )
+from bidnerf_core.localization.picture import Shown
 from bidnerf_core.localization.problem import (
     Problem,
     SceneMap,
@@ -47,6 +48,8 @@ from bidnerf_core.progress import counter, current_job, job_context
 
 STREAMS = 8
 """Number of queries that share an accelerator, which computes for some while the host detects keypoints of others."""
+LOADERS: list[Callable[[Path], SceneMap]] = []
+"""How the map in a folder is loaded. The package of stored maps, which builds on this one, adds its function."""
 Start = SE3 | Float[Tensor, "4 4"] | np.ndarray | Sequence[Sequence[float]]
 """A pose T_world_camera: an ``SE3``, or any 4x4 matrix, by rows."""
 
@@ -60,14 +63,14 @@ class Localizer:
 
     def __init__(
         self,
-        scene: SceneMap,
+        scene: SceneMap | str | Path,
         method: str = USUAL_METHOD,
         config: Any = None,
         device: torch.device | str | None = None,
         warm_up: bool = True,
         preset: str | None = None,
     ) -> None:
-        """Prepare the map ``scene`` for ``method``.
+        """Prepare the map ``scene``, or the one in that folder, for ``method``.
 
         ``config`` holds the method's settings: an instance of their type (``METHODS[method].config_type``), or a dictionary of those
         that differ from the defaults, or from ``preset``, the name of other settings (``METHODS[method].presets``). ``device`` is that of the
@@ -84,6 +87,10 @@ class Localizer:
         self.matcher = None if landmarks is None else LandmarkMatcher(landmarks)
         if warm_up:
             self._warm_up()
+
+    def __repr__(self) -> str:
+        """A one-line description of the map and the method."""
+        return f"<Localizer in {self.scene!r} by {self.method}>"
 
     def __call__(
         self,
@@ -104,7 +111,9 @@ class Localizer:
             require_use_of_depth(self.method)
         origin = origin_of(self.scene)
         near = None if start is None else start_pose(start).translated(-origin)
-        return self.solved(self.problem(query, near, depth_rays), seed).translated(origin)
+        problem = self.problem(query, near, depth_rays)
+        found = replace(self.solved(problem, seed), shown=Shown(self.scene, problem.views[-1].frame))
+        return found.translated(origin)
 
     def many(
         self,
@@ -223,12 +232,15 @@ def map_with_distances(localizer: Localizer) -> SceneMap:
 
 
 def checked_map(given: object, where: str) -> SceneMap:
-    """Return ``given`` if it is a map. Raises ``InputError``, prefixed with ``where``, for anything else, such as its folder."""
+    """Return ``given`` if it is a map, or the map in the folder ``given``. Raises ``InputError``, prefixed with ``where``, for
+    anything else, and as ``load_map`` does.
+    """
+    if isinstance(given, str | Path):
+        for load in LOADERS:
+            return load(Path(given))
     if isinstance(given, SceneMap):
         return given
-    is_path = isinstance(given, str | bytes) or hasattr(given, "__fspath__")
-    hint = "; load_map(folder) gives one" if is_path else ""
-    raise InputError(f"got a {type(given).__name__}", where=where, expected=f"a Map{hint}")
+    raise InputError(f"got a {type(given).__name__}", where=where, expected="a Map, or the folder of one")
 
 
 def _checked_config(method: Method, name: str, config: Any, preset: str | None) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import math
 import time
@@ -49,6 +50,15 @@ class Outcome(StrEnum):
 
 
 @runtime_checkable
+class Picture(Protocol):
+    """What a notebook shows of an answer."""
+
+    def html(self, T_world_camera: SE3, intrinsics: Intrinsics | None) -> str | None:
+        """Return an element of a page for a pose and the intrinsics it was found with, if other than the given; None for none."""
+        ...
+
+
+@runtime_checkable
 class Diagnostics(Protocol):
     """The measures by which a pose is accepted or rejected: a dataclass of numbers that depends on how the pose was found."""
 
@@ -90,6 +100,16 @@ class Localization:
     diagnostics: Diagnostics | None = None  # the measures by which the pose was accepted or rejected
     intrinsics: Intrinsics | None = None  # of the last image, if other than the given ones were used
     unit: LengthUnit = "units"  # of the position and its covariance: that of the map
+    shown: Picture | None = None  # in a notebook; not stored
+
+    def _repr_html_(self) -> str:
+        """The answer in a notebook: the photo, the map at the pose found, and both blended, above a line of text."""
+        picture = None if self.shown is None else self.shown.html(self.T_world_camera, self.intrinsics)
+        return f"{picture or ''}<div>{html.escape(repr(self))}</div>"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the map, which other processes have no need of."""
+        return self.__dict__ | {"shown": None}
 
     def __repr__(self) -> str:
         """A one-line description, without the steps and the covariance."""

@@ -20,6 +20,7 @@ from .importing import import_map as import_map
 from .known_lengths import ScaleFit as ScaleFit
 from .known_lengths import factor_of_distance as factor_of_distance
 from .known_lengths import factor_of_poses as factor_of_poses
+from .map import Localizer as Localizer
 from .map import Map as Map
 from .map import frozen_field as frozen_field
 from .map import load_map as load_map

@@ -34,6 +34,7 @@ from bidnerf_core.mapping import (
     update_scatter,
 )
 from bidnerf_core.maps.description import LandmarkSource, MapInfo, cameras_of
+from bidnerf_core.progress import counter
 
 log = logging.getLogger("bidnerf")
 
@@ -96,6 +97,7 @@ def bake_landmarks(
     if views and not info.distances:
         tracked = tracked.at_distance(info.bounds.side / 2)  # the directions are still informative
     landmarks = None
+    counter("trying the landmarks on images", "stage")(0, 1)
     try:
         landmarks = tried_landmarks(tracked, images, report=log.info)
     except InputError as error:
@@ -121,6 +123,7 @@ def surveyed_photos(
     tracked: TrackedViews, views: Sequence[View], trial: HeldOutTrial, up: UpDirection | None
 ) -> CaptureReport:
     """Return the capture record of photos whose keypoints were ``tracked``, and log its summary."""
+    counter("surveying the photos", "stage")(0, 1)
     capture = surveyed(tracked, views, trial=trial, up=up)
     for line in summary(capture):
         log.info(line)

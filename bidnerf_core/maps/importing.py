@@ -75,6 +75,8 @@ def import_map(
 ) -> Map:
     """Build a map from a field in a file: splats, a checkpoint, or whatever an installed importer reads.
 
+    From a COLMAP model, whose points and tracks become the landmarks, this is a map without a field, which ``train`` adds.
+
     ``config`` holds settings of the importer: an object of its ``config_type``, or a dict of those that differ from the
     defaults. Lengths are multiplied by ``options.scale``, and ``options.T_world_file`` then transforms the file's
     coordinates to the world. If that is far away, as survey coordinates are, the map gets an origin there, see
@@ -208,7 +210,7 @@ def _described(structure: Structure, features: str, origin: Origin) -> tuple[Rea
         order = order[: max(int((observed >= 0).sum()), USUAL_COUNT)]
         scale = torch.tensor([camera.width / stored.width, camera.height / stored.height])
         chosen = Keypoints(
-            keypoints.pixels[order] * scale,
+            (keypoints.pixels[order] * scale).clamp(torch.zeros(2), torch.tensor([camera.width, camera.height])),
             keypoints.sizes[order] * scale.mean(),
             keypoints.descriptors[order],
         )

@@ -39,7 +39,8 @@ from bidnerf_core.fields import (
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import from_plain, locked
-from bidnerf_core.localization import on_device, origin_of
+from bidnerf_core.localization import LOADERS, on_device, origin_of
+from bidnerf_core.localization import Localizer as Localizer  # from the door, with maps to load
 from bidnerf_core.mapping import (
     BakeConfig,
     HeldOutTrial,
@@ -425,6 +426,9 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     if info.interruption is not None:
         log.info(f"{folder}: {info.interruption}")
     return Map(info, frozen_field(info, weights, folder), surface, landmarks, folder).to(device)
+
+
+LOADERS.append(load_map)  # a Localizer opens a folder
 
 
 def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None = None) -> RadianceField:

@@ -136,7 +136,11 @@ class MapSummary:
             sources = {"gravity": "gravity", "planes": "planes and cameras", "cameras": "the cameras"}
             up = _shown(tuple(round(x, 4) for x in self.up.direction))
             frame += f"; up is {up}, by {sources[self.up.source]}"
-        surface = "none; 'bidnerf bake MAP' builds it"
+        training = f"{self.step} steps of backend {self.backend} in {time}, {state}"
+        if not self.step:
+            training = "none; 'bidnerf train DATA --out MAP' trains a field and builds a surface"
+            field = "none; landmarks alone localize photos"
+        surface = "none; 'bidnerf bake MAP' builds it" if self.step else "none"
         if self.surface is not None:
             cells = f"{amount(self.surface.cells, 'cell')} with a side of {self.surface.cell:.3g}"
             surface = f"{amount(self.surfels, 'surfel')}, indexed by {cells}, {self.surface.MiB:.1f} MiB"
@@ -144,7 +148,7 @@ class MapSummary:
         return {
             "map": f"{place}, written by bidnerf {self.bidnerf}",
             "made from": f"{self.data or 'views in memory'}, {photos}{added}",
-            "training": f"{self.step} steps of backend {self.backend} in {time}, {state}",
+            "training": training,
             "field": field,
             "scene": _scene_line(self.bounds),
             **(origin if any(self.origin) else {}),
@@ -152,7 +156,7 @@ class MapSummary:
             "frame": frame,
             "surface": surface,
             "landmarks": str(self.landmarks or "none; 'bidnerf bake MAP --data DATA' builds them"),
-            "settings": _shown(self.config),
+            **({"settings": _shown(self.config)} if self.config else {}),
         }
 
 

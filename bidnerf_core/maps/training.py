@@ -33,7 +33,7 @@ from bidnerf_core.maps.map import USUAL_BAKE, Map, build_field, frozen_field, lo
 from bidnerf_core.maps.options import TrainOptions
 from bidnerf_core.maps.store import load_state, map_folder, write_parts
 from bidnerf_core.maps.views import Images, ReadViews, chosen_origin, read_views
-from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, job_context
+from bidnerf_core.progress import Cancel, ProgressCallback, counter, duration_text, job_context
 from bidnerf_core.registry import PluginError
 from bidnerf_core.structure import lacks_poses
 from bidnerf_core.training import TrainingState, TrainingStopped
@@ -134,7 +134,7 @@ def train(
                 f"{read.place}: the photos are from one place and do not determine distances; the map's"
                 " depth will be arbitrary, and localization in it will give directions, but no positions"
             )
-        check_cancelled("training")
+        counter("finding the bounds of the scene", "stage")(0, 1)
         info = MapInfo(
             backend,
             to_plain(settings, "config"),
@@ -377,6 +377,9 @@ def _trained(
             kept, advice = "saved", "; --resume continues from there"
         raise Cancelled(f"{where}: {kept} after step {stopped.step}{advice}") from stopped
     report.finish(field)
+    log.info(
+        f"{where}: field trained for {amount(report.info.step, 'step')}, {duration_text(report.info.seconds)}"
+    )
     weights = packed(cast(nn.Module, field).state_dict())
     trained = frozen_field(report.info, weights, out)
     return Map(report.info, trained, None, scene.landmarks, out, scene.record).to(device)

@@ -79,7 +79,9 @@ class Answer:
         Only the final pose is kept: intermediate ones take up a lot of memory in long sequences.
         """
         intrinsics = found.frame_as_taken(frame).intrinsics
-        return Answer(frame.name, number, intrinsics, replace(found, poses=found.poses[-1:]), **about)
+        return Answer(
+            frame.name, number, intrinsics, replace(found, poses=found.poses[-1:], shown=None), **about
+        )
 
     @property
     def accepted(self) -> bool:
@@ -258,6 +260,36 @@ class Answers:
         if left_out := len(self) - len(accepted):
             poses = amount(len(accepted), "pose")
             log.info("%s: %s; %d without an accepted pose are left out", path, poses, left_out)
+
+    def to_pandas(self) -> Any:
+        """Return the answers as a table (a pandas ``DataFrame``): a row for each image, in order.
+
+        Its columns are those of ``plain`` that hold one value, the camera's position (``x``, ``y``, ``z``) and its unit quaternion
+        (``qx`` ...), the standard deviations ``sigma_translation`` and ``sigma_rotation_deg``, and, where the truth is known, the
+        errors ``error_translation`` and ``error_rotation_deg``. Raises ``InputError`` if pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise InputError("a table needs pandas (pip install pandas)") from error
+        return pandas.DataFrame([self._row(each) for each in self.given])
+
+    def _row(self, answer: Answer | Failure) -> dict[str, Any]:
+        """Return a row of the table."""
+        row = {key: value for key, value in self.plain(answer).items() if not isinstance(value, list | dict)}
+        if isinstance(answer, Answer):
+            T, found = answer.found.T_world_camera.to("cpu", torch.float64), answer.found
+            row |= zip(("x", "y", "z"), T.translation.tolist(), strict=True)
+            row |= zip(("qx", "qy", "qz", "qw"), T.quaternion("xyzw").tolist(), strict=True)
+            if found.covariance is not None:
+                position, rotation = standard_deviations(found.covariance)
+                row |= {"sigma_translation": position, "sigma_rotation_deg": math.degrees(rotation)}
+            if (error := answer.error) is not None:
+                row |= {
+                    "error_translation": float(error.translation),
+                    "error_rotation_deg": float(error.rotation_deg),
+                }
+        return row
 
     @property
     def lost(self) -> list[tuple[int, int]]:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.fields import RenderedImage, render_picture
+from bidnerf_core.fields import RenderedImage, has_field, render_picture
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3, symbol
 from bidnerf_core.io import reduced, resampled
@@ -237,7 +237,7 @@ def depth_difference(image: RenderedImage, frame: Frame) -> DepthDifference | No
 def _compared(
     scene: SceneMap, camera: Intrinsics, T: SE3, frame: Frame, quick: bool
 ) -> tuple[Picture, DepthDifference | None]:
-    if quick:
+    if quick or not has_field(scene.field):
         return photograph(quick_image(scene, camera, T)), None
     image = render_picture(scene.field, camera, T, scene.bounds)
     return photograph(image.rgb), depth_difference(image, frame)

@@ -10,16 +10,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.fields import render_image
+from bidnerf_core.fields import has_field, render_image
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import SceneMap, surface_renderer
+from bidnerf_core.localization import SceneMap, picture_at, surface_renderer
 
 PIXELS_AT_A_TIME = 4096
 """Number of pixels between two checks whether a rendering is still wanted, see ``job_context``."""
 
 
 def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
-    """Render the colours of the field, in [0, 1], from a camera, which may be farther away than those of the map's images."""
+    """Render the colours of the field, in [0, 1], from a camera, which may be farther away than those of the map's images.
+
+    A map without a field shows its landmarks as dots.
+    """
     bounds = scene.bounds
     place = T_world_camera.translation.detach().cpu().double()
     distance = float((place - torch.tensor(bounds.centre, dtype=torch.float64)).norm())
@@ -27,6 +30,8 @@ def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Flo
         bounds.far if bounds.contracted else math.hypot(*bounds.size) / 2
     )  # of the centre, there is no more matter
     bounds = replace(bounds, far=max(bounds.far, distance + beyond))
+    if not has_field(scene.field):
+        return picture_at(scene, camera, T_world_camera)
     return render_image(scene.field, camera, T_world_camera, bounds, PIXELS_AT_A_TIME).rgb
 
 

@@ -139,7 +139,7 @@ def _facts(scene: Map) -> tuple[tuple[str, str], ...]:
     offset = (("origin", f"positions shown here are relative to ({x:,.0f}, {y:,.0f}, {z:,.0f})"),)
     landmarks = 0 if scene.landmarks is None else len(scene.landmarks)
     return (
-        ("backend", scene.info.backend),
+        ("backend", scene.info.backend if scene.has_field else "no field; landmarks alone"),
         ("images", f"{len(scene.info.cameras):,}"),
         ("surface", f"{surfels:,} surfels" if surfels else "not baked"),
         ("landmarks", f"{landmarks:,}" if landmarks else "none"),

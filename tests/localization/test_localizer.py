@@ -88,7 +88,7 @@ ROW, MATRIX, POSE = "[0, 0, 0, 1]", "a 4x4 matrix T_world_camera", "an SE3 or a 
 RIGID, VIEWS = "an orthonormal rotation of determinant 1", "views: View(frame, T_ref_camera)"
 TRANSPOSE = f"{ROW}; its last column is, so the matrix is column-major: transpose it"
 QUERY = "a Frame (Frame.open reads a file, Frame.from_numpy takes an array), a View, or a list of views"
-FOLDER, TAKES = "a Map; load_map(folder) gives one", "method 'bid' takes a BidConfig or a dictionary"
+FOLDER, TAKES = "a Map, or the folder of one", "method 'bid' takes a BidConfig or a dictionary"
 
 
 @pytest.mark.parametrize(
@@ -129,10 +129,8 @@ def test_a_bad_query_is_refused_in_one_line(query: Any, start: Any, found: str, 
 @pytest.mark.parametrize(
     ("scene", "method", "config", "where", "found", "expected"),
     [
-        ("maps/room", "auto", None, "Localizer", "got a str", FOLDER),
-        (Path("maps/room"), "auto", None, "Localizer", "got a PosixPath", FOLDER),
-        (FIELD, "auto", None, "Localizer", "got a GaussianBlobs", "a Map"),
-        (None, "auto", None, "Localizer", "got a NoneType", "a Map"),
+        (FIELD, "auto", None, "Localizer", "got a GaussianBlobs", FOLDER),
+        (None, "auto", None, "Localizer", "got a NoneType", FOLDER),
         (MAP, "icp", None, None, "no method 'icp'; installed: auto, bid, bid-lm, inerf, inerf-lm", None),
         (MAP, "bid", AutoConfig(), None, f"{TAKES}, got a AutoConfig", None),
         (MAP, "bid", 5, None, f"{TAKES}, got a int", None),

@@ -133,7 +133,7 @@ def test_an_overlay_shows_photo_rendering_and_both(folder: Path) -> None:
 def test_an_overlay_of_something_else_is_refused() -> None:
     _, frame, T = flight()[0]
     wrong: list[tuple[tuple[Any, Any, Any], str | None, str, str]] = [
-        (("map", frame, T), "overlay", "got a str", "a Map; load_map(folder) gives one"),
+        ((7, frame, T), "overlay", "got a int", "a Map, or the folder of one"),
         ((scene(), bn.View(frame, T), T), "overlay", "frame is a View", "a Frame"),
         ((scene(), frame, "pose.json"), None, "found is a str", "an SE3 or a 4x4 matrix"),
         ((scene(), frame, np.eye(3)), None, "found has shape (3, 3)", "a 4x4 matrix"),
