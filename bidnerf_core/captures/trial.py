@@ -26,11 +26,14 @@ from bidnerf_core.mapping import (
     LandmarkConfig,
     LandmarkMap,
     TrackedViews,
+    concatenated,
     tracked_views,
 )
 
 HELD_OUT, MOST_HELD_OUT = 8, 24
 """One in ``HELD_OUT`` images is held out, ``MOST_HELD_OUT`` in all at most."""
+MANY_IMAGES = 200
+"""Number of images above which most landmarks are in none of the held-out ones, which are ``MOST_HELD_OUT``."""
 ENOUGH_ANSWERS = 6
 """Smallest number of localized images from which scatter is estimated."""
 LARGEST_SHARE = 3
@@ -79,7 +82,7 @@ def tried_landmarks(
     """
     landmarks = tracked.landmarks(config, report)
     held_out = _held_out(len(views))
-    answers = _answers(tracked, views, held_out, config)
+    answers = _answers(tracked, views, held_out, config, landmarks)
     landmarks = replace(landmarks, trial=_trial(answers, len(held_out)))
     if len(answers) < ENOUGH_ANSWERS:
         return landmarks
@@ -102,12 +105,23 @@ def _answers(
     views: Sequence[View],
     held_out: Sequence[int],
     config: LandmarkConfig,
+    landmarks: LandmarkMap,
 ) -> list[_Answer]:
-    """Localize the held-out images, and return the accepted answers."""
+    """Localize the held-out images by the landmarks of the others, and return the accepted answers.
+
+    In a map of many images, those of its ``landmarks`` that the held-out images do not show are not built anew.
+    """
     if not held_out:
         return []
     try:
-        landmarks = tracked.without(held_out).landmarks(config)
+        if len(views) <= MANY_IMAGES or landmarks.tracks is None:
+            landmarks = tracked.without(held_out).landmarks(config)
+        else:
+            seen = torch.isin(landmarks.tracks.image, torch.tensor(held_out))
+            others = torch.ones(len(landmarks), dtype=torch.bool)
+            others[landmarks.tracks.landmark[seen].long()] = False
+            anew = tracked.of_points_in(held_out).without(held_out).landmarks(config)
+            landmarks = concatenated([landmarks[others], anew])
     except InputError:  # the rest has no overlap
         return []
     plain = replace(landmarks, correlation=1.0, pose_covariance=torch.zeros_like(landmarks.pose_covariance))

@@ -210,7 +210,9 @@ def _described(structure: Structure, features: str, origin: Origin) -> tuple[Rea
         order = order[: max(int((observed >= 0).sum()), USUAL_COUNT)]
         scale = torch.tensor([camera.width / stored.width, camera.height / stored.height])
         chosen = Keypoints(
-            (keypoints.pixels[order] * scale).clamp(torch.zeros(2), torch.tensor([camera.width, camera.height])),
+            (keypoints.pixels[order] * scale).clamp(
+                torch.zeros(2), torch.tensor([camera.width, camera.height])
+            ),
             keypoints.sizes[order] * scale.mean(),
             keypoints.descriptors[order],
         )

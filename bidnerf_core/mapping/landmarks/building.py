@@ -227,6 +227,12 @@ class TrackedViews:
         left = ~torch.isin(self.observations.image, torch.tensor(images))
         return replace(self, observations=self.observations[left])
 
+    def of_points_in(self, images: Sequence[int]) -> TrackedViews:
+        """Return the tracks that have a keypoint in one of the given images."""
+        own = torch.isin(self.observations.image, torch.tensor(images))
+        left = torch.isin(self.observations.point, self.observations.point[own].unique())
+        return replace(self, observations=self.observations[left])
+
 
 def tracked_views(
     views: Sequence[View],

@@ -1,0 +1,318 @@
+"""Existing COLMAP models as maps of landmarks: by their database, by hloc's features, and by their photos."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import shutil
+import sqlite3
+import sys
+import types
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import bidnerf_core as bn
+import tiny
+from bidnerf_core import SE3, Frame, View
+from bidnerf_core.backend import load_backend, quick_config
+from bidnerf_core.cli import main
+from bidnerf_core.datasets import read_posed_images
+from bidnerf_core.errors import InputError
+from bidnerf_core.mapping import DEFAULT_LANDMARKS, Keypoints, tracked_views
+from bidnerf_core.progress import Progress
+from photo_room import CAMERA, looking, photograph, walk, write_photos
+from refusals import refused
+
+COUNT = 10
+UNSEEN = looking((-0.5, 0.1, -0.2), (1.7, 1.4, 0.2))
+
+
+@dataclass(frozen=True)
+class Model:
+    """A project with photos and a text model of exact poses, whose points are triangulated from SIFT keypoints."""
+
+    folder: Path
+    poses: list[SE3]
+    keypoints: list[Keypoints]
+
+    @property
+    def digests(self) -> dict[str, str]:
+        files = sorted(path for path in self.folder.rglob("*") if path.is_file())
+        return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+    def write_database(self, path: Path, drop: int = 0) -> None:
+        """Write the keypoints as COLMAP does, without the last ``drop`` of each image."""
+        with contextlib.closing(sqlite3.connect(path)) as opened, opened:
+            opened.execute("CREATE TABLE images (image_id INTEGER, name TEXT, camera_id INTEGER)")
+            for name in ("keypoints", "descriptors"):
+                opened.execute(
+                    f"CREATE TABLE {name} (image_id INTEGER, rows INTEGER, cols INTEGER, data BLOB)"
+                )
+            for number, found in enumerate(self.keypoints):
+                count = len(found) - drop
+                scale = (found.sizes[:count, None] / 2).numpy()
+                rows = np.concatenate([found.pixels[:count].numpy(), scale, 0 * scale], axis=1).astype("<f4")
+                opened.execute("INSERT INTO images VALUES (?, ?, 1)", (number, f"{number:03d}.png"))
+                opened.execute("INSERT INTO keypoints VALUES (?, ?, 4, ?)", (number, count, rows.tobytes()))
+                descriptors = found.descriptors[:count].numpy().tobytes()
+                opened.execute("INSERT INTO descriptors VALUES (?, ?, 128, ?)", (number, count, descriptors))
+
+
+def row_of(number: int, T: SE3) -> str:
+    inverse = T.inverse()
+    values = [*inverse.quaternion("wxyz").tolist(), *inverse.translation.tolist()]
+    return f"{number + 1} {' '.join(map(repr, values))} 1 {number:03d}.png"
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Model:
+    folder, poses = tmp_path_factory.mktemp("model") / "project", walk(COUNT)
+    (folder / "images").mkdir(parents=True)
+    (folder / "sparse").mkdir()
+    write_photos(folder / "images", poses)
+    views = [
+        View(Frame.open(folder / "images" / f"{number:03d}.png", camera=CAMERA), T)
+        for number, T in enumerate(poses)
+    ]
+    tracked = tracked_views(views)
+    seen, positions = tracked.triangulated(DEFAULT_LANDMARKS)
+    images, keypoints = [f"# {COUNT}"], [image.keypoints for image in tracked.observations.images]
+    first = np.cumsum([0, *map(len, keypoints)])
+    point_of = dict(zip(seen.number.tolist(), seen.point.tolist(), strict=True))
+    tracks: list[list[str]] = [[] for _ in positions]
+    for number, (T, found) in enumerate(zip(poses, keypoints, strict=True)):
+        observed = []
+        for place, (u, v) in enumerate(found.pixels.tolist()):
+            point = point_of.get(int(first[number]) + place, -1)
+            observed.append(f"{u} {v} {point + 1 if point >= 0 else -1}")
+            if point >= 0:
+                tracks[point].append(f"{number + 1} {place}")
+        images += [row_of(number, T), " ".join(observed)]
+    c = CAMERA
+    (folder / "sparse" / "cameras.txt").write_text(
+        f"1 PINHOLE {c.width} {c.height} {c.fx} {c.fy} {c.cx} {c.cy}\n"
+    )
+    (folder / "sparse" / "images.txt").write_text("\n".join(images) + "\n")
+    (folder / "sparse" / "points3D.txt").write_text(
+        "".join(
+            f"{number + 1} {x} {y} {z} 0 0 0 0.5 {' '.join(track)}\n"
+            for number, ((x, y, z), track) in enumerate(zip(positions.tolist(), tracks, strict=True))
+        )
+    )
+    return Model(folder, poses, keypoints)
+
+
+@pytest.fixture
+def model(original: Model, tmp_path: Path) -> Model:
+    """A copy of the model, which a test may change."""
+    return replace(original, folder=Path(shutil.copytree(original.folder, tmp_path / "project")))
+
+
+@pytest.fixture(scope="module")
+def imported(original: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the map imported by the photos."""
+    folder = tmp_path_factory.mktemp("imported") / "map"
+    bn.import_map(original.folder, folder)
+    return folder
+
+
+def error_of(found: bn.Localization, true: SE3) -> float:
+    return float((found.T_world_camera.translation - true.translation).norm())
+
+
+def unseen() -> Frame:
+    return Frame.from_numpy(photograph(UNSEEN).round().clip(0, 255).astype(np.uint8), CAMERA)
+
+
+@pytest.mark.parametrize("source", ["photos", "database"])
+def test_a_model_becomes_a_map_of_landmarks_in_its_own_frame(
+    model: Model, source: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    if source == "database":
+        model.write_database(model.folder / "database.db")
+    before = model.digests
+    with caplog.at_level(logging.INFO, "bidnerf"):
+        bn.import_map(model.folder, tmp_path / "map")
+    assert model.digests == before
+    assert ("the keypoints and their descriptors" in caplog.text) == (source == "database")
+    scene = bn.load_map(tmp_path / "map")
+    assert not scene.has_field
+    assert "landmarks alone localize photos" in str(scene.describe())
+    assert [camera.name for camera in scene.info.cameras] == [f"{number:03d}" for number in range(COUNT)]
+    assert [camera.file for camera in scene.info.cameras] == [f"images/{n:03d}.png" for n in range(COUNT)]
+    for camera, T in zip(scene.info.cameras, model.poses, strict=True):
+        assert camera.intrinsics == CAMERA
+        torch.testing.assert_close(camera.pose.matrix(), T.matrix())
+    found = bn.Localizer(tmp_path / "map")(unseen())
+    assert found.converged, found.reason
+    assert error_of(found, UNSEEN) < 0.01
+
+
+def test_a_database_replaces_the_photos(model: Model, tmp_path: Path) -> None:
+    model.write_database(tmp_path / "keypoints.db")
+    for photo in (model.folder / "images").iterdir():
+        photo.unlink()
+    scene = bn.import_map(model.folder / "sparse", None, {"keypoints": str(tmp_path / "keypoints.db")})
+    assert error_of(bn.Localizer(scene)(unseen()), UNSEEN) < 0.01
+    assert {camera.file for camera in scene.info.cameras} == {None}
+
+
+def test_keypoints_of_another_model_are_not_used(
+    model: Model, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    model.write_database(model.folder / "database.db", drop=1)
+    with caplog.at_level(logging.INFO, "bidnerf"):
+        scene = bn.import_map(model.folder)
+    assert "not used: it has" in caplog.text
+    assert error_of(bn.Localizer(scene)(unseen()), UNSEEN) < 0.01
+    given = {"keypoints": str(model.folder / "database.db")}
+    with refused(where="database.db", found="keypoints of 000.png, the model", expected="the keypoints of"):
+        bn.import_map(model.folder, None, given)
+    (tmp_path / "other.db").write_bytes(b"no database")
+    with refused(where="other.db", found="cannot be read", expected="a database of COLMAP"):
+        bn.import_map(model.folder, None, {"keypoints": str(tmp_path / "other.db")})
+
+
+def test_features_of_hloc_are_read_with_their_detector(
+    model: Model, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """h5py itself is not needed for the test: its files are mappings of mappings."""
+    file = tmp_path / "features.h5"
+    file.write_bytes(b"")
+    with refused(where="features.h5", found="need h5py"):
+        monkeypatch.setitem(sys.modules, "h5py", None)
+        bn.import_map(model.folder, None, {"keypoints": str(file)})
+    groups: dict[str, Any] = {
+        f"{number:03d}.png": {
+            "keypoints": (found.pixels - 0.5).numpy(), "scales": (found.sizes / 2).numpy(),
+            "descriptors": (found.descriptors.float() / 512).T.numpy(),
+        }
+        for number, found in enumerate(model.keypoints)
+    }  # fmt: skip
+    fake = types.SimpleNamespace(File=lambda path, mode: contextlib.nullcontext(groups))
+    monkeypatch.setitem(sys.modules, "h5py", fake)
+    scene = bn.import_map(model.folder, None, {"keypoints": str(file)})
+    assert error_of(bn.Localizer(scene)(unseen()), UNSEEN) < 0.01
+    for group in groups.values():
+        group["descriptors"] = group["descriptors"][:64]
+    with refused(found="its descriptors have 64 channels, those of 'sift' 128"):
+        bn.import_map(model.folder, None, {"keypoints": str(file)})
+
+
+def test_each_photo_that_is_left_out_has_a_reason(model: Model, caplog: pytest.LogCaptureFixture) -> None:
+    (model.folder / "images" / "003.png").unlink()
+    lines = (model.folder / "sparse" / "images.txt").read_text().splitlines()
+    lines[2 + 2 * 5] = ""
+    (model.folder / "sparse" / "images.txt").write_text("\n".join(lines) + "\n")
+    with caplog.at_level(logging.INFO, "bidnerf"):
+        scene = bn.import_map(model.folder)
+    assert len(scene.info.cameras) == COUNT - 2
+    assert "left out: 003.png: no such photo" in caplog.text
+    assert "left out: 005.png: it observes fewer than 6 points" in caplog.text
+
+
+def test_a_model_is_scaled_and_placed(model: Model) -> None:
+    place = SE3.exp(torch.tensor([5.0, -3.0, 1.0, 0.4, 0.2, -0.7], dtype=torch.float64))
+    scene = bn.import_map(model.folder, options=bn.ImportOptions(scale=2.0, T_world_file=place))
+    found = bn.Localizer(scene)(unseen())
+    assert found.converged
+    assert scene.unit == "metres"
+    expected = place.apply(2 * UNSEEN.translation)
+    assert float((found.T_world_camera.translation - expected).norm()) < 0.02
+
+
+def test_answers_are_written_in_the_frame_of_the_model(imported: Path, tmp_path: Path) -> None:
+    write_photos(tmp_path / "queries", [UNSEEN])
+    photo = next((tmp_path / "queries").iterdir())
+    out = tmp_path / "answers" / "images.txt"
+    out.parent.mkdir()
+    main(["localize", str(imported), str(photo), "--focal", str(CAMERA.fx), "--out", str(out)])
+    ((image,), _) = read_posed_images(out.parent)
+    assert image.name == photo.name
+    assert float((image.T_camera_model.inverse().translation - UNSEEN.translation).norm()) < 0.02
+
+
+def test_what_needs_a_field_says_so_in_one_sentence(imported: Path) -> None:
+    scene = bn.load_map(imported)
+    view, start = View(unseen(), UNSEEN), UNSEEN.translated(torch.tensor([0.01, 0, 0], dtype=torch.float64))
+    no_field = "the map has no radiance field"
+    for work in (
+        lambda: scene.render(view),
+        lambda: bn.Localizer(scene, "bid")(view.frame, start),
+        scene.bake,
+    ):
+        with refused(found=no_field):
+            work()
+    with refused(found="has no radiance field to extend"):
+        bn.extend(scene, [view.frame])
+
+
+def test_training_adds_a_field_and_keeps_landmarks_and_cameras(
+    original: Model, imported: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(imported, tmp_path / "map")
+    before = bn.load_map(tmp_path / "map")
+    after = bn.train(original.folder, out=tmp_path / "map", config=tiny.config(20))
+    assert after.has_field
+    assert after.info.cameras == before.info.cameras
+    assert after.landmarks is not None
+    assert before.landmarks is not None
+    assert torch.equal(after.landmarks.positions, before.landmarks.positions)
+    assert bn.load_map(tmp_path / "map").info.step == 20
+    with pytest.raises(InputError, match=r"not empty|holds"):
+        bn.train(original.folder, out=tmp_path / "map", config=tiny.config(20))
+
+
+# Training in parts.
+
+
+def stopping_at(stage: str) -> Iterator[Any]:
+    """Yield a progress callback and a cancel function that stop a job in a stage."""
+    reached: list[str] = []
+
+    def progress(now: Progress) -> None:
+        if now.stage == stage:
+            reached.append(stage)
+
+    yield progress
+    yield lambda: bool(reached)
+
+
+@pytest.mark.parametrize(
+    ("stage", "kept"), [("training", "landmarks and field"), ("baking", "landmarks and field")]
+)
+def test_what_was_finished_is_kept_when_a_stage_is_cancelled_and_finish_ends_it(
+    model: Model, stage: str, kept: str, tmp_path: Path
+) -> None:
+    progress, cancel = stopping_at(stage)
+    with pytest.raises(bn.Cancelled) as stopped:
+        bn.train(model.folder, out=tmp_path / "map", config=tiny.config(20), progress=progress, cancel=cancel)
+    half = bn.load_map(tmp_path / "map")
+    assert bn.Localizer(half)(unseen()).converged
+    if stage == "baking":
+        assert f"the map has its {kept} so far" in str(stopped.value)
+    else:
+        assert 0 < half.info.step < 20
+    done = bn.resume(tmp_path / "map", model.folder, finish=True)
+    assert done.info.complete
+    assert done.info.step == half.info.step
+    assert done.landmarks is not None
+    assert half.landmarks is not None
+    assert torch.equal(done.landmarks.positions, half.landmarks.positions)
+    with refused(found="nothing to resume"):
+        bn.resume(tmp_path / "map", model.folder)
+
+
+def test_quick_training_takes_the_backends_quick_settings(model: Model, tmp_path: Path) -> None:
+    progress, cancel = stopping_at("training")
+    with pytest.raises(bn.Cancelled):
+        bn.train(model.folder, out=tmp_path / "map", config="quick", progress=progress, cancel=cancel)
+    info = bn.load_map(tmp_path / "map").info
+    assert info.config["steps"] == quick_config(load_backend("hashgrid")).steps
