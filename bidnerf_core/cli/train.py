@@ -49,8 +49,8 @@ class Train:
     Poses that photos or video frames lack are found first, as by 'bidnerf poses', and kept in the folder MAP-poses. The landmarks
     come next, since they localize photos on their own, then the field and the surface. Ctrl-C stops after a step and saves
     the map; --resume continues from there, or from the last checkpoint if the program was killed, with the same result as an
-    uninterrupted training, and --finish ends it as it stands. The field takes 5 to 7 minutes on two cores, --quick 2 to 4
-    minutes of CPU time for the whole map of 85 to 174 photos with poses. If --out holds a map of landmarks alone, as 'bidnerf import' makes
+    uninterrupted training, and --finish ends it as it stands. All of it takes 5 to 10 minutes on two cores for 85 to 436 images with
+    poses, and 2 to 4 minutes of CPU time with --quick. If --out holds a map of landmarks alone, as 'bidnerf import' makes
     of a COLMAP model, it gets a field and a surface.
     """
 
