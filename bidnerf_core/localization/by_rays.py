@@ -118,7 +118,7 @@ def localization_by_rays(
     verdict = compared.verdict(f"{agreement:.0%} of newly drawn rays agree with the measurements")
     path = found.path if problem.start is None else SE3.cat([problem.start[None], found.path[1:]])
     path = SE3.cat([path[:-1], T[None]])
-    loss = float(normal.cost) * rays.noise**2 / rays.independent
+    loss = float(normal.cost) * float(rays.noise) ** 2 / rays.independent
     covariance = (covariance + covariance.mT) / 2
     return Localization.of(
         verdict, path, found.losses, method, began, loss, covariance if determined else None, compared

@@ -393,12 +393,10 @@ class Loop:
         before = found  # rays about one camera's pose must not decide between cameras
         blurred = self._blur(found, landmarks) > RAYS_BEYOND
         if problem is not None and self.rays and found.mode == 0 and blurred:
-            here = found.chosen
-            rays = Rays.of(problem.views, problem.field, problem.bounds, self.rays, self.seed).fitted(here)
+            place = "cpu" if problem.device == self.device else None
+            rays = Rays.of(problem.views, problem.field, problem.bounds, self.rays, self.seed, device=place)
             fused.append("rendering")
-            # A number that changes from query to query is a tensor, so that they share a graph.
-            rays = replace(rays, noise=here.noise.new_tensor(rays.noise))  # type: ignore[arg-type]
-            best = States.cat([here, best[1:]])
+            best = States.cat([found.chosen, best[1:]])
             minima, by_rays = run_on(self.device, fit_with_rays, best, terms, rays, given)
             systematic = torch.zeros_like(minima[0].hessian)
             systematic[:1] = (FIELD_ERRORS - 1) * by_rays.hessian

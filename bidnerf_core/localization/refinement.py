@@ -81,6 +81,7 @@ def fit_with_rays(
 
     Rays are too expensive to be rendered for all hypotheses.
     """
+    rays = rays.fitted(best)
     here, _ = descend(best[:1], [*terms, rays], 8)
     quadratic = linearize(States.cat([here, best[1:]]), terms, given)
     by_rays = Quadratic.of(rays(quadratic.here[:1]), quadratic.here[:1])

@@ -94,12 +94,12 @@ def test_auto_by_landmarks(depth: bool) -> None:
     assert ("fused with depth and rendering" if depth else "fused with rendering") in here.reason
 
 
-@pytest.mark.parametrize(("depth", "most"), [(False, 18), (True, 26)])
+@pytest.mark.parametrize(("depth", "most"), [(False, 22), (True, 30)])
 def test_the_host_waits_a_handful_of_times_for_a_query(depth: bool, most: int) -> None:
     """It uploads and reads once for the matches, for each round of matching by projection, and for each measurement."""
     frame = unseen().frame if depth else without_depth(unseen().frame)
     with Elsewhere() as mode:
-        localizer = Localizer(ground(), config=AutoConfig(fused_rays=0), device=DEVICE)
+        localizer = Localizer(ground(), device=DEVICE)
         localizer(frame)
         mode.waits.clear()
         assert localizer(frame).converged

@@ -39,7 +39,8 @@ OUTLIER = 3.0
 class Rays:
     """Colours of rendered rays and, with a ``depth_loss``, their distances.
 
-    A gain and an offset of the exposure are eliminated per channel (variable projection). All tensors are on the field's device.
+    A gain and an offset of the exposure are eliminated per channel (variable projection). All tensors are on the field's device when it
+    is evaluated.
     """
 
     field: RadianceField
@@ -48,7 +49,7 @@ class Rays:
     rgb: Float[Tensor, "n 3"]
     coloured: Float[Tensor, "n"]  # 1 where a colour was measured, else 0
     distance: Float[Tensor, "n"]  # metres along the ray, 0 where none was measured
-    noise: float = 0.1  # of a channel, in the information of a ray
+    noise: float | Float[Tensor, ""] = 0.1  # of a channel, in the information of a ray
     independent: float = INDEPENDENT
     # of the norm of a colour difference: wide enough for a wide basin, and narrow enough to reject occluders
     loss: Robust = Robust("geman-mcclure", 0.1)
@@ -68,11 +69,12 @@ class Rays:
         seed: int,
         blur: int = 1,
         depth_rays: Observations | None = None,
+        device: torch.device | str | None = None,
     ) -> Rays:
         """Draw ``count`` visible pixels of ``views``, whose poses are relative to the last, and at most as many of
         ``depth_rays``, which another sensor measured in the last camera's frame.
 
-        Colours are averaged over squares of ``blur`` pixels.
+        Colours are averaged over squares of ``blur`` pixels. The tensors are put on ``device``, by default the field's.
         """
         generator, parts = torch.Generator().manual_seed(seed), []
         for view in views:
@@ -97,7 +99,8 @@ class Rays:
                 zero[:, :2], zero[:, 0], _looking_along(some.directions), some.origins, zero, zero[:, 0], some.distance,
             ))  # fmt: skip
         image, times, R, t, rgb, coloured, depth = (torch.cat(part) for part in zip(*parts, strict=True))
-        return moved(Rays(field, bounds, Sights(image, times, R, t), rgb, coloured, depth), device_of(field))
+        measured = moved((Sights(image, times, R, t), rgb, coloured, depth), device or device_of(field))
+        return Rays(field, bounds, *measured)
 
     def __len__(self) -> int:
         return len(self.rgb)
@@ -279,7 +282,7 @@ class ComparedRays:
         total = self.value[..., :3].square().sum((1, 2)) / 3
         return (total / coloured.sum().clamp(min=1)).sqrt()
 
-    def fitted_noise(self) -> float:
+    def fitted_noise(self) -> Float[Tensor, ""]:
         """Return the noise that follows from the scatter of the rays' gradients at the first state."""
         weight = self.term._robust(self.value)[1][0, :, :, None]
         rows = self.rows[0, :, :, :6]
@@ -287,9 +290,10 @@ class ComparedRays:
         scores = (weight[..., 0] * self.value[0])[..., None] * rows
         scores = (scores - scores.mean(0)).flatten(0, 1)
         unit = hessian.diagonal().clamp(min=1e-12).rsqrt()
-        whitened = torch.linalg.pinv(unit[:, None] * hessian * unit, hermitian=True)
-        ratio = whitened @ (unit[:, None] * (scores.mT @ scores) * unit)
-        return min(max(math.sqrt(max(float(ratio.trace()), 0) / 6), 0.005), 0.3)  # host
+        eye = torch.eye(6, dtype=unit.dtype, device=unit.device)
+        factor, _ = torch.linalg.cholesky_ex(unit[:, None] * hessian * unit + 1e-9 * eye)
+        whitened = torch.linalg.solve_triangular(factor, unit[:, None] * scores.mT, upper=False)
+        return (whitened.square().sum() / 6).sqrt().nan_to_num(0.0).clamp(0.005, 0.3)
 
 
 def averaged(frame: Frame, size: int) -> Float[Tensor, "h w 3"]:
