@@ -91,14 +91,15 @@ def may_wait(device: torch.device) -> bool:
 # for the device, has the same shapes each time, and reads and writes the same tensors. Numbers computed in Python
 # keep their values from the capture.
 
-MOST_GRAPHS = 64
-"""Number of functions with different shapes whose graphs are kept, the least recently used being discarded."""
+MOST_GRAPHS = 128
+"""Number of functions with different shapes whose graphs a thread can use, the least recently used being discarded."""
 _capturing = Lock()
 """Allows one capture at a time: a capture begins by waiting for the device, which is forbidden during another."""
 _ALIGNMENT = 16
 """Bytes to whose multiples tensors of any dtype are aligned in a common buffer."""
 _sharing = Lock()
-_free: OrderedDict[Hashable, list[_Remote]] = OrderedDict()
+_free: dict[torch.device, list[_Lane]] = {}
+"""The lanes of each device that no thread uses now, the last used at the end."""
 
 
 class Resident:
@@ -106,13 +107,17 @@ class Resident:
 
 
 def captured(
-    step: Callable[[], None], device: torch.device, generator: Generator | None = None
+    step: Callable[[], None],
+    device: torch.device,
+    generator: Generator | None = None,
+    memory: tuple[Any, torch.cuda.Stream] | None = None,
 ) -> Callable[[], None]:
     """Return a callable equivalent to ``step``; on a GPU, it replays a CUDA graph.
 
     ``generator`` is the one from which the step draws, if any. Capturing does not execute the step. If the
     capture fails, ``step`` itself is returned, with a warning. Take a step or two before: these fill caches and
-    load kernels, as a capture does not allow.
+    load kernels, as a capture does not allow. Graphs that are never replayed at the same time may share their
+    temporary ``memory``, a pool and the stream of their captures.
     """
     if device.type != "cuda":
         return step
@@ -123,10 +128,10 @@ def captured(
     with _capturing, torch.cuda.device(device), torch.cuda.stream(torch.cuda.current_stream(device)):
         try:
             # Each device has its own stream. Other threads may continue to launch.
-            stream = torch.cuda.Stream(device)
+            pool, stream = memory or (None, torch.cuda.Stream(device))
             with (
                 noted() as constants,
-                torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
+                torch.cuda.graph(graph, pool, stream, capture_error_mode="thread_local"),
             ):
                 step()
         except RuntimeError as error:  # it waits for the device somewhere, as a third party's field may
@@ -156,26 +161,44 @@ def run_on(device: torch.device, function: Callable[..., T], *values: Any) -> T:
     if device.type == "cpu":
         return function(*values)
     tensors: list[Tensor] = []
-    key = (function, device, _structure(values, tensors))
+    key = (function, _structure(values, tensors))
     with _sharing:
-        free = _free.setdefault(key, [])
-        _free.move_to_end(key)
-        while len(_free) > MOST_GRAPHS:
-            _free.popitem(last=False)
-        remote = free.pop() if free else _Remote(function, values, tensors, device)
-    found: T = remote(tensors)
-    with _sharing:
-        free.append(remote)
-    return found
+        free = _free.setdefault(device, [])
+        lane = next((lane for lane in reversed(free) if key in lane.remotes), free[-1] if free else None)
+        if lane is None:
+            lane = _Lane(device)
+        else:
+            free.remove(lane)
+    try:
+        if key not in lane.remotes:
+            lane.remotes[key] = _Remote(function, values, tensors, lane)
+        lane.remotes.move_to_end(key)
+        while len(lane.remotes) > MOST_GRAPHS:
+            lane.remotes.popitem(last=False)
+        found: T = lane.remotes[key](tensors)
+        return found
+    finally:
+        with _sharing:
+            free.append(lane)
+
+
+class _Lane:
+    """Functions on a device that one thread at a time calls, so that their graphs share memory."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device, self.remotes = device, OrderedDict[Hashable, _Remote]()
+        self.memory = (
+            (torch.cuda.graph_pool_handle(), torch.cuda.Stream(device)) if device.type == "cuda" else None
+        )
 
 
 class _Remote:
-    """A function with fixed tensors on a device for its arguments, as a CUDA graph requires; one thread at a time may call it."""
+    """A function with fixed tensors on a device for its arguments, as a CUDA graph requires."""
 
     def __init__(
-        self, function: Callable[..., Any], values: Any, tensors: Sequence[Tensor], device: torch.device
+        self, function: Callable[..., Any], values: Any, tensors: Sequence[Tensor], lane: _Lane
     ) -> None:
-        self._device, self._calls = device, 0
+        self._lane, self._calls, device = lane, 0, lane.device
         sizes = [-(-t.nbytes // _ALIGNMENT) * _ALIGNMENT if t.device.type == "cpu" else 0 for t in tensors]
         self._sent = torch.empty(sum(sizes), dtype=torch.uint8, pin_memory=device.type == "cuda")
         self._received = torch.empty_like(self._sent, device=device)
@@ -205,7 +228,7 @@ class _Remote:
             source.copy_(tensor)
         self._received.copy_(self._sent, non_blocking=True)
         if self._calls == 1:  # the first call, of a rare shape perhaps, loads kernels and fills caches
-            self._step = captured(self._step, self._device)
+            self._step = captured(self._step, self._lane.device, memory=self._lane.memory)
         self._calls += 1
         with without_waiting():
             self._step()

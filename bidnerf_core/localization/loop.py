@@ -71,7 +71,7 @@ REFITS = 3
 """Most fits of a mode until the explanation that it is linearized about is the most probable one."""
 MOST_FIRST = 100
 """Number of matches on which kinds of cameras are compared."""
-PADDED = 128
+PADDED = 256
 """Matches are padded to multiples of this number on an accelerator, so that few CUDA graphs are captured."""
 RADII = (3.0, 1.5)
 """Radii of the rounds of matching by projection, in units of the inlier threshold."""
