@@ -19,12 +19,15 @@ PIXELS_AT_A_TIME = 4096
 
 
 def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
-    """Render the colours of the field, in [0, 1], from a camera, which may be farther away than those of the map's images.
+    """Render the colours of the field, in [0, 1], from a camera, which may be farther away or nearer than those of the images.
 
     A map without a field shows its landmarks as dots.
     """
     bounds = scene.bounds
     place = T_world_camera.translation.detach().cpu().double()
+    if scene.surface is not None and len(scene.surface.surfels):
+        away = (scene.surface.surfels.positions.cpu().double() - place).norm(dim=-1).min()
+        bounds = replace(bounds, near=min(bounds.near, float(away) / 2))  # the nearest matter is seen
     distance = float((place - torch.tensor(bounds.centre, dtype=torch.float64)).norm())
     beyond = (
         bounds.far if bounds.contracted else math.hypot(*bounds.size) / 2

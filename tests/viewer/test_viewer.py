@@ -399,6 +399,18 @@ def test_the_field_is_seen_from_beyond_the_reach_of_the_images_rays(contracted: 
     assert float(((field_image(scene, camera, away) - background).abs() > 0.05).float().mean()) > 0.02
 
 
+def test_the_field_is_seen_from_nearer_than_the_images_saw_it(room: Map) -> None:
+    """Rays begin before the nearest matter, which the surface tells, however far the images were from it."""
+    pose, camera = viewed.walk(3)[1], Intrinsics.from_hfov(60, 16, 9)
+    from_afar = replace(
+        room, info=replace(room.info, bounds=replace(room.bounds, near=0.99 * room.bounds.far))
+    )
+    assert render_image(from_afar.field, camera, pose, from_afar.bounds).opacity.max() < 0.1
+    torch.testing.assert_close(
+        field_image(from_afar, camera, pose), field_image(room, camera, pose), atol=0.1, rtol=0
+    )
+
+
 def test_a_rendering_is_the_fields_and_stops_when_it_is_not_wanted(room: Map) -> None:
     scene, pose = room, viewed.walk(3)[1]
     camera = Intrinsics.from_hfov(60, 160, 90)
