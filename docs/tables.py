@@ -336,6 +336,18 @@ def training_times(records: Records) -> str:
         f"With default settings, `train` took {times[0]} to {times[-1]} minutes and {memory[0]:.1f} to {memory[-1]:.1f} GiB for each of five"
         " scenes of 85 to 436 images, on two cores without a GPU."
     )
+    if (records.folder / "quick_maps.json").exists():
+        quick = [scene for scene in records["quick_maps"].values() if isinstance(scene, dict)]
+        minutes = sorted(scene["cpu_minutes"] for scene in quick)
+        asked = [both for scene in quick for both in scene["answers"].values()]
+        right, usual, n = (
+            sum(both[which][key] for both in asked)
+            for which, key in (("quick", "right"), ("default", "right"), ("quick", "n"))
+        )
+        text += (
+            f" `--quick` took {minutes[0]:.0f} to {minutes[-1]:.0f} minutes of CPU time; its maps find {right} of {n} images,"
+            f" where maps of the default settings find {usual}."
+        )
     return f"{textwrap.fill(text, 118)}\n\n{records.caption()}"
 
 
