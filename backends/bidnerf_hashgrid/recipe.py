@@ -10,6 +10,7 @@ from typing import Annotated
 
 import torch
 from torch import Generator, Tensor
+from torch.nn.functional import adaptive_max_pool3d
 
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.devices import may_wait
@@ -88,8 +89,10 @@ def adapted(config: HashGridConfig, bounds: SceneBounds) -> HashGridConfig:
 def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, report: Report) -> None:
     """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
     if config.carve and report.resume() is None:
-        for grid in (field.occupancy, field.coarse_sampler):
-            grid.restrict(occupied_voxels(views, grid.grid))
+        allowed = occupied_voxels(views, field.occupancy.grid)
+        field.occupancy.restrict(allowed)
+        coarse = adaptive_max_pool3d(allowed[None].float(), field.coarse_sampler.grid.shape)[0]
+        field.coarse_sampler.restrict(coarse > 0)
     config = adapted(config, field.bounds)
     supervision = Supervision(views, field.bounds, config, device_of(field))
     groups = [
