@@ -126,12 +126,25 @@ class HashGridField(nn.Module):
             moving = torch.is_grad_enabled() and (points.requires_grad or along.requires_grad)
             density, rgb = fused.Query.apply(points, along, moving, *kernel).split((1, 3), -1)
         else:
-            harmonics = spherical_harmonics(along, 9)
-            encoded = self.encode(points, active)
-            log_density, rgb = log_density_and_rgb(self.geometry, self.colour, encoded, harmonics)
-            # Per side of the scene, so that an untrained field is equally thin in any unit of length.
-            density = log_density.clamp(max=LARGEST_LOG_DENSITY).exp() / self.side
+            found = self.values_of(self.encode(points, active), along)
+            density, rgb = found.density, found.rgb
         return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
+
+    def values_of(self, encoded: Float[Tensor, "p f"], directions: Float[Tensor, "p 3"]) -> FieldValues:
+        """Return the values at encoded positions."""
+        harmonics = spherical_harmonics(directions, 9)
+        log_density, rgb = log_density_and_rgb(self.geometry, self.colour, encoded, harmonics)
+        return FieldValues(self._density(log_density), rgb)
+
+    @torch.no_grad()
+    def density_of(self, encoded: Float[Tensor, "p f"]) -> Float[Tensor, "p"]:
+        """Return the density alone at encoded positions, without recording gradients."""
+        last: Any = self.geometry[2]
+        return self._density(torch.addmv(last.bias[:1], self.geometry[:2](encoded), last.weight[0]))
+
+    def _density(self, log_density: Float[Tensor, "p"]) -> Float[Tensor, "p"]:
+        # Per side of the scene, so that an untrained field is equally thin in any unit of length.
+        return log_density.clamp(max=LARGEST_LOG_DENSITY).exp() / self.side
 
     def jacobian_of_levels(
         self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"], wanted: Bool[Tensor, "p"] | None,

@@ -9,13 +9,23 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
+from jaxtyping import Float
 from torch import Generator, Tensor
 from torch.nn.functional import adaptive_max_pool3d
 
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.devices import may_wait
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields import Rendering, SceneBounds, device_of, query_packed, query_samples, render_values
+from bidnerf_core.fields import (
+    FieldValues,
+    Rays,
+    RaySamples,
+    SceneBounds,
+    device_of,
+    query_packed,
+    render_values,
+    rendering_weights,
+)
 from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, NotNegative, Positive, Range
 from bidnerf_core.training import (
@@ -24,7 +34,6 @@ from bidnerf_core.training import (
     StepOutcome,
     Supervision,
     SupervisionConfig,
-    TrainingBatch,
 )
 from bidnerf_hashgrid.field import CoarseField, FieldConfig, HashGridField
 from bidnerf_hashgrid.occupancy import OccupancyGrid
@@ -34,6 +43,8 @@ log = logging.getLogger("bidnerf")
 
 SETTLED = 10
 """Step up to which the number of samples per ray changes so much that it is read in each step."""
+NEGLIGIBLE = 0.1
+"""Weight of a sample, relative to that up to which a cell is empty, up to which it does not count, once cells are pruned."""
 SPARE = 1.25
 """Room for the samples of a step on a GPU, relative to their expected number: its standard deviation is a few per cent."""
 
@@ -89,7 +100,7 @@ def adapted(config: HashGridConfig, bounds: SceneBounds) -> HashGridConfig:
 def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, report: Report) -> None:
     """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
     if config.carve and report.resume() is None:
-        allowed = occupied_voxels(views, field.occupancy.grid)
+        allowed = occupied_voxels(views, field.occupancy.grid, device=device_of(field))
         field.occupancy.restrict(allowed)
         coarse = adaptive_max_pool3d(allowed[None].float(), field.coarse_sampler.grid.shape)[0]
         field.coarse_sampler.restrict(coarse > 0)
@@ -109,35 +120,43 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
     def is_coarse(step: int) -> bool:
         return config.coarse_every > 0 and step % config.coarse_every == config.coarse_every - 1
 
-    def prepare(step: int) -> tuple[bool, int] | None:
+    def prepare(step: int) -> tuple[bool, int, int]:
+        grids = field.occupancy, field.coarse_sampler
         if step >= config.prune_from and step % config.prune_every == 0:
-            for grid in (field.occupancy, field.coarse_sampler):
+            for grid in grids:
                 grid.prune(config.prune_threshold, grow=step < config.grow_until * config.steps)
         if device.type == "cpu" or step <= SETTLED or step % config.prune_every == 0 or not rays:
-            grids = field.occupancy, field.coarse_sampler
             *counts, missed = torch.stack([*(grid.samples_per_ray for grid in grids), lost]).tolist()
-            for coarse, samples in zip((False, True), counts, strict=True):
-                affordable = config.samples_per_step / max(samples, 1.0)
-                if device.type != "cpu":  # few different numbers, as each is captured
-                    affordable = 2 ** (math.floor(2 * math.log2(max(affordable, 1.0))) / 2)
-                rays[coarse] = max(1, min(config.rays_at_most, int(affordable)))
+            for coarse, samples in enumerate(counts):
+                count = config.samples_per_step / max(samples, 1.0)
+                if (
+                    device.type != "cpu"
+                ):  # few different numbers, as each is captured, and kernels like multiples of 16
+                    count = 2 ** (math.floor(2 * math.log2(max(count, 1.0))) / 2)
+                    count -= count % 16 if count >= 16 else 0
+                rays[coarse > 0] = max(1, min(config.rays_at_most, int(count)))
             if missed:
                 log.info(f"step {step}: {missed:.0f} samples did not fit into the steps since the last count")
                 lost.zero_()
-        return None if step <= SETTLED else (is_coarse(step), rays[is_coarse(step)])
+        return is_coarse(step), rays[is_coarse(step)], min(step, SETTLED + 1)
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
         level: CoarseField | HashGridField = field.levels[0] if is_coarse(step) else field
         batch = supervision.draw(rays[is_coarse(step)], generator)
         samples = level.sampler(batch.rays, generator)
         if may_wait(device):
-            values = query_samples(level, batch.rays, samples)
+            least = NEGLIGIBLE * config.prune_threshold * (step >= config.prune_from)
+            active = config.coarse_levels if is_coarse(step) else None
+            values, seen, density = _visible(field, active, batch.rays, samples, least)
+            weights = rendering_weights(density, samples)
+            rendering = render_values(values, seen, batch.background)
         else:
-            found, room = samples, round(SPARE * config.samples_per_step)
-            values, samples = query_packed(level, batch.rays, found, room)
-            lost.add_(found.valid.sum() - samples.valid.sum())
-        rendering = render_values(values, samples, batch.background)
-        _update(level.occupancy, batch, rendering, step, config)
+            room = round(SPARE * config.samples_per_step)
+            values, seen = query_packed(level, batch.rays, samples, room)
+            lost.add_(samples.valid.sum() - seen.valid.sum())
+            rendering = render_values(values, seen, batch.background)
+            density, weights = values.density.detach(), rendering.weights.detach()
+        _update(level.occupancy, batch.rays, samples, weights, density, step, config)
         loss, mse = supervision.loss(rendering, batch)
         return StepOutcome(loss, mse, level.occupancy.samples_per_ray)
 
@@ -145,31 +164,52 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
         supervision.fit(field, groups, Replayable(prepare, outcome), config.steps, report, seed=config.seed)
 
 
+@torch.no_grad()
 def _update(
-    grid: OccupancyGrid, batch: TrainingBatch, rendering: Rendering, step: int, config: HashGridConfig
-) -> None:
-    """Update the occupancy grid with one step's rendering."""
-    samples, density = rendering.samples, rendering.density
-    assert density is not None  # it comes from ``render``
+    grid: OccupancyGrid, rays: Rays, samples: RaySamples, weights: Float[Tensor, "r s"], density: Float[Tensor, "r s"],
+    step: int, config: HashGridConfig,
+) -> None:  # fmt: skip
+    """Update the occupancy grid with the rendering weights and densities of one step's samples."""
     # Weights as if samples were one grid step long: concentrated samples are longer or shorter.
-    place = grid.bounds.spacing(batch.rays).place
-    weights = (
-        rendering.weights.detach() * grid.step / (place(samples.ends) - place(samples.starts)).clamp(min=1e-9)
-    )
-    middles, valid, density = (
-        part.detach().reshape(-1) for part in (samples.middles, samples.valid, density)
-    )
-    ray, weights = (
-        torch.arange(valid.numel(), device=valid.device) // samples.valid.shape[1],
-        weights.reshape(-1),
-    )
-    counted: Tensor | None = valid
+    place = grid.bounds.spacing(rays).place
+    weights = weights * grid.step / (place(samples.ends) - place(samples.starts)).clamp(min=1e-9)
+    middles, valid = samples.middles.reshape(-1), samples.valid.reshape(-1)
+    index, counted = torch.arange(valid.numel(), device=valid.device), valid
     if may_wait(valid.device):  # often most samples are not valid
         index, counted = valid.nonzero()[:, 0], None
-        ray, middles, weights, density = (
-            part.index_select(0, index) for part in (ray, middles, weights, density)
-        )
-    origins, directions = (part.index_select(0, ray) for part in (batch.rays.origins, batch.rays.directions))
+    ray = index // samples.valid.shape[1]
+    origins, directions = (part.index_select(0, ray) for part in (rays.origins, rays.directions))
+    middles, weights, density = (
+        part.reshape(-1).index_select(0, index) for part in (middles, weights, density)
+    )
     positions = origins + middles[:, None] * directions
     grid.observe(positions, weights.clamp(max=1), density, config.prune_fade, counted)
-    grid.samples_per_ray.lerp_(samples.valid.sum() / len(samples.valid), 0.1 if step > SETTLED else 1.0)
+    grid.samples_per_ray.lerp_(valid.sum() / len(samples.valid), 0.1 if step > SETTLED else 1.0)
+
+
+def _visible(
+    field: HashGridField, active: int | None, rays: Rays, samples: RaySamples, least: float
+) -> tuple[FieldValues, RaySamples, Float[Tensor, "r s"]]:
+    """Return the values at the samples whose weight is above ``least``, these samples, and the densities at all.
+
+    The other samples hardly change the colours, nor would their gradients, which are about as small, change the field.
+    They cost only the density (as in NerfAcc, Li et al. 2023).
+    """
+    valid = samples.valid.reshape(-1)
+    index = valid.nonzero()[:, 0]
+    ray = index // samples.valid.shape[-1]
+    origins, directions = (part.index_select(0, ray) for part in (rays.origins, rays.directions))
+    middles = samples.middles.reshape(-1).index_select(0, index)
+    encoded = field.encode(origins + middles[:, None] * directions, active)
+    density = encoded.new_zeros(valid.numel()).index_copy(0, index, field.density_of(encoded))
+    density = density.view_as(samples.valid)
+    weights = rendering_weights(density, samples).reshape(-1).index_select(0, index)
+    some = (weights > least).nonzero()[:, 0]
+    found = field.values_of(encoded.index_select(0, some), directions.index_select(0, some))
+    index = index.index_select(0, some)
+    values = FieldValues(
+        density.new_zeros(valid.numel()).index_copy(0, index, found.density).view_as(density),
+        density.new_zeros(valid.numel(), 3).index_copy(0, index, found.rgb).view(*density.shape, 3),
+    )
+    seen = torch.zeros_like(valid).index_fill(0, index, True).view_as(samples.valid)
+    return values, replace(samples, valid=seen), density

@@ -57,7 +57,7 @@ class VanillaConfig(FieldConfig, SupervisionConfig):
 def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, report: Report) -> None:
     """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
     if config.carve:
-        field.room.cells.copy_(occupied_voxels(views, field.room.grid))
+        field.room.cells.copy_(occupied_voxels(views, field.room.grid, device=device_of(field)))
     supervision = Supervision(views, field.bounds, config, device_of(field))
     rays_per_step = _rays_per_step(field, supervision, config)
 

@@ -11,10 +11,12 @@ from torch import Tensor
 
 from bidnerf_core.carving.boxes import Corner
 from bidnerf_core.carving.free_space import FreeSpace
+from bidnerf_core.devices import moved, one_thread
 from bidnerf_core.fields import SceneBounds, VoxelGrid
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 
+CPU = torch.device("cpu")
 BLOCK = 8
 """Cells along the side of a block. Processing a block for a view that does not see it costs next to nothing."""
 BLOCKS_AT_ONCE = 128
@@ -25,23 +27,23 @@ filled again."""
 
 
 def occupied_voxels(
-    views: Sequence[View], grid: VoxelGrid, tolerance: float = SENSOR_TOLERANCE
+    views: Sequence[View], grid: VoxelGrid, tolerance: float = SENSOR_TOLERANCE, device: torch.device = CPU
 ) -> Bool[Tensor, "x y z"]:
     """Return which cells of ``grid`` may hold matter, see ``occupied_cells``. Contracted cells always may."""
     if grid.contracted is not None:
-        return _within_contraction(views, grid, grid.contracted, tolerance)
-    return occupied_cells(views, grid.lower, grid.upper, grid.shape, tolerance)
+        return _within_contraction(views, grid, grid.contracted, tolerance, device)
+    return occupied_cells(views, grid.lower, grid.upper, grid.shape, tolerance, device=device)
 
 
 def _within_contraction(
-    views: Sequence[View], grid: VoxelGrid, bounds: SceneBounds, tolerance: float
+    views: Sequence[View], grid: VoxelGrid, bounds: SceneBounds, tolerance: float, device: torch.device
 ) -> Bool[Tensor, "x y z"]:
     """Carve the inner half of a grid in contracted space, the cube around the box. The grid's shape is divisible by 4."""
-    held = torch.ones(grid.shape, dtype=torch.bool)
+    held = torch.ones(grid.shape, dtype=torch.bool, device=device)
     inner = VoxelGrid.cube(replace(bounds, contracted=False), grid.shape[0] // 2)
     quarter = grid.shape[0] // 4
     middle = slice(quarter, quarter + inner.shape[0])
-    held[middle, middle, middle] = occupied_voxels(views, inner, tolerance)
+    held[middle, middle, middle] = occupied_voxels(views, inner, tolerance, device)
     return held
 
 
@@ -52,27 +54,30 @@ def occupied_cells(
     shape: tuple[int, int, int] = (128, 128, 128),
     tolerance: float = 0.02,
     footprint: int = 8,
+    device: torch.device = CPU,
 ) -> Bool[Tensor, "nx ny nz"]:
-    """Return which cells of the box ``lower``..``upper`` (metres, world) may hold matter.
+    """Return on ``device`` which cells of the box ``lower``..``upper`` (metres, world) may hold matter.
 
     A cell is emptied when two views (one, if there is only one) see all of it as free: as background (alpha 0), or nearer
     than the measured depth by more than the fraction ``tolerance`` of it. Pixels without a measurement empty nothing, nor
     does a view in which the cell's radius is over ``footprint`` pixels.
     """
     grid = _Blocks(lower, upper, shape)
-    votes = torch.zeros(grid.blocks.shape[1], BLOCK**3, dtype=torch.uint8)
+    votes = torch.zeros(grid.blocks.shape[1], BLOCK**3, dtype=torch.uint8, device=device)
     needed = 1 if len(views) < 2 else 2
-    undecided = torch.ones(len(votes), dtype=torch.bool)
-    for view in (view for view in views if view.frame.has_depth or view.frame.alpha is not None):
-        space = FreeSpace.seen_by(view, tolerance, footprint)
-        firsts, within = grid.middles(view.T_ref_camera)
-        seen = space.may_free(firsts + within.mean(dim=1, keepdim=True), grid.block_radius)
-        for rows in (seen & undecided).nonzero()[:, 0].split(BLOCKS_AT_ONCE):
-            points = (firsts[:, rows, None] + within[:, None, :]).flatten(1)
-            freed = space.frees(points, grid.cell_radius).unflatten(0, (-1, BLOCK**3))
-            votes[rows] = (votes[rows] + freed).clamp(max=needed)  # a byte would overflow with many views
-            undecided[rows] = (votes[rows] < needed).any(dim=1)
-    return grid.assembled(votes < needed)
+    undecided = torch.ones(len(votes), dtype=torch.bool, device=device)
+    at_once = BLOCKS_AT_ONCE if device.type == "cpu" else max(1, len(votes))
+    with one_thread():  # the operations are short
+        for view in (view for view in views if view.frame.has_depth or view.frame.alpha is not None):
+            space = moved(FreeSpace.seen_by(view, tolerance, footprint), device)
+            firsts, within = moved(grid.middles(view.T_ref_camera), device)
+            seen = space.may_free(firsts + within.mean(dim=1, keepdim=True), grid.block_radius)
+            for rows in (seen & undecided).nonzero()[:, 0].split(at_once):
+                points = (firsts[:, rows, None] + within[:, None, :]).flatten(1)
+                freed = space.frees(points, grid.cell_radius).unflatten(0, (-1, BLOCK**3))
+                votes[rows] = (votes[rows] + freed).clamp(max=needed)  # a byte would overflow with many views
+                undecided[rows] = (votes[rows] < needed).any(dim=1)
+        return grid.assembled(votes < needed)
 
 
 class _Blocks:

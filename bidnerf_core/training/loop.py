@@ -45,8 +45,8 @@ class Replayable:
 
     ``prepare(step)`` is called before each step. It does what must not be part of a graph, such as reading numbers from the
     device, and returns a key: steps with equal keys launch the same operations on tensors of the same shapes, with the same
-    numbers. Steps with the key None are not captured. ``outcome(step, generator)`` draws from a generator on the field's device;
-    unless the key is None, it must not wait for the device (see ``without_waiting``), and may run for another step of its key.
+    numbers. ``outcome(step, generator)`` draws from a generator on the field's device, must not wait for the device (see
+    ``without_waiting``), and may run for another step of its key.
     """
 
     prepare: Callable[[int], Hashable]
@@ -113,12 +113,12 @@ def fit(
         log.index_copy_(0, row, torch.stack(parts)[None])
 
     for step in range(first, steps):
-        key = None if replayable is None else replayable.prepare(step)
+        key = replayable and replayable.prepare(step)
         row.fill_(step % every)
         for group, rate in zip(optimizer.param_groups, rates, strict=True):
             factor = schedule(step, steps)
             group["lr"] = group["lr"].fill_(rate * factor) if ahead else rate * factor
-        if key is None:
+        if not ahead:
             take(step)
         else:
             with without_waiting():
