@@ -174,7 +174,8 @@ def _update(
     place = grid.bounds.spacing(rays).place
     weights = weights * grid.step / (place(samples.ends) - place(samples.starts)).clamp(min=1e-9)
     middles, valid = samples.middles.reshape(-1), samples.valid.reshape(-1)
-    index, counted = torch.arange(valid.numel(), device=valid.device), valid
+    index = torch.arange(valid.numel(), device=valid.device)
+    counted: Tensor | None = valid
     if may_wait(valid.device):  # often most samples are not valid
         index, counted = valid.nonzero()[:, 0], None
     ray = index // samples.valid.shape[1]

@@ -26,8 +26,6 @@ READ_EVERY = 16
 """Steps after which the host reads the figures of a training on a GPU; in between, it never waits."""
 WARM_UP = 2
 """Steps before a capture, which load kernels and create Adam's moments, as a capture does not allow this."""
-MOST_GRAPHS = 24
-"""Number of captured steps that are kept: each has memory of its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +97,7 @@ def fit(
         group.update(lr=torch.full((), group["lr"], device=device), capturable=True)
     log, row = torch.zeros((every, 3), device=device), torch.zeros(1, dtype=torch.long, device=device)
     first = reported = _restore(report.resume(), field, optimizer, generator, beside)
+    memory = (torch.cuda.graph_pool_handle(), torch.cuda.Stream(device)) if device.type == "cuda" else None
     graphs, seen = dict[Hashable, Callable[[], None]](), Counter[Hashable]()
 
     def take(step: int) -> None:
@@ -124,9 +123,7 @@ def fit(
             with without_waiting():
                 seen[key] += 1
                 if seen[key] > WARM_UP and key not in graphs:
-                    if len(graphs) == MOST_GRAPHS:
-                        del graphs[next(iter(graphs))]
-                    graphs[key] = captured(partial(take, step), device, generator)
+                    graphs[key] = captured(partial(take, step), device, generator, memory)
                 graphs.get(key, partial(take, step))()
         if (step + 1) % every and step + 1 < steps:
             continue

@@ -38,7 +38,9 @@ def elsewhere(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     replays: list[int] = []
     with Elsewhere() as mode:
 
-        def captured(step: Callable[[], None], device: torch.device, generator: Any) -> Callable[[], None]:
+        def captured(
+            step: Callable[[], None], device: torch.device, generator: Any, memory: Any
+        ) -> Callable[[], None]:
             assert device == generator.device == DEVICE
 
             def replay() -> None:
