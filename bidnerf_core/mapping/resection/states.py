@@ -17,7 +17,7 @@ from torch.nn.functional import pad
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.devices import constant
-from bidnerf_core.geometry import SE3
+from bidnerf_core.geometry import SE3, skew
 
 NUISANCES = (
     "log_focal",
@@ -33,6 +33,10 @@ NUISANCES = (
 from the first row of the image to the last (metres, radians), and the scale of measured depth."""
 N, P = len(NUISANCES), 6 + len(NUISANCES)
 CAMERA, MOTION, DEPTH = slice(0, 6), slice(6, 12), 12
+_twists = torch.zeros(6, 4, 4)
+_twists[:3, :3, 3], _twists[3:, :3, :3] = torch.eye(3), skew(torch.eye(3))
+TWISTS = tuple(_twists.flatten().tolist())
+"""The 4x4 matrices of a unit translation along, and of a unit rotation about each axis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +72,18 @@ class States:
         return torch.cat([torch.ones_like(self.z[:, :6]), 1 / self.deviation.clamp(min=1e-9)], -1)
 
     def retract(self, step: Float[Tensor, "h P"]) -> States:
-        return replace(self, T=self.T.retract(step[:, :6]).polished(), z=self.z + step[:, 6:])
+        """Return the states after a step, whose poses are ``T exp(step)``, polished; in few operations, without a derivative at 0."""
+        R, t = self.T.rotation, self.T.translation
+        twist = (step[:, :6] @ constant(TWISTS, step).view(6, 16)).view(-1, 4, 4)
+        squared = step[:, 3:6].square().sum(-1)[:, None, None]
+        angle = squared.sqrt() / math.pi
+        # exp(M) = 1 + M + (1 - cos a) / a^2 M^2 + (a - sin a) / a^3 M^3 for a rotation by a (Sola et al. 2018, eqs. 146 and 171).
+        second, third = (angle / 2).sinc().square() / 2, (1 - angle.sinc()) / squared.clamp(min=1e-300)
+        square = twist @ twist
+        moved = R @ (twist.addcmul(second, square).addcmul(third, square @ twist))[:, :3]
+        R = R + moved[..., :3]
+        R = torch.baddbmm(R, R, R.mT @ R, beta=1.5, alpha=-0.5)  # see ``SE3.polished``
+        return replace(self, T=SE3(R, t + moved[..., 3]), z=self.z + step[:, 6:])
 
     def where(self, mask: Bool[Tensor, "h"], other: States) -> States:
         """Return these poses and nuisances where ``mask`` holds, and the ``other`` ones elsewhere."""
