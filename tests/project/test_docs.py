@@ -34,6 +34,7 @@ from bidnerf_core.maps import MapInfo
 from bidnerf_core.registry import registered
 from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import demo_object
+from bidnerf_core.testing import BackendContract
 from bidnerf_core.training import Silent
 
 ROOT = Path(__file__).parents[2]
@@ -256,6 +257,13 @@ def test_the_backend_of_the_documentation_trains_and_localizes(inside: Path) -> 
         float(pose_error(T, unseen.T_ref_camera).translation) for T in (start, found.T_world_camera)
     )
     assert after < 0.5 * before
+
+
+@pytest.mark.slow
+class TestFog(BackendContract):
+    """The backend of the documentation, as it stands there, keeps the contract."""
+
+    backend = executed(ROOT / "docs" / "extend.md", "backend = Fog()")["backend"]
 
 
 def test_readme_is_short() -> None:
