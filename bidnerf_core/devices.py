@@ -93,6 +93,8 @@ def may_wait(device: torch.device) -> bool:
 
 MOST_GRAPHS = 128
 """Number of functions with different shapes whose graphs a thread can use, the least recently used being discarded."""
+ATTEMPTS = 2
+"""Number of attempts at a capture: what a library loads only then makes the first one fail, but not the second."""
 _capturing = Lock()
 """Allows one capture at a time: a capture begins by waiting for the device, which is forbidden during another."""
 _ALIGNMENT = 16
@@ -121,28 +123,31 @@ def captured(
     """
     if device.type != "cuda":
         return step
-    graph, before = torch.cuda.CUDAGraph(), None if generator is None else generator.clone_state()
-    if generator is not None:
-        graph.register_generator_state(generator)
-    # If a capture fails, torch leaves the thread on the capture's stream; the outer context restores it.
-    with _capturing, torch.cuda.device(device), torch.cuda.stream(torch.cuda.current_stream(device)):
-        try:
-            # Each device has its own stream. Other threads may continue to launch.
-            pool, stream = memory or (None, torch.cuda.Stream(device))
-            with (
-                noted() as constants,
-                torch.cuda.graph(graph, pool, stream, capture_error_mode="thread_local"),
-            ):
-                step()
-        except RuntimeError as error:  # it waits for the device somewhere, as a third party's field may
-            if generator is not None and before is not None:
-                generator.graphsafe_set_state(before)  # the registered one still expects a capture
-            why = str(error).partition("\n")[0]
-            warnings.warn(
-                f"operations are launched one by one, since a step cannot be captured: {why}",
-                stacklevel=2,
-            )
-            return step
+    why, constants = "", list[Tensor]()
+    for _ in range(ATTEMPTS):
+        graph, before = torch.cuda.CUDAGraph(), None if generator is None else generator.clone_state()
+        if generator is not None:
+            graph.register_generator_state(generator)
+        # If a capture fails, torch leaves the thread on the capture's stream; the outer context restores it.
+        with _capturing, torch.cuda.device(device), torch.cuda.stream(torch.cuda.current_stream(device)):
+            try:
+                # Each device has its own stream. Other threads may continue to launch.
+                pool, stream = memory or (None, torch.cuda.Stream(device))
+                with (
+                    noted() as constants,
+                    torch.cuda.graph(graph, pool, stream, capture_error_mode="thread_local"),
+                ):
+                    step()
+                break
+            except RuntimeError as error:  # it waits for the device somewhere, as a third party's field may
+                if generator is not None and before is not None:
+                    generator.graphsafe_set_state(before)  # the registered one still expects a capture
+                why, memory = str(error).partition("\n")[0], None
+    else:
+        warnings.warn(
+            f"operations are launched one by one, since a step cannot be captured: {why}", stacklevel=2
+        )
+        return step
 
     def replay(read: list[Tensor] = constants) -> None:  # keeps alive what the graph reads
         graph.replay()
@@ -341,19 +346,21 @@ _setting = Lock()
 
 
 @contextmanager
-def one_thread() -> Iterator[int]:
-    """Run torch operators called from this Python thread on one thread within the block; yields the usual
-    number.
+def threads_at_most(count: int) -> Iterator[int]:
+    """Run torch operators called from this Python thread on at most ``count`` threads within the block; yields
+    the usual number.
 
-    Sums are then the same on any machine. Other Python threads are not affected, and may be in such blocks
-    too.
+    On one thread, sums are the same on any machine. Other Python threads are not affected, and may be in such
+    blocks too.
     """
     usual = torch.get_num_threads()
-    set_threads_here(1)
+    if usual > count:
+        set_threads_here(count)
     try:
         yield usual
     finally:
-        set_threads_here(usual)
+        if usual > count:
+            set_threads_here(usual)
 
 
 def set_threads_here(count: int) -> None:

@@ -122,9 +122,9 @@ class HashGridField(nn.Module):
         """Return the values with the first ``active`` levels of the encoding only (None: all)."""
         shape = positions.shape[:-1]
         points, along = positions.reshape(-1, 3), directions.reshape(-1, 3)
-        if (kernel := self._kernel(active)) is not None:
-            moving = torch.is_grad_enabled() and (points.requires_grad or along.requires_grad)
-            density, rgb = fused.Query.apply(points, along, moving, *kernel).split((1, 3), -1)
+        moving = torch.is_grad_enabled() and (points.requires_grad or along.requires_grad)
+        if (kernel := None if moving else self._kernel(active)) is not None:
+            density, rgb = fused.query(points, along, False, None, *kernel)[0].split((1, 3), -1)
         else:
             found = self.values_of(self.encode(points, active), along)
             density, rgb = found.density, found.rgb

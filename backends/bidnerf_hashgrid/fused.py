@@ -156,25 +156,6 @@ def _padded(matrix: Float[Tensor, "i o"], rows: int, columns: int) -> Float[Tens
     return pad(matrix, (0, columns - matrix.shape[1], 0, rows - matrix.shape[0]))
 
 
-class Query(torch.autograd.Function):
-    """Density and colour (n 4) at points and directions (n 3); derivatives are carried forward with the values."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, positions: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], derivatives: bool, *field: Any
-    ) -> Float[Tensor, "n 4"]:  # fmt: skip
-        values, by_both = query(positions, directions, derivatives, None, *field)
-        ctx.save_for_backward(by_both)
-        return values
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Float[Tensor, "n 4"]) -> tuple[Tensor | None, ...]:
-        (by_both,) = ctx.saved_tensors
-        pull = (gradient[..., None] * by_both).sum(1)
-        return pull[:, :3], pull[:, 3:], *([None] * (len(ctx.needs_input_grad) - 2))
-
-
 def query(
     positions: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], derivatives: bool, wanted: Bool[Tensor, "n"] | None,
     packed: PackedNetworks, levels: tuple[Level, ...], tables: Sequence[Tensor], smooth: bool, limits: tuple[SceneBounds, float],

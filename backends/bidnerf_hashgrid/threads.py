@@ -11,7 +11,7 @@ from threading import Barrier, Lock
 
 import torch
 
-from bidnerf_core.devices import one_thread, set_threads_here
+from bidnerf_core.devices import set_threads_here, threads_at_most
 
 THREADED = 4096  # number of points from which several threads are worthwhile
 
@@ -31,7 +31,7 @@ def pools_only(device: torch.device) -> Iterator[None]:
     if device.type != "cpu":
         yield
         return
-    with one_thread() as usual:
+    with threads_at_most(1) as usual:
         token = _for_pools.set(usual)
         try:
             yield

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import Capture, SparseChoice, SparsePoints
-from bidnerf_core.devices import one_thread, working_device
+from bidnerf_core.devices import threads_at_most, working_device
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.faults import faulty, parse_faults
 from bidnerf_core.evaluation.plan import Setup, Trial, parse_settings
@@ -136,7 +136,7 @@ def run_trial(
     registered the same names.
     """
     require_registered(registered)
-    with one_thread():
+    with threads_at_most(1):
         stored, dataset = scene or opened(trial.map, trial.data, trial)
         views = trial_views(trial, dataset)
         truth, protocol = views[-1].T_ref_camera, find_protocol(trial.protocol)

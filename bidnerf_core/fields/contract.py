@@ -6,7 +6,7 @@ metre. Directions are always unit vectors, so distance along the ray is the only
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Protocol, runtime_checkable
 
@@ -215,15 +215,23 @@ def device_of(field: RadianceField) -> torch.device:
     """Return the device of a field's parameters or buffers, or of the first field that a dataclass wraps;
     else the CPU.
     """
-    for kind in ("parameters", "buffers"):
-        first = next(iter(getattr(field, kind, tuple)()), None)
-        if isinstance(first, torch.Tensor):
-            return first.device
-    wrapped: list[object] = (
-        [getattr(field, part.name) for part in fields(field)] if is_dataclass(field) else []
-    )
-    inner = next((part for part in wrapped if isinstance(part, RadianceField)), None)
-    return torch.device("cpu") if inner is None else device_of(inner)
+    tensors = (first for kind in ("parameters", "buffers") for first in _tensors_of(field, kind))
+    found = next(tensors, None)
+    return torch.device("cpu") if found is None else found.device
+
+
+def is_frozen(field: RadianceField) -> bool:
+    """Return whether none of the parameters of a field, or of the first field that a dataclass wraps, is being trained."""
+    return not any(part.requires_grad for part in _tensors_of(field, "parameters"))
+
+
+def _tensors_of(field: object, kind: str) -> Iterator[Tensor]:
+    """Yield the parameters or the buffers of a module, or of the first field that a dataclass wraps."""
+    if (found := getattr(field, kind, None)) is not None:
+        yield from found()
+    elif is_dataclass(field):
+        inner = (getattr(field, part.name) for part in fields(field))
+        yield from _tensors_of(next((part for part in inner if isinstance(part, RadianceField)), None), kind)
 
 
 LARGEST_LENGTH = 1e15

@@ -8,12 +8,14 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import interpolate, max_pool2d
 
 from bidnerf_core.camera import Intrinsics, exposure_times, poses_of_rows
 from bidnerf_core.devices import constant, may_wait
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import (
+    DifferentiatedField,
     FieldValues,
     HitField,
     RadianceField,
@@ -22,6 +24,7 @@ from bidnerf_core.fields.contract import (
     RaySamples,
     SceneBounds,
     device_of,
+    is_frozen,
 )
 from bidnerf_core.geometry import SE3
 from bidnerf_core.progress import check_cancelled
@@ -177,12 +180,21 @@ def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> Fiel
     """Return the field's values at the samples (*r s), with density 0 at invalid samples.
 
     Invalid samples are skipped. If the host must not wait for the device to count them (see ``may_wait``), the
-    field is queried at the origin instead, and the result is discarded.
+    field is queried at the origin instead, and the result is discarded; but rays that are differentiated in a field
+    whose parameters are not get the field's own derivatives, if it offers them.
     """
     valid = samples.valid
-    if not may_wait(valid.device) or bool(valid.all()):
+    waiting = may_wait(valid.device)
+    if not waiting or bool(valid.all()):
         positions = rays.at(samples.middles)
         directions = rays.directions[..., None, :].expand_as(positions)
+        moving = torch.is_grad_enabled() and (rays.origins.requires_grad or rays.directions.requires_grad)
+        if moving and not waiting and isinstance(field, DifferentiatedField) and is_frozen(field):
+            found = _Queried.apply(
+                positions.reshape(-1, 3), directions.reshape(-1, 3), valid.reshape(-1), field
+            )
+            density, rgb = found.view(*valid.shape, 4).split((1, 3), -1)
+            return FieldValues(density[..., 0], rgb)
         found = field.query(torch.where(valid[..., None], positions, 0), directions)
         return FieldValues(torch.where(valid, found.density, 0), found.rgb)
     index = valid.reshape(-1).nonzero()[:, 0]
@@ -224,6 +236,27 @@ def query_packed(
     return values, replace(samples, valid=kept.view_as(samples.valid))
 
 
+class _Queried(torch.autograd.Function):
+    """Density and colour (p 4) at points, 0 at those that are not wanted, with the derivatives that the field offers."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"], wanted: Bool[Tensor, "p"],
+        field: DifferentiatedField,
+    ) -> Float[Tensor, "p 4"]:  # fmt: skip
+        found = field.jacobian(positions, directions, wanted)
+        ctx.save_for_backward(found.by_position, found.by_direction, wanted)
+        values = torch.cat([found.values.density[:, None], found.values.rgb], -1)
+        return torch.where(wanted[:, None], values, 0)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Float[Tensor, "p 4"]) -> tuple[Tensor | None, ...]:
+        *by_both, wanted = ctx.saved_tensors
+        pull = torch.where(wanted[:, None], gradient, 0)[..., None]
+        return *((pull * by).sum(1) for by in by_both), None, None
+
+
 def rendering_weights(density: Float[Tensor, "*r s"], samples: RaySamples) -> Float[Tensor, "*r s"]:
     """Return ``w_i = exp(-sum_{j<i} sigma_j dt_j) (1 - exp(-sigma_i dt_i))`` (eq. 3)."""
     absorbed = torch.where(
@@ -261,8 +294,49 @@ def render_values(
     background: tuple[float, float, float] | Float[Tensor, "*#r 3"] = (0.0, 0.0, 0.0),
 ) -> Rendering:
     """Render rays from a field's values at their samples (*r s), see ``render``."""
+    if torch.is_grad_enabled() and not (samples.starts.requires_grad or samples.ends.requires_grad):
+        rgb, distance, opacity, weights = _Composite.apply(values.density, values.rgb, *samples.parts)
+        behind = constant(background, rgb) if isinstance(background, tuple) else background.to(rgb)
+        rgb = rgb + (1 - opacity)[..., None] * behind
+        return Rendering(rgb, distance, opacity, weights, samples, values.density)
     weights = rendering_weights(values.density, samples)
     return _over(background, values.rgb, weights, samples, values.density)
+
+
+class _Composite(torch.autograd.Function):
+    """Colour (without background), distance, opacity and weights of rays, from density and colour at their samples.
+
+    With ``q_i`` the derivative by weight i, that by the density of sample i, of length l_i, is
+    ``l_i (T_i+1 q_i - sum_j>i w_j q_j)``, where T_i+1 is the share of the light that passes it.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, density: Float[Tensor, "*r s"], rgb: Float[Tensor, "*r s 3"], starts: Float[Tensor, "*r s"],
+        ends: Float[Tensor, "*r s"], valid: Bool[Tensor, "*r s"],
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        samples = RaySamples(starts, ends, valid)
+        weights = rendering_weights(density, samples)
+        ctx.save_for_backward(density, rgb, weights, *samples.parts)
+        middles = samples.middles
+        return (weights[..., None] * rgb).sum(-2), (weights * middles).sum(-1), weights.sum(-1), weights
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any, to_rgb: Tensor, to_distance: Tensor, to_opacity: Tensor, to_weights: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        density, rgb, weights, starts, ends, valid = ctx.saved_tensors
+        length, to_rgb = ends - starts, to_rgb[..., None, :]
+        by_weight = (
+            (to_rgb * rgb).sum(-1) + to_distance[..., None] * (starts + ends) / 2 + to_opacity[..., None]
+        )
+        by_weight = by_weight + to_weights
+        share = weights * by_weight
+        behind = share.sum(-1, keepdim=True) - share.cumsum(-1)
+        passed = torch.exp(-torch.where(valid, density * length, 0).cumsum(-1))
+        to_density = torch.where(valid, length * (passed * by_weight - behind), 0)
+        return to_density, weights[..., None] * to_rgb, None, None, None
 
 
 def render_hits(

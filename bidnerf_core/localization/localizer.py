@@ -19,7 +19,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.depth import DepthSensorModel, find_depth_sensor
-from bidnerf_core.devices import constant, set_threads_here
+from bidnerf_core.devices import constant, set_threads_here, threads_at_most
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import Observations, device_of, has_field, render
 from bidnerf_core.frames import Frame, View
@@ -52,6 +52,10 @@ LOADERS: list[Callable[[Path], SceneMap]] = []
 """How the map in a folder is loaded. The package of stored maps, which builds on this one, adds its function."""
 Start = SE3 | Float[Tensor, "4 4"] | np.ndarray | Sequence[Sequence[float]]
 """A pose T_world_camera: an ``SE3``, or any 4x4 matrix, by rows."""
+
+
+MOST_THREADS = 4
+"""Number of threads from which torch's operators become slower: they are short, and on 16 cores a query took twice as long."""
 
 
 class Localizer:
@@ -187,7 +191,8 @@ class Localizer:
 
     def solved(self, problem: Problem, seed: int = 0) -> Localization:
         """Solve a ``problem`` created by this localizer."""
-        found = self._method.solve(problem, self.config, _checked_seed(seed))
+        with threads_at_most(MOST_THREADS):
+            found = self._method.solve(problem, self.config, _checked_seed(seed))
         if not isinstance(found, Localization):
             raise InputError(
                 f"method {self.method!r} returned a {type(found).__name__}", expected="a Localization"

@@ -7,7 +7,7 @@ from threading import Barrier
 import pytest
 import torch
 
-from bidnerf_core.devices import one_thread, set_threads_here
+from bidnerf_core.devices import set_threads_here, threads_at_most
 
 
 @pytest.fixture(autouse=True)
@@ -24,19 +24,19 @@ def in_new_thread() -> int:
 
 
 def test_the_usual_number_is_told_and_restored() -> None:
-    with one_thread() as usual:
+    with threads_at_most(1) as usual:
         assert (usual, torch.get_num_threads()) == (3, 1)
     assert torch.get_num_threads() == 3
 
 
 def test_the_usual_number_is_restored_after_an_error() -> None:
-    with pytest.raises(KeyboardInterrupt), one_thread():
+    with pytest.raises(KeyboardInterrupt), threads_at_most(1):
         raise KeyboardInterrupt
     assert torch.get_num_threads() == in_new_thread() == 3
 
 
 def test_threads_that_start_meanwhile_have_the_usual_number() -> None:
-    with one_thread():
+    with threads_at_most(1):
         assert in_new_thread() == 3
     set_threads_here(2)
     assert (torch.get_num_threads(), in_new_thread()) == (2, 3)
@@ -57,14 +57,14 @@ def test_blocks_that_overlap_leave_no_trace() -> None:
     began, ended = Barrier(2), Barrier(2)
 
     def first() -> int:
-        with one_thread():
+        with threads_at_most(1):
             began.wait()
         ended.wait()
         return torch.get_num_threads()
 
     def second() -> tuple[int, int]:
         began.wait()
-        with one_thread() as usual:
+        with threads_at_most(1) as usual:
             ended.wait()
         return usual, torch.get_num_threads()
 

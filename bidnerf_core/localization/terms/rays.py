@@ -99,7 +99,8 @@ class Rays:
                 zero[:, :2], zero[:, 0], _looking_along(some.directions), some.origins, zero, zero[:, 0], some.distance,
             ))  # fmt: skip
         image, times, R, t, rgb, coloured, depth = (torch.cat(part) for part in zip(*parts, strict=True))
-        measured = moved((Sights(image, times, R, t), rgb, coloured, depth), device or device_of(field))
+        sights = Sights(image, times, R, t, single=len(views) == 1 and depth_rays is None)
+        measured = moved((sights, rgb, coloured, depth), device or device_of(field))
         return Rays(field, bounds, *measured)
 
     def __len__(self) -> int:
@@ -216,8 +217,11 @@ class Rays:
             for part in (found.value, found.by_origin, found.by_direction)
         )
         value, gain = self._differences(seen)
-        R, sights = states.T.rotation[:, None], self.sights
-        by_origin, by_direction = by_origin @ R, by_direction @ R  # in the rig's axes
+        R, sights = states.T.rotation, self.sights
+        # In the rig's axes. Products of many rows by one matrix are faster than many of few rows.
+        by_origin, by_direction = (
+            (part.flatten(1, 2) @ R).view(part.shape) for part in (by_origin, by_direction)
+        )
 
         def by_frame(origin: Tensor, direction: Tensor, at: Tensor, along: Tensor) -> Tensor:
             turning = torch.linalg.cross(along[..., None, :].expand_as(direction), direction)
@@ -225,7 +229,9 @@ class Rays:
             return torch.cat([origin, turning + lever], -1)
 
         by_pose = by_frame(by_origin, by_direction, sights.translation.expand_as(unit), unit)
-        own, turned = by_origin @ sights.rotation, by_direction @ sights.rotation  # in the camera's axes
+        own, turned = by_origin, by_direction  # in the camera's axes
+        if not sights.single:
+            own, turned = own @ sights.rotation, turned @ sights.rotation
         sight = rays / length
         by_row = by_frame(own, turned, torch.zeros_like(sight), sight)
         across = (turned - (turned @ sight[..., None]) * sight[..., None, :]) / length[..., None]

@@ -61,16 +61,24 @@ def differentiate(
     values = query_samples(field, rays, samples)
     rendering = render_values(values, samples, background)
     matters = (rendering.weights > LEAST_WEIGHT).reshape(-1)
-    every, r = not may_wait(matters.device), len(rays.near)
     # Where the host must not wait to count them, all samples are passed on, with those that matter marked.
-    index = torch.arange(len(matters), device=matters.device) if every else matters.nonzero()[:, 0]
-    ray = index // max(samples.valid.shape[-1], 1)
-    middles, origins, directions = (
-        part.index_select(0, at)
-        for part, at in ((samples.middles.reshape(-1), index), (rays.origins, ray), (rays.directions, ray))
-    )
+    index = matters.nonzero()[:, 0] if may_wait(matters.device) else None
+
+    def chosen(part: Float[Tensor, "r s *f"]) -> Float[Tensor, "k *f"]:
+        flat = part.flatten(0, 1)
+        return flat if index is None else flat.index_select(0, index)
+
+    middles = chosen(samples.middles)
+    if index is None:
+        origins, directions = (
+            part[:, None].expand(*samples.valid.shape, 3).flatten(0, 1)
+            for part in (rays.origins, rays.directions)
+        )
+    else:
+        ray = index // max(samples.valid.shape[-1], 1)
+        origins, directions = (part.index_select(0, ray) for part in (rays.origins, rays.directions))
     positions = origins + middles[:, None] * directions
-    jacobian = derivatives_of(field, positions, directions, matters if every else None)
+    jacobian = derivatives_of(field, positions, directions, matters if index is None else None)
     seen, weights, features = channels(rendering, measured, miss), rendering.weights, values.rgb
     if measured is not None:
         off = torch.where(measured[:, None] > 0, samples.middles - measured[:, None], 0)
@@ -78,9 +86,9 @@ def differentiate(
     length = samples.ends - samples.starts
     passed = torch.exp(-(torch.where(samples.valid, values.density * length, 0)).cumsum(-1))
     behind = seen[:, None] - (weights[..., None] * features).cumsum(1)
-    steep = (length[..., None] * (passed[..., None] * features - behind)).flatten(0, 1).index_select(0, index)
-    share = weights.reshape(-1, 1, 1).index_select(0, index)
-    if every:
+    steep = chosen(length[..., None] * (passed[..., None] * features - behind))
+    share = chosen(weights)[:, None, None]
+    if index is None:
         steep, share = torch.where(matters[:, None], steep, 0), torch.where(matters[:, None, None], share, 0)
 
     def along(by: Float[Tensor, "k 4 3"]) -> Float[Tensor, "k c 3"]:
@@ -90,11 +98,11 @@ def differentiate(
 
     by_position = along(jacobian.by_position)
     by_direction = middles[:, None, None] * by_position + along(jacobian.by_direction)
-    if every:
-        sums = [part.unflatten(0, (r, -1)).sum(1) for part in (by_position, by_direction)]
+    if index is None:
+        sums = [part.unflatten(0, samples.valid.shape).sum(1) for part in (by_position, by_direction)]
     else:
         sums = [
-            part.new_zeros(r, *part.shape[1:]).index_add_(0, ray, part)
+            part.new_zeros(len(rays.near), *part.shape[1:]).index_add_(0, ray, part)
             for part in (by_position, by_direction)
         ]
     return Derivatives(seen, *sums)
