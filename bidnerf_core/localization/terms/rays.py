@@ -99,8 +99,8 @@ class Rays:
                 zero[:, :2], zero[:, 0], _looking_along(some.directions), some.origins, zero, zero[:, 0], some.distance,
             ))  # fmt: skip
         image, times, R, t, rgb, coloured, depth = (torch.cat(part) for part in zip(*parts, strict=True))
-        sights = Sights(image, times, R, t, single=len(views) == 1 and depth_rays is None)
-        measured = moved((sights, rgb, coloured, depth), device or device_of(field))
+        seen = Sights(image, times, R, t, single=len(views) == 1 and depth_rays is None)
+        measured = moved((seen, rgb, coloured, depth), device or device_of(field))
         return Rays(field, bounds, *measured)
 
     def __len__(self) -> int:
