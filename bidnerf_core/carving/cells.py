@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bidnerf_core.carving.boxes import Corner
 from bidnerf_core.carving.free_space import FreeSpace
-from bidnerf_core.devices import moved, one_thread
+from bidnerf_core.devices import moved, threads_at_most
 from bidnerf_core.fields import SceneBounds, VoxelGrid
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
@@ -67,7 +67,7 @@ def occupied_cells(
     needed = 1 if len(views) < 2 else 2
     undecided = torch.ones(len(votes), dtype=torch.bool, device=device)
     at_once = BLOCKS_AT_ONCE if device.type == "cpu" else max(1, len(votes))
-    with one_thread():  # the operations are short
+    with threads_at_most(1):  # the operations are short
         for view in (view for view in views if view.frame.has_depth or view.frame.alpha is not None):
             space = moved(FreeSpace.seen_by(view, tolerance, footprint), device)
             firsts, within = moved(grid.middles(view.T_ref_camera), device)
