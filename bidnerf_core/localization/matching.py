@@ -315,7 +315,9 @@ class Projected:
             if tree is None or not len(own):
                 continue
             observed = query.sights.image[own] * focal + shift
-            _, found = tree.query(observed.numpy(), k=CANDIDATES, distance_upper_bound=radius)  # host
+            _, found = tree.query(
+                observed.numpy(), CANDIDATES, distance_upper_bound=radius, workers=torch.get_num_threads()
+            )  # host
             found = torch.from_numpy(np.asarray(found, dtype=np.int64).reshape(len(own), -1))
             row, column = (found < len(index)).nonzero().unbind(-1)
             place = found[row, column]
