@@ -250,10 +250,11 @@ def _structure(value: Any, tensors: list[Tensor]) -> Hashable:
     if isinstance(value, nn.Module | Resident):
         return value
     if is_dataclass(value) and not isinstance(value, type):
-        return type(value), *(_structure(getattr(value, part.name), tensors) for part in fields(value))
+        parts = (vars(value)[part.name] for part in fields(value) if part.name in vars(value))
+        return type(value), *(_structure(part, tensors) for part in parts)
     if isinstance(value, dict):
         return dict, tuple(value), *(_structure(part, tensors) for part in value.values())
-    if isinstance(value, list | tuple):
+    if type(value) in (list, tuple):
         return type(value), *(_structure(part, tensors) for part in value)
     kept: Hashable = value
     return kept
@@ -261,21 +262,8 @@ def _structure(value: Any, tensors: list[Tensor]) -> Hashable:
 
 def _rebuilt(value: Any, tensors: Iterator[Tensor]) -> Any:
     """Return ``value`` with its tensors replaced by the next of ``tensors``."""
-    if isinstance(value, Tensor):
-        return next(tensors)
-    if isinstance(value, nn.Module | Resident):
-        return value
-    if is_dataclass(value) and not isinstance(value, type):
-        found = object.__new__(type(value))
-        vars(found).update(
-            {part.name: _rebuilt(getattr(value, part.name), tensors) for part in fields(value)}
-        )
-        return found
-    if isinstance(value, dict):
-        return {key: _rebuilt(part, tensors) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return type(value)([_rebuilt(part, tensors) for part in value])
-    return value
+    whole = nn.Module, Resident
+    return _mapped(value, lambda part: next(tensors) if isinstance(part, Tensor) else part, whole)
 
 
 # Moving objects that hold tensors to a device.
@@ -306,29 +294,35 @@ def moved(value: T, device: torch.device | str) -> T:
     these. Anything else stays the same object, as does ``value`` itself if it is already on ``device``.
     Values cached by a dataclass are recomputed on the device.
     """
-    found: Any = _moved(value, torch.device(device))
+    there = torch.device(device)
+
+    def change(part: Any) -> Any:
+        if isinstance(part, Tensor):
+            return part if _is_on(part, there) else part.to(there)
+        tensors = (*part.parameters(), *part.buffers())
+        return part if all(_is_on(t, there) for t in tensors) else copy.deepcopy(part).to(there)
+
+    found: T = _mapped(value, change, (nn.Module,))
     return found
 
 
-def _moved(value: Any, device: torch.device) -> Any:
-    if isinstance(value, nn.Module):
-        tensors = (*value.parameters(), *value.buffers())
-        return value if all(_is_on(t, device) for t in tensors) else copy.deepcopy(value).to(device)
-    if isinstance(value, Tensor):
-        return value if _is_on(value, device) else value.to(device)
+def _mapped(value: Any, change: Callable[[Any], Any], whole: tuple[type, ...]) -> Any:
+    """Return ``value`` with each tensor, and each part of a type in ``whole``, changed; itself if nothing changes."""
+    if isinstance(value, (Tensor, *whole)):
+        return change(value)
     if is_dataclass(value) and not isinstance(value, type):
         parts = {part.name: vars(value)[part.name] for part in fields(value) if part.name in vars(value)}
-        there = _moved(parts, device)
+        there = _mapped(parts, change, whole)
         if there is parts:
             return value
         found = object.__new__(type(value))
         vars(found).update(there)  # also the fields that its constructor does not take
         return found
     if isinstance(value, dict):
-        content = {key: _moved(part, device) for key, part in value.items()}
+        content = {key: _mapped(part, change, whole) for key, part in value.items()}
         return content if any(content[key] is not value[key] for key in value) else value
     if type(value) in (list, tuple):
-        items = [_moved(part, device) for part in value]
+        items = [_mapped(part, change, whole) for part in value]
         same = all(new is old for new, old in zip(items, value, strict=True))
         return value if same else type(value)(items)
     return value
