@@ -29,7 +29,7 @@ from bidnerf_core import SE3
 from bidnerf_core.geometry import Similarity, fit_similarity
 from bidnerf_core.results import Answer, Answers
 
-SIDE, IMAGES, POINTS, TRACK = 40.0, 320, 220_000, 6
+SIDE, IMAGES, POINTS, TRACK = 40.0, 320, 205_000, 6
 """Of the large project: side of its square floor, number of images and of points, and images that observe a point."""
 
 
@@ -76,6 +76,8 @@ def make_large_project(project: Path) -> None:
         own = np.flatnonzero((near == number).any(1))
         local = (points[own] - [*place, 6.0]) @ down
         pixels = 1200 * local[:, :2] / local[:, 2:] + [800, 600] + random.normal(0, 0.5, (len(own), 2))
+        inside = ((pixels > 0) & (pixels < [1600, 1200])).all(1)
+        own, pixels = own[inside], pixels[inside]
         keypoints.append(pixels)
         of_image.append(own)
         image = pycolmap.Image(
