@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from math import radians
+from math import ceil, radians
 from typing import Annotated, TypeVar
 
 import torch
@@ -58,6 +58,8 @@ _Item = TypeVar("_Item")
 Result = TypeVar("Result")
 TOLERANCES = (10.0, 4.0, 2.0)
 """Largest reprojection error (pixels) of an observation that stays in its track, round by round."""
+SCATTERED_IMAGES = 200
+"""Largest number of images whose poses are estimated again for the scatter of poses: deviations are then known to 7 %."""
 TWO_VIEW_TOLERANCE = 1.5
 """Largest reprojection error (pixels) in a track of only two images."""
 
@@ -68,7 +70,7 @@ def pose_scatter(tracked: TrackedKeypoints, positions: Float[Tensor, "n 3"]) -> 
     The points from which an image is resected were triangulated from it as well, so its pose scatters too little: with k views
     of a point, by 1 - 1/k of the true variance, against 1 + 1/k for a new image. The updates are rescaled accordingly.
     """
-    return update_scatter(list(pose_updates(tracked, positions).values()))
+    return update_scatter(list(pose_updates(tracked, positions, SCATTERED_IMAGES).values()))
 
 
 def update_scatter(updates: Sequence[Float[Tensor, "6"] | None]) -> Float[Tensor, "6 6"]:
@@ -79,8 +81,12 @@ def update_scatter(updates: Sequence[Float[Tensor, "6"] | None]) -> Float[Tensor
     return robust_covariance(torch.stack(known))
 
 
-def pose_updates(tracked: TrackedKeypoints, positions: Float[Tensor, "n 3"]) -> dict[int, Float[Tensor, "6"]]:
+def pose_updates(
+    tracked: TrackedKeypoints, positions: Float[Tensor, "n 3"], most: int | None = None
+) -> dict[int, Float[Tensor, "6"]]:
     """Return the right updates from given to resected poses, by image number, for images with enough points.
+
+    With ``most``, no more than that many of them, at regular intervals, are resected.
 
     They are corrected for each image's influence on its points, see ``pose_scatter``.
     """
@@ -90,6 +96,7 @@ def pose_updates(tracked: TrackedKeypoints, positions: Float[Tensor, "n 3"]) -> 
     views = summed(seen, image, len(count)) / count
     factor = ((1 + 1 / views) / (1 - 1 / views)).sqrt()
     known, updates = (count >= LEAST_VISIBLE_POINTS).nonzero()[:, 0], dict[int, Float[Tensor, "6"]]()
+    known = known[:: 1 if most is None else max(1, ceil(len(known) / most))]
     for numbers, states, _ in resections(sightings, positions, known):
         updates |= zip(numbers.tolist(), states.T.log() * factor[numbers, None], strict=True)
     return {number: updates[number] for number in known.tolist()}
