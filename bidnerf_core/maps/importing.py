@@ -235,7 +235,8 @@ def _described(structure: Structure, features: str, origin: Origin) -> tuple[Rea
         replace(image, T_ref_camera=view.T_ref_camera) for image, view in zip(images, read.views, strict=True)
     ]
     label = torch.cat(labels)
-    return read, TrackedViews(TrackedKeypoints(images, label, torch.arange(len(label))), features)
+    points = structure.positions - torch.tensor(origin, dtype=torch.float64)
+    return read, TrackedViews(TrackedKeypoints(images, label, torch.arange(len(label))), features, points)
 
 
 def _own_photos(found: ImportedField, where: str) -> Capture | None:

@@ -26,13 +26,13 @@ def intersected(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
 
 
 def refined_points(
-    sightings: Sightings, points: Float[Tensor, "n 3"], scale: float
+    sightings: Sightings, points: Float[Tensor, "n 3"], scale: float, steps: int = TRIANGULATION_STEPS
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """Minimize the reprojection errors under a Cauchy loss of ``scale`` pixels.
+    """Minimize the reprojection errors under a Cauchy loss of ``scale`` pixels by a number of Gauss-Newton ``steps``.
 
     Returns the points and their covariances for a noise of one pixel (the inverses of their normal matrices).
     """
-    for _ in range(TRIANGULATION_STEPS):
+    for _ in range(steps):
         matrix, gradient = _normal_equations(sightings, points, scale)
         points = points - torch.linalg.solve(_damped(matrix), gradient)
     matrix, _ = _normal_equations(sightings, points, scale)

@@ -17,6 +17,7 @@ from bidnerf_core.frames import SeenLandmarks, View
 from bidnerf_core.geometry import SE3, chi_squared_quantile, inlier_weight
 from bidnerf_core.mapping.geometry.observations import Sightings, summed
 from bidnerf_core.mapping.geometry.triangulation import (
+    TRIANGULATION_STEPS,
     fitting,
     intersected,
     noise,
@@ -154,6 +155,8 @@ class TrackedViews:
 
     observations: TrackedKeypoints
     features: str | Features = USUAL_FEATURES  # the detector of the keypoints: its name, if it is registered
+    # Positions (metres, world, float64) of the points by number, if they are known; otherwise they are triangulated.
+    points: Float[Tensor, "p 3"] | None = None
 
     @property
     def detector(self) -> Features:
@@ -168,7 +171,7 @@ class TrackedViews:
         self, config: LandmarkConfig, report: Callable[[str], None] = lambda sentence: None
     ) -> LandmarkMap:
         """Return the landmarks built from the tracks. Raises ``InputError`` if there are none."""
-        found = _located(self.observations, config)
+        found = _located(self.observations, config, self.points)
         if not len(found):
             images = len(self.observations.images)
             raise InputError(
@@ -230,9 +233,9 @@ class TrackedViews:
         return replace(self, observations=_joined(images, pairs, steps))
 
     def without(self, images: Sequence[int]) -> TrackedViews:
-        """Return the tracks without the keypoints of the given images."""
+        """Return the tracks without the keypoints of the given images, from which known points may be: they are not known then."""
         left = ~torch.isin(self.observations.image, torch.tensor(images))
-        return replace(self, observations=self.observations[left])
+        return replace(self, observations=self.observations[left], points=None)
 
     def of_points_in(self, images: Sequence[int]) -> TrackedViews:
         """Return the tracks that have a keypoint in one of the given images."""
@@ -295,9 +298,11 @@ def posed_keypoints(views: Sequence[View], features: Features) -> list[ImageKeyp
     return list(_mapped(lambda view: image_keypoints(view, features), views))
 
 
-def _located(observations: TrackedKeypoints, config: LandmarkConfig) -> LandmarkMap:
-    """Return the triangulated landmarks, followed by the remaining keypoints' landmarks from measured depth."""
-    kept, positions, covariance = _triangulated(observations, radians(config.parallax))
+def _located(
+    observations: TrackedKeypoints, config: LandmarkConfig, known: Float[Tensor, "p 3"] | None
+) -> LandmarkMap:
+    """Return the triangulated or ``known`` landmarks, followed by the remaining keypoints' landmarks from measured depth."""
+    kept, positions, covariance = _triangulated(observations, radians(config.parallax), known)
     sightings = kept.sightings
     pixel_noise = noise(sightings, positions)
     triangulated = replace(
@@ -317,18 +322,19 @@ def _tracked(observations: TrackedKeypoints) -> Bool[Tensor, "m"]:
 
 
 def _triangulated(
-    observations: TrackedKeypoints, least: float
+    observations: TrackedKeypoints, least: float, known: Float[Tensor, "p 3"] | None = None
 ) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Return the inlier keypoints, their points (metres, world), and the points' covariance for a noise of one pixel.
 
-    ``least`` is the minimum parallax (radians) of a point.
+    ``least`` is the minimum parallax (radians) of a point. ``known`` positions, by number, are taken as they are.
     """
-    observations, _ = observations[_tracked(observations)].compacted()
+    observations, former = observations[_tracked(observations)].compacted()
     count = observations.count
-    points = intersected(observations.sightings, count)
     covariance = torch.zeros((count, 3, 3), dtype=torch.float64)
-    for tolerance in TOLERANCES:
-        points, covariance = refined_points(observations.sightings, points, tolerance / 2)
+    points = intersected(observations.sightings, count) if known is None else known[former]
+    for tolerance in TOLERANCES if known is None else TOLERANCES[-1:]:
+        steps = TRIANGULATION_STEPS if known is None else 0
+        points, covariance = refined_points(observations.sightings, points, tolerance / 2, steps)
         observations = observations[_inliers(observations.sightings, points, tolerance)]
     wide = parallax(observations.sightings, points) >= least
     observations, numbers = observations[wide[observations.point]].compacted()
