@@ -346,7 +346,7 @@ def training_times(records: Records) -> str:
         )
         text += (
             f" `--quick` took {minutes[0]:.0f} to {minutes[-1]:.0f} minutes of CPU time; its maps find {right} of {n} images,"
-            f" where maps of the default settings find {usual}."
+            f" maps of 1,500 default steps {usual}."
         )
     return f"{textwrap.fill(text, 118)}\n\n{records.caption()}"
 
