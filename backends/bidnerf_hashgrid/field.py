@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -139,8 +139,9 @@ class HashGridField(nn.Module):
     @torch.no_grad()
     def density_of(self, encoded: Float[Tensor, "p f"]) -> Float[Tensor, "p"]:
         """Return the density alone at encoded positions, without recording gradients."""
-        last: Any = self.geometry[2]
-        return self._density(torch.addmv(last.bias[:1], self.geometry[:2](encoded), last.weight[0]))
+        first, _, last = cast(Sequence[Any], self.geometry)
+        hidden = torch.addmm(first.bias, encoded, first.weight.t()).relu_()
+        return self._density(torch.addmv(last.bias[:1], hidden, last.weight[0]))
 
     def _density(self, log_density: Float[Tensor, "p"]) -> Float[Tensor, "p"]:
         # Per side of the scene, so that an untrained field is equally thin in any unit of length.

@@ -8,10 +8,10 @@ import torch
 
 import tiny
 from bidnerf_core.carving import estimate_bounds
-from bidnerf_core.fields import SceneBounds
+from bidnerf_core.fields import RaySamples, SceneBounds, query_samples, render_values, rendering_weights
 from bidnerf_core.training import Silent
 from bidnerf_hashgrid import HashGridConfig, HashGridField, backend
-from bidnerf_hashgrid.recipe import adapted
+from bidnerf_hashgrid.recipe import _visible, adapted
 from bidnerf_hashgrid.threads import THREADED, pools_only, threads_for
 
 BOX = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 6.0)
@@ -89,3 +89,28 @@ def test_contracted_scenes_are_pruned_later_and_learned_more_slowly() -> None:
     assert slower.grow_until > usual.grow_until
     kept = replace(usual, grow_until=1.0)
     assert adapted(kept, replace(BOX, contracted=True)).grow_until == 1.0
+
+
+def test_only_samples_that_are_seen_are_shaded(generator: torch.Generator) -> None:
+    """The others change colours by less than their weights, and what they add to gradients is exactly left out."""
+    field = backend.build(tiny.config(), BOX)
+    rays = BOX.rays(torch.randn((40, 3), generator=generator) / 9, torch.eye(3)[torch.arange(40) % 3])
+    borders = torch.linspace(0.2, 0.8, 13).expand(40, -1)
+    samples = RaySamples(borders[:, :-1], borders[:, 1:], torch.rand((40, 12), generator=generator) < 0.7)
+    whole = query_samples(field, rays, samples)
+    weights = rendering_weights(whole.density, samples)
+    least = float(weights[samples.valid].detach().median())
+    found = {}
+    for name, values, seen in (
+        ("alone", *_visible(field, None, rays, samples, least)[:2]),
+        ("of all", whole, replace(samples, valid=samples.valid & (weights > least))),
+    ):
+        field.zero_grad()
+        rendering = render_values(values, seen, (0.0, 0.0, 0.0))
+        rendering.rgb.square().sum().backward()
+        found[name] = [rendering.rgb.detach(), *(table.grad.clone() for table in field.encoding.tables)]
+    for ours, theirs in zip(*found.values(), strict=True):
+        torch.testing.assert_close(ours, theirs)
+    everything = render_values(whole, samples, (0.0, 0.0, 0.0))
+    assert 0 < float((everything.rgb - found["alone"][0]).detach().abs().max()) < 12 * least
+    torch.testing.assert_close(_visible(field, None, rays, samples, 0.0)[2], whole.density.detach())
