@@ -127,14 +127,14 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
                 grid.prune(config.prune_threshold, grow=step < config.grow_until * config.steps)
         if device.type == "cpu" or step <= SETTLED or step % config.prune_every == 0 or not rays:
             *counts, missed = torch.stack([*(grid.samples_per_ray for grid in grids), lost]).tolist()
-            for coarse, samples in enumerate(counts):
+            for coarse, grid, samples in zip((False, True), grids, counts, strict=True):
                 count = config.samples_per_step / max(samples, 1.0)
-                if (
-                    device.type != "cpu"
-                ):  # few different numbers, as each is captured, and kernels like multiples of 16
+                if device.type != "cpu":
+                    count /= 1 if grid.observed else 4  # before the first step, rays may cross the whole grid
+                    # Few different numbers, as each is captured, and of those for which kernels were compiled.
                     count = 2 ** (math.floor(2 * math.log2(max(count, 1.0))) / 2)
                     count -= count % 16 if count >= 16 else 0
-                rays[coarse > 0] = max(1, min(config.rays_at_most, int(count)))
+                rays[coarse] = max(1, min(config.rays_at_most, int(count)))
             if missed:
                 log.info(f"step {step}: {missed:.0f} samples did not fit into the steps since the last count")
                 lost.zero_()
