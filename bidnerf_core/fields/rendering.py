@@ -248,20 +248,20 @@ class _Queried(torch.autograd.Function):
         found = field.jacobian(positions, directions, wanted)
         ctx.save_for_backward(found.by_position, found.by_direction, wanted)
         values = torch.cat([found.values.density[:, None], found.values.rgb], -1)
-        return torch.where(wanted[:, None], values, 0)
+        return torch.where(wanted[:, None], values, constant((0.0,), values))
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Float[Tensor, "p 4"]) -> tuple[Tensor | None, ...]:
         *by_both, wanted = ctx.saved_tensors
-        pull = torch.where(wanted[:, None], gradient, 0)[..., None]
+        pull = torch.where(wanted[:, None], gradient, constant((0.0,), gradient))[..., None]
         return *((pull * by).sum(1) for by in by_both), None, None
 
 
 def rendering_weights(density: Float[Tensor, "*r s"], samples: RaySamples) -> Float[Tensor, "*r s"]:
     """Return ``w_i = exp(-sum_{j<i} sigma_j dt_j) (1 - exp(-sigma_i dt_i))`` (eq. 3)."""
     absorbed = torch.where(
-        samples.valid, density * (samples.ends - samples.starts), torch.zeros_like(density)
+        samples.valid, density * (samples.ends - samples.starts), constant((0.0,), density)
     )
     before = torch.cumsum(absorbed, dim=-1) - absorbed
     return torch.exp(-before) * -torch.expm1(-absorbed)
@@ -335,8 +335,9 @@ class _Composite(torch.autograd.Function):
         by_weight = by_weight + to_weights
         share = weights * by_weight
         behind = share.sum(-1, keepdim=True) - share.cumsum(-1)
-        passed = torch.exp(-torch.where(valid, density * length, 0).cumsum(-1))
-        to_density = torch.where(valid, length * (passed * by_weight - behind), 0)
+        nothing = constant((0.0,), density)
+        passed = torch.exp(-torch.where(valid, density * length, nothing).cumsum(-1))
+        to_density = torch.where(valid, length * (passed * by_weight - behind), nothing)
         return to_density, weights[..., None] * to_rgb, None, None, None
 
 
