@@ -247,10 +247,12 @@ class UntilSharp(Silent):
     def __init__(self, field: RadianceField, bounds: SceneBounds, views: Sequence[View]) -> None:
         self._field, self._bounds, self._views = field, bounds, views
         self.began, self.seconds, self.steps, self.reached = time.perf_counter(), 0.0, 0, 0.0
+        self.before = 0.0  # seconds before the first steps were done: kernels are compiled, and images sent
 
     def step(self, progress: TrainingStep) -> None:
         torch.cuda.synchronize()
         trained = self.seconds + time.perf_counter() - self.began
+        self.before = self.before or trained
         if trained < EVERY * (self._checks + 1):
             return
         self._checks += 1

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
@@ -43,7 +42,17 @@ def available(device: torch.device) -> bool:
 @lru_cache(maxsize=1)
 def kernels() -> Any:
     """Return the module of kernels, which imports Triton."""
-    return import_module("bidnerf_hashgrid.kernels")
+    from bidnerf_hashgrid import kernels as found
+
+    return found
+
+
+@lru_cache(maxsize=1)
+def marches() -> Any:
+    """Return the module of the sampler's kernels."""
+    from bidnerf_hashgrid import march as found
+
+    return found
 
 
 def _power_of_two(size: int) -> int:
@@ -210,12 +219,12 @@ def sampled(
     starts, ends = packed.new_empty(n, count), packed.new_empty(n, count)
     valid = torch.empty(n, count, dtype=torch.bool, device=packed.device)
     length = 2 * bounds.side  # a cube's diagonal, and contracted space, are not longer
-    kernels().march_kernel[(n,)](
+    marches().march_kernel[(n,)](
         packed, grid, offset, occupied.view(torch.uint8), middles, counts, n,
         STEPS=math.ceil(length / step) + 1, MOST=most, CONTRACTED=bounds.contracted, CHUNK=MARCHED,
     )  # fmt: skip
     steps = _power_of_two(most)
-    kernels().concentrate_kernel[(n,)](
+    marches().concentrate_kernel[(n,)](
         packed, grid, middles, counts, density, shift, starts, ends, valid.view(torch.uint8), n, LARGEST_THICKNESS, TAIL,
         COUNT=count, EVEN=even, MOST=most, S=steps, J=_power_of_two(count + 1), CONTRACTED=bounds.contracted,
         num_warps=max(4, steps // 32),

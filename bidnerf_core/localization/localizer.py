@@ -54,8 +54,8 @@ Start = SE3 | Float[Tensor, "4 4"] | np.ndarray | Sequence[Sequence[float]]
 """A pose T_world_camera: an ``SE3``, or any 4x4 matrix, by rows."""
 
 
-MOST_THREADS = 4
-"""Number of threads from which torch's operators become slower: they are short, and on 16 cores a query took twice as long."""
+HOST_THREADS = 4
+"""Largest number of threads on the host of a GPU, which has little to compute."""
 
 
 class Localizer:
@@ -191,7 +191,8 @@ class Localizer:
 
     def solved(self, problem: Problem, seed: int = 0) -> Localization:
         """Solve a ``problem`` created by this localizer."""
-        with threads_at_most(MOST_THREADS):
+        # On a CPU, operators are so short that sharing each of them among threads takes longer, and far longer on a busy machine.
+        with threads_at_most(1 if problem.device.type == "cpu" else HOST_THREADS):
             found = self._method.solve(problem, self.config, _checked_seed(seed))
         if not isinstance(found, Localization):
             raise InputError(

@@ -56,7 +56,9 @@ def _public(tree: ast.Module | ast.ClassDef) -> Iterator[Function]:
     for node in tree.body:
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
             yield from _public(node)
-        if isinstance(node, Function) and (node.name == "__init__" or not node.name.startswith("_")):
+        named = isinstance(node, Function) and (node.name == "__init__" or not node.name.startswith("_"))
+        # Triton takes the types of a kernel's parameters from what it is launched with.
+        if named and "jit" not in _names(ast.Module(list(map(ast.Expr, node.decorator_list)), [])):
             yield node
 
 
