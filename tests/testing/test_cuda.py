@@ -13,7 +13,7 @@ from torch import Tensor
 import baked
 import module_fields
 import tiny
-from bidnerf_core import Localizer, devices
+from bidnerf_core import Localization, Localizer, devices
 from bidnerf_core.backend import load_backend, quick_config
 from bidnerf_core.cli import main
 from bidnerf_core.devices import captured, constant
@@ -22,7 +22,7 @@ from bidnerf_core.fields import FieldValues, SceneBounds, device_of, levels, ren
 from bidnerf_core.localization import settings_of
 from bidnerf_core.maps import load_map
 from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
-from bidnerf_core.testing import rgbd_views
+from bidnerf_core.testing import rgbd_views, textured_map, unseen
 from bidnerf_core.training import Silent, TrainingState, TrainingStep, TrainingStopped
 from problems import FieldMap
 
@@ -112,6 +112,33 @@ def test_steps_of_a_field_that_reads_from_the_device_are_launched(captures: list
     assert torch.cuda.current_stream() == torch.cuda.default_stream()
     for found in (reading, again):
         torch.testing.assert_close(found, plain, rtol=0, atol=1e-4)
+
+
+def test_queries_have_the_answers_of_the_cpu_and_replay_graphs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Several at once as well as one by one."""
+    here, replayed = textured_map(surface=True), list[bool]()
+    scene = replace(here, field=module_fields.AsModule(here.field))
+    frames = [unseen().frame, unseen().frame.replace(depth=None)]
+
+    def noted(step: Any, *rest: Any, **more: Any) -> Any:
+        replay = captured(step, *rest, **more)
+        replayed.append(replay is not step)
+        return replay
+
+    monkeypatch.setattr("bidnerf_core.devices.captured", noted)
+    expected, there = [Localizer(scene)(frame) for frame in frames], Localizer(scene, device="cuda")
+    for _ in range(3):
+        found = [there(frame) for frame in frames]
+    assert replayed
+    assert all(replayed)
+    for number, answer in enumerate(there.many(4 * frames, workers=3)):
+        assert isinstance(answer, Localization)
+        for other in (found, expected):
+            same = other[number % 2]
+            assert answer.outcome is same.outcome
+            torch.testing.assert_close(
+                answer.T_world_camera.matrix(), same.T_world_camera.matrix(), rtol=0, atol=1e-3
+            )
 
 
 class LossRecorder(Silent):
