@@ -311,12 +311,18 @@ def test_views_with_and_without_alpha_and_depth_mix() -> None:
     assert bool((distance == 0).any())
 
 
-def test_every_pixel_is_as_likely_as_any_other() -> None:
-    bank = RayBank(random_views(3, False, False), BOUNDS)
-    batch = bank.draw(20000, torch.Generator().manual_seed(0))
-    _, counts = batch.observed.rgb.unique(dim=0, return_counts=True)
-    assert len(counts) == bank.count
-    expected = 20000 / bank.count
+@pytest.mark.parametrize("share", [0.0, 0.6])
+def test_every_visible_pixel_is_as_likely_as_any_other(share: float, generator: torch.Generator) -> None:
+    views = random_views(3, False, False)
+    hidden = [torch.rand(view.frame.rgb.shape[:2], generator=generator) < share for view in views]
+    views = [
+        replace(view, frame=view.frame.with_hidden(part)) for view, part in zip(views, hidden, strict=True)
+    ]
+    batch = RayBank(views, BOUNDS).draw(20000, torch.Generator().manual_seed(0))
+    colours, counts = batch.observed.rgb.unique(dim=0, return_counts=True)
+    visible = torch.cat([view.frame.rgb[~part] for view, part in zip(views, hidden, strict=True)])
+    assert torch.equal(colours, visible.unique(dim=0))
+    expected = 20000 / len(visible)
     assert bool(((counts - expected).abs() < 6 * expected**0.5).all())
 
 
