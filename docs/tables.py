@@ -482,19 +482,40 @@ def risk(records: Records) -> str:
 
 
 @table
-def steps(records: Records) -> str:
-    """A step of ``bid`` with 2048 rays on a GPU."""
-    names = {"blender_lego": "hashgrid"}
-    rows = []
-    for field, levels in records["gpu_steps"]["steps"].items():
+def gpu(records: Records) -> str:
+    """What a GPU takes."""
+    found, rows = records["gpu"], []
+    for scene, levels in found["steps"].items():
         for level, m in levels.items():
-            coarse = level == "level 0" and len(levels) > 1
+            coarse = "coarse level" if level == "level 0" and len(levels) > 1 else "full detail"
             rows.append(
-                (f"`{names.get(field, field)}`", "coarse" if coarse else "full detail", f"{m['launched_ms']:.1f} ms",
-                 f"{m['graph_ms']:.1f} ms", f"{m['kernels']:.0f}")
+                (f"step of `bid` with {found['rays']} rays, {coarse}", SCENES[scene], f"{m['graph_ms']:.2f} ms", f"{m['launched_ms']:.1f} ms one by one")
             )  # fmt: skip
-    head = ("backend", "level", "operations launched one by one", "replayed as a CUDA graph", "kernels")
-    return _table(head, rows, records)
+    for scene, sizes in found["search"].items():
+        for size, m in sizes.items():
+            rows.append((f"5 Gauss-Newton steps of {size}", SCENES[scene], f"{m['ms']:.1f} ms", ""))
+    for scene, modes in found["queries"].items():
+        for mode, m in modes.items():
+            same = f"right {m['right']} of {m['frames']}, on the CPU {m['right_on_cpu']}"
+            rows.append((f"query without a start, {mode}", SCENES[scene], f"{m['ms']:.0f} ms", same))
+            if "many_per_second" in m:
+                rows.append(
+                    (
+                        "queries with `Localizer.many`",
+                        SCENES[scene],
+                        f"{m['many_per_second']:.0f} a second",
+                        "",
+                    )
+                )
+    for scene, m in found["training"].items():
+        rest = f"{m['steps']} steps of {m['ms_a_step']:.1f} ms after {m['seconds_before_first_steps']:.0f} s"
+        rows.append((f"training to {m['psnr']:.1f} dB", SCENES[scene], f"{m['seconds']:.0f} s", rest))
+    for scene, m in found["kernel"].items():
+        rest = f"{m['share']:.0%} of what its reads allow"
+        rows.append(
+            (f"hash grid with derivatives, {m['points']} points", SCENES[scene], f"{m['ms']:.1f} ms", rest)
+        )
+    return _table(("what", "map", "time", ""), rows, records)
 
 
 # The paper's experiments
