@@ -23,6 +23,7 @@ from bidnerf_core.fields import (
     SceneBounds,
     device_of,
     query_packed,
+    query_samples,
     render_values,
     rendering_weights,
 )
@@ -144,19 +145,20 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
         level: CoarseField | HashGridField = field.levels[0] if is_coarse(step) else field
         batch = supervision.draw(rays[is_coarse(step)], generator)
         samples = level.sampler(batch.rays, generator)
-        if may_wait(device):
-            least = NEGLIGIBLE * config.prune_threshold * (step >= config.prune_from)
+        if may_wait(device) and step >= config.prune_from:
             active = config.coarse_levels if is_coarse(step) else None
+            least = NEGLIGIBLE * config.prune_threshold
             values, seen, density = _visible(field, active, batch.rays, samples, least)
-            weights = rendering_weights(density, samples)
-            rendering = render_values(values, seen, batch.background)
         else:
-            room = round(SPARE * config.samples_per_step)
-            values, seen = query_packed(level, batch.rays, samples, room)
-            lost.add_(samples.valid.sum() - seen.valid.sum())
-            rendering = render_values(values, seen, batch.background)
-            density, weights = values.density.detach(), rendering.weights.detach()
-        _update(level.occupancy, batch.rays, samples, weights, density, step, config)
+            if may_wait(device):
+                values, seen = query_samples(level, batch.rays, samples), samples
+            else:
+                room = round(SPARE * config.samples_per_step)
+                values, seen = query_packed(level, batch.rays, samples, room)
+                lost.add_(samples.valid.sum() - seen.valid.sum())
+            density = values.density.detach()
+        _update(level.occupancy, batch.rays, samples, density, step, config)
+        rendering = render_values(values, seen, batch.background)
         loss, mse = supervision.loss(rendering, batch)
         return StepOutcome(loss, mse, level.occupancy.samples_per_ray)
 
@@ -166,13 +168,16 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
 
 @torch.no_grad()
 def _update(
-    grid: OccupancyGrid, rays: Rays, samples: RaySamples, weights: Float[Tensor, "r s"], density: Float[Tensor, "r s"],
-    step: int, config: HashGridConfig,
+    grid: OccupancyGrid, rays: Rays, samples: RaySamples, density: Float[Tensor, "r s"], step: int, config: HashGridConfig
 ) -> None:  # fmt: skip
-    """Update the occupancy grid with the rendering weights and densities of one step's samples."""
+    """Update the occupancy grid with the densities of one step's samples, and their rendering weights."""
     # Weights as if samples were one grid step long: concentrated samples are longer or shorter.
     place = grid.bounds.spacing(rays).place
-    weights = weights * grid.step / (place(samples.ends) - place(samples.starts)).clamp(min=1e-9)
+    weights = (
+        rendering_weights(density, samples)
+        * grid.step
+        / (place(samples.ends) - place(samples.starts)).clamp(min=1e-9)
+    )
     middles, valid = samples.middles.reshape(-1), samples.valid.reshape(-1)
     index = torch.arange(valid.numel(), device=valid.device)
     counted: Tensor | None = valid
