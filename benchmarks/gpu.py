@@ -62,7 +62,7 @@ from bidnerf_core.localization import (
 from bidnerf_core.mapping import descend
 from bidnerf_core.training import Silent, TrainingStep, TrainingStopped
 
-TIMED_RAYS, WARM_UP, TIMED, PROFILED = 2048, 30, 200, 20
+TIMED_RAYS, WARM_UP, TIMED, PROFILED = 2048, 30, 200, 5
 POINTS, SIDE = 2**19, 4096
 """Points at which the field is timed, and the side of the matrices whose product shows what the device can do."""
 SEARCH_STEPS = 5
