@@ -10,6 +10,7 @@ from pathlib import Path
 from torch import nn
 
 from bidnerf_core.fields import RadianceField
+from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.maps.description import MapInfo, load_info
 from bidnerf_core.maps.store import write_parts
 from bidnerf_core.progress import Progress, current_job
@@ -22,8 +23,8 @@ class Checkpoints:
     """The ``Report`` of a training run. States are saved to ``folder``, unless that is None; ``info``
     describes the last one.
 
-    Progress goes to the current job, which may also stop the training. ``state`` is the one to resume from, and ``seconds`` the
-    time between checkpoints.
+    Progress goes to the current job, which may also stop the training. ``state`` is the one to resume from, ``seconds`` the
+    time between checkpoints, and ``landmarks`` are stored with the first if they are not in the folder yet.
     """
 
     def __init__(
@@ -32,10 +33,12 @@ class Checkpoints:
         folder: Path | None = None,
         state: TrainingState | None = None,
         seconds: float = CHECKPOINT_SECONDS,
+        landmarks: LandmarkMap | None = None,
     ) -> None:
         self.info, self.folder = info, folder
         self._state, self._seconds, self._job = state, seconds, current_job()
         self._step = self._total = info.step
+        self._landmarks = landmarks
         self._earlier, self._began = info.seconds, time.monotonic()
         self._saved = self._began
 
@@ -65,7 +68,8 @@ class Checkpoints:
         if self.folder is not None:
             if info.weights:  # the first save may replace another map, whose anchor does not count
                 info = replace(info, anchor=load_info(self.folder).anchor)
-            info = write_parts(self.folder, info, state, keep=True)
+            info = write_parts(self.folder, info, state, landmarks=self._landmarks, keep=True)
+            self._landmarks = None
         self.info = info
         self._saved = time.monotonic()
 

@@ -28,10 +28,10 @@ from bidnerf_core.frames import View
 from bidnerf_core.io import from_plain, packed, to_plain
 from bidnerf_core.mapping import BakeConfig, TrackedViews
 from bidnerf_core.maps.checkpoints import Checkpoints
-from bidnerf_core.maps.description import MapInfo, load_info, longest_side
+from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info, longest_side
 from bidnerf_core.maps.map import USUAL_BAKE, Map, build_field, frozen_field, load_map
 from bidnerf_core.maps.options import TrainOptions
-from bidnerf_core.maps.store import load_state, map_folder, write_parts
+from bidnerf_core.maps.store import load_landmarks, load_state, map_folder, write_parts
 from bidnerf_core.maps.views import Images, ReadViews, chosen_origin, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, counter, duration_text, job_context
 from bidnerf_core.registry import PluginError
@@ -154,10 +154,12 @@ def train(
         )
         built = build_field(chosen, info, str(place or read.place))
         scene, tracked = Map(info, NoField()), taken.tracked
-        if place is not None:
-            scene = replace(scene, info=write_parts(place, info, TrainingState(0, {}, {})), folder=place)
         if baking is not None:
+            # A map that is already there stays until the first checkpoint.
+            if place is not None and not (place / DESCRIPTION).exists():
+                scene = replace(scene, info=write_parts(place, info, TrainingState(0, {}, {})), folder=place)
             scene, tracked = scene.with_landmarks(taken.views, tracked=tracked)
+        scene = replace(scene, folder=place)
         return _baked(_trained(chosen, built, taken.views, scene, options), taken.views, tracked, baking)
 
 
@@ -251,13 +253,13 @@ def resume(
             tracked, views = located(
                 views, features=info.landmark_features, trust_poses=True, depth_unit=read.depth_unit
             )  # the same as when training began
-        scene = load_map(out, device)
-        if finish and not info.complete:
-            log.info(f"{out}: ends with the {amount(info.step, 'step')} done so far")
-            scene = scene.completed()
-        if scene.landmarks is None and baking is not None:
-            scene, tracked = scene.with_landmarks(views, tracked=tracked)
-        if scene.info.complete:
+        if info.complete or finish:
+            scene = load_map(out, device)
+            if not info.complete:
+                log.info(f"{out}: ends with the {amount(info.step, 'step')} done so far")
+                scene = scene.completed()
+            if scene.landmarks is None and baking is not None:
+                scene, tracked = scene.with_landmarks(views, tracked=tracked)
             return _baked(scene, views, tracked, baking) if scene.has_field else scene
         backend = load_backend(info.backend, str(out))
         built = build_field(backend, info, str(out))
@@ -265,6 +267,9 @@ def resume(
         if info.step:
             state = load_state(out, info, built[0])
             log.info(f"{out}: resuming from step {info.step}")
+        scene = Map(info, NoField(), None, load_landmarks(out, info), out)
+        if scene.landmarks is None and baking is not None:
+            scene, tracked = scene.with_landmarks(views, tracked=tracked)
         return _baked(_trained(backend, built, views, scene, options, state), views, tracked, baking)
 
 
@@ -365,7 +370,8 @@ def _trained(
 ) -> Map:  # fmt: skip
     """Train the field of a map, ``built`` with its config, from a ``state``, or from the beginning, to the end."""
     out, device = scene.folder, working_device(options.device)
-    report = Checkpoints(scene.info, out, state, options.checkpoint_seconds)
+    unsaved = scene.landmarks if scene.info.landmarks is None else None
+    report = Checkpoints(scene.info, out, state, options.checkpoint_seconds, unsaved)
     del state  # the report frees it once training resumes from it
     config, where = built[1], str(out or scene.info.data or "map in memory")
     field = moved(built[0], device)
