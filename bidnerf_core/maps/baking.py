@@ -38,6 +38,8 @@ from bidnerf_core.progress import counter
 
 log = logging.getLogger("bidnerf")
 
+NO_CAMERAS = "holds no cameras to render from; give a dataset of its views with --data"
+
 
 UNLIKE, UNLIKE_ITS_OWN, UNLIKE_ANY = 0.2, 2.0, 0.3
 """Smallest difference (RMS) between rendered and photographed colours that indicates another scene: absolute;
@@ -58,9 +60,7 @@ def bake_surface(
     began = time.monotonic()
     cameras = cameras_of(info) or [(view.frame.intrinsics, view.T_ref_camera) for view in views]
     if not cameras:
-        raise InputError(
-            "holds no cameras to render from; give a dataset of its views with --data", where=where
-        )
+        raise InputError(NO_CAMERAS, where=where)
     measured = [view for view in views if view.frame.has_depth]
     if any(view.frame.has_dense_depth for view in measured):
         cameras = []
@@ -92,6 +92,8 @@ def bake_landmarks(
     began = time.monotonic()
     source: LandmarkSource = "photos" if views else "rendered images"
     images = views or rendered_views(field, info.bounds, cameras_of(info))
+    if not images:
+        raise InputError(NO_CAMERAS, where=where)
     if tracked is None:
         tracked = tracked_views(images, info.landmark_features)
     if views and not info.distances:

@@ -37,7 +37,7 @@ class StructureSettings(Settings):
 class StructureImporter:
     """Reads COLMAP projects, with a database of SIFT keypoints, with hloc's features, or with photos."""
 
-    summary = "COLMAP models (cameras, images, points3D) with their database or photos: landmarks, to which 'train' adds a field"
+    summary = "COLMAP models with their database or photos, as landmarks ('train' adds a field)"
     config_type = StructureSettings
     reader = ColmapReader()
 
