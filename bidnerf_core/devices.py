@@ -93,8 +93,6 @@ def may_wait(device: torch.device) -> bool:
 
 MOST_GRAPHS = 128
 """Number of functions with different shapes whose graphs a thread can use, the least recently used being discarded."""
-ATTEMPTS = 2
-"""Number of attempts at a capture: what a library loads only then makes the first one fail, but not the second."""
 _capturing = Lock()
 """Allows one capture at a time: a capture begins by waiting for the device, which is forbidden during another."""
 _ALIGNMENT = 16
@@ -123,31 +121,27 @@ def captured(
     """
     if device.type != "cuda":
         return step
-    why, constants = "", list[Tensor]()
-    for _ in range(ATTEMPTS):
-        graph, before = torch.cuda.CUDAGraph(), None if generator is None else generator.clone_state()
-        if generator is not None:
-            graph.register_generator_state(generator)
-        # If a capture fails, torch leaves the thread on the capture's stream; the outer context restores it.
-        with _capturing, torch.cuda.device(device), torch.cuda.stream(torch.cuda.current_stream(device)):
-            try:
-                # Each device has its own stream. Other threads may continue to launch.
-                pool, stream = memory or (None, torch.cuda.Stream(device))
-                with (
-                    noted() as constants,
-                    torch.cuda.graph(graph, pool, stream, capture_error_mode="thread_local"),
-                ):
-                    step()
-                break
-            except RuntimeError as error:  # it waits for the device somewhere, as a third party's field may
-                if generator is not None and before is not None:
-                    generator.graphsafe_set_state(before)  # the registered one still expects a capture
-                why, memory = str(error).partition("\n")[0], None
-    else:
-        warnings.warn(
-            f"operations are launched one by one, since a step cannot be captured: {why}", stacklevel=2
-        )
-        return step
+    graph, before = torch.cuda.CUDAGraph(), None if generator is None else generator.clone_state()
+    if generator is not None:
+        graph.register_generator_state(generator)
+    # If a capture fails, torch leaves the thread on the capture's stream; the outer context restores it.
+    with _capturing, torch.cuda.device(device), torch.cuda.stream(torch.cuda.current_stream(device)):
+        try:
+            # Each device has its own stream. Other threads may continue to launch.
+            pool, stream = memory or (None, torch.cuda.Stream(device))
+            with (
+                noted() as constants,
+                torch.cuda.graph(graph, pool, stream, capture_error_mode="thread_local"),
+            ):
+                step()
+        except RuntimeError as error:  # it waits for the device somewhere, as a third party's field may
+            if generator is not None and before is not None:
+                generator.graphsafe_set_state(before)  # the registered one still expects a capture
+            why = str(error).partition("\n")[0]
+            warnings.warn(
+                f"operations are launched one by one, since a step cannot be captured: {why}", stacklevel=2
+            )
+            return step
 
     def replay(read: list[Tensor] = constants) -> None:  # keeps alive what the graph reads
         graph.replay()
@@ -232,10 +226,10 @@ class _Remote:
         for source, tensor in zip(self._sources, tensors, strict=True):
             source.copy_(tensor)
         self._received.copy_(self._sent, non_blocking=True)
-        if self._calls == 1:  # the first call, of a rare shape perhaps, loads kernels and fills caches
-            self._step = captured(self._step, self._lane.device, memory=self._lane.memory)
-        self._calls += 1
         with without_waiting():
+            if self._calls == 1:  # the first call, of a rare shape perhaps, loads kernels and fills caches
+                self._step = captured(self._step, self._lane.device, memory=self._lane.memory)
+            self._calls += 1
             self._step()
         bytes_of = self._bytes.cpu().split([part.nbytes for part in self._parts])
         shapes = zip(bytes_of, self._parts, strict=True)

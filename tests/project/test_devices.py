@@ -16,7 +16,7 @@ import module_fields
 import tiny
 from bidnerf_core import Localizer, Map
 from bidnerf_core.backend import load_backend
-from bidnerf_core.devices import Resident, moved, run_on
+from bidnerf_core.devices import Resident, may_wait, moved, run_on
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.mapping import LandmarkMap
@@ -160,6 +160,24 @@ def test_functions_run_elsewhere_with_one_copy_there_and_one_back() -> None:
         assert torch.equal(ours[0], theirs[0])
         assert all(map(torch.equal, ours[1].given, theirs[1].given))
         assert (ours[1].module, ours[2]) == (given.module, True)
+
+
+def test_neither_a_capture_nor_a_call_may_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is computed often depends on it: a capture must see what is then replayed."""
+    waits = []
+
+    def noted(step: Any, *rest: Any, **more: Any) -> Any:
+        step()
+        return step
+
+    def doubled(values: Tensor) -> Tensor:
+        waits.append(may_wait(values.device))
+        return 2 * values
+
+    monkeypatch.setattr("bidnerf_core.devices.captured", noted)
+    with Elsewhere():
+        assert [float(run_on(DEVICE, doubled, torch.tensor(k))) for k in (1.0, 2.0, 3.0)] == [2, 4, 6]
+    assert waits == [False] * 4  # one of them in the capture
 
 
 @pytest.mark.parametrize(
