@@ -494,7 +494,7 @@ def gpu(records: Records) -> str:
     for scene, sizes in found["search"].items():
         for size, m in sizes.items():
             rows.append((f"5 Gauss-Newton steps of {size}", SCENES[scene], f"{m['ms']:.1f} ms", ""))
-    for scene, modes in found["queries"].items():
+    for scene, modes in found.get("queries", {}).items():
         for mode, m in modes.items():
             same = f"right {m['right']} of {m['frames']}, on the CPU {m['right_on_cpu']}"
             rows.append((f"query without a start, {mode}", SCENES[scene], f"{m['ms']:.0f} ms", same))
