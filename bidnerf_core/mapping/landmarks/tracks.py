@@ -123,7 +123,10 @@ def matches_of_points(
             continue
         local = image.T_ref_camera.inverse().apply(positions[points])
         pixels = image.intrinsics.project(local).nan_to_num(torch.inf)
-        distance = torch.cdist(pixels.float(), image.keypoints.pixels)
+        # Exact differences: products would round by about a pixel, and give NaN for points behind the camera.
+        distance = torch.cdist(
+            pixels.float(), image.keypoints.pixels, compute_mode="donot_use_mm_for_euclid_dist"
+        )
         best, partner = distance.min(dim=1)
         mutual = distance.argmin(dim=0)[partner] == torch.arange(len(points))
         kept = (mutual & (best <= EPIPOLAR_BAND)).nonzero()[:, 0]
