@@ -181,10 +181,10 @@ def _with_field(
         info.origin
     )
     own = {camera.name: camera for camera in info.cameras}
-    strangers = [view.frame.name for view in read.views if view.frame.name not in own]
-    if strangers:
+    unknown = [view.frame.name for view in read.views if view.frame.name not in own]
+    if unknown:
         raise InputError(
-            f"image {strangers[0]!r} is none of those of {scene.name}",
+            f"image {unknown[0]!r} is none of those of {scene.name}",
             where=read.place,
             expected="images of that map",
         )
@@ -249,7 +249,7 @@ def resume(
         _check_same_views(out, info, read, images.split)
         views = at_stored_poses(read.views, info.cameras)
         tracked = None
-        if not info.complete or info.landmarks is None:
+        if not info.complete or info.landmarks is None or info.capture is None:
             tracked, views = located(
                 views, features=info.landmark_features, trust_poses=True, depth_unit=read.depth_unit
             )  # the same as when training began
