@@ -127,8 +127,8 @@ def captured(
     # If a capture fails, torch leaves the thread on the capture's stream; the outer context restores it.
     with _capturing, torch.cuda.device(device), torch.cuda.stream(torch.cuda.current_stream(device)):
         try:
-            # Each device has its own stream. Other threads may continue to launch.
-            pool, stream = memory or (None, torch.cuda.Stream(device))
+            # Other threads may continue to launch.
+            pool, stream = memory or graph_memory(device)
             with (
                 noted() as constants,
                 torch.cuda.graph(graph, pool, stream, capture_error_mode="thread_local"),
@@ -147,6 +147,20 @@ def captured(
         graph.replay()
 
     return replay
+
+
+def graph_memory(device: torch.device) -> tuple[Any, torch.cuda.Stream]:
+    """Return a pool for the temporary memory of graphs, and the stream of their captures."""
+    # Torch hands out the same 32 streams of a priority in turn. Those of captures have another priority than usual
+    # ones, since what another thread launches on a stream would become part of the graph that is captured there.
+    return torch.cuda.graph_pool_handle(), torch.cuda.Stream(device, priority=-1)
+
+
+def wait_for(device: torch.device) -> None:
+    """Wait until a GPU has finished all queued work, on any stream; does nothing for a CPU."""
+    if device.type == "cuda":
+        with _capturing:
+            torch.cuda.synchronize(device)
 
 
 def run_on(device: torch.device, function: Callable[..., T], *values: Any) -> T:
@@ -186,9 +200,7 @@ class _Lane:
 
     def __init__(self, device: torch.device) -> None:
         self.device, self.remotes = device, OrderedDict[Hashable, _Remote]()
-        self.memory = (
-            (torch.cuda.graph_pool_handle(), torch.cuda.Stream(device)) if device.type == "cuda" else None
-        )
+        self.memory = graph_memory(device) if device.type == "cuda" else None
 
 
 class _Remote:
@@ -212,8 +224,11 @@ class _Remote:
             self._arguments.append(argument)
             first += size
 
+        # The shape of the values without their tensors, which would be kept alive.
+        template = _rebuilt(values, (torch.empty(0) for _ in tensors))
+
         def step() -> None:
-            self._result = function(*_rebuilt(values, iter(self._arguments)))
+            self._result = function(*_rebuilt(template, iter(self._arguments)))
             parts: list[Tensor] = []
             _structure(self._result, parts)
             self._parts = parts

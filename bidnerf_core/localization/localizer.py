@@ -19,7 +19,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.depth import DepthSensorModel, find_depth_sensor
-from bidnerf_core.devices import constant, set_threads_here, threads_at_most
+from bidnerf_core.devices import constant, set_threads_here, threads_at_most, wait_for
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import Observations, device_of, has_field, render
 from bidnerf_core.frames import Frame, View
@@ -158,7 +158,9 @@ class Localizer:
                     return error
 
         if device.type == "cuda":
-            torch.cuda.synchronize(device)  # streams do not wait for what was queued on another
+            # Streams do not wait for what was queued on another, such as what a first use of the field prepares.
+            self._warm_up()
+            wait_for(device)
         with ThreadPoolExecutor(workers, "bidnerf-localizer", begin) as pool:
             try:
                 for query in queries:

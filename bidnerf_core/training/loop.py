@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 from torch.autograd.graph import increment_version
 
-from bidnerf_core.devices import captured, without_waiting
+from bidnerf_core.devices import captured, graph_memory, without_waiting
 from bidnerf_core.errors import InputError
 from bidnerf_core.training.report import Report, TrainingState, TrainingStep, TrainingStopped
 
@@ -97,7 +97,7 @@ def fit(
         group.update(lr=torch.full((), group["lr"], device=device), capturable=True)
     log, row = torch.zeros((every, 3), device=device), torch.zeros(1, dtype=torch.long, device=device)
     first = reported = _restore(report.resume(), field, optimizer, generator, beside)
-    memory = (torch.cuda.graph_pool_handle(), torch.cuda.Stream(device)) if device.type == "cuda" else None
+    memory = graph_memory(device) if device.type == "cuda" else None
     graphs, seen = dict[Hashable, Callable[[], None]](), Counter[Hashable]()
 
     def take(step: int) -> None:
