@@ -1,4 +1,7 @@
-"""The encoding, the whole field and its sampler in one kernel each, where torch brings Triton and the field is on a GPU."""
+"""The encoding, the whole field and its sampler in one kernel each, where torch brings Triton and the field is on a GPU.
+
+Triton launches on the current device, which may be another than that of the field.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ from bidnerf_hashgrid.levels import Level
 MOST = 96
 """Maximum number of samples per ray if the host must not wait to count them; the nearest ones in occupied cells are kept."""
 WIDEST = 128
-"""Units of a hidden layer up to which a field's tiles fit into the registers of a GPU."""
+"""Features of the encoding, and units of a layer, up to which a field's tiles fit into the registers of a GPU."""
 POINTS, VALUE_POINTS, FIELD_POINTS, MARCHED = 64, 128, 64, 128
 """Points of a tile of the encoding, of the field's values, and with derivatives; and steps of a ray that are looked up at once."""
 PRECISION = "tf32"
@@ -84,10 +87,11 @@ class Encode(torch.autograd.Function):
         width = total * features
         values = points.new_empty(n, width)
         slopes = points.new_empty((3, n, width) if want_slopes else (0,))
-        kernels().encode_kernel[_blocks(n, POINTS)](
-            points, values, slopes, *_launched(levels, tables), n, width,
-            LEVELS=len(levels), F=features, C=_power_of_two(width), SMOOTH=smooth, SLOPES=want_slopes, BLOCK=POINTS,
-        )  # fmt: skip
+        with torch.cuda.device_of(points):
+            kernels().encode_kernel[_blocks(n, POINTS)](
+                points, values, slopes, *_launched(levels, tables), n, width,
+                LEVELS=len(levels), F=features, C=_power_of_two(width), SMOOTH=smooth, SLOPES=want_slopes, BLOCK=POINTS,
+            )  # fmt: skip
         ctx.save_for_backward(points, slopes)
         ctx.levels, ctx.smooth, ctx.features = levels, smooth, features
         return values
@@ -103,10 +107,11 @@ class Encode(torch.autograd.Function):
         flat = points.new_zeros(sum(level.entries for level in levels), ctx.features)
         parts = flat.split([level.entries for level in levels])
         n, width = gradient.shape
-        kernels().scatter_kernel[_blocks(n, POINTS)](
-            points, gradient.contiguous(), *_launched(levels, parts), n, width,
-            LEVELS=len(levels), F=ctx.features, C=_power_of_two(width), SMOOTH=ctx.smooth, BLOCK=POINTS,
-        )  # fmt: skip
+        with torch.cuda.device_of(points):
+            kernels().scatter_kernel[_blocks(n, POINTS)](
+                points, gradient.contiguous(), *_launched(levels, parts), n, width,
+                LEVELS=len(levels), F=ctx.features, C=_power_of_two(width), SMOOTH=ctx.smooth, BLOCK=POINTS,
+            )  # fmt: skip
         found = [part if wanted else None for part, wanted in zip(parts, needed, strict=True)]
         return to_points, None, None, None, None, *found
 
@@ -135,7 +140,7 @@ class PackedNetworks:
             part for part in (*geometry, *colour) if isinstance(part, nn.Linear)
         )
         width, features = _power_of_two(first.out_features), _power_of_two(out_of.out_features)
-        if into is last or len(between) > 1 or max(width, features) > WIDEST:
+        if into is last or len(between) > 1 or max(width, features, first.in_features) > WIDEST:
             return None
         passed = out_of.out_features - 1
         of_features = pad(into.weight[:, :passed].t(), (0, 0, 1, 0))  # none of the log density
@@ -178,6 +183,8 @@ def query(
     bounds, largest = limits
     new = positions.new_empty if wanted is None else positions.new_zeros
     values, by_both = new((n, 4)), new((n, 4, 6) if derivatives else (0,))
+    if not n:
+        return values, by_both
     box = constant((*bounds.centre, 2 / bounds.side, 1 / bounds.side), values)
     inputs = len(levels) * features
     index = count = torch.empty(0, dtype=torch.long, device=values.device)
@@ -186,13 +193,14 @@ def query(
         index, count = place.new_empty(n + 1), place[-1:]
         index.scatter_(0, torch.where(wanted, place - 1, n), torch.arange(n, device=place.device))
     block = FIELD_POINTS if derivatives else VALUE_POINTS
-    kernels().field_kernel[_blocks(n, block)](
-        positions.contiguous(), directions.contiguous(), values, by_both, index, count, *_launched(levels, tables),
-        packed.weights(inputs), packed.biases, box, n,
-        LEVELS=len(levels), F=features, C=_power_of_two(inputs), WIDTH=packed.width, FEATURES=packed.features,
-        HIDDEN=packed.hidden, SMOOTH=smooth, CONTRACTED=bounds.contracted, LIMIT=largest, DERIVATIVES=derivatives,
-        SOME=wanted is not None, BLOCK=block, PRECISION=PRECISION,
-    )  # fmt: skip
+    with torch.cuda.device_of(values):
+        kernels().field_kernel[_blocks(n, block)](
+            positions.contiguous(), directions.contiguous(), values, by_both, index, count, *_launched(levels, tables),
+            packed.weights(inputs), packed.biases, box, n,
+            LEVELS=len(levels), F=features, C=_power_of_two(inputs), WIDTH=packed.width, FEATURES=packed.features,
+            HIDDEN=packed.hidden, SMOOTH=smooth, CONTRACTED=bounds.contracted, LIMIT=largest, DERIVATIVES=derivatives,
+            SOME=wanted is not None, BLOCK=block, PRECISION=PRECISION,
+        )  # fmt: skip
     return values, by_both
 
 
@@ -219,14 +227,15 @@ def sampled(
     starts, ends = packed.new_empty(n, count), packed.new_empty(n, count)
     valid = torch.empty(n, count, dtype=torch.bool, device=packed.device)
     length = 2 * bounds.side  # a cube's diagonal, and contracted space, are not longer
-    marches().march_kernel[(n,)](
-        packed, grid, offset, occupied.view(torch.uint8), middles, counts, n,
-        STEPS=math.ceil(length / step) + 1, MOST=most, CONTRACTED=bounds.contracted, CHUNK=MARCHED,
-    )  # fmt: skip
     steps = _power_of_two(most)
-    marches().concentrate_kernel[(n,)](
-        packed, grid, middles, counts, density, shift, starts, ends, valid.view(torch.uint8), n, LARGEST_THICKNESS, TAIL,
-        COUNT=count, EVEN=even, MOST=most, S=steps, J=_power_of_two(count + 1), CONTRACTED=bounds.contracted,
-        num_warps=max(4, steps // 32),
-    )  # fmt: skip
+    with torch.cuda.device_of(packed):
+        marches().march_kernel[(n,)](
+            packed, grid, offset, occupied.view(torch.uint8), middles, counts, n,
+            STEPS=math.ceil(length / step) + 1, MOST=most, CONTRACTED=bounds.contracted, CHUNK=MARCHED,
+        )  # fmt: skip
+        marches().concentrate_kernel[(n,)](
+            packed, grid, middles, counts, density, shift, starts, ends, valid.view(torch.uint8), n, LARGEST_THICKNESS, TAIL,
+            COUNT=count, EVEN=even, MOST=most, S=steps, J=_power_of_two(count + 1), CONTRACTED=bounds.contracted,
+            num_warps=max(4, steps // 32),
+        )  # fmt: skip
     return RaySamples(starts, ends, valid)

@@ -281,7 +281,7 @@ class ConcentratedInGrid(Concentrated):
     guide: GridDensity
 
     def _of_known_shape(self, rays: Rays, jitter: Generator | None) -> RaySamples:
-        if fused.available(rays.near.device):
+        if fused.available(rays.near.device) and self.count <= MOST:
             return self.guide.grid.of_known_shape(rays, self.count, jitter)
         return super()._of_known_shape(rays, jitter)
 
