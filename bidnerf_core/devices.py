@@ -244,8 +244,8 @@ class _Remote:
         with without_waiting():
             if self._calls == 1:  # the first call, of a rare shape perhaps, loads kernels and fills caches
                 self._step = captured(self._step, self._lane.device, memory=self._lane.memory)
-            self._calls += 1
             self._step()
+        self._calls += 1
         bytes_of = self._bytes.cpu().split([part.nbytes for part in self._parts])
         shapes = zip(bytes_of, self._parts, strict=True)
         return _rebuilt(self._result, (b.clone().view(part.dtype).view(part.shape) for b, part in shapes))

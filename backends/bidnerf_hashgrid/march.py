@@ -187,7 +187,9 @@ def concentrate_kernel(
 
         # Borders by weight, where the share passes their levels, then by length.
         by_weight: tl.constexpr = COUNT + 1 - EVEN
-        level = tl.where(j < by_weight, j / (by_weight - 1.0), (j - by_weight) / (EVEN - 1.0))
+        level = tl.where(
+            j < by_weight, j / (by_weight - 1.0 + (by_weight == 1)), (j - by_weight) / (EVEN - 1.0)
+        )
         level += tl.load(shift + ray * (COUNT + 1) + j, mask=j <= COUNT, other=0.0)
         dense = (tail + (1 - 2 * tail) * level)[None, :]
         below = share[:, None] <= dense

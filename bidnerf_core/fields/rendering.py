@@ -187,7 +187,7 @@ def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> Fiel
     valid = samples.valid
     waiting = may_wait(valid.device)
     if not waiting or bool(valid.all()):
-        positions = rays.at(samples.middles)
+        positions = torch.where(valid[..., None], rays.at(samples.middles), 0)
         directions = rays.directions[..., None, :].expand_as(positions)
         moving = torch.is_grad_enabled() and (rays.origins.requires_grad or rays.directions.requires_grad)
         if moving and not waiting and isinstance(field, DifferentiatedField) and is_frozen(field):
@@ -196,7 +196,7 @@ def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> Fiel
             )
             density, rgb = found.view(*valid.shape, 4).split((1, 3), -1)
             return FieldValues(density[..., 0], rgb)
-        found = field.query(torch.where(valid[..., None], positions, 0), directions)
+        found = field.query(positions, directions)
         return FieldValues(torch.where(valid, found.density, 0), found.rgb)
     index = valid.reshape(-1).nonzero()[:, 0]
     ray = index // valid.shape[-1]

@@ -47,7 +47,8 @@ SUPPORT_BOUNDS = (
     Bound("new_inliers", 0.93, True, Outcome.RENDERING_MISMATCH, "{0:.0%} of newly drawn rays agree with the measurements, expected {1:.0%}"),
     Bound("confidence", 0.8, True, Outcome.UNDETERMINED, "{2} fits about as well"),
     Bound("explained", 0.5, True, Outcome.RENDERING_MISMATCH, "the pose explains only {0:.0%} of the contrast of the image"),
-    Bound("further_step", 0.01, False, Outcome.NOT_SETTLED, "newly drawn rays give a further step of {0:.3g}, expected {1:g} at most"),
+    # Right poses before a wall of weak texture, from twelve places, have steps of up to 0.018: the noise of the rays.
+    Bound("further_step", 0.02, False, Outcome.NOT_SETTLED, "newly drawn rays give a further step of {0:.3g}, expected {1:g} at most"),
     # A wrong pose can be the best one far around, so that rivals nearby are no better, but its colours differ more. On test images of
     # Lego and the room, the ratio was 0.8 to 1.4 at right poses, and 2.1 and more at wrong ones.
     Bound("colour_ratio", 1.8, False, Outcome.RENDERING_MISMATCH, "the colours differ {0:.1f} times as much as in the map's own images"),
