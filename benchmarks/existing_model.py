@@ -30,7 +30,7 @@ from bidnerf_core.geometry import Similarity, fit_similarity
 from bidnerf_core.results import Answer, Answers
 
 SIDE, IMAGES, POINTS, TRACK = 40.0, 320, 210_000, 6
-"""Of the large project: side of its square floor, number of images and of points, and images that observe a point."""
+"""The size of the large project: side of its square floor, number of images and of points, and images that observe a point."""
 
 
 def make_model(data: Any, project: Path) -> None:

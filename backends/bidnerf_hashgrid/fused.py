@@ -29,7 +29,7 @@ WIDEST = 128
 POINTS, VALUE_POINTS, FIELD_POINTS, MARCHED = 64, 128, 64, 128
 """Points of a tile of the encoding, of the field's values, and with derivatives; and steps of a ray that are looked up at once."""
 PRECISION = "tf32"
-"""Of the derivatives' products; those of the values are as exact as single precision."""
+"""The precision of the derivatives' products; those of the values are as exact as single precision."""
 
 
 @lru_cache(maxsize=1)

@@ -481,7 +481,7 @@ def test_a_report_links_to_the_frames_from_the_worst_to_the_best(tmp_path: Path)
 
 
 def test_the_worst_frames_are_shown_as_the_method_received_them(tmp_path: Path) -> None:
-    """With their faults; results name a dataset, of which the reader may have a copy anywhere."""
+    """They are shown with their faults; results name a dataset, of which the reader may have a copy anywhere."""
     views = tiny.views(2)
     write_transforms(tmp_path / "photos", {"train": views, "test": views}, tiny.BACKGROUND)
     names = [view.frame.name for view in views]

@@ -140,7 +140,7 @@ def test_images_of_a_dataset_keep_the_names_of_their_files(tmp_path: Path) -> No
 
 
 def test_landmarks_without_tracks_are_points_alone(scene: Map, tmp_path: Path) -> None:
-    """As in maps that earlier versions stored, and in those whose landmarks come from rendered images."""
+    """There are none in maps that earlier versions stored, and in those whose landmarks come from rendered images."""
     pycolmap = pytest.importorskip("pycolmap")
     assert scene.landmarks is not None
     bn.export_map(replace(scene, landmarks=replace(scene.landmarks, tracks=None)), tmp_path / "out", "colmap")

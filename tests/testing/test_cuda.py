@@ -209,7 +209,7 @@ def test_training_on_a_gpu_replays_its_steps_and_learns_what_it_learns_on_a_cpu(
 
 
 def test_a_training_goes_on_on_another_device() -> None:
-    """With other random numbers, as those of a CPU are not those of a GPU."""
+    """Its random numbers are others, as those of a CPU are not those of a GPU."""
     backend = load_backend("hashgrid")
     config, views = replace(quick_config(backend), steps=48), rgbd_views()
     half, losses = Interrupted(stop=24), []
