@@ -242,8 +242,14 @@ class _Remote:
             source.copy_(tensor)
         self._received.copy_(self._sent, non_blocking=True)
         with without_waiting():
-            if self._calls == 1:  # the first call, of a rare shape perhaps, loads kernels and fills caches
-                self._step = captured(self._step, self._lane.device, memory=self._lane.memory)
+            if self._calls == 1:  # the first call, of a rare shape perhaps, fills caches
+                # What a thread uses first, such as its handles of linear algebra, is not created during a capture, and
+                # another thread may have made the first call.
+                launched = self._step
+                launched()
+                self._step = captured(launched, self._lane.device, memory=self._lane.memory)
+                if self._step is launched and self._lane.memory:  # a failed capture leaves its pool unusable
+                    self._lane.memory = graph_memory(self._lane.device)
             self._step()
         self._calls += 1
         bytes_of = self._bytes.cpu().split([part.nbytes for part in self._parts])
