@@ -1,76 +1,276 @@
-"""Intersections of rays and points with the pieces of a scene (Gaussians, triangles, discs), found with a tree of boxes.
+"""Fields that consist of pieces (Gaussians, triangles, discs): what rays hit, the density that has the same opacity, and a sampler.
 
-Pieces are sorted along a Morton curve, eight neighbours share a box, eight of these boxes share the next, and
-so on (Lauterbach et al. 2009, with eight children). The tree has no pointers: child ``c`` of node ``n`` is ``8 n + c`` on the
-level below. The boxes of a node's children are stored side by side, as (6 nodes 8): lower corner, upper corner.
+Pieces are found with a tree of boxes. They are sorted along a Morton curve, eight neighbours share a box, eight of these boxes share the
+next, and so on (Lauterbach et al. 2009, with eight children). The tree has no pointers: child ``c`` of node ``n`` is ``8 n + c`` on
+the level below. The boxes of a node's children are stored side by side, as (6 nodes 8): lower corner, upper corner.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from torch import Generator, Tensor, nn
 from torch.nn.functional import pad
 
 from bidnerf_core.devices import may_wait
-from bidnerf_core.fields.contract import FieldValues, Rays
+from bidnerf_core.fields.contract import FieldValues, RayHits, Rays, RaySamples
 
+LEAST_ALPHA = 1 / 255
+"""Opacity of a piece along a ray below which it is not seen."""
+LARGEST_ALPHA = 0.999
+"""Largest opacity of a piece along a ray, as in gsplat: the optical thickness stays finite."""
 CHILDREN = 8
-TOP = 8
-"""Largest number of nodes on the highest level; all of them are tested."""
+"""Children of a node, and the largest number of nodes on the highest level, all of which are tested."""
 MORTON_BITS = 16
 """Bits of each coordinate on the Morton curve."""
-LEAST_COMPONENT = 1e-9
-"""Smallest magnitude of a direction's component along an axis; smaller ones are replaced by it, so that
-slopes stay finite."""
 MOST_PAIRS = 2**22
-"""Largest number of ray-box pairs tested at once: some 300 MB."""
-KEPT_NODES = 128
-"""Number of nodes kept per ray on each level if the number must be known beforehand; the nearest ones are kept."""
-STOPPED = 1e-4
-"""Transmittance below which nothing behind is considered, as in the code of 3D Gaussian splatting."""
-RAYS_AT_ONCE = 384
-"""Number of rays looked up together: small enough for what they meet to stay in the processor's cache."""
-POINTS_AT_ONCE = 2**15
-"""Number of points looked up together."""
+"""Largest number of line-box pairs tested at once: some 300 MB."""
 KEPT_HITS = 64
-"""Number of pieces kept along a ray if the number must be known beforehand; the nearest ones are kept."""
+"""Number of pieces kept along a line if the number must be known beforehand; on each level, twice as many nodes are. The nearest are
+kept."""
 
-Boxes = Sequence[Float[Tensor, "6 _ 8"]]
-"""The boxes of the children of each node, the lowest level (whose children are pieces) first."""
-
-
-def level_sizes(count: int) -> list[int]:
-    """Return the number of nodes on each level above ``count`` pieces, the lowest first."""
-    sizes = [max(1, -(-count // CHILDREN))]
-    while sizes[-1] > TOP:
-        sizes.append(-(-sizes[-1] // CHILDREN))
-    return sizes
+T = TypeVar("T")
 
 
-def tree_of(
-    centres: Float[Tensor, "n 3"], halves: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]
-) -> tuple[Int[Tensor, "n"], list[Float[Tensor, "6 _ 8"]]]:
-    """Return the order of the pieces, and the boxes of all levels. Pieces that are not ``seen`` are in an empty box."""
-    order = torch.argsort(_morton(centres, seen), stable=True)
-    centres, halves, seen = centres[order], halves[order], seen[order]
-    lower = torch.where(seen[:, None], centres - halves, torch.inf)
-    upper = torch.where(seen[:, None], centres + halves, -torch.inf)
-    levels = []
-    for size in level_sizes(len(order)):
-        missing = size * CHILDREN - len(lower)
-        low, high = (
-            pad(part, (0, 0, 0, missing), value=fill).reshape(size, CHILDREN, 3)
-            for part, fill in ((lower, torch.inf), (upper, -torch.inf))
+@dataclass(frozen=True, eq=False)
+class Meeting:
+    """The intersections of pairs of a line and a piece."""
+
+    distance: Float[Tensor, "*p"]  # metres along the line from its origin; may be negative
+    alpha: Float[Tensor, "*p"]  # fraction of the light stopped there; 0 where the line misses
+    key: Float[Tensor, "*p"]  # sort key of the pieces along a ray, such as the distance
+
+
+class PieceField(nn.Module, ABC):
+    """A field of pieces, such as Gaussians or triangles, each of which a ray meets at one point.
+
+    ``hits`` returns these points with the opacity alpha of each piece. The density that ``query`` returns distributes the optical
+    thickness ``-log(1 - alpha)`` along the line of sight, so that its integral along a ray gives the same opacity. A field
+    calls ``register_tree`` once it knows the number of its pieces and ``rebuild`` whenever they have moved, and defines ``meet``,
+    ``colours``, ``profile`` and ``half_length``.
+    """
+
+    order: Tensor
+    reach: float | None = None
+    """Metres from a piece's box within which the line of sight through a point must meet it for the piece to have density there;
+    None if the box must contain the point."""
+
+    @abstractmethod
+    def meet(
+        self, index: Int[Tensor, "p"], origins: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
+    ) -> Meeting:
+        """Return where lines meet the pieces with indices ``index``; an opacity below ``LEAST_ALPHA`` counts as none."""
+
+    @abstractmethod
+    def colours(
+        self, index: Int[Tensor, "p"], meeting: Meeting, directions: Float[Tensor, "p 3"]
+    ) -> Float[Tensor, "p 3"]:
+        """Return the colours in [0, 1] of pieces where lines meet them."""
+
+    @abstractmethod
+    def profile(self, meeting: Meeting) -> Float[Tensor, "p"]:
+        """Return the share per metre of a piece's optical thickness at the lines' origins; its integral along a line is 1."""
+
+    @abstractmethod
+    def half_length(self, meeting: Meeting) -> Float[Tensor, "p"]:
+        """Return half the length (metres) of the interval that a piece has in ``sampler``."""
+
+    def register_tree(self, count: int) -> None:
+        """Register the buffers of the tree of ``count`` pieces."""
+        self.register_buffer("order", torch.arange(count))
+        number, nodes = 0, count
+        while number == 0 or nodes > CHILDREN:
+            nodes = max(1, -(-nodes // CHILDREN))
+            self.register_buffer(f"boxes_{number}", torch.zeros(6, nodes, CHILDREN))
+            number += 1
+
+    @property
+    def boxes(self) -> list[Float[Tensor, "6 _ 8"]]:
+        """The boxes of the children of each node, the lowest level (whose children are pieces) first."""
+        return [part for name, part in self.named_buffers(recurse=False) if name.startswith("boxes_")]
+
+    def rebuild(
+        self, centres: Float[Tensor, "n 3"], halves: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]
+    ) -> None:
+        """Set the tree for boxes with these centres and half sizes; pieces that are not ``seen`` are in an empty box."""
+        self.order.copy_(torch.argsort(_morton(centres, seen), stable=True))
+        centres, halves, seen = centres[self.order], halves[self.order], seen[self.order, None]
+        lower = torch.where(seen, centres - halves, torch.inf)
+        upper = torch.where(seen, centres + halves, -torch.inf)
+        for boxes in self.boxes:
+            missing = boxes.shape[1] * CHILDREN - len(lower)
+            low, high = (
+                pad(part, (0, 0, 0, missing), value=fill).unflatten(0, (-1, CHILDREN))
+                for part, fill in ((lower, torch.inf), (upper, -torch.inf))
+            )
+            boxes.copy_(torch.cat([low, high], dim=-1).movedim(-1, 0))
+            lower, upper = low.amin(1), high.amax(1)
+
+    @property
+    def sampler(self) -> PieceSampler:
+        """The sampler that places an interval around each piece."""
+        return PieceSampler(self)
+
+    def hits(self, rays: Rays) -> RayHits:
+        """Return where rays meet pieces, with colour and alpha; differentiable in the rays and the parameters."""
+        shape, flat = rays.near.shape, _flattened(rays)
+        piece, valid = self.met(flat)
+        width = piece.shape[1]
+        place = torch.arange(valid.numel(), device=valid.device)
+        if may_wait(valid.device):
+            place = valid.reshape(-1).nonzero()[:, 0]
+        ray, index = place // max(1, width), piece.reshape(-1).index_select(0, place)
+        directions = flat.directions.index_select(0, ray)
+        found = self.meet(index, flat.origins.index_select(0, ray), directions)
+        distance, alpha, rgb = (
+            value.new_zeros((valid.numel(), *value.shape[1:]))
+            .index_copy(0, place, value)
+            .reshape(*shape, width, *value.shape[1:])
+            for value in (found.distance, found.alpha, self.colours(index, found, directions))
         )
-        levels.append(torch.cat([low, high], dim=-1).movedim(-1, 0).contiguous())
-        lower, upper = low.amin(1), high.amax(1)
-    return order, levels
+        valid = valid.reshape(*shape, width)
+        distance = torch.where(valid, distance, rays.near[..., None])
+        return RayHits(distance, torch.where(valid, alpha, 0), rgb, valid)
+
+    @torch.no_grad()
+    def met(self, rays: Rays, by_distance: bool = False) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
+        """Return the indices of the pieces that rays (r) meet, in the order of compositing until the transmittance is
+        negligible, and which slots are in use.
+
+        The order is that of ``Meeting.key``, or of the distances with ``by_distance``.
+        """
+        waiting = may_wait(rays.near.device)
+
+        def met_by_few(
+            origins: Tensor, directions: Tensor, near: Tensor, far: Tensor
+        ) -> tuple[Tensor, Tensor]:
+            last = torch.where(far > near, far, near - 1)  # rays that miss the scene meet nothing
+            line, index, hit = self._nearby(origins, directions, near, last)
+            found = self.meet(index, origins.index_select(0, line), directions.index_select(0, line))
+            alpha, key, rays = found.alpha, found.distance if by_distance else found.key, len(near)
+            hit = hit & (found.distance >= near.index_select(0, line)) & (alpha >= LEAST_ALPHA)
+            hit = hit & (found.distance <= far.index_select(0, line))
+            if waiting:
+                kept = hit.nonzero()[:, 0]
+                line, index, key, alpha = (part.index_select(0, kept) for part in (line, index, key, alpha))
+                count = torch.bincount(line, minlength=rays)
+                width = int(count.max()) if len(line) else 0
+                place = line * width + torch.arange(len(line), device=line.device)
+                place -= (count.cumsum(0) - count)[line]
+                key, alpha, index = (
+                    value.new_full((rays * width,), fill).index_copy(0, place, value)
+                    for value, fill in ((key, torch.inf), (alpha, 0), (index, 0))
+                )
+            else:
+                key, width = torch.where(hit, key, torch.inf), len(index) // max(1, rays)
+            key, order = key.view(rays, width).sort(dim=1, stable=True)
+            if not waiting:
+                key, order = key[:, :KEPT_HITS], order[:, :KEPT_HITS]
+            index = index.view(rays, width).gather(1, order)
+            alpha = torch.where(key < torch.inf, alpha.view(rays, width).gather(1, order), 0)
+            thickness = -torch.log1p(-alpha)
+            # Behind a transmittance of 1e-4 nothing is considered, as in the code of 3D Gaussian splatting.
+            valid = (key < torch.inf) & (thickness.cumsum(1) - thickness < -math.log(1e-4))
+            if waiting:
+                width = int(valid.sum(1).max()) if valid.numel() else 0
+                return index[:, :width], valid[:, :width]
+            return index, valid
+
+        some = (
+            384 if waiting else max(1, len(rays.near))
+        )  # what so few rays meet stays in the processor's cache
+        parts = _in_parts(met_by_few, tuple(vars(rays).values()), some)
+        width = max(piece.shape[1] for piece, _ in parts)
+        piece, valid = (
+            torch.cat([pad(part, (0, width - part.shape[1])) for part in column])
+            for column in zip(*parts, strict=True)
+        )
+        return piece, valid
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        """Return the density whose integral along ``directions`` gives the opacity of ``hits``, and the mean colour."""
+
+        def values_of(places: Tensor, ways: Tensor) -> tuple[Tensor, Tensor]:
+            with torch.no_grad():
+                away = torch.full_like(places[:, 0], self.reach or 0.0)
+                towards = torch.ones_like(ways) if self.reach is None else ways
+                point, index, counts = self._nearby(places, towards, -away, away)
+            towards = ways.index_select(0, point)
+            found = self.meet(index, places.index_select(0, point), towards)
+            counts = counts & (found.alpha >= LEAST_ALPHA)
+            density = torch.where(counts, -torch.log1p(-found.alpha), 0) * self.profile(found)
+            rgb = density[:, None] * self.colours(index, found, towards)
+            total = density.new_zeros(len(places)).index_add(0, point, density)
+            colour = rgb.new_zeros((len(places), 3)).index_add(0, point, rgb)
+            return total, (colour / total.clamp(min=1e-20)[:, None]).clamp(0, 1)
+
+        flat = positions.reshape(-1, 3), directions.reshape(-1, 3)
+        density, rgb = map(torch.cat, zip(*_in_parts(values_of, flat, 2**15), strict=True))
+        return FieldValues(density.reshape(positions.shape[:-1]), rgb.reshape(positions.shape))
+
+    def _nearby(
+        self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"], near: Float[Tensor, "r"], far: Float[Tensor, "r"]
+    ) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"], Bool[Tensor, "p"]]:  # fmt: skip
+        """Return pairs of a line and a piece whose box it meets between ``near`` and ``far``, sorted by line, and which of them count.
+
+        If the host must not wait, each line has equally many pairs, of the boxes that it enters first. Otherwise all pairs are returned and
+        count, and ``TooMany`` is raised if several lines meet so many boxes that memory might not suffice.
+        """
+        least = torch.full_like(
+            directions, 1e-9
+        )  # components of a direction are at least so large: slopes are finite
+        slopes = 1 / torch.where(directions.abs() < least, torch.copysign(least, directions), directions)
+        offsets, slopes = -(origins * slopes).mT.contiguous(), slopes.mT.contiguous()
+        lines, waiting, boxes = len(near), may_wait(near.device), self.boxes
+        each, device = torch.arange(CHILDREN, device=near.device), near.device
+        node = torch.arange(boxes[-1].shape[1], device=device).repeat(lines)
+        line = torch.arange(lines, device=device).repeat_interleave(boxes[-1].shape[1])
+        counts = torch.ones_like(node, dtype=torch.bool)
+        for level in reversed(boxes):
+            if waiting and lines > 1 and len(node) * CHILDREN > MOST_PAIRS:
+                raise TooMany
+            corners = level.index_select(1, node)
+            enter, leave = near.index_select(0, line)[:, None], far.index_select(0, line)[:, None]
+            for axis in range(3):
+                offset, slope = (part[axis].index_select(0, line)[:, None] for part in (offsets, slopes))
+                low, high = (torch.addcmul(offset, corners[side + axis], slope) for side in (0, 3))
+                enter = torch.maximum(enter, torch.minimum(low, high))
+                leave = torch.minimum(leave, torch.maximum(low, high))
+            # The corners of an empty box are swapped, at infinity, and its slabs would hold all lines.
+            hit = (enter <= leave) & (corners[0] <= corners[3])
+            if waiting:
+                parent, child = hit.nonzero(as_tuple=True)
+                line, node = line.index_select(0, parent), node.index_select(0, parent) * CHILDREN + child
+                continue
+            key = torch.where(hit & counts[:, None], enter, torch.inf).view(lines, -1)
+            children = (node[:, None] * CHILDREN + each).view(lines, -1)
+            kept = key.topk(min(2 * KEPT_HITS, key.shape[1]), dim=1, largest=False)
+            counts = (kept.values < torch.inf).reshape(-1)
+            node = torch.where(counts, children.gather(1, kept.indices).reshape(-1), 0)
+            line = torch.arange(lines, device=device).repeat_interleave(kept.values.shape[1])
+        counts = torch.ones_like(node, dtype=torch.bool) if waiting else counts
+        return line, self.order.index_select(0, node), counts
+
+
+class TooMany(Exception):
+    """Lines meet more boxes than may be tested at once; fewer lines may work."""
+
+
+def _in_parts(function: Callable[..., T], parts: Sequence[Tensor], count: int) -> list[T]:
+    """Return the results of ``function`` for ``count`` rows of ``parts`` at a time, or for fewer where these are ``TooMany``."""
+    found: list[T] = []
+    for few in zip(*(part.split(count) for part in parts), strict=True):
+        try:
+            found.append(function(*few))
+        except TooMany:
+            found += _in_parts(function, few, (len(few[0]) + 1) // 2)
+    return found
 
 
 def _morton(centres: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]) -> Int[Tensor, "n"]:
@@ -88,261 +288,34 @@ def _morton(centres: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]) -> Int[Tenso
     return torch.where(seen, code, 2 ** (3 * MORTON_BITS))
 
 
-@dataclass(frozen=True, eq=False)
-class Lines:
-    """Segments of rays, prepared for box tests. A point is a ray of zero length."""
-
-    offsets: Float[Tensor, "3 r"]  # -origin / direction
-    slopes: Float[Tensor, "3 r"]  # 1 / direction, finite
-    near: Float[Tensor, "r"]
-    far: Float[Tensor, "r"]
-
-    @classmethod
-    def of(
-        cls, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"], near: Tensor, far: Tensor
-    ) -> Lines:
-        least = torch.full_like(directions, LEAST_COMPONENT)
-        slopes = 1 / torch.where(directions.abs() < least, torch.copysign(least, directions), directions)
-        return cls(-(origins * slopes).mT.contiguous(), slopes.mT.contiguous(), near, far)
-
-    def entered(
-        self, rays: Int[Tensor, "p"], boxes: Float[Tensor, "6 p 8"]
-    ) -> tuple[Float[Tensor, "p 8"], Bool[Tensor, "p 8"]]:
-        """Return where the rays with indices ``rays`` enter each of the boxes, and whether they meet it
-        within their segment.
-        """
-        offsets, slopes = (
-            self.offsets.index_select(1, rays)[..., None],
-            self.slopes.index_select(1, rays)[..., None],
-        )
-        enter, leave = self.near.index_select(0, rays)[:, None], self.far.index_select(0, rays)[:, None]
-        for axis in range(3):
-            low, high = (
-                torch.addcmul(offsets[axis], corner[axis], slopes[axis]) for corner in (boxes[:3], boxes[3:])
-            )
-            enter = torch.maximum(enter, torch.minimum(low, high))
-            leave = torch.minimum(leave, torch.maximum(low, high))
-        # The corners of an empty box are swapped, at infinity, and its slabs would hold all rays.
-        return enter, (enter <= leave) & (boxes[0] <= boxes[3])
-
-
-class TooMany(Exception):
-    """The rays meet more boxes than may be tested at once; fewer rays may work."""
-
-
-def met(lines: Lines, boxes: Boxes, order: Int[Tensor, "n"]) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
-    """Return all pairs of a ray and a piece whose box it meets, sorted by ray. Their number is read from the
-    device.
-
-    Raises ``TooMany`` if several rays meet so many boxes that memory might not suffice.
-    """
-    rays = len(lines.near)
-    top = boxes[-1].shape[1]
-    ray = torch.arange(rays, device=order.device).repeat_interleave(top)
-    node = torch.arange(top, device=order.device).repeat(rays)
-    for level in reversed(boxes):
-        if rays > 1 and len(node) * CHILDREN > MOST_PAIRS:
-            raise TooMany
-        _, hit = lines.entered(ray, level.index_select(1, node))
-        parent, child = hit.nonzero(as_tuple=True)
-        ray, node = ray.index_select(0, parent), node.index_select(0, parent) * CHILDREN + child
-    return ray, order.index_select(0, node)
-
-
-def nearest_met(
-    lines: Lines, boxes: Boxes, order: Int[Tensor, "n"]
-) -> tuple[Int[Tensor, "r c"], Bool[Tensor, "r c"]]:
-    """Return the pieces whose boxes each ray meets first, and which of these slots are in use; the shape is
-    known beforehand.
-    """
-    rays = len(lines.near)
-    node = torch.arange(boxes[-1].shape[1], device=order.device).expand(rays, -1)
-    valid = torch.ones_like(node, dtype=torch.bool)
-    each = torch.arange(CHILDREN, device=order.device)
-    for level in reversed(boxes):
-        width = node.shape[1]
-        ray = torch.arange(rays, device=order.device)[:, None].expand(-1, width).reshape(-1)
-        enter, hit = lines.entered(ray, level.index_select(1, node.reshape(-1)))
-        hit = hit.reshape(rays, width, CHILDREN) & valid[..., None]
-        key = torch.where(hit, enter.reshape(hit.shape), torch.inf).flatten(1)
-        child = (node[..., None] * CHILDREN + each).flatten(1)
-        kept = key.topk(min(KEPT_NODES, key.shape[1]), dim=1, largest=False)
-        node, valid = child.gather(1, kept.indices), kept.values < torch.inf
-        node = torch.where(valid, node, 0)
-    return order.index_select(0, node.reshape(-1)).reshape(node.shape), valid
+def _flattened(rays: Rays) -> Rays:
+    parts = rays.origins.reshape(-1, 3), rays.directions.reshape(-1, 3)
+    return Rays(*parts, rays.near.reshape(-1), rays.far.reshape(-1))
 
 
 @dataclass(frozen=True, eq=False)
-class Meeting:
-    """The intersections of pairs of a line and a piece."""
+class PieceSampler:
+    """An interval around each piece that a ray meets, as long as its density there divided by its peak.
 
-    distance: Float[Tensor, "*p"]  # metres along the line from its origin; may be negative
-    alpha: Float[Tensor, "*p"]  # fraction of the light stopped there; 0 where the line misses
-    key: Float[Tensor, "*p"]  # sort key of the pieces along a ray, such as the distance
-
-
-Meet: TypeAlias = Callable[[Int[Tensor, "p"], Float[Tensor, "p 3"], Float[Tensor, "p 3"]], Meeting]
-"""A function from piece indices and the origins and directions of lines to their intersections."""
-
-
-def met_pieces(
-    rays: Rays, boxes: Boxes, order: Int[Tensor, "n"], meet: Meet
-) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
-    """Return the indices of the pieces that rays (r) hit, in key order until the transmittance is negligible, and
-    which slots are in use.
+    For an isolated piece, density times length is its optical thickness; if several overlap, their intervals
+    end half-way between them. ``hits`` is exact, and is what the core renders.
     """
-    if not len(rays.near):
-        empty = torch.zeros((0, 0), dtype=torch.long, device=order.device)
-        return empty, empty.bool()
-    if not may_wait(rays.near.device):
-        return _met_in_known_shape(rays, boxes, order, meet)
-    parts = _met_in_parts(rays, RAYS_AT_ONCE, boxes, order, meet)
-    width = max(piece.shape[1] for piece, _ in parts)
-    piece, valid = (
-        torch.cat([pad(part[i], (0, width - part[i].shape[1])) for part in parts]) for i in range(2)
-    )
-    return piece, valid
 
+    field: PieceField
 
-def _met_in_parts(
-    rays: Rays, count: int, boxes: Boxes, order: Tensor, meet: Meet
-) -> list[tuple[Tensor, Tensor]]:
-    parts = zip(
-        *(getattr(rays, n).split(count) for n in ("origins", "directions", "near", "far")), strict=True
-    )
-    found = []
-    for part in parts:
-        few = Rays(*part)
-        try:
-            found.append(_met_by_few(few, boxes, order, meet))
-        except TooMany:
-            found += _met_in_parts(few, (len(few.near) + 1) // 2, boxes, order, meet)
-    return found
-
-
-def _met_by_few(rays: Rays, boxes: Boxes, order: Tensor, meet: Meet) -> tuple[Tensor, Tensor]:
-    ray, index = met(_lines(rays), boxes, order)
-    found = meet(index, rays.origins.index_select(0, ray), rays.directions.index_select(0, ray))
-    kept = _is_hit(found, rays.near.index_select(0, ray), rays.far.index_select(0, ray)).nonzero()[:, 0]
-    ray, index, key, alpha = (part.index_select(0, kept) for part in (ray, index, found.key, found.alpha))
-    count = torch.bincount(ray, minlength=len(rays.near))
-    width = int(count.max()) if len(ray) else 0
-    place = ray * width + torch.arange(len(ray), device=ray.device) - (count.cumsum(0) - count)[ray]
-    rows = (len(rays.near), width)
-    return _in_order(*(
-        value.new_full((rows[0] * width,), fill).index_copy(0, place, value).reshape(rows)
-        for value, fill in ((key, torch.inf), (alpha, 0), (index, 0))
-    ))  # fmt: skip
-
-
-def _met_in_known_shape(rays: Rays, boxes: Boxes, order: Tensor, meet: Meet) -> tuple[Tensor, Tensor]:
-    index, valid = nearest_met(_lines(rays), boxes, order)
-    ray = torch.arange(len(index), device=index.device)[:, None].expand(index.shape).reshape(-1)
-    found = meet(index.reshape(-1), rays.origins.index_select(0, ray), rays.directions.index_select(0, ray))
-    near, far = (part.index_select(0, ray) for part in (rays.near, rays.far))
-    hit = _is_hit(found, near, far).reshape(index.shape) & valid
-    key = torch.where(hit, found.key.reshape(index.shape), torch.inf)
-    kept = key.topk(min(KEPT_HITS, key.shape[1]), dim=1, largest=False, sorted=True).indices
-    alpha = torch.where(hit, found.alpha.reshape(index.shape), 0)
-    return _in_order(*(part.gather(1, kept) for part in (key, alpha, index)))
-
-
-def _lines(rays: Rays) -> Lines:
-    far = torch.where(rays.far > rays.near, rays.far, rays.near - 1)  # rays that miss the scene meet nothing
-    return Lines.of(rays.origins, rays.directions, rays.near, far)
-
-
-def _is_hit(found: Meeting, near: Float[Tensor, "p"], far: Float[Tensor, "p"]) -> Bool[Tensor, "p"]:
-    return (found.alpha > 0) & (found.distance >= near) & (found.distance <= far)
-
-
-def _in_order(
-    key: Float[Tensor, "r s"], alpha: Float[Tensor, "r s"], index: Int[Tensor, "r s"]
-) -> tuple[Int[Tensor, "r k"], Bool[Tensor, "r k"]]:
-    """Return the indices in order of ``key``, and which of them are reached by any light."""
-    key, order = key.sort(dim=1, stable=True)
-    alpha, index = alpha.gather(1, order), index.gather(1, order)
-    thickness = -torch.log1p(-alpha)
-    before = thickness.cumsum(1) - thickness
-    valid = (key < torch.inf) & (before < -math.log(STOPPED))
-    if may_wait(valid.device):
-        width = int(valid.sum(1).max()) if valid.numel() else 0
-        return index[:, :width], valid[:, :width]
-    return index, valid
-
-
-def pieces_about(
-    positions: Float[Tensor, "p 3"], boxes: Boxes, order: Int[Tensor, "n"],
-    directions: Float[Tensor, "p 3"] | None = None, reach: float = 0.0,
-) -> tuple[Int[Tensor, "q"], Int[Tensor, "q"], Bool[Tensor, "q"]]:  # fmt: skip
-    """Return pairs of a point and a piece whose box contains it, and whether each pair counts.
-
-    With unit ``directions``, the line through the point must meet the piece's box within ``reach`` (metres)
-    in either direction. If the host must not wait, each point has equally many pairs, some of which do not
-    count. Raises ``TooMany`` if several points lie in so many boxes that memory might not suffice.
-    """
-    away = torch.full_like(positions[:, 0], reach)
-    lines = Lines.of(positions, torch.ones_like(positions) if directions is None else directions, -away, away)
-    if may_wait(positions.device):
-        point, index = met(lines, boxes, order)
-        return point, index, torch.ones_like(point, dtype=torch.bool)
-    index, valid = nearest_met(lines, boxes, order)
-    point = torch.arange(len(index), device=index.device)[:, None].expand(index.shape)
-    return point.reshape(-1), index.reshape(-1), valid.reshape(-1)
-
-
-AboutPoints: TypeAlias = Callable[
-    [Float[Tensor, "p 3"], Float[Tensor, "p 3"]],
-    tuple[Int[Tensor, "q"], Float[Tensor, "q"], Float[Tensor, "q 3"]],
-]
-"""A function from positions and directions to pairs of a point and a piece: the point's index, the density
-(1/metre), the colour.
-
-It may raise ``TooMany``, as ``pieces_about`` does.
-"""
-
-
-def values_of_pieces(
-    positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"], about: AboutPoints
-) -> FieldValues:
-    """Return the sum of the pieces' densities at points, and their density-weighted mean colour."""
-    shape = positions.shape[:-1]
-    places, ways = (part.reshape(-1, 3).split(POINTS_AT_ONCE) for part in (positions, directions))
-    found = _joined([_values(place, way, about) for place, way in zip(places, ways, strict=True)])
-    return FieldValues(found.density.reshape(shape), found.rgb.reshape(*shape, 3))
-
-
-def _values(
-    positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"], about: AboutPoints
-) -> FieldValues:
-    try:
-        point, density, rgb = about(positions, directions)
-    except TooMany:
-        halves = zip(positions.chunk(2), directions.chunk(2), strict=True)
-        return _joined([_values(place, way, about) for place, way in halves])
-    count = len(positions)
-    total = density.new_zeros(count).index_add(0, point, density)
-    colour = rgb.new_zeros((count, 3)).index_add(0, point, density[:, None] * rgb)
-    return FieldValues(total, (colour / total.clamp(min=1e-20)[:, None]).clamp(0, 1))
-
-
-def _joined(parts: list[FieldValues]) -> FieldValues:
-    return FieldValues(torch.cat([part.density for part in parts]), torch.cat([part.rgb for part in parts]))
-
-
-def listed(
-    index: Int[Tensor, "r s"], valid: Bool[Tensor, "r s"]
-) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"], Int[Tensor, "p"]]:
-    """Return slot, row and index of the valid entries or, if the host must not wait, of all entries."""
-    if may_wait(valid.device):
-        place = valid.reshape(-1).nonzero()[:, 0]
-    else:
-        place = torch.arange(valid.numel(), device=valid.device)
-    return place, place // max(1, valid.shape[1]), index.reshape(-1).index_select(0, place)
-
-
-def flattened(rays: Rays) -> Rays:
-    """Return rays of any shape flattened to one axis."""
-    return Rays(
-        rays.origins.reshape(-1, 3), rays.directions.reshape(-1, 3), rays.near.reshape(-1), rays.far.reshape(-1)
-    )  # fmt: skip
+    @torch.no_grad()
+    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+        flat = _flattened(rays)
+        piece, valid = self.field.met(flat, by_distance=True)
+        ray = torch.arange(len(piece), device=piece.device).repeat_interleave(piece.shape[1])
+        origins, directions = (part.index_select(0, ray) for part in (flat.origins, flat.directions))
+        found = self.field.meet(piece.reshape(-1), origins, directions)
+        middle, half = (part.reshape(piece.shape) for part in (found.distance, self.field.half_length(found)))
+        near, far = flat.near[:, None], torch.maximum(flat.near, flat.far)[:, None]
+        starts = torch.where(valid, torch.maximum(middle - half, near), far)
+        ends = torch.where(valid, torch.minimum(middle + half, far), far)
+        place = torch.where(valid, middle, torch.inf)
+        between = (place[:, 1:] + place[:, :-1]) / 2
+        starts[:, 1:] = torch.maximum(starts[:, 1:], torch.where(valid[:, 1:], between, far))
+        ends[:, :-1] = torch.where(valid[:, 1:], torch.minimum(ends[:, :-1], between), ends[:, :-1])
+        return RaySamples(starts, torch.maximum(starts, ends), valid).unflattened(rays.near.shape)
