@@ -19,7 +19,6 @@ from bidnerf_core.fields import (
     RaySpacing,
     SceneBounds,
     VoxelGrid,
-    rows_of,
 )
 from bidnerf_hashgrid import fused
 from bidnerf_hashgrid.fused import MOST
@@ -96,43 +95,45 @@ class OccupancyGrid(nn.Module):
     def prune(self, threshold: float, grow: bool = True) -> None:
         """Recompute which cells are occupied: those whose peak is above ``threshold`` and, with ``grow``, their neighbours."""
         self.occupied.copy_(_dilated(self.peak > threshold, 1 if grow else 0))
-        self._refresh()
+        self.near_occupied.copy_(_dilated(self.occupied, self._reach))
 
     @torch.no_grad()
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
-        """Return the intervals of the rays in occupied cells, equally long in the coordinate of ``SceneBounds.spacing``."""
-        if not may_wait(rays.near.device):
-            return self.of_known_shape(rays, self._most, jitter)
-        march = self._march(rays, jitter)
-        place, ray = self._occupied_steps(march)
-        return self._padded(march, place, _counts(ray, march)).unflattened(rays.near.shape)
+        """Return the intervals of the rays in occupied cells, equally long in the coordinate of ``SceneBounds.spacing``.
 
-    @torch.no_grad()
-    def split_by_count(
-        self, rays: Rays, count: int, jitter: Generator | None = None
-    ) -> tuple[RaySamples, Int[Tensor, "m"], RaySamples]:
-        """Return the intervals that ``__call__`` returns, separately for rays with many of them, see
-        ``SplittingSampler``.
+        If the host must not wait, only the first ``MOST`` of a ray count, except in training, when cells that are empty are still
+        occupied.
         """
-        march = self._march(rays, jitter)
-        place, ray = self._occupied_steps(march)
-        counts = _counts(ray, march)
-        many = counts > count
-        numbers, of_many = many.nonzero()[:, 0], many.index_select(0, ray)
-        few = self._padded(march, place[~of_many], torch.where(many, 0, counts))
-        rest = self._padded(march.rows(numbers), place[of_many], counts.index_select(0, numbers))
-        return few.unflattened(rays.near.shape), numbers, rest
+        if (found := self.by_kernel(rays, self._most, jitter)) is not None:
+            return found
+        flat = rays.flattened()
+        spacing = self.bounds.spacing(flat)
+        near, far = spacing.place(torch.stack([flat.near, flat.far], dim=-1)).unbind(-1)
+        offset = torch.full_like(near, 0.5)  # of the middle of the first step from ``near``, in steps
+        if jitter is not None:
+            offset = torch.rand(near.shape, generator=jitter, device=jitter.device).to(near)
+        find = self._all_steps if may_wait(near.device) else self._first_steps
+        middles, valid = find(flat, spacing, near, far, offset)
+        near, far, half = near[:, None], far[:, None], self.step / 2
+        starts = torch.where(valid, torch.maximum(middles - half, near), middles)
+        ends = torch.where(valid, torch.minimum(middles + half, far), middles)
+        if self.bounds.contracted:
+            # The remainder of a step at the far end is short in the coordinate, but long in metres.
+            last = torch.arange(middles.shape[-1], device=middles.device) == valid.sum(-1, keepdim=True) - 1
+            ends = torch.where(last & (far - ends < self.step), far, ends)
+        return RaySamples(spacing.distance(starts), spacing.distance(ends), valid).unflattened(
+            rays.near.shape
+        )
 
-    def of_known_shape(self, rays: Rays, count: int, jitter: Generator | None) -> RaySamples:
-        """Return the intervals in occupied cells or, on a GPU, at most ``count`` concentrated ones, without waiting.
-
-        Only the first ``MOST`` of a ray count, except in training, when cells that are empty are still occupied.
-        """
-        if fused.available(rays.near.device) and count <= MOST:
-            return fused.sampled(
-                _flat(rays), self.bounds, self.occupied, self.density, self.step, count, self._most, jitter
-            ).unflattened(rays.near.shape)
-        return self._of_known_shape(self._march(rays, jitter)).unflattened(rays.near.shape)
+    def by_kernel(self, rays: Rays, count: int, jitter: Generator | None) -> RaySamples | None:
+        """Return ``count`` concentrated intervals of each ray, or those in occupied cells if there are no more; None without a kernel."""
+        device = rays.near.device
+        if may_wait(device) or not fused.available(device) or count > MOST:
+            return None
+        found = fused.sampled(
+            rays.flattened(), self.bounds, self.occupied, self.density, self.step, count, self._most, jitter
+        )
+        return found.unflattened(rays.near.shape)
 
     @property
     def _steps(self) -> int:
@@ -147,43 +148,44 @@ class OccupancyGrid(nn.Module):
     def _most(self) -> int:
         return self._steps if self.training else MOST
 
-    def _march(self, rays: Rays, jitter: Generator | None) -> _March:
-        flat = _flat(rays)
-        spacing = self.bounds.spacing(flat)
-        near, far = spacing.place(torch.stack([flat.near, flat.far], dim=-1)).unbind(-1)
-        offset = torch.full_like(near, 0.5)
-        if jitter is not None:
-            offset = torch.rand(near.shape, generator=jitter, device=jitter.device).to(near)
-        return _March(flat, spacing, near, far, offset)
+    def _all_steps(
+        self, rays: Rays, spacing: RaySpacing, near: Float[Tensor, "r"], far: Float[Tensor, "r"], offset: Float[Tensor, "r"]
+    ) -> tuple[Float[Tensor, "r s"], Bool[Tensor, "r s"]]:  # fmt: skip
+        """Return the coordinates of each ray's steps in occupied cells, padded to the length of the longest row, and which are steps."""
+        length = BLOCK * self.step
+        count = int(((far - near).amax() / length).ceil()) if near.numel() else 0
+        starts = near[:, None] + length * torch.arange(count, dtype=near.dtype, device=near.device)
+        near_matter = self.grid.at(self.near_occupied, _at(rays, spacing.distance(starts + length / 2)))
+        ray, block = ((starts < far[:, None]) & near_matter).nonzero(as_tuple=True)
+        start = starts.view(-1).index_select(0, ray * count + block)
+        steps = torch.arange(BLOCK, dtype=near.dtype, device=near.device) * self.step
+        place = start[:, None] + steps + (offset.index_select(0, ray) * self.step)[:, None]
+        positions = _at(rays, spacing.rows(ray).distance(place), ray)
+        kept = self._occupied_at(positions) & (place < far.index_select(0, ray)[:, None])
+        block, step = kept.nonzero(as_tuple=True)
+        place = place.view(-1).index_select(0, block * BLOCK + step)
+        counts = torch.bincount(ray.index_select(0, block), minlength=len(near))
+        width = int(counts.amax()) if len(counts) else 0
+        valid = torch.arange(width, device=counts.device) < counts[:, None]
+        return far[:, None].expand(-1, width).masked_scatter(valid, place), valid
 
-    def _occupied_steps(self, march: _March) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
-        """Return the coordinates of all steps in occupied cells, and the numbers of their rays in ascending order."""
-        ray, start = self._busy_blocks(march)
-        steps = torch.arange(BLOCK, dtype=start.dtype, device=start.device) * self.step
-        far, offset = (part.index_select(0, ray) for part in (march.far, march.offset))
-        place = start[:, None] + steps + (offset * self.step)[:, None]
-        positions = _at(march.rays, march.spacing.rows(ray).distance(place), ray)
-        block, step = (self._occupied_at(positions) & (place < far[:, None])).nonzero(as_tuple=True)
-        return place.view(-1).index_select(0, block * BLOCK + step), ray.index_select(0, block)
-
-    def _of_known_shape(self, march: _March) -> RaySamples:
-        """Return the first intervals of each ray in occupied cells, without waiting for the device."""
-        near, far = march.near, march.far
-        box = self.grid.rays(march.rays.origins, march.rays.directions)
+    def _first_steps(
+        self, rays: Rays, spacing: RaySpacing, near: Float[Tensor, "r"], far: Float[Tensor, "r"], offset: Float[Tensor, "r"]
+    ) -> tuple[Float[Tensor, "r s"], Bool[Tensor, "r s"]]:  # fmt: skip
+        """Return each ray's first steps in occupied cells, as ``_all_steps`` does, without waiting for the device."""
+        box = self.grid.rays(rays.origins, rays.directions)
         # Steps are counted from ``near``, as everywhere, and those before the grid are skipped; contracted space has none.
         skipped = ((box.near - near) / self.step).floor().clamp(min=0) * (not self.bounds.contracted)
         steps, most = torch.arange(self._steps, dtype=near.dtype, device=near.device), self._most
-        place = near[:, None] + (skipped[:, None] + steps + march.offset[:, None]) * self.step
-        positions = march.rays.at(march.spacing.distance(place))
-        kept = self._occupied_at(positions) & (place < far[:, None])
+        place = near[:, None] + (skipped[:, None] + steps + offset[:, None]) * self.step
+        kept = self._occupied_at(rays.at(spacing.distance(place))) & (place < far[:, None])
         order = (~kept).sort(dim=-1, stable=True).indices[:, :most]
         place, kept = place.gather(-1, order), kept.gather(-1, order)
-        middles = torch.where(kept, place, far[:, None])
-        if middles.shape[-1] < most:
-            missing = most - middles.shape[-1]
-            middles = torch.cat([middles, far[:, None].expand(-1, missing)], dim=-1)
-            kept = pad(kept, (0, missing))
-        return self._intervals(march, middles, kept, kept.sum(-1))
+        missing = most - kept.shape[-1]
+        middles = torch.cat(
+            [torch.where(kept, place, far[:, None]), far[:, None].expand(-1, missing)], dim=-1
+        )
+        return middles, pad(kept, (0, missing))
 
     def _occupied_at(self, positions: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
         """Return whether positions (metres, world) are within the grid, in an occupied cell."""
@@ -193,70 +195,9 @@ class OccupancyGrid(nn.Module):
             grid = replace(grid, contracted=None)
         return grid.at(self.occupied, positions) & grid.contains(positions)
 
-    def _busy_blocks(self, march: _March) -> tuple[Tensor, Tensor]:
-        """Return the ray and the start of each block of ``BLOCK`` steps that passes near an occupied cell, in order."""
-        near, far = march.near, march.far
-        length = BLOCK * self.step
-        count = int(((far - near).amax() / length).ceil()) if near.numel() else 0
-        starts = near[:, None] + length * torch.arange(count, dtype=near.dtype, device=near.device)
-        positions = _at(march.rays, march.spacing.distance(starts + length / 2))
-        near_matter = self.grid.at(self.near_occupied, positions)
-        ray, block = ((starts < far[:, None]) & near_matter).nonzero(as_tuple=True)
-        return ray, starts.view(-1).index_select(0, ray * count + block)
-
-    def _padded(self, march: _March, place: Float[Tensor, "n"], counts: Int[Tensor, "r"]) -> RaySamples:
-        """Return the samples, packed at the front of their ray's row; rows are padded to the length of the longest."""
-        width = int(counts.amax()) if len(counts) else 0
-        valid = torch.arange(width, device=counts.device) < counts[:, None]
-        middles = march.far[:, None].expand(-1, width).masked_scatter(valid, place)
-        return self._intervals(march, middles, valid, counts)
-
-    def _intervals(
-        self, march: _March, middles: Float[Tensor, "r s"], valid: Bool[Tensor, "r s"], counts: Int[Tensor, "r"]
-    ) -> RaySamples:  # fmt: skip
-        """Return intervals one step long around ``middles``, clipped to the rays; the first ``counts`` are valid."""
-        near, far = march.near[:, None], march.far[:, None]
-        half = self.step / 2
-        starts = torch.where(valid, torch.maximum(middles - half, near), middles)
-        ends = torch.where(valid, torch.minimum(middles + half, far), middles)
-        if self.bounds.contracted:
-            # The remainder of a step at the far end is short in the coordinate, but long in metres.
-            last = torch.arange(middles.shape[-1], device=middles.device) == counts[:, None] - 1
-            ends = torch.where(last & (far - ends < self.step), far, ends)
-        return RaySamples(march.spacing.distance(starts), march.spacing.distance(ends), valid)
-
     def _loaded(self) -> None:
         self.observed = self.bounds.contracted or bool(self.density.any())
-        self._refresh()
-
-    def _refresh(self) -> None:
         self.near_occupied.copy_(_dilated(self.occupied, self._reach))
-
-
-@dataclass(frozen=True, eq=False)
-class _March:
-    """Rays, and where steps along them begin and end."""
-
-    rays: Rays
-    spacing: RaySpacing
-    near: Float[Tensor, "r"]  # in the coordinate of ``spacing``, unlike those of ``rays``
-    far: Float[Tensor, "r"]
-    offset: Float[Tensor, "r"]  # of the middle of the first step from ``near``, in steps
-
-    def rows(self, numbers: Int[Tensor, "m"]) -> _March:
-        """Return the march along the rays with these numbers."""
-        near, far, offset = (part.index_select(0, numbers) for part in (self.near, self.far, self.offset))
-        return _March(rows_of(self.rays, numbers), self.spacing.rows(numbers), near, far, offset)
-
-
-def _flat(rays: Rays) -> Rays:
-    leading = rays.near.dim()
-    parts = (rays.origins, rays.directions, rays.near, rays.far)
-    return Rays(*(part.detach().reshape(-1, *part.shape[leading:]) for part in parts))
-
-
-def _counts(ray: Int[Tensor, "n"], march: _March) -> Int[Tensor, "r"]:
-    return torch.bincount(ray, minlength=len(march.near))
 
 
 @dataclass(frozen=True)
@@ -280,10 +221,10 @@ class ConcentratedInGrid(Concentrated):
 
     guide: GridDensity
 
-    def _of_known_shape(self, rays: Rays, jitter: Generator | None) -> RaySamples:
-        if fused.available(rays.near.device) and self.count <= MOST:
-            return self.guide.grid.of_known_shape(rays, self.count, jitter)
-        return super()._of_known_shape(rays, jitter)
+    @torch.no_grad()
+    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+        found = self.guide.grid.by_kernel(rays, self.count, jitter)
+        return super().__call__(rays, jitter) if found is None else found
 
 
 def _at(

@@ -65,7 +65,6 @@ from .sampling import Importance as Importance
 from .sampling import OccupiedOnly as OccupiedOnly
 from .sampling import Resampled as Resampled
 from .sampling import ScaledField as ScaledField
-from .sampling import SplittingSampler as SplittingSampler
 from .sampling import Stratified as Stratified
 from .sampling import gathered as gathered
 from .sampling import inverse_transform as inverse_transform

@@ -32,6 +32,11 @@ class Rays:
     def at(self, distance: Float[Tensor, "*r s"]) -> Float[Tensor, "*r s 3"]:
         return self.origins[..., None, :] + distance[..., None] * self.directions[..., None, :]
 
+    def flattened(self) -> Rays:
+        """Return the rays flattened to one axis."""
+        points = self.origins.reshape(-1, 3), self.directions.reshape(-1, 3)
+        return Rays(*points, self.near.reshape(-1), self.far.reshape(-1))
+
 
 @dataclass(frozen=True, eq=False)
 class RaySamples:

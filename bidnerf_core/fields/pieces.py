@@ -119,7 +119,7 @@ class PieceField(nn.Module, ABC):
 
     def hits(self, rays: Rays) -> RayHits:
         """Return where rays meet pieces, with colour and alpha; differentiable in the rays and the parameters."""
-        shape, flat = rays.near.shape, _flattened(rays)
+        shape, flat = rays.near.shape, rays.flattened()
         piece, valid = self.met(flat)
         width = piece.shape[1]
         place = torch.arange(valid.numel(), device=valid.device)
@@ -288,11 +288,6 @@ def _morton(centres: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]) -> Int[Tenso
     return torch.where(seen, code, 2 ** (3 * MORTON_BITS))
 
 
-def _flattened(rays: Rays) -> Rays:
-    parts = rays.origins.reshape(-1, 3), rays.directions.reshape(-1, 3)
-    return Rays(*parts, rays.near.reshape(-1), rays.far.reshape(-1))
-
-
 @dataclass(frozen=True, eq=False)
 class PieceSampler:
     """An interval around each piece that a ray meets, as long as its density there divided by its peak.
@@ -305,7 +300,7 @@ class PieceSampler:
 
     @torch.no_grad()
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
-        flat = _flattened(rays)
+        flat = rays.flattened()
         piece, valid = self.field.met(flat, by_distance=True)
         ray = torch.arange(len(piece), device=piece.device).repeat_interleave(piece.shape[1])
         origins, directions = (part.index_select(0, ray) for part in (flat.origins, flat.directions))

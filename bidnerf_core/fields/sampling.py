@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -53,14 +53,7 @@ class Stratified:
         limits = torch.stack([rays.near.detach(), rays.far.detach()], dim=-1)
         spacing = None if self.bounds is None else self.bounds.spacing(rays)
         near, far = (limits if spacing is None else spacing.place(limits)).split(1, dim=-1)
-        borders = torch.linspace(0, 1, self.count + 1, dtype=near.dtype, device=near.device)
-        borders = borders.expand(*rays.near.shape, -1)
-        if jitter is not None:
-            shift = (
-                torch.rand((*rays.near.shape, self.count - 1), generator=jitter, device=jitter.device) - 0.5
-            )
-            inner = borders[..., 1:-1] + shift.to(near) / self.count
-            borders = torch.cat([borders[..., :1], inner, borders[..., -1:]], dim=-1)
+        borders = _levels(self.count + 1, near, jitter)
         distances = near + (far - near) * borders
         if spacing is not None:
             distances = spacing.distance(distances)
@@ -101,17 +94,6 @@ def rows_of(of: OfRays, index: Int[Tensor, "n"]) -> OfRays:
     parts = (getattr(of, field.name) for field in fields(of))
     flat = (part.reshape(shape.numel(), *part.shape[len(shape) :]) for part in parts)
     return type(of)(*(part.index_select(0, index) for part in flat))
-
-
-def either(which: Bool[Tensor, "*r"], yes: RaySamples, no: RaySamples) -> RaySamples:
-    """Return the samples ``yes`` for the rays of ``which`` and ``no`` for the others, padded to a common number per ray."""
-    width = max(yes.starts.shape[-1], no.starts.shape[-1])
-
-    def filled(part: Tensor) -> Tensor:
-        return pad(part, (0, width - part.shape[-1]))
-
-    pairs = ((yes.starts, no.starts), (yes.ends, no.ends), (yes.valid, no.valid))
-    return RaySamples(*(torch.where(which[..., None], filled(a), filled(b)) for a, b in pairs))
 
 
 @dataclass(frozen=True)
@@ -214,37 +196,6 @@ class HierarchicalField(nn.Module):
         return self.fine.query(positions, directions)
 
 
-@runtime_checkable
-class SplittingSampler(RaySampler, Protocol):
-    """A sampler that returns rays with many intervals separately, so that short rows are not padded to the
-    length of long ones.
-    """
-
-    def split_by_count(
-        self, rays: Rays, count: int, jitter: Generator | None = None
-    ) -> tuple[RaySamples, Int[Tensor, "m"], RaySamples]:
-        """Return the samples of all rays, the (flattened) indices of rays with more than ``count``, and the
-        samples of these.
-
-        The intervals are those of ``__call__`` with the same ``jitter``. In the first part, rows have at most
-        ``count`` entries, which are meaningless for the rays with more. Called only if the host may wait for
-        the device.
-        """
-        ...
-
-
-def _split(
-    sampler: RaySampler, rays: Rays, count: int, jitter: Generator | None
-) -> tuple[RaySamples, Int[Tensor, "m"], RaySamples]:
-    """Gather any sampler's intervals and split them by count, as a ``SplittingSampler`` does."""
-    if isinstance(sampler, SplittingSampler):
-        few, many, rest = sampler.split_by_count(rays, count, jitter)
-        return gathered(few), many, gathered(rest)
-    rough = gathered(sampler(rays, jitter))
-    many = (rough.valid.sum(-1) > count).reshape(-1).nonzero()[:, 0]
-    return _first(rough, count), many, rows_of(rough, many)
-
-
 @dataclass(frozen=True)
 class Concentrated:
     """At most ``count`` intervals per ray, short where the field ``guide`` has its weight and long elsewhere.
@@ -259,37 +210,27 @@ class Concentrated:
 
     @torch.no_grad()
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
-        if not may_wait(rays.near.device):
-            return self._of_known_shape(rays, jitter)
-        few, many, rough = _split(self.guide.sampler, rays, self.count, jitter)
-        if not len(many):
-            return few
-        found = self._concentrated(rows_of(rays, many), rough, jitter)
-        merged = (
-            pad(old, (0, self.count - old.shape[-1])).reshape(-1, self.count).index_copy(0, many, new)
-            for old, new in zip(few.parts, found.parts, strict=True)
-        )
-        return RaySamples(*merged).unflattened(rays.near.shape)
-
-    def _of_known_shape(self, rays: Rays, jitter: Generator | None) -> RaySamples:
-        """Return the intervals without waiting for the device: all rays are concentrated, including those
-        that keep theirs.
-        """
         rough = gathered(self.guide.sampler(rays, jitter))
         if rough.starts.shape[-1] <= self.count:
             return rough
-        few = rough.valid.sum(-1) <= self.count
-        return either(few, _first(rough, self.count), self._concentrated(rays, rough, jitter))
+        many = rough.valid.sum(-1) > self.count
+        first = [part[..., : self.count] for part in rough.parts]
+        if not may_wait(many.device):  # all rays are concentrated, including those that keep their intervals
+            found = self._concentrated(rays, rough, jitter)
+            pairs = zip(found.parts, first, strict=True)
+            return RaySamples(*(torch.where(many[..., None], new, old) for new, old in pairs))
+        index = many.reshape(-1).nonzero()[:, 0]
+        found = self._concentrated(rows_of(rays, index), rows_of(rough, index), jitter)
+        merged = (
+            old.reshape(-1, self.count).index_copy(0, index, new)
+            for new, old in zip(found.parts, first, strict=True)
+        )
+        return RaySamples(*merged).unflattened(many.shape)
 
     def _concentrated(self, rays: Rays, rough: RaySamples, jitter: Generator | None) -> RaySamples:
         length = (rough.ends - rough.starts).clamp(min=torch.finfo(rough.ends.dtype).tiny)
         density = torch.minimum(query_samples(self.guide, rays, rough).density, LARGEST_THICKNESS / length)
         return concentrated(rough, rendering_weights(density, rough), self.count, jitter)
-
-
-def _first(samples: RaySamples, count: int) -> RaySamples:
-    """Return the first ``count`` intervals of each ray."""
-    return RaySamples(*(part[..., :count] for part in samples.parts))
 
 
 def concentrated(

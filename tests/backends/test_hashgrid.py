@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from dataclasses import dataclass, replace
 
 import pytest
@@ -12,20 +11,17 @@ from torch import Tensor
 
 import tiny
 from bidnerf_core.fields import (
-    Concentrated,
     FieldValues,
     RadianceField,
     Rays,
     RaySampler,
-    Resampled,
     SceneBounds,
-    SplittingSampler,
     VoxelGrid,
     render,
 )
 from bidnerf_hashgrid import HashGridConfig, HashGridField, backend
 from bidnerf_hashgrid.encoding import HashEncodingConfig
-from bidnerf_hashgrid.occupancy import GridDensity, OccupancyGrid
+from bidnerf_hashgrid.occupancy import OccupancyGrid
 from refusals import refused
 from voxels import cell_centres, cells_of
 
@@ -94,34 +90,6 @@ def test_skipping_blocks_loses_no_sample(share: float, steps_per_cell: int, jitt
     torch.testing.assert_close(
         samples.ends[samples.valid], torch.minimum(every + half, far)[samples.valid], atol=1e-9, rtol=0
     )
-
-
-@pytest.mark.parametrize(
-    "bounds", [BOUNDS, replace(BOUNDS, far=90.0, contracted=True)], ids=["box", "contracted"]
-)
-@pytest.mark.parametrize("shape", [(300,), (3, 100), ()], ids=str)
-@pytest.mark.parametrize("jitter", [False, True])
-def test_rays_with_many_samples_are_concentrated_as_without_splitting(
-    jitter: bool, shape: tuple[int, ...], bounds: SceneBounds
-) -> None:
-    every, count = random_rays(), math.prod(shape)
-    rays = bounds.rays(*(part[:count].reshape(*shape, 3) for part in (every.origins, every.directions)))
-    grid = OccupancyGrid(bounds, RESOLUTION)
-    grid.restrict(random_cells(0.6, 3))
-    grid.density.uniform_(0, 30, generator=torch.Generator().manual_seed(4))
-    density = GridDensity(grid)
-    found = []
-    for guide, splits in ((density, True), (Resampled(density, grid.__call__), False)):
-        assert isinstance(guide.sampler, SplittingSampler) == splits
-        draws = torch.Generator().manual_seed(5) if jitter else None
-        found.append(Concentrated(guide, 8)(rays, draws))
-    if shape:
-        assert 0.1 < float((grid(rays).valid.sum(-1) > 8).double().mean()) < 1
-    assert found[0].starts.shape == found[1].starts.shape
-    valid = found[1].valid
-    assert torch.equal(found[0].valid, valid)
-    for name in ("starts", "ends"):
-        assert torch.equal(*(getattr(samples, name)[valid] for samples in found))
 
 
 @dataclass(frozen=True, eq=False)
