@@ -22,6 +22,7 @@ from bidnerf_core.fields import (
     RaySamples,
     SceneBounds,
     device_of,
+    points_of,
     query_packed,
     query_samples,
     render_values,
@@ -178,17 +179,13 @@ def _update(
         * grid.step
         / (place(samples.ends) - place(samples.starts)).clamp(min=1e-9)
     )
-    middles, valid = samples.middles.reshape(-1), samples.valid.reshape(-1)
+    valid = samples.valid.reshape(-1)
     index = torch.arange(valid.numel(), device=valid.device)
     counted: Tensor | None = valid
     if may_wait(valid.device):  # often most samples are not valid
         index, counted = valid.nonzero()[:, 0], None
-    ray = index // samples.valid.shape[1]
-    origins, directions = (part.index_select(0, ray) for part in (rays.origins, rays.directions))
-    middles, weights, density = (
-        part.reshape(-1).index_select(0, index) for part in (middles, weights, density)
-    )
-    positions = origins + middles[:, None] * directions
+    weights, density = (part.reshape(-1).index_select(0, index) for part in (weights, density))
+    positions, _ = points_of(rays, samples, index)
     grid.observe(positions, weights.clamp(max=1), density, config.prune_fade, counted)
     grid.samples_per_ray.lerp_(valid.sum() / len(samples.valid), 0.1 if step > SETTLED else 1.0)
 
@@ -203,10 +200,8 @@ def _visible(
     """
     valid = samples.valid.reshape(-1)
     index = valid.nonzero()[:, 0]
-    ray = index // samples.valid.shape[-1]
-    origins, directions = (part.index_select(0, ray) for part in (rays.origins, rays.directions))
-    middles = samples.middles.reshape(-1).index_select(0, index)
-    encoded = field.encode(origins + middles[:, None] * directions, active)
+    positions, directions = points_of(rays, samples, index)
+    encoded = field.encode(positions, active)
     density = encoded.new_zeros(valid.numel()).index_copy(0, index, field.density_of(encoded))
     density = density.view_as(samples.valid)
     weights = rendering_weights(density, samples).reshape(-1).index_select(0, index)

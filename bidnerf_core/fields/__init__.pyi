@@ -33,6 +33,7 @@ from .pieces import PieceField as PieceField
 from .rendering import Observations as Observations
 from .rendering import RenderedImage as RenderedImage
 from .rendering import Rendering as Rendering
+from .rendering import points_of as points_of
 from .rendering import query_packed as query_packed
 from .rendering import query_samples as query_samples
 from .rendering import render as render

@@ -172,10 +172,6 @@ def levels(field: RadianceField) -> tuple[RadianceField, ...]:
     return tuple(getattr(field, "levels", None) or (field,))
 
 
-MOST_COPIED = 2**16
-"""Number of points up to which ``backward_derivatives`` copies them on an accelerator."""
-
-
 def derivatives_of(
     field: RadianceField, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"],
     wanted: Bool[Tensor, "p"] | None = None,
@@ -192,10 +188,10 @@ def backward_derivatives(
     """Return the values of ``query`` at points and their derivatives, by a backward pass for each channel.
 
     Points are independent, so the gradient of a channel's sum has the gradients of all points. On an accelerator, where launches
-    take most of the time, one pass over four copies of few points replaces the four.
+    take most of the time, one pass over four copies of up to 65536 points replaces the four.
     """
     n = len(positions)
-    copies = 4 if positions.device.type != "cpu" and n <= MOST_COPIED else 1
+    copies = 4 if positions.device.type != "cpu" and n <= 2**16 else 1
     with torch.enable_grad():
         leaves = [part.detach().repeat(copies, 1).requires_grad_() for part in (positions, directions)]
         found = query(*leaves)

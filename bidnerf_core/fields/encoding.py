@@ -12,12 +12,6 @@ from torch.nn import functional
 
 from bidnerf_core.fields.contract import FieldValues, SceneBounds
 
-SHARPNESS = 30.0
-"""Density per side of the scene at a raw density of about 1, so that networks with small outputs can
-represent surfaces."""
-THINNESS = 1.0
-"""Shift of raw density that makes an untrained field nearly transparent (Barron et al. 2021, mip-NeRF)."""
-
 Network: TypeAlias = Callable[
     [Float[Tensor, "p 3"], Float[Tensor, "p 3"]], tuple[Float[Tensor, "p"], Float[Tensor, "p 3"]]
 ]
@@ -60,7 +54,9 @@ def query_network(
     """Return a network's values; positions are scaled to the cube [-1, 1], so that the length unit has no effect."""
     shape = positions.shape[:-1]
     raw, rgb = network(bounds.normalized(positions.reshape(-1, 3)), directions.reshape(-1, 3))
-    density = functional.softplus(raw - THINNESS) * (SHARPNESS / bounds.side)
+    # Shifted, so that an untrained field is nearly transparent (Barron et al. 2021, mip-NeRF); 30 per side of the scene at a raw
+    # density of about 1, so that networks with small outputs can represent surfaces.
+    density = functional.softplus(raw - 1) * (30 / bounds.side)
     return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
 
 

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn.functional import interpolate, max_pool2d
+from torch.nn.functional import interpolate, max_pool2d, pad
 
 from bidnerf_core.camera import Intrinsics, exposure_times, poses_of_rows
 from bidnerf_core.devices import constant, may_wait
@@ -20,7 +20,6 @@ from bidnerf_core.fields.contract import (
     FieldValues,
     HitField,
     RadianceField,
-    RayHits,
     Rays,
     RaySamples,
     SceneBounds,
@@ -29,9 +28,6 @@ from bidnerf_core.fields.contract import (
 )
 from bidnerf_core.geometry import SE3
 from bidnerf_core.progress import check_cancelled
-
-PICTURE_CONTRAST = 0.12
-"""Difference of neighbours (of colours and opacity; of distances, as a share) beyond which pictures are rendered pixel by pixel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,11 +95,6 @@ class Observations:
     def points(self) -> Float[Tensor, "*p 3"]:
         """The measured points (metres, reference frame); the ray's origin where no distance was measured."""
         return self.origins + self.distance[..., None] * self.directions
-
-    def without_colour(self) -> Observations:
-        """Return the rays along which a distance was measured, without colours. Raises ``InputError`` if there are none."""
-        measured = self[self.measured]
-        return Observations.of_depth(measured.origins, measured.directions, measured.distance)
 
     def gathered(self, index: Int[Tensor, "k m"]) -> Observations:
         """Return m rays from each row of rays of shape (k p), at ``index`` along the second axis."""
@@ -199,16 +190,22 @@ def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> Fiel
         found = field.query(positions, directions)
         return FieldValues(torch.where(valid, found.density, 0), found.rgb)
     index = valid.reshape(-1).nonzero()[:, 0]
-    ray = index // valid.shape[-1]
-    # Positions are computed only for these samples: often most of a row is padding.
+    found = field.query(*points_of(rays, samples, index))
+    density = found.density.new_zeros(valid.numel()).index_copy(0, index, found.density)
+    rgb = found.rgb.new_zeros((valid.numel(), 3)).index_copy(0, index, found.rgb)
+    return FieldValues(density.reshape(valid.shape), rgb.reshape(*valid.shape, 3))
+
+
+def points_of(
+    rays: Rays, samples: RaySamples, index: Int[Tensor, "n"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Return the positions (metres, world) of the samples with these flat indices, and the directions of their rays."""
+    ray = index // samples.valid.shape[-1]
     origins, directions = (
         part.reshape(-1, 3).index_select(0, ray) for part in (rays.origins, rays.directions)
     )
     middles = samples.middles.reshape(-1).index_select(0, index)
-    found = field.query(origins + middles[:, None] * directions, directions)
-    density = found.density.new_zeros(valid.numel()).index_copy(0, index, found.density)
-    rgb = found.rgb.new_zeros((valid.numel(), 3)).index_copy(0, index, found.rgb)
-    return FieldValues(density.reshape(valid.shape), rgb.reshape(*valid.shape, 3))
+    return origins + middles[:, None] * directions, directions
 
 
 def query_packed(
@@ -218,7 +215,7 @@ def query_packed(
 
     The field is queried at ``room`` points whatever the number of valid samples is, so that the host need not wait for it.
     """
-    valid, width = samples.valid.reshape(-1), samples.valid.shape[-1]
+    valid = samples.valid.reshape(-1)
     total, room = valid.numel(), min(room, valid.numel())
     order = valid.cumsum(0)
     kept = valid & (order <= room)
@@ -227,9 +224,7 @@ def query_packed(
     index = torch.cat([slot, slot[:1]]).index_copy(
         0, torch.where(kept, order - 1, room), torch.arange(total, device=valid.device)
     )[:room]
-    origins, directions = (part.index_select(0, index // width) for part in (rays.origins, rays.directions))
-    middles = samples.middles.reshape(-1).index_select(0, index)
-    found = field.query(origins + middles[:, None] * directions, directions)
+    found = field.query(*points_of(rays, samples, index))
     target = torch.where(slot < order[-1:], index, total)
     density = found.density.new_zeros(total + 1).index_copy(0, target, found.density)[:-1]
     rgb = found.rgb.new_zeros((total + 1, 3)).index_copy(0, target, found.rgb)[:-1]
@@ -273,9 +268,15 @@ def render(
     background: tuple[float, float, float] | Float[Tensor, "*#r 3"] = (0.0, 0.0, 0.0),
     jitter: Generator | None = None,
 ) -> Rendering:
-    """Render rays; differentiable in the field's parameters and in the rays."""
+    """Render rays; differentiable in the field's parameters and in the rays.
+
+    Hits are composited as ``w_i = alpha_i prod_{j<i} (1 - alpha_j)``, which is eq. 3 with ``alpha = 1 - exp(-sigma dt)``.
+    """
     if isinstance(field, HitField):
-        return render_hits(field.hits(rays), background)
+        hits = field.hits(rays)
+        passed = torch.cumprod(1 - hits.alpha, dim=-1)
+        weights = hits.alpha * pad(passed, (1, 0), value=1.0)[..., :-1]
+        return _over(background, hits.rgb, weights, hits.samples, None)
     return render_samples(field, rays, field.sampler(rays, jitter), background)
 
 
@@ -341,18 +342,6 @@ class _Composite(torch.autograd.Function):
         return to_density, weights[..., None] * to_rgb, None, None, None
 
 
-def render_hits(
-    hits: RayHits, background: tuple[float, float, float] | Float[Tensor, "*#r 3"] = (0.0, 0.0, 0.0)
-) -> Rendering:
-    """Composite the hits of rays: ``w_i = alpha_i prod_{j<i} (1 - alpha_j)``, which is eq. 3 with ``alpha = 1
-    - exp(-sigma dt)``.
-    """
-    passed = torch.cumprod(1 - hits.alpha, dim=-1)
-    before = torch.cat([torch.ones_like(passed[..., :1]), passed[..., :-1]], dim=-1)[..., : passed.shape[-1]]
-    weights = hits.alpha * before
-    return _over(background, hits.rgb, weights, hits.samples, None)
-
-
 def _over(
     background: tuple[float, float, float] | Float[Tensor, "*#r 3"], colours: Float[Tensor, "*r s 3"],
     weights: Float[Tensor, "*r s"], samples: RaySamples, density: Float[Tensor, "*r s"] | None,
@@ -384,7 +373,7 @@ def render_picture(
 ) -> RenderedImage:  # fmt: skip
     """Render an image to look at: every second pixel of every second row, and of the others those whose neighbours differ.
 
-    The others are interpolated, which misses only what is smaller than two pixels, and saves up to half of the time, see ``PICTURE_CONTRAST``.
+    The others are interpolated, which misses only what is smaller than two pixels, and saves up to half of the time.
     """
     pixels = intrinsics.pixel_centres().reshape(-1, 2)
     height, width = intrinsics.height, intrinsics.width
@@ -395,20 +384,17 @@ def render_picture(
     coarse = values[::2, ::2].movedim(-1, 0)[None]
     size = 2 * coarse.shape[2] - 1, 2 * coarse.shape[3] - 1  # of what lies between the first pixels
     between = interpolate(coarse, size=size, mode="bilinear", align_corners=True)[0].movedim(0, -1)
+    largest, least = max_pool2d(coarse, 3, 1, 1)[0], -max_pool2d(-coarse, 3, 1, 1)[0]
+    distance, shown = largest[3], torch.cat([largest[:3] - least[:3], largest[4:] - least[4:]])
+    # Neighbours differ by more than 0.12 in a colour or the opacity, or by this share of the distance.
+    differs = (shown > 0.12).any(0) | (distance - least[3] > 0.12 * distance)
+    differs = differs.repeat_interleave(2, 0).repeat_interleave(2, 1)
     again = ~first
-    again[: size[0], : size[1]] &= _differs(coarse)[: size[0], : size[1]]
+    again[: size[0], : size[1]] &= differs[: size[0], : size[1]]
     filled = ~first & ~again
     values[filled] = between[:height, :width][filled[: size[0], : size[1]]]
     values[again] = _rendered(field, intrinsics, T_world_camera, bounds, pixels[again.reshape(-1)], chunk)
     return _image_of(values.reshape(-1, 5), intrinsics)
-
-
-def _differs(coarse: Float[Tensor, "1 5 h w"]) -> Bool[Tensor, "H W"]:
-    """Return where the first pixels around a pixel of the whole image differ too much to interpolate between them."""
-    largest, least = max_pool2d(coarse, 3, 1, 1)[0], -max_pool2d(-coarse, 3, 1, 1)[0]
-    distance, shown = largest[3], torch.cat([largest[:3] - least[:3], largest[4:] - least[4:]])
-    apart = (shown > PICTURE_CONTRAST).any(0) | (distance - least[3] > PICTURE_CONTRAST * distance)
-    return apart.repeat_interleave(2, 0).repeat_interleave(2, 1)
 
 
 def _rendered(

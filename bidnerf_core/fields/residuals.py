@@ -60,21 +60,15 @@ def depth_residual(
     return rendering.distance - rendering.opacity * observed.distance + (1 - rendering.opacity) * miss
 
 
-TRUNCATION = 0.3
-"""Largest depth difference of a sample (metres) in ``truncated_depth_residual`` if none is given."""
-SURFACE_DEPTH = 0.1
-"""Distance (metres) from the first surface within which ``first_surface_residual`` averages."""
-
-
 def truncated_depth_residual(
     rendering: Rendering, observed: Observations, miss: float | None = None
 ) -> Float[Tensor, "*p"]:
-    """Return ``sum_i w_i clip(t_i - d) + (1 - sum_i w_i) miss``, metres, where clip limits to +-``miss``.
+    """Return ``sum_i w_i clip(t_i - d) + (1 - sum_i w_i) miss``, metres, where clip limits to +-``miss`` (0.3 by default).
 
     At a silhouette, part of the weight lies on a surface far behind. Here its contribution is limited to
     ``miss``, however far away the surface is; in the paper's residual it counts with its full distance.
     """
-    limit = TRUNCATION if miss is None else miss
+    limit = 0.3 if miss is None else miss
     off = (rendering.samples.middles - observed.distance[..., None]).clamp(-limit, limit)
     return (rendering.weights * off).sum(-1) + (1 - rendering.opacity) * limit
 
@@ -84,7 +78,8 @@ def first_surface_residual(
 ) -> Float[Tensor, "*p"]:
     """Return how far the first surface lies behind the measured distance, metres; 0 for a ray that is not stopped.
 
-    The first surface is where the cumulative weight reaches half of the ray's total; its distance is the weighted mean nearby.
+    The first surface is where the cumulative weight reaches half of the ray's total; its distance is the weighted mean within
+    0.1 m.
     """
     middles, weights = rendering.samples.middles, rendering.weights
     if middles.shape[-1] == 0:
@@ -92,7 +87,7 @@ def first_surface_residual(
     with torch.no_grad():
         met = weights.cumsum(-1) >= rendering.opacity[..., None] / 2
         first = torch.where(met & rendering.samples.valid, middles, torch.inf).amin(-1, keepdim=True)
-        near = (middles - first).abs() <= SURFACE_DEPTH
+        near = (middles - first).abs() <= 0.1
     share = torch.where(near, weights, 0)
     distance = (share * middles).sum(-1) / share.sum(-1).clamp(min=1e-6)
     return torch.where(rendering.opacity > 0.5, distance - observed.distance, 0)

@@ -114,4 +114,6 @@ def _write_png(path: Path, pixels: np.ndarray) -> None:
 def depth_rays_of(views: Sequence[View]) -> Observations:
     """Return all pixels with measured depth as rays without colour, in the views' reference frame; float64."""
     parts = [observe(view, all_pixels(view.frame), torch.float64, "cpu") for view in views]
-    return Observations.joined(parts).without_colour()
+    every = Observations.joined(parts)
+    measured = every[every.measured]
+    return Observations.of_depth(measured.origins, measured.directions, measured.distance)
