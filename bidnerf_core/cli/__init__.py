@@ -80,9 +80,7 @@ def _guarded(name: str, given: list[str]) -> int:
     except InputError as error:
         return _failed(name, str(error), WRONG_USAGE if isinstance(error, UsageError) else BAD_INPUT)
     except RuntimeError as error:
-        if (
-            type(error).__name__ != "OutOfMemoryError"
-        ):  # a torch error; torch is not imported here, so that --help is quick
+        if type(error).__name__ != "OutOfMemoryError":  # of torch, which --help does not wait for
             raise
         return _failed(name, f"the GPU's memory is full, try --device cpu ({error})", BAD_INPUT)
 
@@ -101,7 +99,9 @@ def _dispatch(given: list[str]) -> int:
         return _failed("bidnerf", unknown, WRONG_USAGE, f"\n{_usage()}")
     if any("\0" in word for word in given):
         return _failed(f"bidnerf {given[0]}", "an argument holds a NUL character, expected text", WRONG_USAGE)
-    importlib.import_module(f"bidnerf_core.cli.{given[0]}").run(given[1:])
+    from bidnerf_core.cli.parser import parse  # imported here, for the sake of a quick --version
+
+    parse(given[0], importlib.import_module(f"bidnerf_core.cli.{given[0]}").run, given[1:])
     return DONE
 
 
@@ -110,18 +110,14 @@ def _warnings_as_lines(name: str) -> Iterator[None]:
     """Print each ``InputWarning`` as one line on stderr, once, without the source line that Python would print."""
     told = set[str]()
     with warnings.catch_warnings():
-        others = warnings.showwarning
 
-        def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
-            if issubclass(category, InputWarning):
-                if str(message) not in told:  # a broken plugin is found again with every folder
-                    _failed(name, str(message), DONE)
+        def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
+            if not issubclass(category, InputWarning):
+                lines = warnings.formatwarning(message, category, *where[:2]).split("\n")
+                sys.stderr.write("\n".join(map(printable, lines)))
+            elif str(message) not in told:  # a broken plugin is found again with every folder
                 told.add(str(message))
-                return
-            from bidnerf_core.cli.output import PrintableStream  # imported here, since few commands warn
-
-            with contextlib.redirect_stderr(PrintableStream(sys.stderr)):
-                others(message, category, *place)
+                _failed(name, str(message), DONE)
 
         warnings.simplefilter("always", InputWarning)
         warnings.showwarning = show  # type: ignore[assignment]
@@ -146,9 +142,7 @@ def _remarks_as_lines() -> Iterator[None]:
 
 class _Lines(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
-        from bidnerf_core.cli.output import (
-            say,
-        )  # imported here, because importing rich takes longer than --help should
+        from bidnerf_core.cli.output import say  # imported here, because rich takes longer than --help should
 
         say(record.getMessage())
 

@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from bidnerf_core.cli.options import BakeSettings, Device, MapFolder
-from bidnerf_core.cli.parser import Flag, Option, Without, parse
+from bidnerf_core.cli.parser import Flag, Option, Without
 from bidnerf_core.cli.progress import working
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import UsageError
 
 
-@dataclass(frozen=True)
-class Bake:
-    """Find the surface and the landmarks of a map, and store them in the map.
-
-    Depth is rendered from the poses of the training images; what several of these views agree on is kept. With --data,
-    measured depth is used directly where views have it, and landmarks are built from the photos; without --data they are built
-    from images rendered by the field, which are only as sharp as the field. Landmarks from photos are kept unless --data gives
-    new photos or --rendered-landmarks is set.
-    """
-
-    map: MapFolder
+def run(
+    map: MapFolder,
     data: Annotated[
         Path | None,
         Option(
@@ -31,37 +21,37 @@ class Bake:
             "dataset whose photos give landmarks and whose measured depth gives the surface",
             "rendered images only",
         ),
-    ] = None
+    ] = None,
     rendered_landmarks: Annotated[
         Flag, Option(None, "replace landmarks of photos by landmarks of rendered images")
-    ] = False
+    ] = False,
     landmark_features: Annotated[
         str | None,
         Option("NAME", "detector of the landmarks, one of 'bidnerf plugins features'", "the map's"),
-    ] = None
-    device: Device = "cpu"
-    images: Annotated[DatasetOptions, Without("background")] = DatasetOptions()
-    config: BakeSettings = None
-    """settings of the surface and the landmarks"""
+    ] = None,
+    device: Device = "cpu",
+    *,
+    images: Annotated[DatasetOptions, Without("background")],
+    config: BakeSettings = None,
+) -> None:
+    """Find the surface and the landmarks of a map, and store them in the map.
 
-    def run(self) -> None:
-        from bidnerf_core.maps import load_map
+    Depth is rendered from the poses of the training images; what several of these views agree on is kept. With --data,
+    measured depth is used directly where views have it, and landmarks are built from the photos; without --data they are built
+    from images rendered by the field, which are only as sharp as the field. Landmarks from photos are kept unless --data gives
+    new photos or --rendered-landmarks is set.
+    """
+    from bidnerf_core.maps import load_map
 
-        images = self.images
-        if self.rendered_landmarks and self.data is not None:
-            raise UsageError(
-                "--rendered-landmarks uses no photos, but --data gives some;", expected="only one of them"
-            )
-        if images.masks is not None and self.data is None:
-            raise UsageError("--masks was given without --data", expected="the dataset that they belong to")
-        # Its baked parts may be damaged, and are replaced anyway.
-        scene = load_map(self.map, self.device, baked=False)
-        with working():
-            scene.bake(
-                self.data, self.config, images=images, rendered_landmarks=self.rendered_landmarks,
-                features=self.landmark_features,
-            )  # fmt: skip
-
-
-def run(arguments: list[str]) -> None:
-    parse("bake", Bake, arguments).run()
+    if rendered_landmarks and data is not None:
+        raise UsageError(
+            "--rendered-landmarks uses no photos, but --data gives some;", expected="only one of them"
+        )
+    if images.masks is not None and data is None:
+        raise UsageError("--masks was given without --data", expected="the dataset that they belong to")
+    # Its baked parts may be damaged, and are replaced anyway.
+    scene = load_map(map, device, baked=False)
+    with working():
+        scene.bake(
+            data, config, images=images, rendered_landmarks=rendered_landmarks, features=landmark_features
+        )

@@ -8,22 +8,20 @@ from typing import Annotated
 from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import MapFolder
 from bidnerf_core.cli.output import show
-from bidnerf_core.cli.parser import Flag, Option, parse
-
-FORMATS = (
-    "ply: surface, landmarks and cameras as point clouds and meshes; colmap: a text model of cameras and landmarks;"
-    " transforms.json: cameras in nerfstudio's format, with landmarks as sparse points; or another one of"
-    " 'bidnerf plugins exporters'"
-)
+from bidnerf_core.cli.parser import Flag, Option
 
 
-def run(arguments: list[str]) -> None:
-    parse("export", export, arguments)
-
-
-def export(
+def run(
     map: MapFolder,
-    to: Annotated[str, Option("FORMAT", FORMATS)],
+    to: Annotated[
+        str,
+        Option(
+            "FORMAT",
+            "ply: surface, landmarks and cameras as point clouds and meshes; colmap: a text model of cameras and landmarks;"
+            " transforms.json: cameras in nerfstudio's format, with landmarks as sparse points; or another one of"
+            " 'bidnerf plugins exporters'",
+        ),
+    ],
     out: Annotated[Path, Option("DIR", "folder for the files")],
     overwrite: Annotated[Flag, Option(None, "write into a non-empty folder")] = False,
 ) -> None:

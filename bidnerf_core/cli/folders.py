@@ -9,9 +9,6 @@ from pathlib import Path
 
 from bidnerf_core.errors import InputError, UsageError
 
-PLOTS = ".png", ".svg"
-"""The file extensions of plots."""
-
 
 def check_output(out: Path, inputs: Iterable[Path | str | None]) -> None:
     """Raise, before any work is done, if the file ``out`` cannot be written or would replace an input.
@@ -24,7 +21,7 @@ def check_output(out: Path, inputs: Iterable[Path | str | None]) -> None:
         what = "is a folder" if os.path.isdir(out) else f"no folder {out.parent}"
         raise InputError(what, where=out, expected="a file in an existing folder")
     require_outside_maps(out.parent, out)
-    require_writable(out.parent, out)
+    _require_writable(out.parent, out)
     if not os.path.exists(out):
         return
     for given in [Path(each) for each in inputs if each is not None]:
@@ -36,25 +33,13 @@ def check_output(out: Path, inputs: Iterable[Path | str | None]) -> None:
             )
 
 
-def check_pose_file(out: Path, inputs: Iterable[Path | str | None]) -> None:
-    """Check an output file of poses as ``check_output`` does. Raises ``UsageError`` for an unknown file extension."""
-    from bidnerf_core.results import pose_format  # imported here, since 'report' works without torch
+def check_folder(
+    out: Path, inputs: Iterable[Path | str | None], may_be_map: bool = False, create: bool = False
+) -> None:
+    """Raise ``UsageError`` if an output folder lies inside a map, is one of the inputs, or is a map.
 
-    pose_format(out)
-    check_output(out, inputs)
-
-
-def check_plot(plot: Path, inputs: Iterable[Path | str | None]) -> None:
-    """Check the file of a plot as ``check_output`` does. Raises ``UsageError`` for a file extension that is
-    not a plot's.
+    With ``create`` it is created, and ``InputError`` raised if that or files in it are not possible.
     """
-    if plot.suffix.lower() not in PLOTS:
-        raise UsageError(where=plot, expected=f"a name that ends with {' or '.join(PLOTS)}")
-    check_output(plot, inputs)
-
-
-def check_folder(out: Path, inputs: Iterable[Path | str | None], may_be_map: bool = False) -> None:
-    """Raise ``UsageError`` if an output folder lies inside a map, is one of the inputs, or is a map."""
     require_outside_maps(out.parent, out)
     if not may_be_map:
         require_outside_maps(out, out)
@@ -63,15 +48,12 @@ def check_folder(out: Path, inputs: Iterable[Path | str | None], may_be_map: boo
             raise UsageError(
                 "is an input of this command", where=out, expected="another folder for its output"
             )
-
-
-def require_writable(folder: Path, out: Path) -> None:
-    """Raise ``InputError`` if no file can be created in ``folder``, which is to hold the output ``out``."""
-    try:
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        reason = f"cannot be written: {error.strerror}"
-        raise InputError(reason, where=out, expected="a folder in which files can be created") from error
+    if create:
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(error.strerror, where=out, expected="a folder that can be created") from error
+        _require_writable(out, out)
 
 
 def require_outside_maps(folder: Path, out: Path) -> None:
@@ -82,14 +64,9 @@ def require_outside_maps(folder: Path, out: Path) -> None:
         raise UsageError("lies in the folder of a map", where=out, expected="a name outside of it")
 
 
-def make_folder(folder: Path, inputs: Iterable[Path | str | None]) -> None:
-    """Create a folder for pictures.
-
-    Raises ``UsageError`` if it is a map or one of the inputs, and ``InputError`` if it cannot be created.
-    """
-    check_folder(folder, inputs)
+def _require_writable(folder: Path, out: Path) -> None:
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        raise InputError(error.strerror, where=folder, expected="a folder that can be created") from error
-    require_writable(folder, folder)
+        reason = f"cannot be written: {error.strerror}"
+        raise InputError(reason, where=out, expected="a folder in which files can be created") from error

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from bidnerf_core.cli.folders import check_folder
-from bidnerf_core.cli.options import Device, FeaturesName, require, wrong_usage
-from bidnerf_core.cli.parser import Flag, Option, Settings, Without, parse
+from bidnerf_core.cli.options import MapOptions, wrong_usage
+from bidnerf_core.cli.parser import Option, Settings, Without
 from bidnerf_core.cli.progress import working
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError
-
-LEAST_SCALE = 1e-9
+from bidnerf_core.settings import Above
 
 
 def _importer_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
@@ -34,7 +33,42 @@ def _importer_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
 
 
 @dataclass(frozen=True)
-class Import:
+class WorldOptions:
+    """How the coordinates of the file are taken to the world."""
+
+    scale: Annotated[float, Above(0.0), Option("FACTOR", "metres per unit of length in the file")] = 1.0
+    T_world_file: Annotated[
+        Path | None,
+        Option(
+            "POSE", "file of a pose (JSON, 4x4) that takes the scaled coordinates of the file to the world"
+        ),
+    ] = None
+
+
+def run(
+    file: Annotated[
+        Path,
+        Option("FILE", "file or folder of a trained field, or folder of a COLMAP project", positional=True),
+    ],
+    out: Annotated[Path, Option("MAP", "folder for the map")],
+    as_: Annotated[
+        str | None, Option("NAME", "one of 'bidnerf plugins importers'", "the one that recognizes the file")
+    ] = None,
+    *,
+    world: WorldOptions,
+    photos: Annotated[
+        Path | None,
+        Option(
+            "DATA", "dataset whose photos, with poses in the world, provide the landmarks", "rendered images"
+        ),
+    ] = None,
+    written: MapOptions,
+    images: Annotated[
+        DatasetOptions,
+        Without("register_depth", "depth_unit", "masks", "mask_hides", "largest", "background"),
+    ],
+    config: Annotated[Any, Settings(_importer_settings, "settings of the importer")] = None,
+) -> None:
     """Build a map from a field that was trained elsewhere, or from an existing COLMAP model.
 
     The installed importer that recognizes the file reads it. The command reports what it found: counts, what was left out, and
@@ -44,64 +78,18 @@ class Import:
     The points and tracks of a COLMAP model (a project folder or the model in it) become the landmarks, and answers are in its
     world; its files are not changed. Such a map localizes photos without a field, which 'bidnerf train FILE --out MAP' adds.
     """
+    from bidnerf_core.devices import working_device
+    from bidnerf_core.maps import ImportOptions, import_map
+    from bidnerf_core.results import read_pose
 
-    file: Annotated[
-        Path,
-        Option("FILE", "file or folder of a trained field, or folder of a COLMAP project", positional=True),
-    ]
-    out: Annotated[Path, Option("MAP", "folder for the map")]
-    as_: Annotated[
-        str | None, Option("NAME", "one of 'bidnerf plugins importers'", "the one that recognizes the file")
-    ] = None
-    scale: Annotated[float, Option("FACTOR", "metres per unit of length in the file")] = 1.0
-    T_world_file: Annotated[
-        Path | None,
-        Option(
-            "POSE", "file of a pose (JSON, 4x4) that takes the scaled coordinates of the file to the world"
-        ),
-    ] = None
-    photos: Annotated[
-        Path | None,
-        Option(
-            "DATA", "dataset whose photos, with poses in the world, provide the landmarks", "rendered images"
-        ),
-    ] = None
-    landmark_features: FeaturesName = "sift"
-    overwrite: Annotated[Flag, Option(None, "replace the map in --out")] = False
-    no_bake: Annotated[Flag, Option(None, "leave the surface and landmarks to 'bidnerf bake'")] = False
-    device: Device = "cpu"
-    images: Annotated[
-        DatasetOptions,
-        Without("register_depth", "depth_unit", "masks", "mask_hides", "largest", "background"),
-    ] = DatasetOptions()
-    config: Annotated[Any, Settings(_importer_settings)] = None
-    """settings of the importer"""
-
-    def run(self) -> None:
-        from bidnerf_core.devices import working_device
-        from bidnerf_core.maps import ImportOptions, import_map
-        from bidnerf_core.results import read_pose
-
-        require("--scale", self.scale, LEAST_SCALE)
-        check_folder(self.out, (self.file, self.photos), may_be_map=True)
-        working_device(self.device)
-        pose = None
-        if self.T_world_file is not None:
-            with wrong_usage():
-                pose = read_pose(self.T_world_file)
-        options = ImportOptions(
-            self.images, self.landmark_features, self.device, self.overwrite, self.as_, self.scale, pose
-        )
-        with working():
-            import_map(
-                self.file,
-                self.out,
-                self.config,
-                photos=self.photos,
-                bake=not self.no_bake,
-                options=options,
-            )
-
-
-def run(arguments: list[str]) -> None:
-    parse("import", Import, arguments).run()
+    check_folder(out, (file, photos), may_be_map=True)
+    working_device(written.device)
+    pose = None
+    if world.T_world_file is not None:
+        with wrong_usage():
+            pose = read_pose(world.T_world_file)
+    options = ImportOptions(
+        images, written.landmark_features, written.device, written.overwrite, as_, world.scale, pose
+    )
+    with working():
+        import_map(file, out, config, photos=photos, bake=not written.no_bake, options=options)

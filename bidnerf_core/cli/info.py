@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from bidnerf_core.cli.folders import check_output
 from bidnerf_core.cli.options import Json, MapFolder
 from bidnerf_core.cli.output import print_json, show
-from bidnerf_core.cli.parser import Option, parse
+from bidnerf_core.cli.parser import Option
 from bidnerf_core.errors import InputError
 
-if TYPE_CHECKING:
-    from bidnerf_core.maps import Map
 
-
-def run(arguments: list[str]) -> None:
-    parse("info", info, arguments)
-
-
-def info(
+def run(
     map: MapFolder,
     json: Json = False,
     draw: Annotated[
@@ -28,6 +21,7 @@ def info(
 ) -> None:
     """Describe a map and the photos it was built from. The whole map is loaded, so that damage is detected."""
     from bidnerf_core.maps import load_map
+    from bidnerf_core.results import draw_capture
 
     if draw is not None:
         if draw.suffix.lower() != ".png":
@@ -36,23 +30,15 @@ def info(
     scene = load_map(map)
     summary = scene.describe()
     if draw is not None:
-        _draw(scene, draw)
+        if scene.capture is None:
+            raise InputError(
+                "has no record of its photos to draw; 'bidnerf bake MAP --data DATA' creates one", where=map
+            )
+        seen_by = None if scene.landmarks is None else scene.landmarks.views
+        points = None if scene.landmarks is None else scene.landmarks.positions
+        draw_capture(scene.capture, points, seen_by, draw, scene.unit)
     if json:
         print_json(summary.plain())
         return
     for line in str(summary).splitlines():
         show(line)
-
-
-def _draw(scene: Map, out: Path) -> None:
-    """Draw the capture from above. Raises ``InputError`` if the map has no record of it."""
-    from bidnerf_core.results import draw_capture
-
-    if scene.capture is None:
-        raise InputError(
-            "has no record of its photos to draw; 'bidnerf bake MAP --data DATA' creates one",
-            where=scene.folder,
-        )
-    seen_by = None if scene.landmarks is None else scene.landmarks.views
-    points = None if scene.landmarks is None else scene.landmarks.positions
-    draw_capture(scene.capture, points, seen_by, out, scene.unit)

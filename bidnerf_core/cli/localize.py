@@ -9,23 +9,60 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from bidnerf_core.cli.folders import check_output, check_pose_file, make_folder
+from bidnerf_core.cli.folders import check_folder, check_output
 from bidnerf_core.cli.interruptions import uninterrupted
-from bidnerf_core.cli.options import Json, MapFolder, MethodOptions, PointChoice, StartOptions, require
+from bidnerf_core.cli.options import TEST_IMAGES, Json, MapFolder, MethodOptions, Seed, require_one
 from bidnerf_core.cli.output import print_json, say, show
-from bidnerf_core.cli.parser import Option, Without, parse
+from bidnerf_core.cli.parser import FLAG, Option, Without
 from bidnerf_core.cli.progress import displayed
 from bidnerf_core.cli.queries import QueryOptions
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount, enumeration
-from bidnerf_core.settings import LARGEST_SEED
 
 if TYPE_CHECKING:
-    from bidnerf_core.datasets import DepthPoints, Query
+    from bidnerf_core.datasets import Query
     from bidnerf_core.geometry import SE3
     from bidnerf_core.localization import Localizer
-    from bidnerf_core.maps import Map, MapCollection
+    from bidnerf_core.maps import MapCollection
     from bidnerf_core.results import Answer, Answers, Failure, PoseError
+
+
+@dataclass(frozen=True)
+class StartOptions:
+    """Where to start (default: no start; at most one of these)."""
+
+    start: Annotated[
+        Path | None,
+        Option("POSE.json", "file with a 4x4 T_world_camera to start from, or with one per query by name"),
+    ] = None
+    perturb: Annotated[
+        tuple[float, float] | None,
+        Option("T R", "start from the dataset's pose moved by T metres and R degrees"),
+    ] = None
+    no_start: Annotated[bool, FLAG, Option(None, "no start is known")] = False
+
+    def __post_init__(self) -> None:
+        require_one({"--start": self.start, "--perturb": self.perturb, "--no-start": self.no_start or None})
+
+    def of_queries(self, seed: int) -> Callable[[Query], SE3 | None]:
+        """Return the function that gives the start of each query. Raises ``UsageError`` for a perturbation out of range."""
+        from bidnerf_core.evaluation import find_protocol, perturb
+        from bidnerf_core.results import pose_of, read_poses
+
+        start, moved = self.start, self.perturb
+        if moved is not None:
+            try:
+                find_protocol("perturb").check_size(moved)
+            except InputError as error:
+                raise UsageError(error, where="--perturb") from error
+        poses = None if start is None else read_poses(start)
+
+        def start_of(query: Query) -> SE3 | None:
+            if moved is not None and query.truth is not None:
+                return perturb(query.truth, *moved, seed)
+            return None if poses is None else pose_of(poses, query.name, start or "start")
+
+        return start_of
 
 
 @dataclass(frozen=True)
@@ -44,12 +81,15 @@ class OutputOptions:
     ] = None
     json: Json = False
 
-    def check(self, inputs: Sequence[Path | str | None]) -> None:
+    def check(self, inputs: Sequence[Path]) -> None:
         """Check, before any work, that the outputs can be written."""
+        from bidnerf_core.results import pose_format
+
         if self.out is not None:
-            check_pose_file(self.out, inputs)
+            pose_format(self.out)
+            check_output(self.out, inputs)
         if self.draw is not None:
-            make_folder(self.draw, inputs)
+            check_folder(self.draw, inputs, create=True)
 
     def picture(self, name: str) -> Path:
         """Return the file of a picture."""
@@ -57,17 +97,8 @@ class OutputOptions:
         return self.draw / f"overlay-{name}.png"
 
 
-@dataclass(frozen=True)
-class Localize:
-    """Find the poses of photos or dataset frames in a map, or in the one of several maps that they show.
-
-    QUERY is image files, folders of photos, or a dataset. A photo's camera comes from its EXIF unless it is given; if EXIF has no
-    focal length, method auto begins with the camera of the map's images. Dataset frames named by --frame form a rig: their
-    relative poses come from the dataset, and the pose found is that of the last one's camera. Poses are camera to world with
-    OpenCV axes (x right, y down, z forward). Points are in the camera's axes, unless a .npz also holds T_camera_sensor.
-    """
-
-    map: MapFolder
+def run(
+    map: MapFolder,
     query: Annotated[
         tuple[Path, ...],
         Option(
@@ -76,133 +107,64 @@ class Localize:
             " image is localized in the one it shows",
             positional=True,
         ),
-    ] = ()
-    output: OutputOptions = OutputOptions()
-    queries: QueryOptions = QueryOptions()
-    depth_points: Annotated[
-        Path | None,
-        Option(
-            "FILE",
-            "points measured by a sensor, in the camera frame, metres: rows of x y z, .npy, or .npz; or the folder of a"
-            " COLMAP sparse model, whose points are used where the frames observe them",
-        ),
-    ] = None
-    images: Annotated[DatasetOptions, Without("largest", "background")] = DatasetOptions(split="test")
-    start: StartOptions = StartOptions()
-    method: MethodOptions = MethodOptions()
-    seed: Annotated[int, Option("N", "seed of every random choice")] = 0
-    model_points: PointChoice = None
-    """which points of a COLMAP model are used"""
+    ] = (),
+    *,
+    output: OutputOptions,
+    queries: QueryOptions,
+    images: Annotated[DatasetOptions, Without("largest", "background")] = TEST_IMAGES,
+    start: StartOptions,
+    method: MethodOptions,
+    seed: Seed = 0,
+) -> None:
+    """Find the poses of photos or dataset frames in a map, or in the one of several maps that they show.
 
-    def run(self) -> None:
-        from bidnerf_core.datasets import Photos
-        from bidnerf_core.evaluation import perturb
-        from bidnerf_core.localization import (
-            Localizer,
-            landmark_cameras,
-            matches_landmarks,
-            require_start,
-            require_use_of_depth,
-        )
-        from bidnerf_core.maps import MapCollection, load_map, maps_in
-        from bidnerf_core.results import Answers, localize_each, pose_of, read_poses
+    QUERY is image files, folders of photos, or a dataset. A photo's camera comes from its EXIF unless it is given; if EXIF has no
+    focal length, method auto begins with the camera of the map's images. Dataset frames named by --frame form a rig: their
+    relative poses come from the dataset, and the pose found is that of the last one's camera. Poses are camera to world with
+    OpenCV axes (x right, y down, z forward). Points are in the camera's axes, unless a .npz also holds T_camera_sensor.
+    """
+    from bidnerf_core.datasets import Photos
+    from bidnerf_core.localization import (
+        Localizer,
+        landmark_cameras,
+        matches_landmarks,
+        require_start,
+        require_use_of_depth,
+    )
+    from bidnerf_core.maps import MapCollection, load_map, maps_in
+    from bidnerf_core.results import Answers, localize_each
 
-        require("--seed", self.seed, 0, LARGEST_SEED)
-        maps, paths = self._maps_and_paths()
-        start, images, output = self.start, self.images, self.output
-        start.check()
-        poses = None if start.start is None else read_poses(start.start)
-        method, config = self.method.method, self.method.config
-        require_start(method, start.given)
-        if self.depth_points is not None:
-            require_use_of_depth(method)
-        files = (
-            *paths,
-            *self.queries.depth,
-            start.start,
-            self.depth_points,
-            images.camera,
-            images.register_depth,
-        )
-        inputs = [file for file in files if isinstance(file, str | Path)]
-        output.check(inputs)
-
-        def start_of(query: Query) -> SE3 | None:
-            if start.perturb is not None and query.truth is not None:
-                return perturb(query.truth, *start.perturb, self.seed)
-            return None if poses is None else pose_of(poses, query.name, start.start or "start")
-
-        if len(maps) > 1 or maps_in(maps[0]) not in ([], [maps[0]]):
-            self._check_for_several()
-            with displayed():
-                collection = MapCollection(maps, method, config)
-            finder: Localizer | MapCollection = collection
-            answers, source = (
-                Answers(collection),
-                self.queries.open(paths, images, None, collection.cameras),
-            )
-        else:
-            scene = load_map(maps[0])
-            points = None if self.depth_points is None else self._points(scene)
-            cameras = landmark_cameras(scene) if matches_landmarks(method, config) else ()
-            source = self.queries.open(paths, images, scene.bounds.background, cameras, points)
-            answers = Answers(scene)
-            finder = Localizer(scene, method, config, warm_up=len(source.names) > 1)
-        if start.perturb is not None and isinstance(source, Photos):
-            raise UsageError("--perturb moves the true pose, which photos do not have;", expected="--start")
-        if output.draw is not None:
-            for name in source.names:
-                check_output(output.picture(name), inputs)
-        run = Run(output, answers, len(source.names), start_of)
-        with displayed(), run.saved():
-            localize_each(finder, source, start=start_of, seed=self.seed, answers=run.answers, each=run.show)
-
-    def _maps_and_paths(self) -> tuple[list[Path], tuple[Path, ...]]:
-        """Split the arguments into the maps, or folders of maps, that they begin with, and the queries after them."""
-        from bidnerf_core.maps import maps_in
-
-        count = next((n for n, path in enumerate(self.query) if not _holds_maps(path)), len(self.query))
-        maps, paths = [self.map, *self.query[:count]], self.query[count:]
-        if paths:
-            return maps, paths
-        expected = "image files, folders of photos, or a folder of a dataset"
-        if len(maps) == 1:
-            raise UsageError("no QUERY", expected=expected)
-        if self.map.exists() and not maps_in(self.map):
-            raise UsageError(
-                f"{str(self.map)!r} is not a map, but {str(maps[1])!r} is: MAP comes first, then QUERY"
-            )
-        named = enumeration([repr(str(path)) for path in maps])
-        raise UsageError(f"{named} are maps, and no QUERY follows them;", expected=expected)
-
-    def _check_for_several(self) -> None:
-        """Raise ``UsageError`` for options that apply only to one map."""
-        from bidnerf_core.results import pose_format
-
-        start, out = self.start, self.output.out
-        given = {
-            "--start": start.start, "--perturb": start.perturb, "--draw": self.output.draw,
-            "--depth-points": self.depth_points,
-        }  # fmt: skip
-        for option, value in given.items():
-            if value is not None:
-                raise UsageError(f"{option} applies to one map, but several are given")
-        if out is not None and pose_format(out) != ".json":
-            raise UsageError(
-                "poses in several maps have different worlds", where=out, expected="a .json file"
-            )
-
-    def _points(self, scene: Map) -> DepthPoints:
-        from bidnerf_core.datasets import DepthPoints, SparsePoints
-        from bidnerf_core.evaluation import places_of
-
-        path = self.depth_points
-        assert path is not None
-        if not path.is_dir():
-            return DepthPoints(path, None)
-        sparse = SparsePoints(path, places_of(scene.info), self.model_points)
-        say(sparse.summary)
-        return DepthPoints(path, sparse)
+    count = next((n for n, path in enumerate(query) if not _holds_maps(path)), len(query))
+    maps, paths = [map, *query[:count]], query[count:]
+    if not paths:
+        raise _no_query(maps)
+    start_of = start.of_queries(seed)
+    require_start(method.method, start.start is not None or start.perturb is not None)
+    if queries.depth_points is not None:
+        require_use_of_depth(method.method)
+    files = (*paths, *queries.depth, start.start, queries.depth_points, images.camera, images.register_depth)
+    inputs = [Path(file) for file in files if isinstance(file, str | Path)]
+    output.check(inputs)
+    if len(maps) > 1 or maps_in(map) not in ([], [map]):
+        _check_for_several(output, queries, start)
+        with displayed():
+            collection = MapCollection(maps, method.method, method.config)
+        finder: Localizer | MapCollection = collection
+        answers, source = Answers(collection), queries.open(paths, images, collection.cameras)
+    else:
+        scene = load_map(map)
+        cameras = landmark_cameras(scene) if matches_landmarks(method.method, method.config) else ()
+        source = queries.open(paths, images, cameras, scene)
+        answers = Answers(scene)
+        finder = Localizer(scene, method.method, method.config, warm_up=len(source.names) > 1)
+    if start.perturb is not None and isinstance(source, Photos):
+        raise UsageError("--perturb moves the true pose, which photos do not have;", expected="--start")
+    if output.draw is not None:
+        for name in source.names:
+            check_output(output.picture(name), inputs)
+    shown = Run(output, answers, len(source.names), start_of)
+    with displayed(), shown.saved():
+        localize_each(finder, source, start=start_of, seed=seed, answers=answers, each=shown.show)
 
 
 def _holds_maps(path: Path) -> bool:
@@ -217,6 +179,37 @@ def _holds_maps(path: Path) -> bool:
     return not images and find_reader(path) is None
 
 
+def _no_query(maps: Sequence[Path]) -> UsageError:
+    """Return the error for maps that no query follows."""
+    from bidnerf_core.maps import maps_in
+
+    expected = "image files, folders of photos, or a folder of a dataset"
+    if len(maps) == 1:
+        return UsageError("no QUERY", expected=expected)
+    if maps[0].exists() and not maps_in(maps[0]):
+        return UsageError(
+            f"{str(maps[0])!r} is not a map, but {str(maps[1])!r} is: MAP comes first, then QUERY"
+        )
+    named = enumeration([repr(str(path)) for path in maps])
+    return UsageError(f"{named} are maps, and no QUERY follows them;", expected=expected)
+
+
+def _check_for_several(output: OutputOptions, queries: QueryOptions, start: StartOptions) -> None:
+    """Raise ``UsageError`` for options that apply only to one map."""
+    from bidnerf_core.results import pose_format
+
+    given = {
+        "--start": start.start, "--perturb": start.perturb, "--draw": output.draw, "--depth-points": queries.depth_points
+    }  # fmt: skip
+    for option, value in given.items():
+        if value is not None:
+            raise UsageError(f"{option} applies to one map, but several are given")
+    if output.out is not None and pose_format(output.out) != ".json":
+        raise UsageError(
+            "poses in several maps have different worlds", where=output.out, expected="a .json file"
+        )
+
+
 @dataclass
 class Run:
     """Answers as they come: printed, drawn, and written to the pose file however the run ends."""
@@ -228,8 +221,10 @@ class Run:
     not_drawn: int = 0
 
     def show(self, query: Query, answer: Answer | Failure) -> None:
-        """Print an answer and draw it."""
-        from bidnerf_core.results import Failure
+        """Print an answer and draw it. A picture that cannot be written does not end the run."""
+        from bidnerf_core.io import png_bytes, write_file
+        from bidnerf_core.maps import MapCollection
+        from bidnerf_core.results import Failure, overlay
 
         if isinstance(answer, Failure):
             say(f"{answer.name}: {answer.reason}")
@@ -240,15 +235,8 @@ class Run:
         if not self.output.json:
             for line in answer_lines(answer, self.start(query), self.total == 1):
                 show(line)
-        if self.output.draw is not None:
-            self._draw(query, answer)
-
-    def _draw(self, query: Query, answer: Answer) -> None:
-        """Draw an answer. A picture that cannot be written does not end the run."""
-        from bidnerf_core.io import png_bytes, write_file
-        from bidnerf_core.maps import MapCollection
-        from bidnerf_core.results import overlay
-
+        if self.output.draw is None:
+            return
         file, scene = self.output.picture(query.name), self.answers.scene
         assert scene is not None
         assert not isinstance(scene, MapCollection)
@@ -306,22 +294,15 @@ def answer_lines(answer: Answer, start: SE3 | None, full: bool) -> list[str]:
     def shown(error: PoseError) -> str:
         return f"{float(error.translation):.4f} {symbol(error.unit)}, {float(error.rotation_deg):.3f} deg"
 
-    found, error = answer.found, answer.error
-    placement = answer.placement
-    where = world = ""
-    if placement is not None:
-        where = (
-            f"in {placement.map}: " if found.converged else f"in none of the maps; nearest {placement.map}: "
-        )
-        world = f"in the frame of {placement.map}, "
+    found, error, placement = answer.found, answer.error, answer.placement
     verdict = "converged" if found.converged else f"NOT converged: {found.outcome.value}"
-    verdict = f"{where}{verdict} ({found.reason})"
+    verdict = f"{verdict} ({found.reason})"
+    if placement is not None:
+        where = "in" if found.converged else "in none of the maps; nearest"
+        verdict = f"{where} {placement.map}: {verdict}"
     took = f"{amount(found.steps, 'step')}, {found.seconds:.2f} s"
-    if full:
-        lines = [f"{answer.name}: {verdict}"]
-    else:
-        known = "" if error is None else f"error {shown(error)}; "
-        lines = [f"{answer.name}: {known}{verdict}; {took}"]
+    known = "" if error is None else f"error {shown(error)}; "
+    lines = [f"{answer.name}: {verdict}" if full else f"{answer.name}: {known}{verdict}; {took}"]
     if placement is not None and placement.runner_up is not None:
         name, other = placement.runner_up
         lines.append(
@@ -337,13 +318,10 @@ def answer_lines(answer: Answer, start: SE3 | None, full: bool) -> list[str]:
         lines.append(
             f"  uncertainty  {position:.4f} {symbol(found.unit)}, {math.degrees(rotation):.3f} deg (one standard deviation)"
         )
+    world = "" if placement is None else f"in the frame of {placement.map}, "
     lengths = "metres" if found.unit == "metres" else "units of the map"
     lines.append(f"  {took}, loss {found.loss:.5f}, method {found.method}")
     lines.append(f"  T_world_camera ({world}{OPENCV_AXES}; lengths in {lengths})")
     return lines + [
         "    " + " ".join(f"{value: .6f}" for value in row) for row in found.T_world_camera.matrix().tolist()
     ]
-
-
-def run(arguments: list[str]) -> None:
-    parse("localize", Localize, arguments).run()

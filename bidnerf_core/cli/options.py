@@ -3,26 +3,31 @@
 from __future__ import annotations
 
 import contextlib
-import math
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
 from bidnerf_core.cli.parser import FLAG, Option, Settings
+from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
+from bidnerf_core.settings import LARGEST_SEED, WholeNumbers
 
-DEFAULT_BACKEND = "hashgrid"
-USUAL_METHOD = "auto"
+DEFAULT_BACKEND, USUAL_METHOD, USUAL_FEATURES = "hashgrid", "auto", "sift"
+TEST_IMAGES = DatasetOptions(split="test")
+"""Options of the images that a map is tried on."""
 
 MapFolder: TypeAlias = Annotated[
     Path, Option("MAP", "folder of a map, as written by 'bidnerf train'", positional=True)
 ]
-FeaturesName: TypeAlias = Annotated[
-    str, Option("NAME", "detector of the landmarks, one of 'bidnerf plugins features'")
-]
+Method: TypeAlias = Annotated[str, Option("NAME", "how poses are found, one of 'bidnerf plugins methods'")]
 Device: TypeAlias = Annotated[str, Option("NAME", "device on which the field computes: cpu, cuda ...")]
+Host: TypeAlias = Annotated[
+    str | None,
+    Option("ADDRESS", "address to listen on, such as 0.0.0.0; others then need a token", "this machine only"),
+]
+Port: TypeAlias = Annotated[int, WholeNumbers(0, 65535), Option("N", "port to listen on; 0 picks a free one")]
+Seed: TypeAlias = Annotated[int, WholeNumbers(0, LARGEST_SEED), Option("N", "seed of every random choice")]
 Json: TypeAlias = Annotated[bool, FLAG, Option(None, "print JSON: one value on a line")]
 Names: TypeAlias = tuple[str, ...]
 
@@ -39,8 +44,10 @@ def _point_choice(*_: Any) -> Any:
     return SparseChoice()
 
 
-BakeSettings: TypeAlias = Annotated[Any, Settings(_bake_settings)]
-PointChoice: TypeAlias = Annotated[Any, Settings(_point_choice)]
+BakeSettings: TypeAlias = Annotated[
+    Any, Settings(_bake_settings, "settings of the surface and the landmarks")
+]
+PointChoice: TypeAlias = Annotated[Any, Settings(_point_choice, "which points of a COLMAP model are used")]
 
 
 def _method_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
@@ -54,49 +61,24 @@ def _method_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
 class MethodOptions:
     """How poses are found."""
 
-    method: Annotated[str, Option("NAME", "how poses are found, one of 'bidnerf plugins methods'")] = (
-        USUAL_METHOD
-    )
+    method: Method = USUAL_METHOD
     preset: Annotated[
         str | None,
         Option("NAME", "method settings to begin with, such as the paper's (default: the usual ones)"),
     ] = None
-    config: Annotated[Any, Settings(_method_settings)] = None
-    """settings of the method"""
+    config: Annotated[Any, Settings(_method_settings, "settings of the method")] = None
 
 
 @dataclass(frozen=True)
-class StartOptions:
-    """Where to start (default: no start; at most one of these)."""
+class MapOptions:
+    """The map that is written, and its landmarks."""
 
-    start: Annotated[
-        Path | None,
-        Option("POSE.json", "file with a 4x4 T_world_camera to start from, or with one per query by name"),
-    ] = None
-    perturb: Annotated[
-        tuple[float, float] | None,
-        Option("T R", "start from the dataset's pose moved by T metres and R degrees"),
-    ] = None
-    no_start: Annotated[bool, FLAG, Option(None, "no start is known")] = False
-
-    def __post_init__(self) -> None:
-        require_one({"--start": self.start, "--perturb": self.perturb, "--no-start": self.no_start or None})
-
-    def check(self) -> None:
-        """Raise ``UsageError`` for a perturbation out of range."""
-        from bidnerf_core.evaluation import FARTHEST_START
-
-        limits = (("T", "metres", FARTHEST_START), ("R", "degrees", 180.0))
-        for (what, unit, most), value in zip(limits, self.perturb or (), strict=False):
-            if not 0 <= value <= most:
-                raise UsageError(
-                    f"{what} is {value:g}", where="--perturb", expected=f"{unit} from 0 to {most:g}"
-                )
-
-    @property
-    def given(self) -> bool:
-        """Whether there is a start."""
-        return self.start is not None or self.perturb is not None
+    overwrite: Annotated[bool, FLAG, Option(None, "replace the map in --out")] = False
+    no_bake: Annotated[bool, FLAG, Option(None, "leave the surface and landmarks to 'bidnerf bake'")] = False
+    landmark_features: Annotated[
+        str, Option("NAME", "detector of the landmarks, one of 'bidnerf plugins features'")
+    ] = USUAL_FEATURES
+    device: Device = "cpu"
 
 
 def require_one(values: Mapping[str, object], required: bool = False) -> None:
@@ -106,20 +88,6 @@ def require_one(values: Mapping[str, object], required: bool = False) -> None:
         raise UsageError(f"{given[0]} and {given[1]} exclude each other", expected="only one of them")
     if required and not given:
         raise UsageError(f"one of {', '.join(values)} is missing")
-
-
-def require(what: str, value: float, least: float, most: float = math.inf) -> None:
-    """Check a number from the command line. Raises ``UsageError`` if it is out of range."""
-    if not least <= value <= most:
-        expected = f"{least} or more" if most == math.inf else f"{least} to {most}"
-        raise UsageError(f"{what} is {value}", expected=expected)
-
-
-def require_different(what: str, names: Sequence[str]) -> None:
-    """Check that no name is listed twice. Raises ``UsageError``."""
-    twice = [name for name, count in Counter(names).items() if count > 1]
-    if twice:
-        raise UsageError(f"{what} names {twice[0]} more than once", expected="each once")
 
 
 @contextlib.contextmanager

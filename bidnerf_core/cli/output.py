@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import json
 import sys
 from collections.abc import Sequence
-from typing import Any, TextIO
+from typing import Any
 
 from rich.console import Console
 
@@ -52,20 +51,3 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], wide: str
     with screen.capture() as drawn:  # written below, since rich handles a closed pipe in its own way
         screen.print(table)
     sys.stdout.write(drawn.get())
-
-
-class PrintableStream(io.TextIOBase):
-    """A stream that passes on written text, line by line, as ``printable`` text."""
-
-    def __init__(self, stream: TextIO | io.TextIOBase) -> None:
-        self._stream = stream
-
-    def write(self, text: str) -> int:
-        self._stream.write("\n".join(map(printable, text.split("\n"))))
-        return len(text)
-
-    def flush(self) -> None:
-        self._stream.flush()
-
-    def isatty(self) -> bool:
-        return False  # no colours, which are control characters

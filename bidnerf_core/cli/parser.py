@@ -1,4 +1,4 @@
-"""The parser of a command: its arguments are the parameters of a function or a dataclass, and the fields of nested dataclasses.
+"""The parser of a command: its arguments are the parameters of a function, and the fields of dataclasses among these.
 
 Options are named as the parameters are, ``--depth-unit`` for ``depth_unit``, whichever dataclass declares them. The help of each
 is its ``Option``, or the docstring or comment beside the field.
@@ -24,13 +24,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 from bidnerf_core.errors import InputError, UsageError, spelling_hint
-from bidnerf_core.settings import Expert
+from bidnerf_core.settings import Expert, Range
 
 T = TypeVar("T")
 
 HELP, HELP_ALL = "--help", "--help-all"
-LEAST_WIDTH = 40
-"""Minimum line width of help, even in narrower terminals."""
 NEGATIVE = re.compile(r"-[\d.]")
 """Begins a value, such as -1,0,2, that is not an option."""
 KINDS = {
@@ -52,14 +50,11 @@ class Option:
     name: str | None = None  # if it is not the parameter's
 
 
-@dataclass(frozen=True)
-class Without:
+class Without(frozenset[str]):
     """The options of a nested dataclass that a command does not take."""
 
-    names: frozenset[str]
-
-    def __init__(self, *names: str) -> None:
-        object.__setattr__(self, "names", frozenset(names))
+    def __new__(cls, *names: str) -> Without:
+        return super().__new__(cls, names)
 
 
 @dataclass(frozen=True)
@@ -67,10 +62,11 @@ class Settings:
     """A parameter that takes a dataclass of settings, known only once the other arguments are, or slow to import.
 
     ``load`` returns the default settings for the values of the options parsed so far, by parameter name, and all words.
-    ``--help-all`` describes their options, ``--help`` says only that there are some.
+    ``--help-all`` describes their options, ``--help`` says only that there are some, called ``summary``.
     """
 
     load: Callable[[Mapping[str, Any], Sequence[str]], Any]
+    summary: str
 
 
 FLAG = "flag"
@@ -100,10 +96,14 @@ class Parameter:
         )
 
     @property
+    def flag(self) -> str:
+        """The option, such as --depth-unit."""
+        return f"--{self.option.name or self.name.rstrip('_').replace('_', '-')}"
+
+    @property
     def left_out(self) -> frozenset[str]:
         """The fields of the dataclass, if it is one, that are no options."""
-        without = self.note(Without)
-        return frozenset() if without is None else without.names
+        return self.note(Without) or frozenset()
 
 
 def parse(command: str, target: Callable[..., T], arguments: Sequence[str]) -> T:
@@ -111,7 +111,8 @@ def parse(command: str, target: Callable[..., T], arguments: Sequence[str]) -> T
 
     Raises ``UsageError`` for arguments that do not fit, and ``SystemExit`` after help was printed.
     """
-    words = [_with_hyphens(word) for word in arguments]
+    # Names of options may be written with underscores, as in Python.
+    words = [re.sub("^--[^=]*", lambda name: name[0].replace("_", "-"), word) for word in arguments]
     if {"-h", HELP, HELP_ALL} & set(words):
         loaded = _loaded(command, target, words) if HELP_ALL in words else None
         sys.stdout.write(_Parser(command, target, loaded, for_help=True).format_help())
@@ -157,10 +158,13 @@ def _built(
         if dataclasses.is_dataclass(group):
             own = {name: value for name, value in given.items() if name not in parameter.left_out}
             value = _built(type(group), own, loaded, group)
-            if value is not usual:
+            if value is not usual or default is None:
                 values[parameter.name] = value
         elif parameter.name in given:
-            values[parameter.name] = given[parameter.name]
+            value = values[parameter.name] = given[parameter.name]
+            allowed = parameter.note(Range)
+            if allowed is not None and value is not None and value not in allowed:
+                raise UsageError(f"{parameter.flag} is {value}", expected=allowed)
     if default is None:
         return target(**values)
     try:
@@ -176,7 +180,7 @@ class _Parser(argparse.ArgumentParser):
         self, command: str, target: Callable[..., Any], loaded: Mapping[str, Any] | None, *,
         for_help: bool = False, options_only: bool = False,
     ) -> None:  # fmt: skip
-        self.width = max(LEAST_WIDTH, shutil.get_terminal_size().columns)
+        self.width = max(40, shutil.get_terminal_size().columns)
         super().__init__(
             f"bidnerf {command}", add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS,
             description=self._filled(inspect.getdoc(target) or ""),
@@ -187,13 +191,14 @@ class _Parser(argparse.ArgumentParser):
         own = self.add_argument_group("options")
         announced, groups = list[str](), dict[str, Any]()  # group of each parameter
         for parameter, default in _walk(target, loaded or {}):
+            settings = parameter.note(Settings)
             if default is not None:
                 kind: Any = type(default)
-                text = parameter.doc or (inspect.getdoc(kind) or "").split("\n\n")[0]
+                text = settings.summary if settings else (inspect.getdoc(kind) or "").split("\n\n")[0]
                 group = self.add_argument_group(parameter.name.replace("_", " "), self._filled(text, 2))
                 groups |= {inner.name: group for inner in parameters_of(kind)}
-            elif parameter.note(Settings) is not None:
-                announced.append(parameter.doc)
+            elif settings is not None:
+                announced.append(settings.summary)
             else:
                 self._add(parameter, groups.get(parameter.name, own))
         if for_help:
@@ -227,7 +232,7 @@ class _Parser(argparse.ArgumentParser):
                 nargs = nargs if is_required else {None: "?", "+": "*"}[nargs]  # type: ignore[index]
                 self.add_argument(parameter.name, nargs=nargs, **common)
             return
-        flag = f"--{option.name or parameter.name.rstrip('_').replace('_', '-')}"
+        flag = parameter.flag
         self.names.add(flag)
         if parameter.hint is bool:
             pair = FLAG not in parameter.notes
@@ -276,12 +281,6 @@ def _description(parameter: Parameter) -> str:
     return (f"{text} (default: {words})" if words else text).replace("%", "%%")
 
 
-def _with_hyphens(word: str) -> str:
-    """Return an option with hyphens in its name, which may be written with underscores as in Python."""
-    name, equals, value = word.partition("=")
-    return name.replace("_", "-") + equals + value if word.startswith("--") else word
-
-
 def _escaped(words: Sequence[str]) -> list[str]:
     """Return the words such that values like -1,0,2 are not taken for options: argparse takes none with a space for one."""
     return [f" {word}" if NEGATIVE.match(word) else word for word in words]
@@ -312,7 +311,8 @@ def parameters_of(target: Any) -> list[Parameter]:
     found = []
     for name, default in defaults.items():
         hint, notes = _bare(hints[name])
-        found.append(Parameter(name, hint, notes, default, docs.get(name, "")))
+        is_group = default is MISSING and dataclasses.is_dataclass(hint)
+        found.append(Parameter(name, hint, notes, hint() if is_group else default, docs.get(name, "")))
     return found
 
 
@@ -338,37 +338,31 @@ def _field_docs(kind: type) -> dict[str, str]:
     for node, after in zip(tree.body, [*tree.body[1:], None], strict=True):
         if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
             continue
-        match after:
-            case ast.Expr(value=ast.Constant(value=str(text))):
-                found[node.target.id] = text
-                continue
-        beside = [_comment(line) for line in lines[node.lineno - 1 : node.end_lineno]]
-        if not any(beside):
-            first = node.lineno - 1
+        if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+            found[node.target.id] = str(after.value.value)
+            continue
+        first = node.lineno - 1
+        if not any("# " in line for line in lines[first : node.end_lineno]):
             while lines[first - 1].lstrip().startswith("#"):
                 first -= 1
-            beside = [_comment(line) for line in lines[first : node.lineno - 1]]
-        found[node.target.id] = " ".join(filter(None, beside))
+        comments = (line.partition("# ")[2].strip() for line in lines[first : node.end_lineno])
+        found[node.target.id] = " ".join(filter(None, comments))
     return found
-
-
-def _comment(line: str) -> str:
-    return line.partition("# ")[2].strip()
 
 
 def _bare(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     """Return a type without ``Annotated``, and the annotations."""
-    if typing.get_origin(hint) is Annotated:
+    if typing.get_origin(hint) is Annotated:  # one that is annotated twice is flat
         kind, *notes = typing.get_args(hint)
-        inner, more = _bare(kind)
-        return inner, (*notes, *more)
+        return kind, tuple(notes)
     return hint, ()
 
 
 def conversion(hint: Any) -> tuple[int | str | None, Callable[[str], Any], str]:
     """Return argparse's ``nargs`` for a type (None: one word), the function that converts one word, and the name of the value."""
     hint, _ = _bare(hint)
-    members = [_bare(part)[0] for part in typing.get_args(hint)] if _is_union(hint) else [hint]
+    is_union = typing.get_origin(hint) in (typing.Union, types.UnionType)
+    members = [_bare(part)[0] for part in typing.get_args(hint)] if is_union else [hint]
     optional = type(None) in members
     tuples = [part for part in members if typing.get_origin(part) is tuple]
     words = [part for part in members if part in KINDS or typing.get_origin(part) is Literal]
@@ -403,7 +397,3 @@ def conversion(hint: Any) -> tuple[int | str | None, Callable[[str], Any], str]:
         raise argparse.ArgumentTypeError(f"is {word!r}, expected {expected}")
 
     return None, convert_word, metavar
-
-
-def _is_union(hint: Any) -> bool:
-    return typing.get_origin(hint) in (typing.Union, types.UnionType)

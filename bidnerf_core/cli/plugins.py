@@ -6,41 +6,26 @@ from typing import Annotated
 
 from bidnerf_core.cli.options import Json
 from bidnerf_core.cli.output import print_json, print_table
-from bidnerf_core.cli.parser import Option, parse
+from bidnerf_core.cli.parser import Option
 from bidnerf_core.registry import GROUPS, PluginInfo, list_plugins
 
-KINDS = f"one kind of plugin: {', '.join(GROUPS)}"
 
-
-def run(arguments: list[str]) -> None:
-    parse("plugins", plugins, arguments)
-
-
-def plugins(
-    group: Annotated[str | None, Option("[GROUP]", KINDS, "all kinds", positional=True)] = None,
+def run(
+    group: Annotated[
+        str | None,
+        Option("[GROUP]", f"one kind of plugin: {', '.join(GROUPS)}", "all kinds", positional=True),
+    ] = None,
     json: Json = False,
 ) -> None:
     """List everything registered by name: backends, readers, methods, features, faults, writers, importers and exporters."""
     groups = list(GROUPS) if group is None else [group]
-    print_infos(
-        [info for of in groups for info in list_plugins(of)], json, with_group=True, all_kinds=group is None
-    )
+    print_infos([info for of in groups for info in list_plugins(of)], json, "group", all_kinds=group is None)
 
 
-def print_infos(
-    infos: list[PluginInfo], json: bool, with_group: bool = False, all_kinds: bool = False
-) -> None:
-    """Print plugins as a table, with their faults if any, or as a JSON list."""
+def print_infos(infos: list[PluginInfo], json: bool, *more: str, all_kinds: bool = False) -> None:
+    """Print plugins as a table, with their faults if any, or as a JSON list, whose entries have some keys ``more``."""
     if json:
-        keys = [
-            *(["group"] if with_group else []),
-            "name",
-            "summary",
-            "distribution",
-            "version",
-            "value",
-            "fault",
-        ]
+        keys = (*more, "name", "summary", "distribution", "version", "value", "fault")
         print_json([{key: getattr(info, key) for key in keys} for info in infos])
         return
     table = []

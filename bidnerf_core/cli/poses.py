@@ -8,17 +8,11 @@ from typing import Annotated
 from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import Json
 from bidnerf_core.cli.output import print_json
-from bidnerf_core.cli.parser import Flag, Option, parse
+from bidnerf_core.cli.parser import Flag, Option
 from bidnerf_core.cli.progress import working
 
-STOPPING = "stopping (Ctrl-C again: at once); what was found is kept"
 
-
-def run(arguments: list[str]) -> None:
-    parse("poses", poses, arguments)
-
-
-def poses(
+def run(
     photos: Annotated[Path, Option("PHOTOS", "folder of photos, or a video, without poses", positional=True)],
     out: Annotated[Path, Option("DATASET", "folder for the dataset")],
     camera: Annotated[
@@ -41,7 +35,7 @@ def poses(
     from bidnerf_core.structure import find_poses
 
     check_folder(out, (photos,))
-    with working(STOPPING):
+    with working("stopping (Ctrl-C again: at once); what was found is kept"):
         found = find_poses(photos, out, camera, overwrite)
     if json:
         print_json(to_plain(found))

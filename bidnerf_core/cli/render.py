@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from bidnerf_core.cli.folders import check_folder
-from bidnerf_core.cli.options import MapFolder, Names
+from bidnerf_core.cli.options import TEST_IMAGES, MapFolder, Names
 from bidnerf_core.cli.output import say, show
-from bidnerf_core.cli.parser import Flag, Option, Without, parse
+from bidnerf_core.cli.parser import Flag, Option, Without
 from bidnerf_core.cli.progress import displayed
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError
@@ -22,48 +22,41 @@ if TYPE_CHECKING:
     from bidnerf_core.frames import View
     from bidnerf_core.maps import Map
 
-DEEPEST = 65.535  # largest depth in metres that a 16-bit image in millimetres can hold
 
-
-@dataclass(frozen=True)
-class Render:
+def run(
+    map: MapFolder,
+    data: Annotated[Path, Option("DATA", "folder of a dataset, or a .r3d file", positional=True)],
+    out: Annotated[Path, Option("DIR", "folder for the images")],
+    frame: Annotated[Names, Option("NAME...", "render only these frames", "all of the split")] = (),
+    level: Annotated[
+        int | None, Option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
+    ] = None,
+    overwrite: Annotated[Flag, Option(None, "replace images in --out")] = False,
+    images: Annotated[DatasetOptions, Without("masks", "mask_hides", "largest", "background")] = TEST_IMAGES,
+) -> None:
     """Render a map from the poses of a dataset.
 
     Writes NAME.png (8-bit RGB) and NAME.depth.png (16-bit, planar z in mm, 0 where rays hit nothing) per frame into --out, and
     prints PSNR and depth error against the dataset's images.
     """
+    from bidnerf_core.io import output_folder
+    from bidnerf_core.maps import load_map
 
-    map: MapFolder
-    data: Annotated[Path, Option("DATA", "folder of a dataset, or a .r3d file", positional=True)]
-    out: Annotated[Path, Option("DIR", "folder for the images")]
-    frame: Annotated[Names, Option("NAME...", "render only these frames", "all of the split")] = ()
-    level: Annotated[
-        int | None, Option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
-    ] = None
-    overwrite: Annotated[Flag, Option(None, "replace images in --out")] = False
-    images: Annotated[DatasetOptions, Without("masks", "mask_hides", "largest", "background")] = (
-        DatasetOptions(split="test")
-    )
-
-    def run(self) -> None:
-        from bidnerf_core.io import output_folder
-        from bidnerf_core.maps import load_map
-
-        check_folder(self.out, (self.map, self.data))
-        with output_folder(self.out, self.overwrite), displayed():
-            scene = load_map(self.map)
-            dataset = replace(self.images, background=scene.bounds.background).open(self.data)
-            names = list(self.frame) or dataset.frame_names(self.images.split)
-            if not names:
-                raise InputError(f"split {self.images.split!r} has no frames", where=self.data)
-            views = dataset.views(self.images.split, names, counter("reading", "images"))
-            names = [view.frame.name for view in views]
-            for name in {f"{name}.depth" for name in names} & set(names):
-                raise InputError(
-                    f"frame {name!r} would overwrite the depth of {name.removesuffix('.depth')!r}; render them one by one"
-                    " with --frame, into different folders"
-                )
-            _render_views(scene, self.level, views, self.out)
+    check_folder(out, (map, data))
+    with output_folder(out, overwrite), displayed():
+        scene = load_map(map)
+        dataset = replace(images, background=scene.bounds.background).open(data)
+        names = list(frame) or dataset.frame_names(images.split)
+        if not names:
+            raise InputError(f"split {images.split!r} has no frames", where=data)
+        views = dataset.views(images.split, names, counter("reading", "images"))
+        names = [view.frame.name for view in views]
+        for name in {f"{name}.depth" for name in names} & set(names):
+            raise InputError(
+                f"frame {name!r} would overwrite the depth of {name.removesuffix('.depth')!r}; render them one by one"
+                " with --frame, into different folders"
+            )
+        _render_views(scene, level, views, out)
 
 
 def _render_views(scene: Map, level: int | None, views: Sequence[View], out: Path) -> None:
@@ -95,13 +88,11 @@ def write_images(out: Path, name: str, image: RenderedImage) -> None:
     from bidnerf_core.io import png_bytes, write_file
 
     write_file(out / f"{name}.png", png_bytes((image.rgb * 255).round().to(torch.uint8).numpy()))
-    if float(image.depth.max()) > DEEPEST:
+    millimetres = (image.depth * 1000).round().numpy()
+    deepest = np.iinfo(np.uint16).max
+    if millimetres.max() > deepest:
         say(
-            f"{name}: depth beyond {DEEPEST} units does not fit a 16-bit image in steps of 0.001 and is clipped"
+            f"{name}: depth beyond {deepest / 1000} units does not fit a 16-bit image in steps of 0.001 and is clipped"
         )
-    millimetres = (image.depth.clamp(0, DEEPEST) * 1000).round().numpy().astype(np.uint16)
-    write_file(out / f"{name}.depth.png", png_bytes(millimetres))
-
-
-def run(arguments: list[str]) -> None:
-    parse("render", Render, arguments).run()
+    depth = millimetres.clip(0, deepest).astype(np.uint16)
+    write_file(out / f"{name}.depth.png", png_bytes(depth))

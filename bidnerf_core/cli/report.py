@@ -10,24 +10,17 @@ from urllib.parse import quote
 from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import Names, wrong_usage
 from bidnerf_core.cli.output import console, show
-from bidnerf_core.cli.parser import Option, parse
+from bidnerf_core.cli.parser import Option
 from bidnerf_core.errors import InputError, UsageError
 
-CriterionName = Literal["10%", "5deg 0.05", "1deg 0.02"]
 
-
-def run(arguments: list[str]) -> None:
-    """Run the command."""
-    parse("report", report, arguments)
-
-
-def report(
+def run(
     results: Annotated[
         tuple[Path, ...], Option("RESULTS...", "files written by 'bidnerf evaluate'", positional=True)
     ] = (),
     out: Annotated[Path, Option("DIR", "folder for index.html and the figures as PNG and SVG")] = Path("report"),
     criterion: Annotated[
-        CriterionName | None,
+        Literal["10%", "5deg 0.05", "1deg 0.02"] | None,
         Option(None, "success criterion for displays that use only one", "10%; 5deg 0.05 if trials had no start"),
     ] = None,
     title: Annotated[str, Option("TEXT", "title of the page")] = "Localization results",

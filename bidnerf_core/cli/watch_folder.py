@@ -5,24 +5,20 @@ from __future__ import annotations
 import sys
 import time as clocks
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bidnerf_core.errors import InputError
 
 if TYPE_CHECKING:
-    from bidnerf_core.camera import CameraSource
+    from bidnerf_core.datasets import DatasetOptions
     from bidnerf_core.depth import DepthCamera
     from bidnerf_core.frames import Frame
-    from bidnerf_core.io import Background
 
 STDIN = "-"
 POLL = 0.05
 """Seconds between two checks of a watched folder."""
-STEADY = 2
-"""Number of checks for which a file's size must stay the same before it is read, since it may still be being written."""
-KEYS = {"image", "depth", "time", "depth_unit", "mask"}
 
 
 @dataclass(frozen=True)
@@ -44,25 +40,25 @@ class FrameRequest:
         image, depth = request.text("image"), request.text("depth")
         if image is None:
             raise request.error(f'no "image" in {line.strip()[:80]!r}')
-        if unknown := sorted(request.values.keys() - KEYS):
-            raise request.error(f"unknown key {unknown[0]!r}", expected=f"any of {', '.join(sorted(KEYS))}")
-        time, unit = request.number("time"), request.number("depth_unit")
+        keys = {field.name for field in fields(FrameRequest)}
+        if unknown := sorted(request.values.keys() - keys):
+            raise request.error(f"unknown key {unknown[0]!r}", expected=f"any of {', '.join(sorted(keys))}")
         mask = request.text("mask")
         return FrameRequest(
             Path(image),
             None if depth is None else Path(depth),
-            time,
-            unit,
+            request.number("time"),
+            request.number("depth_unit"),
             None if mask is None else Path(mask),
         )
 
-    def read(self, camera: CameraSource, sensor: DepthCamera | None, background: Background) -> Frame:
+    def read(self, images: DatasetOptions, sensor: DepthCamera | None) -> Frame:
         """Read the image and its depth. Raises ``InputError`` if they cannot be read or the camera is unknown."""
         from bidnerf_core.frames import Frame
 
         return Frame.read(
-            self.image, camera, depth=self.depth, depth_unit=self.depth_unit, sensor=sensor,
-            background=background, mask=self.mask,
+            self.image, images.camera_source, depth=self.depth, depth_unit=self.depth_unit, sensor=sensor,
+            background=images.background, mask=self.mask,
         )  # fmt: skip
 
 
@@ -72,10 +68,9 @@ def requests(source: str) -> Iterator[FrameRequest | InputError]:
 
     A line that is not a request is yielded as the error with which to answer it.
     """
-    return _lines() if source == STDIN else _arriving(Path(source))
-
-
-def _lines() -> Iterator[FrameRequest | InputError]:
+    if source != STDIN:
+        yield from _arriving(Path(source))
+        return
     for line in iter(sys.stdin.readline, ""):  # iterating over stdin itself would wait for a full buffer
         if not line.strip():
             continue
@@ -88,6 +83,7 @@ def _lines() -> Iterator[FrameRequest | InputError]:
 def _arriving(folder: Path) -> Iterator[FrameRequest]:
     """Yield the images of a folder in natural name order, and later ones as they arrive."""
     from bidnerf_core.frames import photos_in
+    from bidnerf_core.io import IMAGE_SUFFIXES
 
     if not folder.is_dir():
         raise InputError(
@@ -98,23 +94,20 @@ def _arriving(folder: Path) -> Iterator[FrameRequest]:
         photos, others = photos_in(folder)
         waiting = [photo for photo in photos if photo not in given]
         for photo in waiting:
-            depth = next((file for file in others if _is_depth_of(photo, file)), None)
-            if not all(_is_steady(file, sizes) for file in (photo, depth) if file is not None):
+            # Other files are something else about the photo, such as NAME.json.
+            depths = [
+                file for file in others
+                if file.name.startswith(f"{photo.stem}.") and file.suffix.lower() in (".npy", *IMAGE_SUFFIXES)
+            ]  # fmt: skip
+            if not all(_is_steady(file, sizes) for file in (photo, *depths[:1])):
                 break  # later names have to wait, to keep the name order
             given.add(photo)
-            yield FrameRequest(photo, depth)
+            yield FrameRequest(photo, depths[0] if depths else None)
         clocks.sleep(POLL)
 
 
-def _is_depth_of(photo: Path, file: Path) -> bool:
-    """Return whether a file next to a photo is its depth, rather than something else about it, such as ``NAME.json``."""
-    from bidnerf_core.io import IMAGE_SUFFIXES
-
-    return file.name.startswith(f"{photo.stem}.") and file.suffix.lower() in (".npy", *IMAGE_SUFFIXES)
-
-
 def _is_steady(file: Path, sizes: dict[Path, tuple[int, int]]) -> bool:
-    """Return whether the size of a file has stayed the same for ``STEADY`` checks."""
+    """Return whether the size of a file, which may still be being written, has stayed the same for two checks."""
     try:
         size = file.stat().st_size
     except OSError:
@@ -122,4 +115,4 @@ def _is_steady(file: Path, sizes: dict[Path, tuple[int, int]]) -> bool:
     before, looks = sizes.get(file, (-1, 0))
     looks = looks + 1 if size == before and size > 0 else 0
     sizes[file] = (size, looks)
-    return looks >= STEADY
+    return looks >= 2

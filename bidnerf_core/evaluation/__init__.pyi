@@ -29,7 +29,6 @@ from .protocols import perturb as perturb
 from .protocols import random_units as random_units
 from .protocols import rotation_of_size as rotation_of_size
 from .provenance import VERSIONS as VERSIONS
-from .provenance import command_line as command_line
 from .provenance import note_run as note_run
 from .provenance import provenance as provenance
 from .provenance import read_runs as read_runs

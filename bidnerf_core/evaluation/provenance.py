@@ -67,11 +67,6 @@ def provenance(command: str, workers: str) -> Provenance:
     )
 
 
-def command_line(name: str, arguments: list[str]) -> str:
-    """Return a command, quoted for a shell."""
-    return shlex.join([*name.split(), *arguments])
-
-
 def note_run(results: Path, run: Provenance) -> None:
     """Add a run to the list next to a results file, which may take several runs to complete."""
     runs = [*read_runs(results), run]
@@ -124,7 +119,7 @@ def script_command() -> str:
 
     # Words such as ``--out=PATH`` and ``MAP:DATA`` hold paths, too.
     words = ("".join(map(shortened, re.split(r"([=:])", word))) for word in sys.argv)
-    return shlex.join(["python", *words])
+    return shlex.join(words if Path(sys.argv[0]).name == "bidnerf" else ["python", *words])
 
 
 def write_record(path: Path, results: dict[str, Any], seed: int) -> Path:

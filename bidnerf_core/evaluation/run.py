@@ -76,15 +76,14 @@ def evaluate(
     *,
     out: str | Path | None = None,
     workers: Workers = 1,
-    command: str | None = None,
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> ResultTable:
     """Localize many frames of ``data`` in a map, from the starts of a protocol or from none, and return all results.
 
     ``out`` is a results file: trials already in it are not run again, and each result is on disk before the next trial
-    begins, so that the same call resumes an evaluation that was interrupted or cancelled. ``command`` is recorded next to
-    it as the origin of the results, by default that of the running script. ``workers`` is the number of processes (None:
+    begins, so that the same call resumes an evaluation that was interrupted or cancelled. The command of the running program
+    is recorded next to it as the origin of the results. ``workers`` is the number of processes (None:
     one per core, and one on a GPU), or the address of a dask scheduler; more than one requires a map and data in folders
     and an importable main module, and finds registered names only if importing that module registers them. With one,
     everything runs in the calling thread.
@@ -107,7 +106,7 @@ def evaluate(
         if repeated := repeated_frames(trials):
             log.info(repeated)
         with ResultsFile(None if out is None else Path(out)) as file:
-            run_trials(trials, file, here, 1 if in_memory else workers, command)
+            run_trials(trials, file, here, 1 if in_memory else workers)
             file.put_in_order(trials)
             return ResultTable(tuple(file[trial] for trial in trials))
 
@@ -117,7 +116,6 @@ def run_trials(
     file: ResultsFile,
     scene: Opened | None = None,
     workers: Workers = 1,
-    command: str | None = None,
 ) -> None:
     """Run the trials without results in ``file``, and store each result as soon as it is available.
 
@@ -139,7 +137,7 @@ def run_trials(
     where = "" if file.path is None else f" in {file.path}"
     with executor_of(workers, len(todo), todo[0].device == "cpu") as (executor, at_once, description):
         if file.path is not None:
-            note_run(file.path, provenance(command or script_command(), description))
+            note_run(file.path, provenance(script_command(), description))
         try:
             _run(todo, file, executor, at_once, scene if at_once == 1 else None)
         except BrokenProcessPool as error:

@@ -485,9 +485,8 @@ def test_a_perturbation_is_judged(bidnerf: Run, shared: Path) -> None:
     place = ["localize", shared / "map", shared / "data", "--frame", "t_0000", "--perturb"]
     for wrong in ("nan", "inf"):
         assert_refused(bidnerf(*place, wrong, "5"), 2, f"--perturb is '{wrong}'", "a number")
-    assert_refused(bidnerf(*place, "-1", "5"), 2, "--perturb: T is", "metres from 0 to 1e+06")
-    for wrong in (("0.5", "1e9"), ("0.5", "180.1"), ("0.5", "-1")):
-        assert_refused(bidnerf(*place, *wrong), 2, "--perturb: R is", "degrees from 0 to 180")
+    for wrong in (("-1", "5"), ("0.5", "1e9"), ("0.5", "180.1"), ("0.5", "-1")):
+        assert_refused(bidnerf(*place, *wrong), 2, "--perturb: size is", "0 to 1e+06 : 180")
 
 
 # What is printed.
