@@ -13,7 +13,8 @@ from .colmap import SparsePoints as SparsePoints
 from .colmap_files import read_model as read_model
 from .colmap_files import read_posed_images as read_posed_images
 from .colmap_keypoints import stored_keypoints as stored_keypoints
-from .formats.colmap import ColmapReader as ColmapReader
+from .formats.colmap import colmap_models as colmap_models
+from .formats.colmap import colmap_project as colmap_project
 from .formats.colmap import shot_of as shot_of
 from .formats.transforms_json import read_frames as read_frames
 from .lidar import LidarDepth as LidarDepth

@@ -6,21 +6,29 @@ of them opens an image. Photos without poses, the frames of a video and images i
 
 from __future__ import annotations
 
-import os
+import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, TypeAlias, TypeVar, overload, runtime_checkable
+from typing import Protocol, TypeAlias, overload, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Shaped
 from torch import Tensor
 
-from bidnerf_core.camera import Camera, CameraSource, Intrinsics, Lens, PanoramaFace, Raster, same_aspect
+from bidnerf_core.camera import (
+    PANORAMA_FACES,
+    Camera,
+    CameraSource,
+    Intrinsics,
+    Lens,
+    PanoramaFace,
+    Raster,
+    same_aspect,
+)
 from bidnerf_core.datasets.names import positions, unique_names
-from bidnerf_core.datasets.panoramas import faces_of
 from bidnerf_core.depth import DepthCamera, DepthImage
 from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.frames import (
@@ -39,13 +47,8 @@ from bidnerf_core.frames import (
 from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.io import ImageSource, is_file, read_compact_image, read_header, reduced
 
-Item = TypeVar("Item")
-ReadingProgress: TypeAlias = Callable[[int, int], None]
-"""Called with (frames read, frames requested) after each frame."""
 Colour: TypeAlias = tuple[float, float, float]
 
-ALL = "all"
-"""The split of all images with a pose, unless a capture has a split of that name."""
 HOLD_OUT_EVERY = 8
 SPLITS = ("train", "val", "test")
 """The usual splits, in their order."""
@@ -171,21 +174,17 @@ class Shot:
             found = found.with_hidden(_hidden(mask, found))
         return found
 
-    @property
-    def is_wholly_hidden(self) -> bool:
-        """Whether a mask leaves nothing visible; no image is read."""
-        return any(hides_everything(mask.path, mask.hides) for mask in self.masks)
-
     def faces(self) -> list[Shot]:
         """Return the pinhole views of a panorama with a pose; the shot itself if it is not one."""
         if not isinstance(self.camera, PanoramaFace) or self.T_world_camera is None:
             return [self]
-        return [
-            replace(
-                self, camera=replace(self.camera, face=face), T_world_camera=T, stem=f"{self.stem}_{face}"
-            )
-            for face, T in faces_of(self.T_world_camera)
-        ]
+        faces = list[Shot]()
+        for face in PANORAMA_FACES:
+            camera = replace(self.camera, face=face)
+            turn = SE3(torch.from_numpy(camera.rotation).double(), torch.zeros(3, dtype=torch.float64))
+            T = self.T_world_camera @ turn
+            faces.append(replace(self, camera=camera, T_world_camera=T, stem=f"{self.stem}_{face}"))
+        return faces
 
 
 def _hidden(mask: MaskFile, frame: Frame) -> Bool[Tensor, "h w"] | None:
@@ -238,6 +237,7 @@ class Capture:
     pose_file: Path | str | None = None  # what records the poses, for messages
     poses_expected: str = "at least one"  # what has to be there for an image to have a pose
     unposed: str = ""  # why some images have none
+    rate: float = math.inf  # most frames per second in the dataset, if recordings have more than a map needs
 
     def __post_init__(self) -> None:
         if not all(shot.name for shot in self.shots):
@@ -287,7 +287,7 @@ class Capture:
 
     def split(self, name: str) -> Capture:
         """Return the frames of a split; "all" has every frame that is in any. Raises ``InputError`` for an unknown split."""
-        if name == ALL and ALL not in self.splits:
+        if name == "all" and name not in self.splits:
             return replace(self, shots=_named([shot for shot in self.shots if shot.splits]))
         if name not in self.splits:
             known = ", ".join(self.splits) or "none, since only images with poses are in a split"
@@ -346,13 +346,14 @@ class Capture:
         self,
         split: str,
         names: Sequence[str] | None = None,
-        progress: ReadingProgress | None = None,
+        progress: Callable[[int, int], None] | None = None,
         limit: int | None = None,
     ) -> list[View]:
         """Read the frames ``names``, in that order, or the whole split; no other image is opened.
 
         When reading a whole split, frames that a mask hides entirely are left out. Images with more than ``limit``
-        pixels along the longer side are downscaled to that, where the user asked for nothing else. Raises
+        pixels along the longer side are downscaled to that, where the user asked for nothing else. ``progress`` is called
+        with (frames read, frames requested) after each frame. Raises
         ``InputError`` for an unknown split or frame, and for a file that is missing or invalid.
         """
         shots, views = self.select(split, names), list[View]()
@@ -368,7 +369,11 @@ class Capture:
 
     def wholly_hidden(self, split: str) -> list[str]:
         """Return the frames of a split of which a mask leaves nothing visible; only masks are read."""
-        return [shot.name for shot in self.select(split) if shot.is_wholly_hidden]
+        return [
+            shot.name
+            for shot in self.select(split)
+            if any(hides_everything(mask.path, mask.hides) for mask in shot.masks)
+        ]
 
     def require_poses(self) -> Capture:
         """Return the capture; a remark counts frames without a pose. Raises ``InputError`` if no frame has one."""
@@ -401,18 +406,33 @@ def _named(shots: Sequence[Shot], one_split: bool = False) -> list[Shot]:
     return [replace(shot, name=name) for shot, name in zip(shots, unique_names(paths), strict=True)]
 
 
-def hold_out(shots: Sequence[Shot], where: Callable[[Shot], bool] = lambda shot: True) -> list[Shot]:
+def hold_out(
+    shots: Sequence[Shot], where: Callable[[Shot], bool] = lambda shot: True, rate: float = math.inf
+) -> list[Shot]:
     """Return the shots in splits: of those with a pose, every eighth (the first, the ninth ...) is "test", the others "train".
 
-    A single one is in both splits. Shots of which ``where`` is false are in no split.
+    A single one is in both splits. Shots of which ``where`` is false are in no split, nor are those beyond ``rate`` per
+    second, if all have a time, in their order. Times may be 5 ms early, as rounded ones are.
     """
-    posed = [shot.T_world_camera is not None and where(shot) for shot in shots]
-    single, number, found = sum(posed) == 1, -1, list[Shot]()
-    for shot, chosen in zip(shots, posed, strict=True):
-        number += chosen
-        split = ("train", "test") if single else ("train",) if number % HOLD_OUT_EVERY else ("test",)
-        found.append(replace(shot, splits=split if chosen else ()))
-    return found
+    chosen, due = set[int](), -math.inf
+    if any(shot.time is None for shot in shots):
+        rate = math.inf
+    for number, shot in enumerate(shots):
+        if (
+            shot.T_world_camera is not None
+            and where(shot)
+            and (rate == math.inf or (shot.time or 0.0) >= due)
+        ):
+            chosen.add(number)
+            due = (shot.time or 0.0) + 1 / rate - 0.005
+    place = {number: place for place, number in enumerate(sorted(chosen))}
+    held_out = ("train", "test") if len(chosen) == 1 else ("test",)
+    return [
+        replace(shot, splits=held_out if place[number] % HOLD_OUT_EVERY == 0 else ("train",))
+        if number in chosen
+        else replace(shot, splits=())
+        for number, shot in enumerate(shots)
+    ]
 
 
 def of_views(views: Sequence[View], path: Path, splits: tuple[str, ...] = SPLITS) -> Capture:
@@ -440,37 +460,31 @@ def remark(where: Path | str, text: str) -> None:
     warnings.warn(f"{where}: {text}", InputWarning, stacklevel=3)
 
 
-def present(
-    shots: Sequence[Item],
-    is_there: Callable[[Item], bool],
-    where: Path | str,
-    name: Callable[[Item], object],
-    error: Callable[[Item], InputError] | None = None,
-    noun: str = "image",
-) -> list[Item]:
-    """Return the items whose files exist; a remark counts the others, with the ``name`` of the first missing file.
+def with_files(capture: Capture) -> list[Shot]:
+    """Return the shots whose image files exist, without masks and depth images that do not; remarks count what is missing.
 
-    If nothing is left, the ``error`` of the first is raised, if there is one.
+    Raises ``InputError`` if all images are missing, or all masks.
     """
-    there = [item for item in shots if is_there(item)]
-    if len(there) < len(shots):
-        first = next(item for item in shots if not is_there(item))
-        if not there and error is not None:
-            raise error(first)
-        gone = len(shots) - len(there)
-        are = "is" if gone == 1 else "are"
-        remark(
-            where, f"{gone} of {amount(len(shots), noun)} {are} missing and left out, first: {name(first)}"
+
+    def missing(noun: str, files: Sequence[object]) -> set[object]:
+        gone = [file for file in files if isinstance(file, Path) and not is_file(file)]
+        if gone and len(gone) == len(files) and noun != "depth image":
+            raise InputError(f"no such {noun}, although {capture.path} lists it", where=gone[0])
+        if gone:
+            first = gone[0].relative_to(capture.path) if gone[0].is_relative_to(capture.path) else gone[0]
+            count = f"{len(gone)} of {amount(len(files), noun)} {'is' if len(gone) == 1 else 'are'}"
+            remark(capture.path, f"{count} missing and left out, first: {first}")
+        return set(gone)
+
+    gone = missing("image", [shot.image for shot in capture.shots])
+    shots = [shot for shot in capture.shots if shot.image not in gone]
+    gone = missing("mask", [mask.path for shot in shots for mask in shot.masks])
+    gone |= missing("depth image", [shot.depth.path for shot in shots if shot.depth is not None])
+    return [
+        replace(
+            shot,
+            masks=tuple(mask for mask in shot.masks if mask.path not in gone),
+            depth=None if shot.depth is None or shot.depth.path in gone else shot.depth,
         )
-    return there
-
-
-def images_there(where: Path, shots: Sequence[Shot]) -> list[Shot]:
-    """Return the shots whose image file exists; a remark about ``where``, the list that names them, counts the others."""
-    return present(
-        shots,
-        lambda shot: shot.file is not None and is_file(shot.file),
-        where,
-        lambda shot: shot.file and os.path.relpath(shot.file, where.parent),
-        lambda shot: InputError(f"no such file, although {where} lists it", where=shot.file),
-    )
+        for shot in shots
+    ]

@@ -31,17 +31,8 @@ _Item = TypeVar("_Item")
 _Point = tuple[int, tuple[float, float, float], float, int]
 """The id of a point, its position, its error and the number of its observations."""
 
-COUNT, IMAGE, POINT = struct.Struct("<Q"), struct.Struct("<I7dI"), struct.Struct("<q3d3BdQ")
-OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
-CAMERA_RECORD = struct.Struct("<IiQQ")
 MODEL_FILE = "a file of a COLMAP sparse model"
 LARGEST_MODEL = 2**30  # bytes of one file of a model
-TRACK_BYTES = 8  # an image and one of its keypoints, 4 bytes each
-DEPTH_FOLDER = "stereo/depth_maps"
-KINDS = ("geometric", "photometric")
-"""The kinds of depth maps, the more reliable one first."""
-LARGEST_HEAD = 64
-"""Bytes of the text before the numbers of a depth map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +103,7 @@ def count_posed_images(folder: Path) -> int:
     ``read_posed_images`` does.
     """
     _, images = files_of(folder, "cameras", "images") or (folder, folder / "images.bin")
-    return int(_Bytes(images).take(COUNT)[0]) if images.suffix == ".bin" else len(_images(images))
+    return int(_Bytes(images).take("<Q")[0]) if images.suffix == ".bin" else len(_images(images))
 
 
 def files_of(folder: Path, *names: str) -> list[Path] | None:
@@ -123,13 +114,14 @@ def files_of(folder: Path, *names: str) -> list[Path] | None:
 
 def depth_map_of(model: Path, name: str) -> Path | None:
     """Return the depth map of an image of a model ``WORKSPACE/sparse`` or ``WORKSPACE/sparse/0``, or None."""
-    folders = (model.parent / DEPTH_FOLDER, model.parent.parent / DEPTH_FOLDER)
-    files = (folder / f"{name}.{kind}.bin" for folder in folders for kind in KINDS)
+    folders = (folder / "stereo/depth_maps" for folder in (model.parent, model.parent.parent))
+    kinds = ("geometric", "photometric")  # the more reliable one first
+    files = (folder / f"{name}.{kind}.bin" for folder in folders for kind in kinds)
     return next(filter(is_file, files), None)
 
 
 def _binary_camera(file: _Bytes) -> tuple[int, Camera]:
-    number, model, width, height = file.take(CAMERA_RECORD)
+    number, model, width, height = file.take("<IiQQ")
     name = MODEL_IDS.get(model)
     if name is None:
         expected = ", ".join(MODEL_IDS.values())
@@ -144,13 +136,11 @@ def _binary_camera(file: _Bytes) -> tuple[int, Camera]:
     )
 
 
-def read_colmap_depth(path: Path, unit: float) -> DepthImage:
-    """Read a depth map, with ``unit`` metres per unit of the model. Raises ``InputError`` for other or
-    truncated files.
-    """
+def read_colmap_depth(path: Path) -> DepthImage:
+    """Read a depth map, in units of the model. Raises ``InputError`` for other or truncated files."""
     content = read_file(path, "a COLMAP depth map")
     *sizes, numbers = content.split(b"&", 3)
-    if len(sizes) != 3 or not all(size.isdigit() and len(size) < LARGEST_HEAD for size in sizes):
+    if len(sizes) != 3 or not all(size.isdigit() and len(size) < 10 for size in sizes):
         raise InputError(
             "does not begin with width&height&channels&", where=path, expected="a COLMAP depth map"
         )
@@ -162,7 +152,7 @@ def read_colmap_depth(path: Path, unit: float) -> DepthImage:
             expected=f"{4 * width * height} of one channel",
         )
     values = np.frombuffer(numbers, "<f4").reshape(height, width)
-    return depth_image(np.where(values > 0, values, 0), unit, f"{path}: depth")
+    return depth_image(np.where(values > 0, values, 0), 1.0, f"{path}: depth")
 
 
 def _images(file: Path) -> list[ModelImage]:
@@ -175,27 +165,23 @@ class _Bytes:
     def __init__(self, path: Path) -> None:
         self.path, self._content, self._place = path, read_file(path, MODEL_FILE, LARGEST_MODEL), 0
 
-    def take(self, layout: struct.Struct) -> tuple[Any, ...]:
-        start = self._advance(layout.size)
-        return layout.unpack_from(self._content, start)
+    def take(self, layout: str) -> tuple[Any, ...]:
+        return struct.unpack_from(layout, self._content, self.skip(struct.calcsize(layout)))
 
     def array(self, kind: np.dtype, count: int) -> np.ndarray:
-        start = self._advance(kind.itemsize * count)
-        return np.frombuffer(self._content, kind, count, start)
+        return np.frombuffer(self._content, kind, count, self.skip(kind.itemsize * count))
 
     def text(self) -> str:
         end = self._content.find(b"\0", self._place)
-        start = self._advance((len(self._content) if end < 0 else end + 1) - self._place)
+        start = self.skip((len(self._content) if end < 0 else end + 1) - self._place)
         return self._content[start : self._place - 1].decode("utf-8", "replace")
-
-    def skip(self, size: int) -> None:
-        self._advance(size)
 
     @property
     def left(self) -> int:
         return len(self._content) - self._place
 
-    def _advance(self, size: int) -> int:
+    def skip(self, size: int) -> int:
+        """Go on by ``size`` bytes, and return where they began. Raises ``InputError`` if there are fewer."""
         if size > self.left:
             length = len(self._content)
             raise InputError(
@@ -208,7 +194,7 @@ class _Bytes:
 def _binary(path: Path, one: Callable[[_Bytes], _Item]) -> list[_Item]:
     """Read a count, then that many items, each with ``one``."""
     file = _Bytes(path)
-    (count,) = file.take(COUNT)
+    (count,) = file.take("<Q")
     if count > file.left:  # a false count must not allocate memory
         raise InputError(f"declares {count} entries in {file.left} bytes; is the file damaged?", where=path)
     found = [one(file) for _ in range(int(count))]
@@ -218,15 +204,16 @@ def _binary(path: Path, one: Callable[[_Bytes], _Item]) -> list[_Item]:
 
 
 def _binary_image(file: _Bytes) -> ModelImage:
-    _, *pose, camera = file.take(IMAGE)
+    _, *pose, camera = file.take("<I7dI")
     name = file.text()
-    observed = file.array(OBSERVATION, int(file.take(COUNT)[0]))["point"]
+    keypoint = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
+    observed = file.array(keypoint, int(file.take("<Q")[0]))["point"]
     return _image(str(file.path), name, int(camera), pose, observed)
 
 
 def _binary_point(file: _Bytes) -> _Point:
-    number, x, y, z, *_, error, track = file.take(POINT)
-    file.skip(TRACK_BYTES * int(track))
+    number, x, y, z, *_, error, track = file.take("<q3d3BdQ")
+    file.skip(8 * int(track))  # an image and one of its keypoints, 4 bytes each
     return int(number), (x, y, z), error, int(track)
 
 

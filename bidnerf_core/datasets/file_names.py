@@ -20,52 +20,50 @@ def posix_name(name: str) -> PurePosixPath:
 
 
 class FileNames:
-    """The files below a folder, found by the names in a metadata file; each folder is listed at most once."""
+    """The files below a folder, or else below others, found by the names in a metadata file; each folder is listed at most once."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, *others: Path) -> None:
+        self._folders = [each for each in (folder, *others) if each == folder or each.is_dir()]
         self._listed: dict[Path, dict[str, str]] = {}
 
-    def find(self, name: PurePosixPath, endings: tuple[str, ...] = ("",), moved: bool = False) -> Path | None:
+    def find(
+        self, name: str | PurePosixPath, endings: tuple[str, ...] = ("",), moved: bool = False
+    ) -> Path | None:
         """Return the file named ``name`` plus one of the ``endings``, or None.
 
         The exact name is tried first, then names that differ in case, then the last parts of an absolute path, and of a
         relative one if it may be relative to a folder elsewhere because files were ``moved``.
         """
-        for ending in endings:
-            exact = self._folder / f"{name}{ending}"
-            if is_file(exact):
-                return exact
-        for parts in self._tails(name, moved):
-            for ending in endings:
-                found = self._ignoring_case((*parts[:-1], f"{parts[-1]}{ending}"))
-                if found is not None:
-                    return found
-        return None
-
-    def _tails(self, name: PurePosixPath, moved: bool) -> list[tuple[str, ...]]:
-        """Return the parts of a relative name; for an absolute one, or a ``moved`` one, the parts below each of its folders,
-        longest first.
-        """
+        name = posix_name(str(name))
+        # The parts of a relative name; of an absolute or moved one, those below each of its folders, longest first.
         is_absolute = name.is_absolute() or bool(name.parts and name.parts[0].endswith(":"))
         last = len(name.parts) if is_absolute or moved else min(1, len(name.parts))
-        return [name.parts[first:] for first in range(int(is_absolute), last)]
+        tails = [name.parts[first:] for first in range(int(is_absolute), last)]
+        for folder in self._folders:
+            exact = (folder / f"{name}{ending}" for ending in endings)
+            like = (
+                self._ignoring_case(folder, (*parts[:-1], f"{parts[-1]}{ending}"))
+                for parts in tails
+                for ending in endings
+            )
+            for file in (*exact, *like):
+                if is_file(file):
+                    return file
+        return None
 
-    def _ignoring_case(self, parts: tuple[str, ...]) -> Path | None:
-        place = self._folder
+    def path(self, name: str | PurePosixPath, endings: tuple[str, ...] = ("",), moved: bool = False) -> Path:
+        """Return the file that ``find`` returns, or where it should be."""
+        return self.find(name, endings, moved) or self._folders[0] / posix_name(str(name))
+
+    def _ignoring_case(self, place: Path, parts: tuple[str, ...]) -> Path:
+        """Return the path of ``parts`` below a folder, as the names in each folder are spelled, if only one is spelled so."""
         for part in parts:
-            if part != "..":
-                part = self._entries(place).get(part.lower(), part)
-            place = place / part
-        return place if is_file(place) else None
-
-    def _entries(self, folder: Path) -> dict[str, str]:
-        """Return the names in a folder by lower-case form, without those that differ only in case."""
-        if folder not in self._listed:
-            try:
-                names = [child.name for child in folder.iterdir()]
-            except OSError:
-                names = []
-            count = Counter(name.lower() for name in names)
-            self._listed[folder] = {name.lower(): name for name in names if count[name.lower()] == 1}
-        return self._listed[folder]
+            if place not in self._listed:
+                try:
+                    names = [child.name for child in place.iterdir()]
+                except OSError:
+                    names = []
+                count = Counter(name.lower() for name in names)
+                self._listed[place] = {name.lower(): name for name in names if count[name.lower()] == 1}
+            place = place / (part if part == ".." else self._listed[place].get(part.lower(), part))
+        return place

@@ -12,7 +12,6 @@ frames a second, and the sequence all of them.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,25 +21,20 @@ import torch
 from jaxtyping import Integer
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets.capture import Shot, hold_out, remark
-from bidnerf_core.datasets.trajectories import check_unit
+from bidnerf_core.datasets.capture import remark
+from bidnerf_core.datasets.trajectories import pose_numbers
 from bidnerf_core.depth import MILLIMETRE, DepthImage, read_depth_image
-from bidnerf_core.errors import InputError, amount, enumeration
+from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import decode
 
 LARGEST_SIDE = 640
 """Default limit of the pixels on a photo's longer side."""
-LIDAR_RANGE = 5.0
-"""Range of the lidar (metres) according to Apple."""
 HIGH_CONFIDENCE = 2
-MOST_VALUES = 4
-"""Number of different confidences up to which a remark lists them."""
 FRAMES_PER_SECOND = 5.0
 """Largest frame rate of a dataset."""
-ROUNDING = 0.005
-"""Seconds by which frame times may be early."""
+UP = (0.0, 1.0, 0.0)
+"""ARKit aligns its world with gravity."""
 
 
 class LidarDepth:
@@ -54,23 +48,24 @@ class LidarDepth:
 
     def __call__(self, depth: Path, confidence: Path | None) -> DepthImage:
         """Read depth in millimetres, and its confidence. Raises ``InputError`` as ``sure`` does."""
-        measured, sure = (
-            read_depth_image(depth, MILLIMETRE),
-            None if confidence is None else decode(confidence),
-        )
-        if sure is not None and sure.ndim != 2:
+        measured = read_depth_image(depth, MILLIMETRE)
+        if confidence is None:
+            return self.sure(measured, None, "")
+        sure = decode(confidence)
+        if sure.ndim != 2:
             raise InputError(f"has {sure.shape[-1]} channels", where=confidence, expected="one")
-        return self.sure(measured, None if sure is None else sure.astype(np.int64), str(confidence))
+        return self.sure(measured, sure.astype(np.int64), str(confidence))
 
     def sure(
         self, measured: DepthImage, confidence: Integer[np.ndarray, "h w"] | None, where: str
     ) -> DepthImage:
-        """Return the depth whose confidence, if there is any, is high, and within the range of the lidar; 0 elsewhere.
+        """Return the depth whose confidence, if there is any, is high, and within the range of the lidar, 5 m according to
+        Apple; 0 elsewhere.
 
         Raises ``InputError``, whose message begins with ``where``, for a confidence of another size or with
         values above the high one.
         """
-        metres = torch.where(measured.metres <= LIDAR_RANGE, measured.metres, 0)
+        metres = torch.where(measured.metres <= 5.0, measured.metres, 0)
         if confidence is None:
             return replace(measured, metres=metres)
         if confidence.shape != tuple(metres.shape):
@@ -86,60 +81,28 @@ class LidarDepth:
         sure = torch.where(torch.from_numpy(confidence == high), metres, 0)
         if not self._remarked and bool(metres.any()) and not bool(sure.any()):
             self._remarked = True
+            values = [str(value) for value in np.unique(confidence)]
+            said = f"the values {enumeration(values)}" if len(values) > 1 else f"only the value {values[0]}"
+            if len(values) > 4:
+                said = f"values from {values[0]} to {values[-1]}"
             remark(
                 where,
-                f"{_values(confidence)}, expected {high} where depth is sure; without it, all depth"
+                f"has {said}, expected {high} where depth is sure; without it, all depth"
                 " of this image is left out, and so it is in such images that follow",
             )
         return replace(measured, metres=sure)
 
 
-def _values(confidence: Integer[np.ndarray, "h w"]) -> str:
-    """Return the values of a confidence image in words."""
-    values = np.unique(confidence)
-    if len(values) > MOST_VALUES:
-        return f"has values from {values[0]} to {values[-1]}"
-    return f"has {'only the value' if len(values) == 1 else 'the values'} {enumeration([str(v) for v in values])}"
-
-
-def arkit_camera(numbers: Sequence[float], width: int, height: int, where: str) -> Intrinsics:
-    """Return the camera of fx, fy, cx and cy relative to the centre of the upper left pixel. Raises ``InputError``."""
-    fx, fy, cx, cy = numbers
-    try:
-        return Intrinsics(fx, fy, cx + 0.5, cy + 0.5, width, height)
-    except InputError as error:
-        raise InputError(error, where=where) from error
-
-
 def pose_of_numbers(where: str, numbers: Sequence[float], opengl: bool) -> SE3 | None:
-    """Return ``T_world_camera`` (OpenCV axes) from a quaternion x y z w and a position, or None if they hold
+    """Return ``T_world_camera`` (OpenCV axes) from a position and a quaternion x y z w, or None if they hold
     no pose.
 
     The camera axes are OpenGL's or OpenCV's. Raises ``InputError`` for a quaternion whose length is not 1.
     """
-    length = math.hypot(*numbers[:4])
-    if not all(map(math.isfinite, numbers)) or length == 0:
+    found = pose_numbers(where, numbers)
+    if found is None:
         return None
-    check_unit(length, where, "qx qy qz qw")
-    rotation = torch.from_numpy(Rotation.from_quat(np.array(numbers[:4])).as_matrix())
+    rotation = torch.from_numpy(Rotation.from_quat(found[3:]).as_matrix())
     if opengl:
         rotation = rotation * rotation.new_tensor([1.0, -1.0, -1.0])
-    return SE3(rotation, torch.tensor(list(numbers[4:7]), dtype=torch.float64))
-
-
-def thinned(where: Path, shots: Sequence[Shot]) -> list[Shot]:
-    """Return the frames with those of a dataset in splits, at most ``FRAMES_PER_SECOND``; a remark counts the others.
-
-    ``shots`` are in chronological order. All are in splits if any has no time.
-    """
-    chosen, due = set[int](), -math.inf
-    for shot in shots:
-        if shot.time is None:
-            return hold_out(shots)
-        if shot.time >= due and shot.T_world_camera is not None:
-            chosen.add(id(shot))
-            due = shot.time + 1 / FRAMES_PER_SECOND - ROUNDING
-    if len(chosen) < (count := sum(shot.T_world_camera is not None for shot in shots)):
-        rate = f"{FRAMES_PER_SECOND:g} per second; the sequence has all"
-        remark(where, f"the dataset has {len(chosen)} of {amount(count, 'frame')}, {rate}")
-    return hold_out(shots, lambda shot: id(shot) in chosen)
+    return SE3(rotation, torch.tensor(found[:3], dtype=torch.float64))

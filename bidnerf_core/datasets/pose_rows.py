@@ -1,4 +1,4 @@
-"""Camera poses as rows of numbers, converted to our conventions: ``T_world_camera`` with OpenCV axes.
+"""Cameras and their poses as numbers, converted to our conventions: ``T_world_camera`` with OpenCV axes, pixel centres at +0.5.
 
 NeRF's and nerfstudio's JSON and ARKit's exports hold camera-to-world matrices with OpenGL axes (x right, y up, z backward).
 """
@@ -6,17 +6,37 @@ NeRF's and nerfstudio's JSON and ARKit's exports hold camera-to-world matrices w
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import RIGID_TO, SE3, rigid_pose
-from bidnerf_core.io import Record, read_rows
+from bidnerf_core.io import Record, is_file, read_rows
 
-LARGEST_POSE = 4096
-"""Largest size of a file with one pose, in bytes."""
+
+def camera_of(
+    where: str | Path,
+    numbers: Sequence[float],
+    size: tuple[int, int],
+    lens: Sequence[float] = (),
+    first_centre: float = 0.5,
+) -> Intrinsics:
+    """Return the camera of fx, fy, cx, cy (pixels), of images of this size (width, height), with OpenCV's distortion, if any.
+
+    Where the upper left pixel's centre is (0, 0), half a pixel, the ``first_centre``, is added to the principal point. Raises
+    ``InputError``, whose message begins with ``where``, for numbers that no camera has.
+    """
+    fx, fy, cx, cy = numbers
+    try:
+        return Intrinsics(
+            fx, fy, cx + first_centre, cy + first_centre, *size, tuple(lens) if any(lens) else ()
+        )
+    except InputError as error:
+        raise InputError(error, where=where) from error
 
 
 def pose_and_scale(record: Record, key: str = "transform_matrix") -> tuple[SE3, float]:
@@ -51,13 +71,15 @@ def _from_opengl(record: Record, key: str, rows: list[list[float]]) -> SE3:
 
 
 def read_pose_matrix(path: Path) -> SE3 | None:
-    """Read ``T_world_camera`` (metres, OpenCV axes, float64) from a text file with one 4x4 matrix; None if tracking failed,
-    as numbers that are not finite record.
+    """Read ``T_world_camera`` (metres, OpenCV axes, float64) from a text file with one 4x4 matrix; None if there is no file,
+    or tracking failed, as numbers that are not finite record.
 
     Raises ``InputError``, which names the offending line.
     """
+    if not is_file(path):
+        return None
     expected = "4 rows of 4 numbers, the last of them 0 0 0 1"
-    lines = read_rows(path, "a file of a pose", expected, LARGEST_POSE)
+    lines = read_rows(path, "a file of a pose", expected, most=4096)
     rows = [row.plain_numbers(row.words) for row in lines]
     if not all(map(math.isfinite, (number for row in rows for number in row))):
         return None

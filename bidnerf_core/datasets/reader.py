@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Generic, Literal, Protocol, TypeVar, runtime_checkable
 
 from bidnerf_core.camera import Camera, CameraSource, Intrinsics
-from bidnerf_core.datasets.capture import Capture, hold_out
+from bidnerf_core.datasets.capture import Capture, hold_out, remark, with_files
 from bidnerf_core.datasets.options import DatasetOptions as DatasetOptions
 from bidnerf_core.datasets.options import DepthRegistration
 from bidnerf_core.depth import DepthCamera as DepthCamera  # for authors of readers
@@ -19,10 +19,9 @@ from bidnerf_core.io import IMAGE_SUFFIXES
 from bidnerf_core.io import Background as Background  # for authors of readers
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 
+Found = TypeVar("Found")
 OpenQuestion = Literal["camera", "focal", "register_depth", "depth_unit"]
 """An option of ``DatasetOptions`` that a format may leave open."""
-FARTHEST_CAMERA = 1e10
-"""Largest coordinate of a camera: from the centre of the Earth, and in millimetres, its surface is at 6.4e9."""
 
 
 def read_dataset(
@@ -43,19 +42,17 @@ def read_sequence(
 ) -> Capture:
     """Read frames in chronological order, see ``DatasetOptions.open_sequence``."""
     # The readers of photos and videos are not registered: they find no poses.
-    from bidnerf_core.datasets.formats.photos import PhotoReader
-    from bidnerf_core.datasets.formats.video import VideoReader
-    from bidnerf_core.datasets.video import VIDEO_SUFFIXES
+    from bidnerf_core.datasets.formats.photos import reader as photos
+    from bidnerf_core.datasets.formats.video import reader as video
 
     place = Path(path)
     if not place.exists():
         raise InputError("no such file or folder", where=place)
-    others = (PhotoReader(), VideoReader())
-    reader = _reader_of(place, readers) or next((other for other in others if other.recognises(place)), None)
+    reader = _reader_of(place, readers) or next((r for r in (photos, video) if r.recognises(place)), None)
     if reader is None:
         if place.is_dir():
             raise InputError("no images in it", where=place, expected="image files or a dataset")
-        raise _not_a_dataset(place, f", or a video ({', '.join(VIDEO_SUFFIXES)})")
+        raise _not_a_dataset(place, f", or {video.expected}")
     return _read(options, reader, place).in_time_order()
 
 
@@ -63,43 +60,55 @@ def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
     """Return what a reader reads, in splits, with masks. Raises ``InputError`` for options that the format does not
     accept, and if a third-party reader fails.
     """
-    source = options.camera_source
-    if source.is_given and "camera" not in reader.accepts:
-        raise InputError("is a dataset with its own cameras; leave out the camera", where=path)
-    if source.is_given and source.camera is None and "focal" not in reader.accepts:
+    source, accepts = options.camera_source, reader.accepts
+    refused = {
+        "is a dataset with its own cameras; leave out the camera": source.is_given
+        and "camera" not in accepts,
+        "has no depth, or its depth is already registered to its images; leave out register_depth": (
+            options.registration not in (None, False) and "register_depth" not in accepts
+        ),
+        "has no depth images, or depth in a fixed unit; leave out depth_unit": (
+            options.depth_unit is not None and "depth_unit" not in accepts
+        ),
+    }
+    for problem in (text for text, is_refused in refused.items() if is_refused):
+        raise InputError(problem, where=path)
+    if source.is_given and source.camera is None and "focal" not in accepts:
         raise InputError("is a dataset", where=path, expected="a camera with all intrinsics (camera=)")
-    if options.registration not in (None, False) and "register_depth" not in reader.accepts:
-        raise InputError(
-            "has no depth, or its depth is already registered to its images; leave out register_depth",
-            where=path,
-        )
-    if options.depth_unit is not None and "depth_unit" not in reader.accepts:
-        raise InputError("has no depth images, or depth in a fixed unit; leave out depth_unit", where=path)
     try:
         found: Any = reader.read(path, options)
     except (InputError, OSError, MemoryError):
         raise
     except Exception as error:
-        if any(reader is READERS[name] for name in ORDER if name in READERS):
+        if isinstance(reader, Format):
             raise
         who = f"reader {type(reader).__name__} failed to open it"
         raise InputError(f"{who}: {type(error).__name__}: {error}", where=path) from error
     if not isinstance(found, Capture):
         who = f"reader {type(reader).__name__} returned a {type(found).__name__}"
         raise InputError(who, where=path, expected="a Capture")
-    for shot in found.shots:
-        if (
-            shot.T_world_camera is not None
-            and not shot.T_world_camera.translation.abs().max() < FARTHEST_CAMERA
-        ):
-            position = ", ".join(f"{x:.3g}" for x in shot.T_world_camera.translation.tolist())
-            expected = f"coordinates below {FARTHEST_CAMERA:g}"
+    shots = with_files(found)
+    farthest = 1e10  # from the centre of the Earth, and in millimetres, its surface is at 6.4e9
+    for shot in shots:
+        pose = shot.T_world_camera
+        if pose is not None and not pose.translation.abs().max() < farthest:
+            position = ", ".join(f"{x:.3g}" for x in pose.translation.tolist())
             raise InputError(
-                f"{shot.name} is at {position}", where=found.pose_file or path, expected=expected
+                f"{shot.name} is at {position}",
+                where=found.pose_file or path,
+                expected=f"coordinates below {farthest:g}",
             )
-    shots = found.shots if found.splits else hold_out(found.shots)
-    faces = [face for shot in shots for face in shot.faces()]
-    found = replace(found, shots=[replace(shot, name="") for shot in faces], largest=options.largest)
+    if not found.splits:
+        shots = hold_out(shots, rate=found.rate)
+        posed, chosen = (
+            [shot for shot in shots if shot.T_world_camera is not None],
+            [s for s in shots if s.splits],
+        )
+        if len(chosen) < len(posed):
+            rate = f"{found.rate:g} per second; the sequence has all"
+            remark(path, f"the dataset has {len(chosen)} of {amount(len(posed), 'frame')}, {rate}")
+    faces = [replace(face, name="") for shot in shots for face in shot.faces()]
+    found = replace(found, shots=faces, largest=options.largest)
     return found if (masks := options.mask_folder) is None else found.masked(masks)
 
 
@@ -181,6 +190,26 @@ class Reader(Protocol):
         ...
 
 
+@dataclass(eq=False)
+class Format(Generic[Found]):
+    """A bundled reader: how a folder is recognized, and how what was found in it is read."""
+
+    expected: str
+    find: Callable[[Path], Found | None]
+    """Returns what identifies the format in a folder, such as its metadata file; nothing if there is none."""
+    load: Callable[[Path, Found, DatasetOptions], Capture]
+    accepts: Collection[OpenQuestion] = ()
+    suffixes: Collection[str] = ()
+
+    def recognises(self, path: Path) -> bool:
+        return bool(self.find(path))
+
+    def read(self, path: Path, options: DatasetOptions) -> Capture:
+        found = self.find(path)
+        assert found is not None  # ensured by recognises
+        return self.load(path, found, options)
+
+
 def _defects(reader: Any) -> Iterator[str]:
     methods = {"recognises": ("path",), "read": ("path", "options")}
     yield from interface_defects(reader, ("accepts", "expected"), methods)
@@ -205,11 +234,17 @@ def find_reader(folder: Path) -> Reader | None:
     for name in (name for name in ORDER if name in READERS):
         if may_hold(READERS[name], folder) and READERS[name].recognises(folder):
             return READERS[name]
-    claims = {
-        name: reader
-        for name, reader in _others()
-        if may_hold(reader, folder) and _claims(name, reader, folder)
-    }
+    claims = dict[str, Reader]()
+    for name in (name for name in READERS if name not in ORDER):
+        try:
+            reader = READERS.load(name)
+            if may_hold(reader, folder) and reader.recognises(folder):
+                claims[name] = reader
+        except PluginError as error:
+            warnings.warn(str(error), InputWarning, stacklevel=2)
+        except Exception as error:
+            why = f"{type(error).__name__}: {error}"
+            remark(folder, f"reader {name!r} failed to examine it: {why}")
     if len(claims) > 1:
         raise InputError(
             f"is recognized by the readers {enumeration(list(claims))}",
@@ -226,12 +261,9 @@ def may_hold(reader: Reader, path: Path) -> bool:
 
 def file_of_dataset(path: Path) -> str | None:
     """Return a clause that names the folder to give instead of a file in it that describes a dataset, or None."""
-    is_photo = path.suffix.lower() in IMAGE_SUFFIXES or not path.is_file()
-    return (
-        None
-        if is_photo or find_reader(path.parent) is None
-        else f"is a file of a dataset; give its folder, {path.parent}"
-    )
+    if path.suffix.lower() in IMAGE_SUFFIXES or not path.is_file() or find_reader(path.parent) is None:
+        return None
+    return f"is a file of a dataset; give its folder, {path.parent}"
 
 
 def no_dataset(folder: Path) -> InputError:
@@ -240,33 +272,14 @@ def no_dataset(folder: Path) -> InputError:
         splat = "'bidnerf import' with its point_cloud.ply, or the capture that it was trained on"
         return InputError("is the output of 3D Gaussian Splatting", where=folder, expected=splat)
     found = "contains no photos and is no dataset" if any(folder.iterdir()) else "the folder is empty"
-    return InputError(f"{found};", where=folder, expected=expected_formats())
+    return InputError(f"{found};", where=folder, expected=_expected_formats())
 
 
-def expected_formats(readers: Sequence[Reader] | None = None) -> str:
+def _expected_formats(readers: Sequence[Reader] | None = None) -> str:
     """Return the formats that can be read, for messages: all by name, or the files that some readers expect."""
     if readers is not None:
         return "; or ".join(reader.expected for reader in readers)
     return f"photos or a dataset in one of the formats of docs/datasets.md: {', '.join(READERS)}"
-
-
-def _others() -> Iterator[tuple[str, Reader]]:
-    """Yield the readers that are not bundled, except those that cannot be loaded."""
-    for name in READERS:
-        if name not in ORDER:
-            try:
-                yield name, READERS.load(name)
-            except PluginError as error:
-                warnings.warn(str(error), InputWarning, stacklevel=2)
-
-
-def _claims(name: str, reader: Reader, folder: Path) -> bool:
-    try:
-        return bool(reader.recognises(folder))
-    except Exception as error:
-        why = f"{type(error).__name__}: {error}"
-        warnings.warn(f"{folder}: reader {name!r} failed to examine it: {why}", InputWarning, stacklevel=2)
-        return False
 
 
 def _not_a_dataset(file: Path, or_else: str = "") -> InputError:
@@ -280,11 +293,9 @@ def _not_a_dataset(file: Path, or_else: str = "") -> InputError:
 
 def _without_dataset(folder: Path, readers: Sequence[Reader] | None) -> InputError:
     """Return the error for a folder that is no dataset, and what to do."""
-    inside = [
-        child.name for child in sorted(folder.iterdir()) if child.is_dir() and _reader_of(child, readers)
-    ]
-    if inside:
-        expected = f"one of the folders in it, such as {inside[0]}"
+    children = (child for child in sorted(folder.iterdir()) if child.is_dir())
+    if (inside := next((child for child in children if _reader_of(child, readers)), None)) is not None:
+        expected = f"one of the folders in it, such as {inside.name}"
         return InputError("no dataset found", where=folder, expected=expected)
     photos, _ = photos_in(folder)
     if not photos and readers is None:
@@ -295,12 +306,11 @@ def _without_dataset(folder: Path, readers: Sequence[Reader] | None) -> InputErr
             f": {amount(len(photos), 'photo')} without poses; 'bidnerf poses' finds them, or give those of an AR"
             " framework or a robot;"
         )
-    return InputError(found, where=folder, expected=expected_formats(readers))
+    return InputError(found, where=folder, expected=_expected_formats(readers))
 
 
 def _reader_of(folder: Path, readers: Sequence[Reader] | None) -> Reader | None:
+    """Return the one of ``readers``, by default of all, that recognizes a folder."""
     if readers is None:
         return find_reader(folder)
-    return next(
-        (reader for reader in readers if may_hold(reader, folder) and reader.recognises(folder)), None
-    )
+    return next((each for each in readers if may_hold(each, folder) and each.recognises(folder)), None)

@@ -1,4 +1,4 @@
-"""Rows with time stamps, as in the TUM RGB-D benchmark; trajectories, and their poses interpolated in time.
+"""Rows with time stamps, as in the TUM RGB-D benchmark, and tables; trajectories, and their poses interpolated in time.
 
 A row is ``timestamp value value ...``, separated by spaces or commas; ``#`` begins a comment, empty lines are
 skipped, and Windows line endings are allowed. Rows may be in any order. A truncated last row, as left by an
@@ -12,6 +12,7 @@ matrix, without a time, one row for each image. All are camera to world, or body
 
 from __future__ import annotations
 
+import csv
 import math
 import re
 from collections.abc import Sequence
@@ -28,11 +29,9 @@ from torch import Tensor
 from bidnerf_core.datasets.capture import remark
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.geometry import SE3, rigid_pose
-from bidnerf_core.io import LARGEST_ROWS, Row, parse_rows, read_file, read_rows
+from bidnerf_core.io import LARGEST_ROWS, Row, parse_rows, read_file, read_lines, read_rows
 
-NUMBERS_A_LINE = "tx ty tz qx qy qz qw"
-UNIT_TO = 0.01
-"""Tolerance of a quaternion's length around 1, for example because of rounding to four decimals."""
+POSE = "tx ty tz qx qy qz qw"
 LARGEST_GAP = 0.1
 """Seconds. Within this time a hand-held camera deviates from the interpolated path by a few millimetres;
 motion capture that lost its markers leaves longer gaps, in which no pose is known."""
@@ -41,7 +40,6 @@ KITTI_ROW = 12
 NANOSECONDS = 10**9
 LEAST_NANOSECONDS = 10**14
 """Integers from here on are nanoseconds: as seconds they would be three million years."""
-QUATERNION_COLUMNS = re.compile(r"\bq_?(?:\w+_)?([wxyz])\b", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -50,60 +48,91 @@ class TimedRow:
 
     row: Row
     time: float  # seconds
-    words: tuple[str, ...]  # what follows the time stamp
-    rest: str  # the same as one string, such as a file name with spaces
+    words: list[str]  # what follows the time stamp
 
     @property
-    def where(self) -> str:
-        """The file and the line, for messages."""
-        return self.row.where
+    def rest(self) -> str:
+        """What follows the time stamp as one string, such as a file name with spaces."""
+        return self.row.text[len(_words(self.row)[0]) :].lstrip(", \t")
 
 
-def read_timed_rows(path: Path, columns: str) -> list[TimedRow]:
-    """Read the rows in chronological order; ``columns`` names the columns after the time stamp ("tx ty tz").
+def column_names(line: str) -> list[str]:
+    """Return the names in the head of a table, in lower case."""
+    return [name.strip().lstrip("#").strip().lower() for name in line.split(",")]
 
-    Raises ``InputError`` if the file is missing, not text, too large or without rows, and for a row with too
-    few entries or without a finite time.
+
+def read_table(path: Path, expected: str, columns: str, needed: set[str]) -> list[tuple[Row, dict[str, str]]]:
+    """Read the rows of comma-separated values below a head, each with its cells by the names of their columns.
+
+    ``expected`` briefly describes the file, ``columns`` its head. Raises ``InputError`` unless the ``needed`` columns are
+    there, and for rows that are too short; a truncated last one is left out with a remark.
     """
-    return timed_rows(read_rows(path, "a list of time stamps", f"timestamp {columns}"), path, columns)
+    first, *lines = read_lines(path, expected, columns)
+    names = column_names(first.text)
+    if not needed <= set(names):
+        raise first.error(f" has the columns {first.text[:60]!r}")
+    rows = list[tuple[Row, list[str]]]()
+    for line in (line for line in lines if line.text):
+        try:
+            (cells,) = csv.reader([line.text])
+        except csv.Error as error:  # such as a carriage return inside a field
+            raise line.error(f" is no row of comma-separated values ({error})") from error
+        rows.append((line, [cell.strip() for cell in cells]))
+    return [
+        (row, dict(zip(names, cells, strict=False)))
+        for row, cells in _complete(path, rows, len(names), columns)
+    ]
 
 
-def timed_rows(rows: Sequence[Row], path: Path, columns: str, nanoseconds: bool = False) -> list[TimedRow]:
-    """Return the rows of the file ``path`` in chronological order, as ``read_timed_rows`` does.
-
-    Integer times are nanoseconds if ``nanoseconds`` is set, or if they are too large for seconds.
-    """
-    count = 1 + len(columns.split())
+def _complete(
+    path: Path, rows: Sequence[tuple[Row, list[str]]], count: int, columns: str
+) -> Sequence[tuple[Row, list[str]]]:
+    """Return rows, with their words, of at least ``count`` of these; a truncated last one is left out with a remark."""
     if not rows:
-        raise InputError("has no rows", where=path, expected=f"lines of timestamp {columns}")
-    if len(rows) > 1 and len(_words(rows[-1])) < count:
-        found = len(_words(rows[-1]))
-        remark(rows[-1].where, f"the last row is truncated ({found} of {count} entries) and was left out")
+        raise InputError("has no rows", where=path, expected=f"lines of {columns}")
+    last, words = rows[-1]
+    if len(rows) > 1 and len(words) < count:
+        remark(last.where, f"the last row is truncated ({len(words)} of {count} entries) and was left out")
         rows = rows[:-1]
-    return sorted((_timed(row, count, nanoseconds) for row in rows), key=lambda row: row.time)
+    for row, words in rows:
+        if len(words) < count:
+            raise row.error(f" has {len(words)} of {count} entries")
+    return rows
 
 
 def _words(row: Row) -> list[str]:
     return row.text.replace(",", " ").split()
 
 
-def _timed(row: Row, count: int, nanoseconds: bool) -> TimedRow:
-    words = _words(row)
-    if len(words) < count:
-        raise row.error(f" has {len(words)} of {count} entries")
-    try:
-        time = float(words[0])
-    except ValueError as error:
-        raise row.error(f": {words[0]!r} is not a time stamp") from error
-    if not math.isfinite(time):
-        raise row.error(f": the time stamp is {words[0]}")
-    if words[0].isdecimal() and (nanoseconds or time >= LEAST_NANOSECONDS):
-        time = int(words[0]) / NANOSECONDS
-    return TimedRow(row, time, tuple(words[1:]), row.text[len(words[0]) :].lstrip(", \t"))
+def _timed_rows(rows: Sequence[Row], path: Path, columns: str, nanoseconds: bool = False) -> list[TimedRow]:
+    """Return rows that begin with a time stamp, followed by ``columns``, in chronological order.
+
+    Integer times are nanoseconds if ``nanoseconds`` is set, or if they are too large for seconds. Raises ``InputError`` for a
+    row with too few entries or without a finite time, and if there is none.
+    """
+    timed = list[TimedRow]()
+    columns = f"timestamp {columns}"
+    split = [(row, _words(row)) for row in rows]
+    for row, (stamp, *words) in _complete(path, split, len(columns.split()), columns):
+        try:
+            time = float(stamp)
+        except ValueError as error:
+            raise row.error(f": {stamp!r} is not a time stamp") from error
+        if not math.isfinite(time):
+            raise row.error(f": the time stamp is {stamp}")
+        if stamp.isdecimal() and (nanoseconds or time >= LEAST_NANOSECONDS):
+            time = int(stamp) / NANOSECONDS
+        timed.append(TimedRow(row, time, words))
+    return sorted(timed, key=lambda row: row.time)
 
 
-def require_distinct_times(rows: list[TimedRow]) -> None:
-    """Raise ``InputError`` if two of the rows, which are in chronological order, have the same time stamp."""
+def read_timed_files(path: Path) -> list[TimedRow]:
+    """Read a list of files with their time stamps, in chronological order.
+
+    Raises ``InputError`` if it is missing, not text, too large or empty, and for rows without a file name, without a finite
+    time, or with that of another.
+    """
+    rows = _timed_rows(read_rows(path, "a list of time stamps", "timestamp filename"), path, "filename")
     for row, following in pairwise(rows):
         if row.time == following.time:
             first, second = sorted((row.row, following.row), key=lambda row: row.line)
@@ -112,6 +141,7 @@ def require_distinct_times(rows: list[TimedRow]) -> None:
                 where=second.where,
                 expected="each once",
             )
+    return rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,109 +185,83 @@ def read_trajectory(path: Path, times: Sequence[float] | None = None) -> Traject
     number of images.
     """
     content = read_file(path, "a trajectory", LARGEST_ROWS)
-    rows = parse_rows(content, path, "a trajectory", f"timestamp {NUMBERS_A_LINE}")
+    rows = parse_rows(content, path, "a trajectory", f"timestamp {POSE}")
     if rows and all(len(_words(row)) == KITTI_ROW for row in rows):
         return _kitti(path, rows, times)
-    nanoseconds = any("[ns]" in line for line in _comments(content))
-    timed = timed_rows(rows, path, NUMBERS_A_LINE, nanoseconds)
-    return _timed_trajectory(path, timed, _quaternion_order(content, rows))
-
-
-def _comments(content: bytes) -> list[str]:
     lines = content.decode("utf-8-sig", "replace").splitlines()
-    return [line for line in lines if line.lstrip().startswith("#")]
-
-
-def _quaternion_order(content: bytes, rows: Sequence[Row]) -> str:
-    """Return the quaternion order: the one stated in a comment, else that of EuRoC or TUM."""
-    for line in _comments(content):
-        named = "".join(QUATERNION_COLUMNS.findall(line)).lower()
-        if sorted(named) == sorted("xyzw"):
-            return named
-    is_euroc = rows and "," in rows[0].text and _words(rows[0])[0].isdecimal()
-    return "wxyz" if is_euroc and int(_words(rows[0])[0]) >= LEAST_NANOSECONDS else "xyzw"
-
-
-def _timed_trajectory(path: Path, rows: Sequence[TimedRow], order: str) -> Trajectory:
-    numbers = [_pose_numbers(row, order) for row in rows]
+    comments = [line for line in lines if line.lstrip().startswith("#")]
+    timed = _timed_rows(rows, path, POSE, any("[ns]" in line for line in comments))
+    order = _quaternion_order(comments, rows[0])
+    numbers = [pose_numbers(r.row.where, r.row.plain_numbers(r.words[:7]), order) for r in timed]
     known = [place for place, found in enumerate(numbers) if found is not None]
     if not known:
-        raise InputError("has no finite pose", where=path, expected=f"lines of timestamp {NUMBERS_A_LINE}")
-    if len(known) < len(rows):
-        first = next(place for place, found in enumerate(numbers) if found is None)
-        left = amount(len(rows) - len(known), "pose")
-        remark(
-            path,
-            f"{left} of {len(rows)} not finite or zero, left out (first: line {rows[first].row.line})",
-        )
-    kept = list[int]()
+        raise InputError("has no finite pose", where=path, expected=f"lines of timestamp {POSE}")
+    if len(known) < len(timed):
+        left = amount(len(timed) - len(known), "pose")
+        first = timed[numbers.index(None)].row.line
+        remark(path, f"{left} of {len(timed)} not finite or zero, left out (first: line {first})")
+    distinct = list[int]()
     for place in known:
-        if kept and rows[kept[-1]].time == rows[place].time:
-            if numbers[kept[-1]] != numbers[place]:
-                raise InputError(
-                    f"another pose at the time {rows[place].time:.6f}",
-                    where=rows[place].where,
-                    expected="one pose per time",
-                )
-            continue
-        kept.append(place)
-    values = torch.tensor([numbers[place] for place in kept], dtype=torch.float64)
+        if not distinct or timed[distinct[-1]].time != timed[place].time:
+            distinct.append(place)
+        elif numbers[distinct[-1]] != numbers[place]:
+            found = f"another pose at the time {timed[place].time:.6f}"
+            raise InputError(found, where=timed[place].row.where, expected="one pose per time")
+    values = torch.tensor([numbers[place] for place in distinct], dtype=torch.float64)
     rotations = torch.from_numpy(Rotation.from_quat(values[:, 3:].numpy()).as_matrix())
-    times = torch.tensor([rows[place].time for place in kept], dtype=torch.float64)
-    return Trajectory(times, rotations, values[:, :3])
+    stamps = torch.tensor([timed[place].time for place in distinct], dtype=torch.float64)
+    return Trajectory(stamps, rotations, values[:, :3])
 
 
-def check_unit(length: float, where: str, names: str) -> None:
-    """Raise ``InputError``, which begins with ``where``, unless the length of a quaternion is 1."""
-    if abs(length - 1) > UNIT_TO:
-        raise InputError(f"the quaternion has length {length:.3g}", where=where, expected=f"1 ({names})")
+def _quaternion_order(comments: Sequence[str], first: Row) -> str:
+    """Return the quaternion order: the one stated in a comment, else that of EuRoC or TUM."""
+    for line in comments:
+        named = "".join(re.findall(r"\bq_?(?:\w+_)?([wxyz])\b", line, re.IGNORECASE)).lower()
+        if sorted(named) == sorted("xyzw"):
+            return named
+    stamp = _words(first)[0]
+    is_euroc = "," in first.text and stamp.isdecimal() and int(stamp) >= LEAST_NANOSECONDS
+    return "wxyz" if is_euroc else "xyzw"
 
 
-def _pose_numbers(row: TimedRow, order: str) -> list[float] | None:
-    """Return the translation and the quaternion (x, y, z, w) of a row, or None if it holds no pose."""
-    numbers = row.row.plain_numbers(row.words[:7])
-    quaternion = dict(zip(order, numbers[3:], strict=True))
-    length = math.hypot(*numbers[3:])
+def pose_numbers(where: str, numbers: Sequence[float], order: str = "xyzw") -> list[float] | None:
+    """Return a position and the quaternion (x, y, z, w) after it, given in another order, or None if they hold no pose.
+
+    Raises ``InputError``, which begins with ``where``, unless the length of the quaternion is 1 up to rounding.
+    """
+    quaternion, length = dict(zip(order, numbers[3:], strict=True)), math.hypot(*numbers[3:])
     if length == 0 or not all(map(math.isfinite, numbers)):
         return None
-    check_unit(length, row.where, " ".join(f"q{letter}" for letter in order))
+    if abs(length - 1) > 0.01:  # such as that of numbers with four decimals
+        names = " ".join(f"q{letter}" for letter in order)
+        raise InputError(f"the quaternion has length {length:.3g}", where=where, expected=f"1 ({names})")
     return [*numbers[:3], *(quaternion[letter] for letter in "xyzw")]
 
 
 def _kitti(path: Path, rows: Sequence[Row], times: Sequence[float] | None) -> Trajectory:
     """Return the poses in rows of 3x4 matrices, one for each of ``times``."""
-    kind = f"has rows of {KITTI_ROW} numbers, KITTI's 3x4 poses, which have no times"
     if times is None or len(times) != len(rows):
         images = "images with known times" if times is None else amount(len(times), "image")
+        kind = f"has rows of {KITTI_ROW} numbers, KITTI's 3x4 poses, which have no times"
         raise InputError(
             f"{kind}; there are {len(rows)} for {images}", where=path, expected="one for each image"
         )
     remark(
         path, f"rows of {KITTI_ROW} numbers are read as KITTI's 3x4 camera-to-world poses, one for each image"
     )
-    poses = [_kitti_pose(row) for row in rows]
-    return Trajectory(
-        torch.tensor(times, dtype=torch.float64),
-        torch.stack([pose.rotation for pose in poses]),
-        torch.stack([pose.translation for pose in poses]),
-    )
+    poses = SE3.stack([_kitti_pose(row) for row in rows])
+    return Trajectory(torch.tensor(times, dtype=torch.float64), poses.rotation, poses.translation)
 
 
 def _kitti_pose(row: Row) -> SE3:
-    return rigid_pose(torch.tensor(row.numbers(_words(row)), dtype=torch.float64).reshape(3, 4), row.where)
+    numbers = row.numbers(_words(row), KITTI_ROW)
+    return rigid_pose(torch.tensor(numbers, dtype=torch.float64).reshape(3, 4), row.where)
 
 
 def read_matrices(path: Path) -> list[SE3]:
     """Read KITTI's rows of twelve numbers as poses ``T_world_camera``. Raises ``InputError``, with file and
     line, for others.
     """
-    rows = read_rows(path, "a file of KITTI poses", f"{KITTI_ROW} numbers, a 3x4 matrix")
-    if len(rows) > 1 and len(_words(rows[-1])) < KITTI_ROW:
-        remark(rows[-1].where, "the last row is truncated and was left out")
-        rows = rows[:-1]
-    if not rows:
-        raise InputError("has no rows", where=path, expected=f"{KITTI_ROW} numbers in each")
-    for row in rows:
-        if len(_words(row)) != KITTI_ROW:
-            raise row.error(f" has {len(_words(row))} entries")
-    return [_kitti_pose(row) for row in rows]
+    columns = f"{KITTI_ROW} numbers, a 3x4 matrix"
+    rows = [(row, _words(row)) for row in read_rows(path, "a file of KITTI poses", columns)]
+    return [_kitti_pose(row) for row, _ in _complete(path, rows, KITTI_ROW, columns)]

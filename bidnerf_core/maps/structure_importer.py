@@ -13,7 +13,15 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets import Capture, ColmapReader, read_model, shot_of, stored_keypoints, unique_names
+from bidnerf_core.datasets import (
+    Capture,
+    colmap_models,
+    colmap_project,
+    read_model,
+    shot_of,
+    stored_keypoints,
+    unique_names,
+)
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.geometry import SE3, Similarity
 from bidnerf_core.mapping import Keypoints
@@ -39,15 +47,14 @@ class StructureImporter:
 
     summary = "COLMAP models with their database or photos, as landmarks ('train' adds a field)"
     config_type = StructureSettings
-    reader = ColmapReader()
 
     def recognises(self, path: Path) -> bool:
         """Return whether a folder is a COLMAP project, or has a model in it."""
-        return path.is_dir() and self.reader.recognises(path)
+        return path.is_dir() and bool(colmap_models(path))
 
     def read(self, path: Path, config: StructureSettings, placement: Similarity) -> ImportedField:
         """Read the model in a folder, see ``Importer``."""
-        model, folder, images, cameras, files = self.reader.project(path)
+        model, folder, images, cameras, files = colmap_project(path)
         _, points = read_model(model)
         found = [f"{model}: {amount(len(images), 'image')}, {amount(len(points.ids), 'point')}"]
         shots = [shot_of(model, image, files.get(image.name), cameras) for image in images]

@@ -149,7 +149,7 @@ FAULTS: dict[str, list[tuple[str, Edit, str | tuple[str, ...]]]] = {
         ("frame-000000.depth.png", image((8, 8)), ("depth is 8x8", "aspect ratio")),
     ],
     "reality-capture": [
-        ("cameras.csv", replaced(",f,", ",focal,"), ("no column f", "Internal/External")),
+        ("cameras.csv", replaced(",f,", ",focal,"), ("has the columns", "Internal/External")),
         ("cameras.csv", lambda file: file.write_bytes(file.read_bytes() + b"6.png,0\r7"), ("line 8", "comma-separated")),
     ],
     "kitti": [("../../poses/07.txt", Path.unlink, "poses.txt")],
@@ -331,7 +331,7 @@ def test_an_archive_that_is_cut_or_none_or_empty(tmp_path: Path) -> None:
     with refused(where=file / "metadata", found="not found in the archive, which holds 1 file"):
         read_all(file)
     file = packed(tmp_path, {name: files[name] for name in files if not name.endswith(".jpg")})
-    with refused(where=file / "rgbd/0.jpg", found="no such photo", expected="one for each pose"):
+    with refused(where=file / "rgbd/0.jpg", found="no such image"):
         read_all(file)
 
 

@@ -122,7 +122,7 @@ def test_the_largest_of_several_models_is_used(binary: bool, project: Path) -> N
 
 def test_a_project_without_images_is_refused(project: Path) -> None:
     shutil.rmtree(project / "images")
-    with refused(where=project / "images/left/1.png", found=f"no such file, although {project / 'sparse/0'}"):
+    with refused(where=project / "images/left/1.png", found=f"no such image, although {project}"):
         open_dataset(project)
 
 

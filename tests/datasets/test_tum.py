@@ -123,8 +123,8 @@ def test_a_recording_that_was_copied_in_part(folder: Path) -> None:
     edit_rows(folder / "groundtruth.txt", lambda rows: [*rows[:-1], rows[-1][: rows[-1].index(" ") + 6]])
     said = remarks_of(folder)
     for remark in (
-        "rgb.txt: 4 of 10 images are missing and left out, first: rgb/",
-        "depth.txt: 5 of 10 depth images are missing",
+        "4 of 10 images are missing and left out, first: rgb/",
+        "1 of 6 depth images is missing and left out, first: depth/",
         "the last row is truncated (2 of 8 entries)",
     ):
         assert sum(remark in text for text in said) == 1
@@ -138,7 +138,7 @@ def test_a_recording_that_was_copied_in_part(folder: Path) -> None:
     for file in (folder / "rgb").iterdir():
         file.unlink()
     image = folder / "rgb/1305031102.175304.png"
-    with refused(where=image, found="no such file, although"):
+    with refused(where=image, found="no such image, although"):
         open_dataset(folder)
 
 

@@ -23,7 +23,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from bidnerf_core.camera import Camera
-from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, present, remark
+from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, remark
 from bidnerf_core.datasets.colmap_files import (
     ModelImage,
     count_posed_images,
@@ -32,22 +32,14 @@ from bidnerf_core.datasets.colmap_files import (
     read_colmap_depth,
     read_posed_images,
 )
-from bidnerf_core.datasets.file_names import FileNames, posix_name
-from bidnerf_core.datasets.reader import DatasetOptions, Reader
+from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames, posix_name
+from bidnerf_core.datasets.reader import DatasetOptions, Format
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import natural_order
-from bidnerf_core.io import HEIF_SUFFIXES, IMAGE_SUFFIXES
 
 MODELS = (
-    "sparse",
-    "colmap/sparse",
-    ".",
-    "colmap",
-    "dense/sparse",
-    "dense/0/sparse",
-    "undistorted/sparse",
-    "model",
-)
+    "sparse", "colmap/sparse", ".", "colmap", "dense/sparse", "dense/0/sparse", "undistorted/sparse", "model",
+)  # fmt: skip
 """Where to look for a model, or numbered folders of models, in order of preference."""
 IMAGES = (
     "images", "images_2", "images_4", "images_8", "colmap/images", "dense/images", "dense/0/images", "undistorted/images", "input", "image", "photos", "rgb", ".",
@@ -56,62 +48,51 @@ IMAGES = (
 """Where to look for the images, relative to the folder; those next to the model come first."""
 
 
-class ColmapReader(Reader):
-    """Reader for COLMAP project folders."""
-
-    expected = "images with a sparse model in sparse/0 (COLMAP)"
-
-    def recognises(self, path: Path) -> bool:
-        return bool(_models(path))
-
-    def read(self, path: Path, options: DatasetOptions) -> Capture:
-        """Read the model. Raises ``InputError`` if it is damaged or has no registered image."""
-        model, folder, images, cameras, files = self.project(path)
-        if options.masks is None and any((place / "masks").is_dir() for place in (path, folder.parent)):
-            remark(
-                path,
-                "masks lies beside the images and is not used; name it (--masks, masks= in Python) to use it",
-            )
-        there = present(
-            images,
-            lambda image: image.name in files,
-            folder,
-            lambda image: image.name,
-            lambda image: InputError(
-                f"no such file, although {model} lists that image", where=folder / image.name
-            ),
+def _read(path: Path, models: list[Path], options: DatasetOptions) -> Capture:
+    """Read the model. Raises ``InputError`` if it is damaged or has no registered image."""
+    model, folder, images, cameras, files = colmap_project(path)
+    if options.masks is None and any((place / "masks").is_dir() for place in (path, folder.parent)):
+        remark(
+            path,
+            "masks lies beside the images and is not used; name it (--masks, masks= in Python) to use it",
         )
-        _remark_unregistered(path, folder, files)
-        shots = [shot_of(model, image, files[image.name], cameras) for image in there]
-        return Capture(path, shots, options.colour)
+    if folder != path:
+        photos = [file for file in folder.rglob("[!.]*") if file.suffix.lower() in IMAGE_ENDINGS[1:]]
+        others = sorted(set(photos) - set(files.values()), key=lambda file: natural_order(str(file)))
+        if others:
+            text = f"{len(others)} of {amount(len(photos), 'photo')} are not registered in the model and are left out"
+            remark(folder, f"{text}, first: {others[0].relative_to(folder)}")
+    shots = [shot_of(model, i, files.get(i.name, folder / posix_name(i.name)), cameras) for i in images]
+    return Capture(path, shots, options.colour, pose_file=model)
 
-    def project(self, path: Path) -> tuple[Path, Path, list[ModelImage], dict[int, Camera], dict[str, Path]]:
-        """Return the model that is used, the folder of its images, its images in natural order of names, its cameras by id, and
-        the image files that are there, by the images' names.
 
-        Raises ``InputError`` if the model is damaged or has no registered image.
-        """
-        model = _largest(path, _models(path))
+def colmap_project(path: Path) -> tuple[Path, Path, list[ModelImage], dict[int, Camera], dict[str, Path]]:
+    """Return the model that is used, the folder of its images, its images in natural order of names, its cameras by id, and
+    the image files that are there, by the images' names.
+
+    Raises ``InputError`` if the model is damaged or has no registered image.
+    """
+    model, others = _largest(path, colmap_models(path)), list[Path]()
+    for _ in range(2):
         images, cameras = read_posed_images(model)
         folder, files = _image_folder(path, model, images)
-        own = _models_at(folder.parent / "sparse")
-        if files and own and model.resolve() not in [each.resolve() for each in own]:
-            # such as dense/0, whose images are undistorted, while those of sparse/0 lie elsewhere
-            text = f"{folder.relative_to(path)} has a model of its own, which is used instead of {model.relative_to(path)}"
-            remark(path, text)
-            model = _largest(path, own)
-            images, cameras = read_posed_images(model)
-            folder, files = _image_folder(path, model, images)
-        if not images:
-            raise InputError("has no registered image", where=model, expected="at least one")
-        images.sort(key=lambda image: natural_order(str(posix_name(image.name))))
-        for image, following in pairwise(images):
-            if posix_name(image.name) == posix_name(following.name):
-                raise InputError(f"image {image.name} is registered twice", where=model, expected="once")
-        return model, folder, images, cameras, files
+        others = _models_at(folder.parent / "sparse") if files else []
+        if not others or model.resolve() in [each.resolve() for each in others]:
+            break
+        # such as dense/0, whose images are undistorted, while those of sparse/0 lie elsewhere
+        text = f"{folder.relative_to(path)} has a model of its own, which is used instead of {model.relative_to(path)}"
+        remark(path, text)
+        model = _largest(path, others)
+    if not images:
+        raise InputError("has no registered image", where=model, expected="at least one")
+    images.sort(key=lambda image: natural_order(str(posix_name(image.name))))
+    for image, following in pairwise(images):
+        if posix_name(image.name) == posix_name(following.name):
+            raise InputError(f"image {image.name} is registered twice", where=model, expected="once")
+    return model, folder, images, cameras, files
 
 
-def _models(path: Path) -> list[Path]:
+def colmap_models(path: Path) -> list[Path]:
     """Return the models at the first location that has any."""
     return next((models for place in MODELS if (models := _models_at(path / place))), [])
 
@@ -158,21 +139,6 @@ def _image_folder(path: Path, model: Path, images: Sequence[ModelImage]) -> tupl
     return best
 
 
-def _remark_unregistered(path: Path, folder: Path, files: dict[str, Path]) -> None:
-    """Count the photos in an image folder that the model lacks."""
-    if folder == path:
-        return
-    photos = [
-        file
-        for file in folder.rglob("*")
-        if file.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) and not file.name.startswith(".")
-    ]
-    others = sorted(set(photos) - set(files.values()), key=lambda file: natural_order(str(file)))
-    if others:
-        text = f"{len(others)} of {amount(len(photos), 'photo')} are not registered in the model and are left out"
-        remark(folder, f"{text}, first: {others[0].relative_to(folder)}")
-
-
 def shot_of(model: Path, image: ModelImage, file: Path | None, cameras: dict[int, Camera]) -> Shot:
     """Return an image of a model as a shot, without pixels if it has no file. Raises ``InputError`` if its camera is missing."""
     if image.camera not in cameras:
@@ -183,10 +149,10 @@ def shot_of(model: Path, image: ModelImage, file: Path | None, cameras: dict[int
         image=file,
         camera=cameras[image.camera],
         T_world_camera=image.T_camera_model.inverse(),
-        depth=None if depth is None else DepthFile(depth, partial(read_colmap_depth, depth, 1.0)),
+        depth=None if depth is None else DepthFile(depth, partial(read_colmap_depth, depth)),
         stem=name.stem,
         folders=name.parts[:-1],
     )
 
 
-reader = ColmapReader()
+reader = Format("images with a sparse model in sparse/0 (COLMAP)", colmap_models, _read)

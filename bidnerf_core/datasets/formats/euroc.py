@@ -17,51 +17,35 @@ from pathlib import Path
 
 import torch
 
-from bidnerf_core.camera import CameraSource, Intrinsics
-from bidnerf_core.datasets.capture import Capture, Shot, images_there
-from bidnerf_core.datasets.reader import DatasetOptions, OpenQuestion, Reader
-from bidnerf_core.datasets.trajectories import read_timed_rows, read_trajectory, require_distinct_times
+from bidnerf_core.camera import CameraSource
+from bidnerf_core.datasets.capture import Capture, Shot
+from bidnerf_core.datasets.pose_rows import camera_of
+from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.datasets.trajectories import read_timed_files, read_trajectory
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3, rigid_pose
 from bidnerf_core.io import is_file, read_file
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0", "gt0")
-NUMBERS = r"\s*:[^\[]*\[([^\]]*)\]"
-"""Follows a key whose value is a list of numbers, possibly below a matrix's ``data:``."""
 
 
-class EurocReader(Reader):
-    """Reader for recordings in EuRoC's layout."""
-
-    accepts: tuple[OpenQuestion, ...] = ("camera",)
-    expected = "mav0/cam0/data.csv with mav0/cam0/sensor.yaml (EuRoC)"
-
-    def recognises(self, path: Path) -> bool:
-        return _root(path) is not None
-
-    def read(self, path: Path, options: DatasetOptions) -> Capture:
-        """Read the lists. Raises ``InputError`` if one is missing or invalid."""
-        root = _root(path)
-        assert root is not None  # ensured by recognises
-        images = root / "cam0" / "data.csv"
-        truth = next((file for name in TRUTHS if is_file(file := root / name / "data.csv")), None)
-        rows = read_timed_rows(images, "filename")
-        require_distinct_times(rows)
-        camera, T_body_camera = _sensor(root / "cam0" / "sensor.yaml", options)
-        trajectory = None if truth is None else read_trajectory(truth)
-        shots = list[Shot]()
-        for row in rows:
-            T_world_body = None if trajectory is None else trajectory.at(row.time)
-            pose = None if T_world_body is None else T_world_body @ T_body_camera
-            image = root / "cam0" / "data" / row.words[0]
-            shots.append(Shot(image=image, camera=camera, T_world_camera=pose, time=row.time))
-        return Capture(
-            path, images_there(images, shots), options.colour, unit="metres", pose_file=truth,
-            poses_expected=f"mav0/{TRUTHS[0]}/data.csv at the times of the images",
-        )  # fmt: skip
+def _read(path: Path, root: Path, options: DatasetOptions) -> Capture:
+    """Read the lists. Raises ``InputError`` if one is missing or invalid."""
+    truth = next((file for name in TRUTHS if is_file(file := root / name / "data.csv")), None)
+    rows = read_timed_files(root / "cam0" / "data.csv")
+    camera, T_body_camera = _sensor(root / "cam0" / "sensor.yaml", options)
+    trajectory = None if truth is None else read_trajectory(truth)
+    shots = list[Shot]()
+    for row in rows:
+        T_world_body = None if trajectory is None else trajectory.at(row.time)
+        pose = None if T_world_body is None else T_world_body @ T_body_camera
+        image = root / "cam0" / "data" / row.words[0]
+        shots.append(Shot(image=image, camera=camera, T_world_camera=pose, time=row.time))
+    expected = f"mav0/{TRUTHS[0]}/data.csv at the times of the images"
+    return Capture(path, shots, options.colour, "metres", pose_file=truth, poses_expected=expected)
 
 
-def _root(path: Path) -> Path | None:
+def _find(path: Path) -> Path | None:
     return next((root for root in (path / "mav0", path) if is_file(root / "cam0" / "data.csv")), None)
 
 
@@ -72,7 +56,6 @@ def _sensor(file: Path, options: DatasetOptions) -> tuple[CameraSource, SE3]:
     T_body_camera = rigid_pose(matrix[:3], file, "the rotation of T_BS")
     if options.given_camera is not None:
         return CameraSource(options.given_camera), T_body_camera
-    fx, fy, cx, cy = _numbers(file, text, "intrinsics", 4)
     width, height = _numbers(file, text, "resolution", 2)
     lens = _numbers(file, text, "distortion_coefficients", 4)
     model = re.search(r"distortion_model\s*:\s*([\w-]+)", text)
@@ -81,17 +64,13 @@ def _sensor(file: Path, options: DatasetOptions) -> tuple[CameraSource, SE3]:
         raise InputError(
             f"distortion_model is {found}", where=file, expected="radial-tangential; undistort the images"
         )
-    lens = lens if any(lens) else []
-    try:
-        camera = Intrinsics(fx, fy, cx + 0.5, cy + 0.5, int(width), int(height), tuple(lens))
-    except InputError as error:
-        raise InputError(error, where=file) from error
-    return CameraSource(camera), T_body_camera
+    numbers = _numbers(file, text, "intrinsics", 4)
+    return CameraSource(camera_of(file, numbers, (int(width), int(height)), lens)), T_body_camera
 
 
 def _numbers(file: Path, text: str, key: str, count: int) -> list[float]:
-    """Return the ``count`` numbers of a bracketed YAML list on one or several lines."""
-    found = re.search(rf"^\s*{key}{NUMBERS}", text, re.MULTILINE)
+    """Return the ``count`` numbers of a bracketed YAML list on one or several lines, possibly below a matrix's ``data:``."""
+    found = re.search(rf"^\s*{key}\s*:[^\[]*\[([^\]]*)\]", text, re.MULTILINE)
     try:
         numbers = [float(word) for word in found[1].replace(",", " ").split()] if found else []
     except ValueError as error:
@@ -101,4 +80,4 @@ def _numbers(file: Path, text: str, key: str, count: int) -> list[float]:
     return numbers
 
 
-reader = EurocReader()
+reader = Format("mav0/cam0/data.csv with mav0/cam0/sensor.yaml (EuRoC)", _find, _read, ["camera"])

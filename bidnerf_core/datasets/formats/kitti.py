@@ -17,89 +17,66 @@ import torch
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.capture import Capture, Shot, remark
-from bidnerf_core.datasets.reader import DatasetOptions, Reader
+from bidnerf_core.datasets.pose_rows import camera_of
+from bidnerf_core.datasets.reader import DatasetOptions, Format
 from bidnerf_core.datasets.trajectories import read_matrices
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.frames import natural_order
+from bidnerf_core.frames import photos_in
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import IMAGE_SUFFIXES, is_file, read_header, read_rows
-
-CALIBRATION = "calib.txt"
-CAMERAS = (2, 0, 3, 1)
-"""Camera numbers, in the order in which their images are looked for."""
+from bidnerf_core.io import is_file, read_header, read_rows
 
 
-class KittiReader(Reader):
-    """Reader for sequences of KITTI's odometry benchmark."""
-
-    expected = "calib.txt with image_2 or image_0 (KITTI odometry)"
-
-    def recognises(self, path: Path) -> bool:
-        return is_file(path / CALIBRATION) and _number(path) is not None
-
-    def read(self, path: Path, options: DatasetOptions) -> Capture:
-        """Read the lists. Raises ``InputError`` if one is invalid."""
-        number, name = _number(path), path.resolve().name
-        folder = path / f"image_{number}"
-        images = [
-            file
-            for file in folder.iterdir()
-            if file.suffix.lower() in IMAGE_SUFFIXES and file.stem.isdecimal()
-        ]
-        if number is None or not images:
-            raise InputError("has no images", where=folder, expected="000000.png ...")
-        images.sort(key=lambda file: natural_order(file.name))
-        header = read_header(images[0])
-        camera, T_first_camera = _calibration(path / CALIBRATION, number, header.width, header.height)
-        places = (
-            path / "poses.txt",
-            path / f"{name}.txt",
-            path.resolve().parent.parent / "poses" / f"{name}.txt",
+def _read(path: Path, folder: Path, options: DatasetOptions) -> Capture:
+    """Read the lists. Raises ``InputError`` if one is invalid."""
+    images = [file for file in photos_in(folder)[0] if file.stem.isdecimal()]
+    if not images:
+        raise InputError("has no images", where=folder, expected="000000.png ...")
+    header, sequence = read_header(images[0]), path.resolve()
+    number = folder.name.removeprefix("image_")
+    camera, T_first_camera = _calibration(path / "calib.txt", f"P{number}", (header.width, header.height))
+    name = f"{sequence.name}.txt"
+    places = path / "poses.txt", path / name, sequence.parent.parent / "poses" / name
+    file = next((place for place in places if is_file(place)), None)
+    poses = dict(enumerate([] if file is None else read_matrices(file)))
+    stamps, times = path / "times.txt", dict[int, float]()
+    if is_file(stamps):
+        rows = read_rows(stamps, "KITTI's times.txt", "a time in seconds")
+        times = {number: row.numbers(count=1)[0] for number, row in enumerate(rows)}
+    by_number = {int(image.stem): image for image in images}
+    listed = max(len(poses), len(times))
+    if gone := sorted(set(range(listed)) - by_number.keys()):
+        remark(path, f"{len(gone)} of {amount(listed, 'image')} are missing, first: number {gone[0]}")
+    shots = [
+        Shot(
+            image=image,
+            camera=camera,
+            T_world_camera=poses[index] @ T_first_camera if index in poses else None,
+            time=times.get(index),
         )
-        file = next((place for place in places if is_file(place)), None)
-        poses = dict(enumerate([] if file is None else read_matrices(file)))
-        times = dict(enumerate(_times(path / "times.txt")))
-        listed = max(len(poses), len(times))
-        gone = sorted(set(range(listed)) - {int(image.stem) for image in images})
-        if gone:
-            remark(path, f"{len(gone)} of {amount(listed, 'image')} are missing, first: number {gone[0]}")
-        shots = [
-            Shot(
-                image=image,
-                camera=camera,
-                T_world_camera=poses[index] @ T_first_camera if index in poses else None,
-                time=times.get(index),
-            )
-            for index, image in ((int(image.stem), image) for image in images)  # the name is the number
-        ]
-        return Capture(
-            path, shots, options.colour, unit="metres", pose_file=file,
-            poses_expected=f"poses.txt in it, or ../../poses/{name}.txt",
-        )  # fmt: skip
+        for index, image in by_number.items()
+    ]
+    expected = f"poses.txt in it, or ../../poses/{name}"
+    return Capture(path, shots, options.colour, "metres", pose_file=file, poses_expected=expected)
 
 
-def _number(path: Path) -> int | None:
-    """Return the number of the camera whose images are used."""
-    return next((number for number in CAMERAS if (path / f"image_{number}").is_dir()), None)
+def _find(path: Path) -> Path | None:
+    """Return the folder of the camera whose images are used."""
+    if not is_file(path / "calib.txt"):
+        return None
+    folders = (path / f"image_{number}" for number in (2, 0, 3, 1))
+    return next((folder for folder in folders if folder.is_dir()), None)
 
 
-def _calibration(file: Path, number: int, width: int, height: int) -> tuple[Intrinsics, SE3]:
+def _calibration(file: Path, camera: str, size: tuple[int, int]) -> tuple[Intrinsics, SE3]:
     """Return a camera, and its pose in camera 0. Raises ``InputError`` if the file lacks it."""
     for row in read_rows(file, "KITTI's calib.txt", "P0: 12 numbers"):
         name, _, text = row.text.partition(":")
-        if name.strip() == f"P{number}":
+        if name.strip() == camera:
             projection = torch.tensor(row.numbers(text.split(), 12), dtype=torch.float64).reshape(3, 4)
             shift = torch.linalg.solve(projection[:, :3], projection[:, 3])
-            fx, fy, cx, cy = (float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-            camera = Intrinsics(fx, fy, cx + 0.5, cy + 0.5, width, height)
-            return camera, SE3(torch.eye(3, dtype=torch.float64), -shift)
-    raise InputError(f"has no row P{number}", where=file, expected=f"the projection matrix of image_{number}")
+            numbers = [float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
+            return camera_of(row.where, numbers, size), SE3(torch.eye(3, dtype=torch.float64), -shift)
+    raise InputError(f"has no row {camera}", where=file, expected="the projection matrix of the images")
 
 
-def _times(file: Path) -> list[float]:
-    if not is_file(file):
-        return []
-    return [row.numbers(count=1)[0] for row in read_rows(file, "KITTI's times.txt", "a time in seconds")]
-
-
-reader = KittiReader()
+reader = Format("calib.txt with image_2 or image_0 (KITTI odometry)", _find, _read)

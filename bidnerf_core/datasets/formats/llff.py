@@ -15,57 +15,43 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.capture import Capture, Shot
-from bidnerf_core.datasets.reader import DatasetOptions, Reader
+from bidnerf_core.datasets.pose_rows import camera_of
+from bidnerf_core.datasets.reader import DatasetOptions, Format
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import photos_in
 from bidnerf_core.geometry import rigid_pose
 from bidnerf_core.io import is_file, read_array
 
 POSES = "poses_bounds.npy"
-IMAGES = ("images", "images_2", "images_4", "images_8")
-NUMBERS = 17
 
 
-class LLFFReader(Reader):
-    """Reader for folders with ``poses_bounds.npy``."""
-
-    expected = f"images with {POSES} (LLFF)"
-
-    def recognises(self, path: Path) -> bool:
-        return is_file(path / POSES)
-
-    def read(self, path: Path, options: DatasetOptions) -> Capture:
-        """Read the poses. Raises ``InputError`` if they are invalid or not as many as the images."""
-        file = path / POSES
-        rows = read_array(file, "LLFF's poses")
-        if rows.ndim != 2 or rows.shape[1] != NUMBERS or rows.dtype.kind != "f":
-            found = f"has an array of shape {rows.shape} and type {rows.dtype}"
-            raise InputError(found, where=file, expected=f"rows of {NUMBERS} numbers")
-        if not np.isfinite(rows).all():
-            raise InputError("has numbers that are not finite", where=file, expected="finite ones")
-        folders = [path / name for name in IMAGES if (path / name).is_dir()]
-        folder, images = next(
-            ((f, photos) for f in folders if (photos := photos_in(f)[0])), (path / "images", [])
-        )
-        if len(images) != len(rows):
-            found = f"has {amount(len(rows), 'pose')} for {amount(len(images), 'image')} in {folder.name}"
-            raise InputError(found, where=file, expected="one for each, in the order of names")
-        shots = list[Shot]()
-        for number, (row, image) in enumerate(zip(rows, images, strict=True)):
-            where, matrix = (
-                f"{file}: row {number}",
-                torch.from_numpy(row[:15].astype(np.float64).reshape(3, 5)),
-            )
-            down, right, back, position, (height, width, focal) = matrix.unbind(1)
-            pose = rigid_pose(torch.stack([right, down, -back, position], 1), where, "the rotation")
-            try:
-                camera = Intrinsics.from_focal(float(focal), round(float(width)), round(float(height)))
-            except InputError as error:
-                raise InputError(error, where=where) from error
-            shots.append(Shot(image=image, camera=camera, T_world_camera=pose))
-        return Capture(path, shots, options.colour, pose_file=file)
+def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
+    """Read the poses. Raises ``InputError`` if they are invalid or not as many as the images."""
+    rows = read_array(file, "LLFF's poses")
+    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
+        found = f"has an array of shape {rows.shape} and type {rows.dtype}"
+        raise InputError(found, where=file, expected="rows of 17 numbers")
+    if not np.isfinite(rows).all():
+        raise InputError("has numbers that are not finite", where=file, expected="finite ones")
+    folders = [path / name for name in ("images", "images_2", "images_4", "images_8")]
+    images = next((photos for f in folders if f.is_dir() and (photos := photos_in(f)[0])), [])
+    if len(images) != len(rows):
+        found = f"has {amount(len(rows), 'pose')} for {amount(len(images), 'image')}"
+        raise InputError(found, where=file, expected="one for each, in the order of names")
+    shots = list[Shot]()
+    for number, (row, image) in enumerate(zip(rows, images, strict=True)):
+        where, matrix = f"{file}: row {number}", torch.from_numpy(row[:15].astype(np.float64).reshape(3, 5))
+        down, right, back, position, (height, width, focal) = matrix.unbind(1)
+        pose = rigid_pose(torch.stack([right, down, -back, position], 1), where)
+        size, f = (round(float(width)), round(float(height))), float(focal)
+        camera = camera_of(where, (f, f, size[0] / 2, size[1] / 2), size, first_centre=0)
+        shots.append(Shot(image=image, camera=camera, T_world_camera=pose))
+    return Capture(path, shots, options.colour, pose_file=file)
 
 
-reader = LLFFReader()
+def _find(path: Path) -> Path | None:
+    return file if is_file(file := path / POSES) else None
+
+
+reader = Format(f"images with {POSES} (LLFF)", _find, _read)

@@ -14,84 +14,53 @@ from xml.etree import ElementTree
 
 import torch
 
-from bidnerf_core.camera import Camera, CentralLens, Intrinsics, PanoramaFace
-from bidnerf_core.datasets.capture import Capture, Shot, present
-from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames, posix_name
-from bidnerf_core.datasets.reader import DatasetOptions, Reader
+from bidnerf_core.camera import Camera, PanoramaFace, colmap_camera
+from bidnerf_core.datasets.capture import Capture, Shot
+from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames
+from bidnerf_core.datasets.pose_rows import camera_of
+from bidnerf_core.datasets.reader import DatasetOptions, Format
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import SE3, rigid_pose
 from bidnerf_core.io import open_binary, read_file
 
-IMAGES = (".", "images", "photos", "input")
-HEAD = 4096
-"""Bytes in which the root and the chunk of a file begin."""
+
+def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
+    """Read the cameras. Raises ``InputError`` if one is invalid."""
+    chunk = _chunk(file)
+    sensors = {
+        sensor.get("id"): _camera(sensor, f"{file}: sensor {sensor.get('id')}")
+        for sensor in chunk.iter("sensor")
+    }
+    metric = chunk.find("transform/scale")
+    scale = 1.0 if metric is None else _numbers(metric, f"{file}: the scale of the chunk", 1)[0]
+    names = FileNames(path, *(path / place for place in ("images", "photos", "input")))
+    listed = list(chunk.iter("camera"))
+    cameras = {camera.get("label") or "": camera for camera in listed}
+    if len(cameras) < len(listed):
+        raise InputError("two cameras have the same label", where=file, expected="unique labels of photos")
+    shots = list[Shot]()
+    for label in sorted(cameras, key=natural_order):
+        transform, sensor = cameras[label].find("transform"), sensors.get(cameras[label].get("sensor_id"))
+        where, pose = f"{file}: camera {label}", None
+        if sensor is None:
+            raise InputError("has no calibrated sensor", where=where, expected="the id of one")
+        if transform is not None:
+            matrix = torch.tensor(_numbers(transform, where, 16), dtype=torch.float64).reshape(4, 4)
+            pose = rigid_pose(matrix[:3], where)
+            pose = SE3(pose.rotation, pose.translation * scale)
+        shots.append(Shot(image=names.path(label, IMAGE_ENDINGS), camera=sensor, T_world_camera=pose))
+    return Capture(
+        path, shots, options.colour, unit=None if metric is None else "metres", pose_file=file,
+        poses_expected="a transform of each aligned camera", unposed="they are not aligned",
+    )  # fmt: skip
 
 
-class MetashapeReader(Reader):
-    """Reader for cameras exported by Metashape."""
-
-    expected = "photos with a .xml of a chunk's cameras (Agisoft Metashape)"
-
-    def recognises(self, path: Path) -> bool:
-        return _file(path) is not None
-
-    def read(self, path: Path, options: DatasetOptions) -> Capture:
-        """Read the cameras. Raises ``InputError`` if one is invalid, and if no photo is found."""
-        file = _file(path)
-        assert file is not None  # ensured by recognises
-        chunk = _chunk(file)
-        sensors = {
-            sensor.get("id"): _camera(sensor, f"{file}: sensor {sensor.get('id')}")
-            for sensor in chunk.iter("sensor")
-        }
-        metric = chunk.find("transform/scale")
-        scale = 1.0 if metric is None else _numbers(metric, f"{file}: the scale of the chunk", 1)[0]
-        places = [FileNames(path / place) for place in IMAGES if (path / place).is_dir()]
-        listed = list(chunk.iter("camera"))
-        cameras = {camera.get("label") or "": camera for camera in listed}
-        if len(cameras) < len(listed):
-            raise InputError(
-                "two cameras have the same label", where=file, expected="unique labels of photos"
-            )
-        files = {
-            label: image
-            for label in cameras
-            if (image := next((i for p in places if (i := p.find(posix_name(label), IMAGE_ENDINGS))), None))
-            is not None
-        }
-        labels = present(
-            sorted(cameras, key=natural_order),
-            files.__contains__,
-            file,
-            str,
-            lambda label: InputError(
-                f"no photo {label}", where=file, expected="it in the folder or in images"
-            ),
-            noun="photo",
-        )
-        shots = list[Shot]()
-        for label in labels:
-            transform, sensor = cameras[label].find("transform"), sensors.get(cameras[label].get("sensor_id"))
-            where, pose = f"{file}: camera {label}", None
-            if sensor is None:
-                raise InputError("has no calibrated sensor", where=where, expected="the id of one")
-            if transform is not None:
-                matrix = torch.tensor(_numbers(transform, where, 16), dtype=torch.float64).reshape(4, 4)
-                pose = rigid_pose(matrix[:3], where)
-                pose = SE3(pose.rotation, pose.translation * scale)
-            shots.append(Shot(image=files[label], camera=sensor, T_world_camera=pose))
-        return Capture(
-            path, shots, options.colour, unit=None if metric is None else "metres", pose_file=file,
-            poses_expected="a transform of each aligned camera", unposed="they are not aligned",
-        )  # fmt: skip
-
-
-def _file(path: Path) -> Path | None:
-    for file in sorted(path.glob("[!.]*.xml")) if path.is_dir() else ():
+def _find(path: Path) -> Path | None:
+    for file in sorted(path.glob("[!.]*.xml")):
         try:
             with open_binary(file, "cameras of Metashape") as opened:
-                head = opened.read(HEAD)
+                head = opened.read(4096)  # in which the root and the chunk begin
         except InputError:
             continue
         if b"<document" in head and b"<chunk" in head:
@@ -126,9 +95,7 @@ def _numbers(element: ElementTree.Element, where: str, count: int) -> list[float
 def _camera(sensor: ElementTree.Element, where: str) -> Camera | None:
     """Return the camera of a sensor; None if it is not calibrated."""
     size, found = sensor.find("resolution"), sensor.findall("calibration")
-    adjusted = next(
-        (each for each in reversed(found) if each.get("class") in ("adjusted", None)), next(iter(found), None)
-    )
+    adjusted = [each for each in found if each.get("class") in ("adjusted", None)][-1:] or found[:1]
     if size is None:
         return None
     sides = [size.get(side) or "" for side in ("width", "height")]
@@ -139,26 +106,20 @@ def _camera(sensor: ElementTree.Element, where: str) -> Camera | None:
     width, height = map(int, sides)
     if sensor.get("type") == "spherical":
         return PanoramaFace("front", (width, height))
-    if adjusted is None:
+    if not adjusted:
         return None
     values = {
         child.tag: _numbers(child, where, 1)[0]
-        for child in adjusted
+        for child in adjusted[0]
         if child.tag not in ("resolution", "covariance", "params")
     }
     f, cx, cy, k1, k2, k3, k4, p1, p2, b1 = (
         values.get(key, 0.0) for key in ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "b1")
     )
-    centre = width / 2 + cx, height / 2 + cy
-    try:
-        if sensor.get("type") == "fisheye":
-            return CentralLens(
-                "OPENCV_FISHEYE", Intrinsics(f + b1, f, *centre, width, height), (k1, k2, k3, k4)
-            )
-        lens = (k1, k2, p2, p1, k3)
-        return Intrinsics(f + b1, f, *centre, width, height, lens if any(lens) else ())
-    except InputError as error:
-        raise InputError(error, where=where) from error
+    numbers = f + b1, f, width / 2 + cx, height / 2 + cy
+    if sensor.get("type") == "fisheye":
+        return colmap_camera(where, "OPENCV_FISHEYE", width, height, [*numbers, k1, k2, k3, k4])
+    return camera_of(where, numbers, (width, height), (k1, k2, p2, p1, k3), first_centre=0)
 
 
-reader = MetashapeReader()
+reader = Format("photos with a .xml of a chunk's cameras (Agisoft Metashape)", _find, _read)

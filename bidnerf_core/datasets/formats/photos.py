@@ -13,11 +13,9 @@ from pathlib import Path
 
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets.capture import Capture, Colour, Shot
-from bidnerf_core.datasets.reader import DatasetOptions, OpenQuestion, Reader
+from bidnerf_core.datasets.reader import DatasetOptions, Format
 from bidnerf_core.depth import MILLIMETRE, DepthCamera
 from bidnerf_core.frames import BLACK, DEPTH_STEM, Frame, photos_in
-
-TIMESTAMP = re.compile(r"\d+\.\d+")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -43,34 +41,31 @@ class PhotoShot(Shot):
         return found.replace(name=self.name)
 
 
-class PhotoReader(Reader):
-    """Reader for folders of images, which finds no poses."""
-
-    accepts: tuple[OpenQuestion, ...] = ("camera", "focal", "register_depth", "depth_unit")
-    expected = "image files"
-
-    def recognises(self, path: Path) -> bool:
-        return path.is_dir() and bool(photos_in(path)[0])
-
-    def read(self, path: Path, options: DatasetOptions) -> Capture:
-        """List the images. Raises ``InputError`` for a depth sensor that cannot be read."""
-        sensor, unit = options.sensor(path), options.depth_unit or MILLIMETRE
-        shots = list[Shot]()
-        for photo in photos_in(path)[0]:
-            depth = photo.with_name(f"{photo.stem}{DEPTH_STEM}.png")
-            shots.append(
-                PhotoShot(
-                    image=photo,
-                    camera=options.camera_source,
-                    time=timestamp(photo.stem),
-                    depth_image=depth if depth.is_file() else None,
-                    depth_unit=unit,
-                    sensor=sensor,
-                )
+def _read(path: Path, photos: list[Path], options: DatasetOptions) -> Capture:
+    """List the images. Raises ``InputError`` for a depth sensor that cannot be read."""
+    sensor, shots = options.sensor(path), list[Shot]()
+    for photo in photos:
+        depth = photo.with_name(f"{photo.stem}{DEPTH_STEM}.png")
+        shots.append(
+            PhotoShot(
+                image=photo,
+                camera=options.camera_source,
+                time=timestamp(photo.stem),
+                depth_image=depth if depth.is_file() else None,
+                depth_unit=options.depth_unit or MILLIMETRE,
+                sensor=sensor,
             )
-        return Capture(path, shots, options.colour)
+        )
+    return Capture(path, shots, options.colour)
+
+
+def _find(path: Path) -> list[Path]:
+    return photos_in(path)[0] if path.is_dir() else []
 
 
 def timestamp(stem: str) -> float | None:
     """Return the time (seconds) in a file name such as ``1305031102.175304.png``; None for names without a fraction."""
-    return float(stem) if TIMESTAMP.fullmatch(stem) else None
+    return float(stem) if re.fullmatch(r"\d+\.\d+", stem) else None
+
+
+reader = Format("image files", _find, _read, ("camera", "focal", "register_depth", "depth_unit"))

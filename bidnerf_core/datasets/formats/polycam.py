@@ -18,111 +18,73 @@ from functools import partial
 from pathlib import Path
 
 from bidnerf_core.datasets import lidar
-from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, present, remark
-from bidnerf_core.datasets.pose_rows import pose_of_rows
-from bidnerf_core.datasets.reader import DatasetOptions, Reader
-from bidnerf_core.errors import InputError, amount
-from bidnerf_core.frames import natural_order
+from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, remark
+from bidnerf_core.datasets.pose_rows import camera_of, pose_of_rows
+from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.errors import amount
+from bidnerf_core.frames import natural_order, photos_in
 from bidnerf_core.io import is_file, read_header, read_record
 
-BORDER = 15
-"""Width in pixels of the hidden border of an undistorted photo."""
-HIGH_CONFIDENCE = 255
-MICROSECONDS = 1_000_000
-SUFFIXES = (".jpg", ".jpeg", ".png")
 LENS = ("fx", "fy", "cx", "cy")
 POSE = [[f"t_{row}{column}" for column in range(4)] for row in range(3)]
 
 
-class PolycamReader(Reader):
-    """Reader for Polycam's raw data."""
-
-    expected = "keyframes/images and keyframes/cameras, or the corrected ones (Polycam, raw data)"
-
-    def recognises(self, path: Path) -> bool:
-        return any(_folders(path, corrected) is not None for corrected in (True, False))
-
-    def read(self, path: Path, options: DatasetOptions) -> Capture:
-        """Read the cameras. Raises ``InputError`` if one is invalid, and if no photo has one."""
-        found = _folders(path, True)
-        corrected = found is not None
-        found = found or _folders(path, False)
-        assert found is not None  # ensured by recognises
-        if not corrected:
-            remark(
-                path,
-                "has no corrected_cameras, so the poses are ARKit's, which drift; Polycam can correct them on"
-                " export",
-            )
-        images, cameras = found
-        descriptions = sorted(_described(cameras), key=lambda file: natural_order(file.name))
-        photos = {
-            file.stem: file
-            for file in images.iterdir()
-            if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
-        }
-        there = present(
-            descriptions,
-            lambda file: file.stem in photos,
-            images,
-            lambda file: f"{file.stem}.jpg",
-            lambda file: InputError(
-                f"no such file, although {file} exists", where=f"{images / file.stem}.jpg"
-            ),
-            noun="photo",
+def _read(path: Path, cameras: Path, options: DatasetOptions) -> Capture:
+    """Read the cameras. Raises ``InputError`` if one is invalid, and if no photo has one."""
+    images = cameras.with_name(cameras.name.replace("cameras", "images"))
+    corrected = cameras.name != "cameras"
+    if not corrected:
+        remark(
+            path,
+            "has no corrected_cameras, so the poses are ARKit's, which drift; Polycam can correct them on export",
         )
-        if alone := len(photos) - len(there):
-            count = amount(len(photos), "photo")
-            remark(images, f"{alone} of {count} have no camera in {cameras.name} and are left out")
-        read = lidar.LidarDepth((lidar.HIGH_CONFIDENCE, HIGH_CONFIDENCE))
-        shots = [_shot(file, photos[file.stem], read, BORDER if corrected else 0) for file in there]
-        measured = sum(shot.depth is not None for shot in shots)
-        if 0 < measured < len(shots):
-            remark(path, f"{len(shots) - measured} of {amount(len(shots), 'photo')} have no depth")
-        up = (0.0, 1.0, 0.0)  # ARKit aligns its world with gravity
-        return Capture(path, shots, options.colour, unit="metres", up=up, pose_file=cameras)
+    photos = {photo.stem: photo for photo in photos_in(images)[0]}
+    total = amount(len(photos), "photo")
+    read, has_depth = lidar.LidarDepth((lidar.HIGH_CONFIDENCE, 255)), (cameras.parent / "depth").is_dir()
+    shots = list[Shot]()
+    for description in sorted(cameras.glob("[!.]*.json"), key=lambda file: natural_order(file.name)):
+        record, time = read_record(description), description.stem
+        photo = photos.pop(time, images / f"{time}.jpg")
+        if not is_file(photo):
+            shots.append(Shot(image=photo))
+            continue
+        rows = [[record.number(key) for key in row] for row in POSE]
+        lens = [number for key in LENS if (number := record.number(key)) is not None]
+        if len(lens) < len(LENS) or any(number is None for row in rows for number in row):
+            raise record.error(
+                "is incomplete", expected="fx, fy, cx, cy, and t_00 to t_23, the rows of the camera's pose"
+            )
+        header = read_header(photo)  # since newer exports store no size
+        size = record.size("width") or header.width, record.size("height") or header.height
+        depth, confidence = (cameras.parent / kind / f"{time}.png" for kind in ("depth", "confidence"))
+        measured = partial(read, depth, confidence if is_file(confidence) else None)
+        shots.append(
+            Shot(
+                image=photo,
+                camera=camera_of(str(description), lens, size),
+                T_world_camera=pose_of_rows(record, "t_00 to t_23", rows),
+                time=int(time) / 1_000_000 if time.isdecimal() else None,
+                depth=DepthFile(depth, measured) if has_depth else None,
+                border=15 if corrected else 0,  # the width that other software crops
+                folders=(),
+                usual_side=lidar.LARGEST_SIDE,
+            )
+        )
+    if photos:
+        remark(images, f"{len(photos)} of {total} have no camera in {cameras.name} and are left out")
+    return Capture(path, shots, options.colour, unit="metres", up=lidar.UP, pose_file=cameras)
 
 
-def _folders(path: Path, corrected: bool) -> tuple[Path, Path] | None:
-    """Return the folders of photos and cameras, or None if one of them is missing or empty."""
-    prefix = "corrected_" if corrected else ""
-    for base in (path / "keyframes", path):
-        images, cameras = base / f"{prefix}images", base / f"{prefix}cameras"
-        if images.is_dir() and cameras.is_dir() and _described(cameras):
-            return images, cameras
+def _find(path: Path) -> Path | None:
+    """Return the folder of cameras, without hidden files such as the companions ``._NAME`` of a Mac, beside that of photos."""
+    for prefix in ("corrected_", ""):
+        for base in (path / "keyframes", path):
+            cameras = base / f"{prefix}cameras"
+            if (base / f"{prefix}images").is_dir() and any(cameras.glob("[!.]*.json")):
+                return cameras
     return None
 
 
-def _described(cameras: Path) -> list[Path]:
-    """Return the descriptions of cameras in a folder, without hidden files such as the companions ``._NAME`` of a Mac."""
-    return [file for file in cameras.glob("*.json") if not file.name.startswith(".")]
-
-
-def _shot(description: Path, photo: Path, read: lidar.LidarDepth, border: int) -> Shot:
-    record, time = read_record(description), description.stem
-    rows = [[record.number(key) for key in row] for row in POSE]
-    missing = [key for row in POSE for key in row if record.number(key) is None]
-    if missing:
-        raise record.error(f"no {missing[0]}", expected="t_00 to t_23, the rows of the camera's pose")
-    numbers = [record.number(key) for key in LENS]
-    if None in numbers:
-        raise record.error(f"no {LENS[numbers.index(None)]}", expected="fx, fy, cx and cy")
-    width, height = record.size("width"), record.size("height")
-    if width is None or height is None:  # as in newer exports
-        header = read_header(photo)
-        width, height = width or header.width, height or header.height
-    files = [description.parents[1] / kind / f"{time}.png" for kind in ("depth", "confidence")]
-    depth, confidence = (file if is_file(file) else None for file in files)
-    return Shot(
-        image=photo,
-        camera=lidar.arkit_camera([number or 0.0 for number in numbers], width, height, str(description)),
-        T_world_camera=pose_of_rows(record, "t_00 to t_23", rows),
-        time=int(time) / MICROSECONDS if time.isdecimal() else None,
-        depth=None if depth is None else DepthFile(depth, partial(read, depth, confidence)),
-        border=border,
-        folders=(),
-        usual_side=lidar.LARGEST_SIDE,
-    )
-
-
-reader = PolycamReader()
+reader = Format(
+    "keyframes/images and keyframes/cameras, or the corrected ones (Polycam, raw data)", _find, _read
+)

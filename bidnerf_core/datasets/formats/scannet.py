@@ -14,71 +14,51 @@ from pathlib import Path
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.capture import Capture, DepthFile, Shot
-from bidnerf_core.datasets.formats.twelve_scenes import FOCAL_TOLERANCE
-from bidnerf_core.datasets.pose_rows import read_pose_matrix
-from bidnerf_core.datasets.reader import DatasetOptions, OpenQuestion, Reader
-from bidnerf_core.depth import MILLIMETRE, DepthCamera, DepthReader
+from bidnerf_core.datasets.formats.twelve_scenes import own_sensor
+from bidnerf_core.datasets.pose_rows import camera_of, read_pose_matrix
+from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.depth import MILLIMETRE, DepthReader
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import natural_order
-from bidnerf_core.geometry import SE3
-from bidnerf_core.io import IMAGE_SUFFIXES, is_file, read_header, read_rows
-
-FOLDERS = ("color", "rgb")
-INTRINSICS = ("intrinsic/intrinsic_{}.txt", "intrinsic_{}.txt", "intrinsics/intrinsic_{}.txt")
+from bidnerf_core.frames import photos_in
+from bidnerf_core.io import is_file, read_header, read_rows
 
 
-class ScanNetReader(Reader):
-    """Reader for exported scans of ScanNet."""
-
-    accepts: tuple[OpenQuestion, ...] = ("register_depth", "depth_unit")
-    expected = "color/0.jpg with pose/0.txt and intrinsic/intrinsic_color.txt (ScanNet)"
-
-    def recognises(self, path: Path) -> bool:
-        return bool(_images(path)) and (path / "pose").is_dir() and _intrinsics(path, "color") is not None
-
-    def read(self, path: Path, options: DatasetOptions) -> Capture:
-        """Read the cameras and poses. Raises ``InputError`` if one is invalid."""
-        images, colour, depth = _images(path), _intrinsics(path, "color"), _intrinsics(path, "depth")
-        assert colour is not None  # ensured by recognises
-        measured = sorted((path / "depth").glob("[!.]*.png"), key=lambda file: natural_order(file.name))
-        camera = _camera(colour, images[0])
-        own = None if depth is None or not measured else _camera(depth, measured[0])
-        same = (
-            own is not None
-            and abs(own.resized(camera.width, camera.height).fx / camera.fx - 1) < FOCAL_TOLERANCE
-        )
-        registered = None if own is None or same else DepthCamera(own, SE3.identity())
-        sensor, unit = options.sensor(path, registered), options.depth_unit or MILLIMETRE
-        read = DepthReader(documented=("65535",))
-        by_stem, shots = {file.stem: file for file in measured}, list[Shot]()
-        for image in images:
-            pose, file = path / "pose" / f"{image.stem}.txt", by_stem.get(image.stem)
-            shots.append(
-                Shot(
-                    image=image,
-                    camera=camera,
-                    T_world_camera=read_pose_matrix(pose) if is_file(pose) else None,
-                    depth=None if file is None else DepthFile(file, partial(read, file, unit), sensor),
-                )
+def _read(path: Path, found: tuple[list[Path], Path], options: DatasetOptions) -> Capture:
+    """Read the cameras and poses. Raises ``InputError`` if one is invalid."""
+    images, intrinsics = found
+    depth = _intrinsics(path, "depth")
+    measured = {file.stem: file for file in photos_in(path / "depth")[0]} if (path / "depth").is_dir() else {}
+    camera = _camera(intrinsics, images[0])
+    own = None if depth is None or not measured else _camera(depth, next(iter(measured.values())))
+    sensor, unit = options.sensor(path, own_sensor(camera, own)), options.depth_unit or MILLIMETRE
+    read, shots = DepthReader(documented=("65535",)), list[Shot]()
+    for image in images:
+        pose, file = path / "pose" / f"{image.stem}.txt", measured.get(image.stem)
+        shots.append(
+            Shot(
+                image=image,
+                camera=camera,
+                T_world_camera=read_pose_matrix(pose),
+                depth=None if file is None else DepthFile(file, partial(read, file, unit), sensor),
             )
-        return Capture(
-            path, shots, options.colour, unit="metres", depth_unit=unit, pose_file=path / "pose",
-            poses_expected="NUMBER.txt of finite numbers for each image",
-        )  # fmt: skip
+        )
+    return Capture(
+        path, shots, options.colour, unit="metres", depth_unit=unit, pose_file=path / "pose",
+        poses_expected="NUMBER.txt of finite numbers for each image",
+    )  # fmt: skip
 
 
-def _images(path: Path) -> list[Path]:
-    found = (
-        file
-        for name in FOLDERS
-        for file in (path / name).glob("[!.]*")
-        if file.suffix.lower() in IMAGE_SUFFIXES
-    )
-    return sorted(found, key=lambda file: natural_order(file.name))
+def _find(path: Path) -> tuple[list[Path], Path] | None:
+    """Return the images, and the file of their intrinsics."""
+    folders = (folder for name in ("color", "rgb") if (folder := path / name).is_dir())
+    images = next((photos for folder in folders if (photos := photos_in(folder)[0])), None)
+    intrinsics = _intrinsics(path, "color")
+    return (images, intrinsics) if images and intrinsics and (path / "pose").is_dir() else None
 
 
 def _intrinsics(path: Path, kind: str) -> Path | None:
-    return next((file for name in INTRINSICS if is_file(file := path / name.format(kind))), None)
+    name = f"intrinsic_{kind}.txt"
+    return next(filter(is_file, (path / "intrinsic" / name, path / name, path / "intrinsics" / name)), None)
 
 
 def _camera(file: Path, image: Path) -> Intrinsics:
@@ -87,12 +67,14 @@ def _camera(file: Path, image: Path) -> Intrinsics:
     rows = [row.numbers() for row in read_rows(file, "ScanNet's intrinsics", expected)]
     if len(rows) < 3 or any(len(row) < 3 for row in rows):
         raise InputError(f"has {len(rows)} rows", where=file, expected=expected)
+    (fx, _, cx, *_), (_, fy, cy, *_) = rows[:2]
     header = read_header(image)
-    try:
-        (fx, _, cx, *_), (_, fy, cy, *_) = rows[:2]
-        return Intrinsics(fx, fy, cx + 0.5, cy + 0.5, header.width, header.height)
-    except InputError as error:
-        raise InputError(error, where=file) from error
+    return camera_of(file, (fx, fy, cx, cy), (header.width, header.height))
 
 
-reader = ScanNetReader()
+reader = Format(
+    "color/0.jpg with pose/0.txt and intrinsic/intrinsic_color.txt (ScanNet)",
+    _find,
+    _read,
+    ("register_depth", "depth_unit"),
+)

@@ -32,8 +32,8 @@ import torch
 from bidnerf_core.camera import CameraSource, Intrinsics, folder_camera
 from bidnerf_core.datasets.capture import Capture, DepthFile, Shot
 from bidnerf_core.datasets.pose_rows import read_pose_matrix
-from bidnerf_core.datasets.reader import DatasetOptions, Reader
-from bidnerf_core.depth import MILLIMETRE, DepthCamera, DepthReader
+from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.depth import MILLIMETRE, DepthCamera, DepthImage, DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import SE3
@@ -55,83 +55,71 @@ T_COLOUR_DEPTH = SE3(
     ),
 ).normalized()
 """https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html, as used by ACE's ``setup_7scenes.py``."""
-SEVEN_SCENES_KINECT = DepthCamera(DEPTH_CAMERA, T_COLOUR_DEPTH)
 
-COLOUR = re.compile(r"(frame-\d+)\.color\.(?:png|jpe?g)", re.IGNORECASE)
 SEQUENCE = re.compile(r"seq(?:uence)?-?0*(\d+)", re.IGNORECASE)
-SPLIT_FILES = {"train": "TrainSplit.txt", "test": "TestSplit.txt"}
 
 
-class SevenScenesReader(Reader):
-    """Reader for 7-Scenes folders.
+def _read(path: Path, folders: dict[int, Path], options: DatasetOptions) -> Capture:
+    """Read the poses and splits. Raises ``InputError`` for invalid ones.
 
-    Poses and depth are transferred from the depth sensor to the colour camera, by default with a Kinect's
-    calibration.
+    Poses and depth are transferred from the depth sensor to the colour camera, by default with a Kinect's calibration.
     """
+    sensor = options.sensor(path, DepthCamera(DEPTH_CAMERA, T_COLOUR_DEPTH))
+    camera = folder_camera(path, options.given_camera, DEPTH_CAMERA if sensor is None else COLOUR_CAMERA)
+    unit, read_depth = options.depth_unit or MILLIMETRE, DepthReader(documented=("65535",))
+    T_depth_colour = SE3.identity() if sensor is None else sensor.T_colour_depth.inverse()
+    lists = {"train": path / "TrainSplit.txt", "test": path / "TestSplit.txt"}
+    numbers = {
+        split: _listed(file, folders) for split, file in lists.items() if 0 not in folders and file.is_file()
+    }
+    shots = list[Shot]()
+    for number in dict.fromkeys(n for group in numbers.values() for n in group) or sorted(folders):
+        splits = tuple(split for split, group in numbers.items() if number in group)
+        for shot in frames_of(folders[number], camera, partial(read_depth, unit=unit), sensor):
+            T = shot.T_world_camera
+            shots.append(
+                shot if T is None else replace(shot, T_world_camera=T @ T_depth_colour, splits=splits)
+            )
+    return Capture(
+        path,
+        shots,
+        options.colour,
+        unit="metres",
+        depth_unit=unit,
+        poses_expected="frame-000000.pose.txt",
+    )
 
-    accepts = ("camera", "register_depth", "depth_unit")
-    expected = "frame-000000.color.png ... in the folder or in seq-01 ... (7-Scenes)"
 
-    def recognises(self, path: Path) -> bool:
-        return any(images_of(folder) for folder in (path, *_sequence_folders(path).values()))
-
-    def read(self, path: Path, options: DatasetOptions) -> Capture:
-        """Read the poses and splits. Raises ``InputError`` for invalid ones."""
-        sensor = options.sensor(path, SEVEN_SCENES_KINECT)
-        camera = folder_camera(path, options.given_camera, DEPTH_CAMERA if sensor is None else COLOUR_CAMERA)
-        unit = options.depth_unit or MILLIMETRE
-        shots_of = reading_frames(
-            camera, unit, sensor, None if sensor is None else sensor.T_colour_depth.inverse()
-        )
-        folders = _sequence_folders(path)
-        lists = {split: path / name for split, name in SPLIT_FILES.items() if (path / name).is_file()}
-        numbers = {split: _listed(file, folders) for split, file in lists.items()} if folders else {}
-        shots = list[Shot]()
-        for number in dict.fromkeys(n for group in numbers.values() for n in group) or sorted(folders):
-            splits = tuple(split for split, group in numbers.items() if number in group)
-            shots += [
-                replace(shot, splits=splits if shot.T_world_camera else ())
-                for shot in shots_of(folders[number])
-            ]
-        return Capture(
-            path,
-            shots or shots_of(path),
-            options.colour,
-            unit="metres",
-            depth_unit=unit,
-            poses_expected="frame-000000.pose.txt",
-        )
+def _find(path: Path) -> dict[int, Path]:
+    """Return the folders of the sequences by number; a folder that is one has number 0."""
+    if images_of(path):
+        return {0: path}
+    found = {child: SEQUENCE.fullmatch(child.name) for child in path.glob("seq*") if child.is_dir()}
+    folders = {int(match[1]): child for child, match in found.items() if match}
+    return folders if any(map(images_of, folders.values())) else {}
 
 
 def images_of(folder: Path) -> list[Path]:
     """Return the colour images of a folder in the order of their numbers."""
-    found = [file for file in folder.glob("frame-*") if COLOUR.fullmatch(file.name)]
+    name = re.compile(r"frame-\d+\.color\.(?:png|jpe?g)", re.IGNORECASE)
+    found = [file for file in folder.glob("frame-*") if name.fullmatch(file.name)]
     return sorted(found, key=lambda file: natural_order(file.name))
 
 
-def reading_frames(
-    camera: CameraSource, unit: float, sensor: DepthCamera | None, T_depth_colour: SE3 | None = None
-) -> Callable[[Path], list[Shot]]:
-    """Return a function that reads the poses in a folder, and returns its frames.
-
-    Poses are those of the colour camera, or of the depth camera if ``T_depth_colour`` is given.
-    """
-    read_depth = DepthReader(documented=("65535",))
-
-    def shots_of(folder: Path) -> list[Shot]:
-        images, shots = images_of(folder), list[Shot]()
-        if not images:
-            raise InputError("has no frames", where=folder, expected="frame-000000.color.png ...")
-        for image in images:
-            stem = image.name.partition(".")[0]
-            depth, pose = (folder / f"{stem}.{kind}" for kind in ("depth.png", "pose.txt"))
-            T = read_pose_matrix(pose) if is_file(pose) else None
-            measured = DepthFile(depth, partial(read_depth, depth, unit), sensor) if is_file(depth) else None
-            T = T if T is None or T_depth_colour is None else T @ T_depth_colour
-            shots.append(Shot(image=image, stem=stem, camera=camera, T_world_camera=T, depth=measured))
-        return shots
-
-    return shots_of
+def frames_of(
+    folder: Path, camera: CameraSource, read_depth: Callable[[Path], DepthImage], sensor: DepthCamera | None
+) -> list[Shot]:
+    """Return the frames of a folder with their poses as stored. Raises ``InputError`` if there is none."""
+    images, shots = images_of(folder), list[Shot]()
+    if not images:
+        raise InputError("has no frames", where=folder, expected="frame-000000.color.png ...")
+    for image in images:
+        stem = image.name.partition(".")[0]
+        depth, pose = (folder / f"{stem}.{kind}" for kind in ("depth.png", "pose.txt"))
+        measured = DepthFile(depth, partial(read_depth, depth), sensor) if is_file(depth) else None
+        T = read_pose_matrix(pose)
+        shots.append(Shot(image=image, stem=stem, camera=camera, T_world_camera=T, depth=measured))
+    return shots
 
 
 def _listed(file: Path, folders: dict[int, Path]) -> list[int]:
@@ -141,21 +129,18 @@ def _listed(file: Path, folders: dict[int, Path]) -> list[int]:
         found = SEQUENCE.fullmatch(row.text)
         if found is None:
             raise row.error(f": {row.text[:40]!r}")
-        if int(found[1]) not in folders:
-            raise InputError(
-                f"no folder for {row.text}", where=row.where, expected=f"seq-{int(found[1]):02d}"
-            )
-        if int(found[1]) in numbers:
+        number = int(found[1])
+        if number not in folders:
+            raise InputError(f"no folder for {row.text}", where=row.where, expected=f"seq-{number:02d}")
+        if number in numbers:
             raise InputError(f"{row.text} is repeated", where=row.where, expected="each sequence once")
-        numbers.append(int(found[1]))
+        numbers.append(number)
     if not numbers:
         raise InputError("lists no sequences", where=file, expected="lines such as sequence1")
     return numbers
 
 
-def _sequence_folders(path: Path) -> dict[int, Path]:
-    found = {child: SEQUENCE.fullmatch(child.name) for child in path.glob("seq*") if child.is_dir()}
-    return {int(match[1]): child for child, match in found.items() if match}
-
-
-reader = SevenScenesReader()
+reader = Format(
+    "frame-000000.color.png ... in the folder or in seq-01 ... (7-Scenes)", _find, _read,
+    ("camera", "register_depth", "depth_unit"),
+)  # fmt: skip

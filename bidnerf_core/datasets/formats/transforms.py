@@ -23,111 +23,80 @@ Images are used as they are stored: poses and intrinsics describe that raster, s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from bidnerf_core.camera import Camera, CameraSource, PanoramaFace, same_aspect
-from bidnerf_core.datasets.capture import SPLITS, Capture, DepthFile, MaskFile, Shot, present, remark
+from bidnerf_core.datasets.capture import SPLITS, Capture, DepthFile, MaskFile, Shot, remark
 from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames
 from bidnerf_core.datasets.formats.transforms_json import FrameRecord, file_of, read_splits
-from bidnerf_core.datasets.reader import DatasetOptions, OpenQuestion, Reader
+from bidnerf_core.datasets.reader import DatasetOptions, Format
 from bidnerf_core.depth import DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import background_colour, is_file, read_header
 
-DYNAMIC_MASK = "dynamic_mask_"
-"""Prefix of instant-ngp's masks, which lie next to the images."""
 
-
-class TransformsReader(Reader):
-    """Reader for folders with ``transforms*.json``."""
-
-    accepts: tuple[OpenQuestion, ...] = ("depth_unit",)
-    expected = "transforms.json or transforms_train.json, transforms_val.json, transforms_test.json"
-
-    def recognises(self, path: Path) -> bool:
-        return any((path / name).is_file() for name in ("transforms.json", *map(file_of, SPLITS)))
-
-    def read(self, path: Path, options: DatasetOptions) -> Capture:
-        """Read the frames, and find their files. Raises ``InputError`` if no image is found."""
-        listed, names = read_splits(path), FileNames(path)
-        frames = [frame for frame, _ in listed]
-        images = _files(names, path, {frame: frame.file_path for frame in frames}, "image", IMAGE_ENDINGS)
-        depths = _files(names, path, {f: f.depth_path for f in images if f.depth_path}, "depth image")
-        masks = _files(names, path, {f: f.mask_path for f in images if f.mask_path}, "mask")
-        _remark_names(path, images)
-        steps, units = {frame.depth_unit for frame in frames}, {frame.unit for frame in frames}
-        read_depth, size = DepthReader(), _first_size(images)
-        shots = list[Shot]()
-        for frame, splits in ((frame, splits) for frame, splits in listed if frame in images):
-            image, depth, mask = images[frame], depths.get(frame), masks.get(frame)
-            camera = _camera(frame, size)
-            if isinstance(camera, PanoramaFace) and frame.depth_path is not None:
-                expected = "none, or pinhole images with depth"
-                raise frame.record.error("an equirectangular image has depth", expected=expected)
-            dynamic = image.with_name(f"{DYNAMIC_MASK}{image.stem}.png")
-            unit = options.depth_unit or frame.depth_unit
-            shots.append(
-                Shot(
-                    image=image,
-                    camera=camera,
-                    T_world_camera=frame.T_world_camera,
-                    time=frame.time,
-                    depth=None if depth is None else DepthFile(depth, partial(read_depth, depth, unit)),
-                    masks=(
-                        *([] if mask is None else [MaskFile(mask)]),
-                        *([MaskFile(dynamic, "white")] if is_file(dynamic) else []),
-                    ),
-                    splits=splits,
-                    stem=frame.stem,
-                    folders=frame.parts[:-1],
-                )
+def _read(path: Path, found: list[Path], options: DatasetOptions) -> Capture:
+    """Read the frames, and find their files. Raises ``InputError`` if no image is found."""
+    listed, names = read_splits(path), FileNames(path)
+    images = [names.path(frame.file_path, IMAGE_ENDINGS, moved=True) for frame, _ in listed]
+    _check_images(path, [frame for frame, _ in listed], images)
+    steps, units = {frame.depth_unit for frame, _ in listed}, {frame.unit for frame, _ in listed}
+    read_depth, size = DepthReader(), _first_size([frame for frame, _ in listed], images)
+    shots, first = list[Shot](), dict[tuple[str, ...], Path]()
+    for (frame, splits), image in zip(listed, images, strict=True):
+        camera = _camera(frame, size)
+        if isinstance(camera, PanoramaFace) and frame.depth_path is not None:
+            expected = "none, or pinhole images with depth"
+            raise frame.record.error("an equirectangular image has depth", expected=expected)
+        depth = frame.depth_path and names.path(frame.depth_path, moved=True)
+        unit = options.depth_unit or frame.depth_unit
+        masks = [MaskFile(names.path(frame.mask_path, moved=True))] if frame.mask_path else []
+        dynamic = image.with_name(f"dynamic_mask_{image.stem}.png")  # of instant-ngp
+        masks += [MaskFile(dynamic, "white")] if is_file(dynamic) else []
+        shots.append(
+            Shot(
+                image=image,
+                camera=camera,
+                T_world_camera=frame.T_world_camera,
+                time=frame.time,
+                depth=DepthFile(depth, partial(read_depth, depth, unit)) if depth else None,
+                masks=tuple(masks),
+                splits=splits,
+                stem=frame.stem,
+                folders=frame.parts[:-1],
             )
-        first = {splits[:1]: images[frame] for frame, splits in reversed(listed) if frame in images}
-        white = options.background is None and any(map(_has_alpha, first.values()))
-        return Capture(
-            path, shots, background_colour("white") if white else options.colour,
-            unit=units.pop() if len(units) == 1 else None,
-            depth_unit=options.depth_unit or (steps.pop() if len(steps) == 1 else None),
-        )  # fmt: skip
-
-
-def _files(
-    names: FileNames,
-    folder: Path,
-    listed: dict[FrameRecord, PurePosixPath],
-    noun: str,
-    endings: tuple[str, ...] = ("",),
-) -> dict[FrameRecord, Path]:
-    """Return the files of the frames that have them; a remark counts the others. Raises ``InputError`` if no image is left."""
-    found = {
-        frame: file
-        for frame, name in listed.items()
-        if (file := names.find(name, endings, moved=True)) is not None
-    }
-    owner: dict[Path, PurePosixPath] = {}
-    for frame, file in found.items():  # parts of several names may fit one file
-        if owner.setdefault(file, listed[frame]) != listed[frame] and noun == "image":
-            expected = f"different images, though {owner[file]} and {listed[frame]} may both be {file}"
-            raise frame.record.error("has the image of another frame", expected=expected)
-
-    def missing(frame: FrameRecord) -> InputError:
-        tried = (
-            " (also tried with image extensions added, in upper and lower case)"
-            if noun == "image"
-            else " (mask_path)"
         )
-        return frame.record.error(f"no {noun} {folder / listed[frame]}", expected=f"that file{tried}")
+        if is_file(image):
+            first.setdefault(splits[:1], image)
+    white = options.background is None and any(map(_has_alpha, first.values()))
+    return Capture(
+        path, shots, background_colour("white") if white else options.colour,
+        unit=units.pop() if len(units) == 1 else None,
+        depth_unit=options.depth_unit or (steps.pop() if len(steps) == 1 else None),
+    )  # fmt: skip
 
-    present(
-        list(listed),
-        found.__contains__,
-        folder,
-        listed.__getitem__,
-        None if noun == "depth image" else missing,
-        noun,
-    )
-    return found
+
+def _find(path: Path) -> list[Path]:
+    return [path / name for name in ("transforms.json", *map(file_of, SPLITS)) if is_file(path / name)]
+
+
+def _check_images(folder: Path, frames: Sequence[FrameRecord], images: Sequence[Path]) -> None:
+    """Report names that differ from the file names by more than an added extension.
+
+    Raises ``InputError`` if parts of several names fit one file.
+    """
+    owner, remarked = dict[Path, FrameRecord](), False
+    for frame, image in zip(frames, images, strict=True):
+        other, written = owner.setdefault(image, frame), frame.record.text("file_path") or ""
+        if other.file_path != frame.file_path:
+            expected = f"different images, though {other.file_path} and {frame.file_path} may both be {image}"
+            raise frame.record.error("has the image of another frame", expected=expected)
+        if not remarked and is_file(image) and not str(image).startswith(str(folder / written)):
+            remarked = True
+            text = f"file_path {written!r} is taken for {image.relative_to(folder)}, and others likewise"
+            remark(folder, text)
 
 
 def _camera(frame: FrameRecord, size: tuple[int, int] | None) -> Camera | CameraSource:
@@ -138,12 +107,12 @@ def _camera(frame: FrameRecord, size: tuple[int, int] | None) -> Camera | Camera
     return frame.camera.intrinsics(width, height)
 
 
-def _first_size(images: dict[FrameRecord, Path]) -> tuple[int, int] | None:
+def _first_size(frames: Sequence[FrameRecord], images: Sequence[Path]) -> tuple[int, int] | None:
     """Return the size of the first readable image. A remark says that cameras are scaled if its camera has another size."""
-    for frame, image in images.items():
+    for frame, image in zip(frames, images, strict=True):
         try:
             header = read_header(image)
-        except InputError:  # raised again when that frame is read
+        except InputError:  # missing, or raised again when that frame is read
             continue
         size = header.width, header.height
         given = frame.camera.width or size[0], frame.camera.height or size[1]
@@ -161,13 +130,5 @@ def _has_alpha(image: Path) -> bool:
         return False
 
 
-def _remark_names(folder: Path, images: dict[FrameRecord, Path]) -> None:
-    """Report names that differ from the file names by more than an added extension."""
-    for frame, path in images.items():
-        written = frame.record.text("file_path") or ""
-        if not str(path).startswith(str(folder / written)):
-            text = f"file_path {written!r} is taken for {path.relative_to(folder)}, and others likewise"
-            return remark(folder, text)
-
-
-reader = TransformsReader()
+expected = "transforms.json or transforms_train.json, transforms_val.json, transforms_test.json"
+reader = Format(expected, _find, _read, ["depth_unit"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, get_args
@@ -19,10 +18,8 @@ from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.io import IMAGE_SUFFIXES, Record, read_record
 
 METRES_PER_DEPTH_UNIT = 0.001
-DEPTH_KEYS = ("depth_file_path", "depth_path")
-"""The keys of a depth image: nerfstudio's, and that of instant-ngp and NeRFCapture."""
-UNIT_KEYS = ("depth_unit_scale_factor", "integer_depth_scale")
-"""The keys for the metres per step of its values, in the same order."""
+UNIT_KEYS = {"depth_file_path": "depth_unit_scale_factor", "depth_path": "integer_depth_scale"}
+"""The keys of a depth image, nerfstudio's, and that of instant-ngp and NeRFCapture; and those of the metres per step of its values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +39,8 @@ class FrameRecord:
     @property
     def unit(self) -> LengthUnit | None:
         """The unit of its position if the file states ``"unit": "metres"`` or ``"units"``, as bidnerf's files do."""
-        said = self.record.value("unit")
-        return said if said in get_args(LengthUnit) else None
+        stated = self.record.value("unit")
+        return stated if stated in get_args(LengthUnit) else None
 
     @property
     def stem(self) -> str:
@@ -73,7 +70,14 @@ def read_splits(path: Path) -> list[tuple[FrameRecord, tuple[str, ...]]]:
     by_path = {frame.file_path: frame for frame in frames}
     splits: dict[FrameRecord, tuple[str, ...]] = {}  # in the order of the lists
     for split, listed in lists.items():
-        for frame in _listed(record, by_path, f"{split}_filenames", listed or []):
+        names = [posix_name(name) if isinstance(name, str) else None for name in listed or []]
+        own = [by_path[name] for name in names if name in by_path]
+        strange = [name for name, path in zip(listed or [], names, strict=True) if path not in by_path]
+        if strange and own:
+            more = f" and {len(strange) - 1} more" if len(strange) > 1 else ""
+            text = f"{split}_filenames lists {strange[0]!r}{more}, which no frame has; the other {len(own)} are used"
+            remark(record.where, text)
+        for frame in own:
             splits[frame] = *splits.get(frame, ()), split
     if not splits:
         (key, listed), *_ = ((f"{split}_filenames", listed) for split, listed in lists.items() if listed)
@@ -92,34 +96,33 @@ def read_frames(file: Record) -> list[FrameRecord]:
     if not entries:
         found = "no frames" if entries is None else "frames is empty"
         raise file.error(found, expected="a list of objects with file_path and transform_matrix")
-    frames = [_frame(file, number, entry) for number, entry in _posed(file, entries)]
+    unposed = [entry for entry in entries if _lacks_pose(entry)]
+    if 0 < len(unposed) < len(entries):
+        remark(
+            file.where,
+            f"{len(unposed)} of {amount(len(entries), 'frame')} have no pose (transform_matrix"
+            f" is missing, zero or not finite) and are left out, first: {unposed[0].get('file_path')}",
+        )
+    is_used = [len(unposed) == len(entries) or not _lacks_pose(entry) for entry in entries]
+    frames = [_frame(file, number, entry) for number, entry in enumerate(entries) if is_used[number]]
     seen: dict[tuple[str, ...], int] = {}
     for number, frame in enumerate(frames):
         first = seen.setdefault(frame.parts, number)
         if first != number:
             raise frame.record.error(f"has the same image as frame {first}", expected="each image once")
-    _remark_scales(file, frames)
+    if scaled := [frame for frame in frames if frame.scale != 1.0]:
+        whose = "all" if len(scaled) == len(frames) else f"{len(scaled)} of"
+        remark(
+            file.where,
+            f"{whose} {len(frames)} matrices have a scale (frame {scaled[0].file_path}: {scaled[0].scale:.6g}), which is"
+            " removed; the positions of the cameras are those of the matrices",
+        )
     for row in file.items("applied_transform") or []:  # which is not undone
         for number in row if isinstance(row, list) else [row]:
             file.checked_number(number, "an entry of applied_transform")
-    if file.value("enable_depth_loading") is False and any(
-        "depth_path" in frame.record.values for frame in frames
-    ):
+    if file.value("enable_depth_loading") is False and any("depth_path" in f.record.values for f in frames):
         remark(file.where, "enable_depth_loading is false, so the images of depth_path are not read")
     return frames
-
-
-def _posed(file: Record, entries: list[Any]) -> list[tuple[int, Any]]:
-    """Return the numbered entries without those lacking a pose, unless all of them do."""
-    kept = [(number, entry) for number, entry in enumerate(entries) if not _lacks_pose(entry)]
-    if kept and len(kept) < len(entries):
-        first = next(entry for entry in entries if _lacks_pose(entry))
-        remark(
-            file.where,
-            f"{len(entries) - len(kept)} of {amount(len(entries), 'frame')} have no pose (transform_matrix"
-            f" is missing, zero or not finite) and are left out, first: {first.get('file_path')}",
-        )
-    return kept or list(enumerate(entries))
 
 
 def _lacks_pose(entry: Any) -> bool:
@@ -135,34 +138,6 @@ def _lacks_pose(entry: Any) -> bool:
     if any(isinstance(value, float) and not math.isfinite(value) for value in numbers):
         return True
     return bool(numbers) and all(value in (0, None) for row in rows[:3] for value in row[:3])
-
-
-def _remark_scales(file: Record, frames: list[FrameRecord]) -> None:
-    scaled = [frame for frame in frames if frame.scale != 1.0]
-    if scaled:
-        whose = "all" if len(scaled) == len(frames) else f"{len(scaled)} of"
-        first = scaled[0]
-        remark(
-            file.where,
-            f"{whose} {len(frames)} matrices have a scale (frame {first.file_path}: {first.scale:.6g}), which is removed; the"
-            " positions of the cameras are those of the matrices",
-        )
-
-
-def _listed(
-    file: Record, by_path: dict[PurePosixPath, FrameRecord], key: str, entries: Iterable[object]
-) -> list[FrameRecord]:
-    """Return the frames that a list names. A remark counts the names without a frame."""
-    given = list(entries)
-    found = [by_path.get(posix_name(entry)) if isinstance(entry, str) else None for entry in given]
-    strange = [entry for entry, frame in zip(given, found, strict=True) if frame is None]
-    if strange and len(strange) < len(given):
-        remark(
-            file.where,
-            f"{key} lists {strange[0]!r}{f' and {len(strange) - 1} more' if len(strange) > 1 else ''}, which no frame has; the"
-            f" other {len(given) - len(strange)} are used",
-        )
-    return [frame for frame in found if frame is not None]
 
 
 def _frame(file: Record, number: int, entry: object) -> FrameRecord:
@@ -194,21 +169,18 @@ def _depth(record: Record, own: Record) -> tuple[PurePosixPath | None, float]:
 
     nerfstudio and instant-ngp use different keys for both; ``enable_depth_loading`` disables instant-ngp's.
     """
-    for key, unit_key in zip(DEPTH_KEYS, UNIT_KEYS, strict=True):
-        path = own.text(key)
-        if path and not (key == "depth_path" and record.value("enable_depth_loading") is False):
-            return posix_name(path), _unit(record, (unit_key, *UNIT_KEYS))
-    return None, _unit(record, UNIT_KEYS)
-
-
-def _unit(record: Record, keys: Iterable[str]) -> float:
-    for key in keys:
+    paths = {key: own.text(key) for key in UNIT_KEYS}
+    if record.value("enable_depth_loading") is False:
+        paths["depth_path"] = None
+    used = next((key for key, path in paths.items() if path), "depth_file_path")
+    for key in (UNIT_KEYS[used], *UNIT_KEYS.values()):
         unit = record.number(key)
         if unit is not None and unit <= 0:
             raise record.error(f"{key} is {unit:g}", expected="a positive number of metres")
         if unit is not None:
-            return unit
-    return METRES_PER_DEPTH_UNIT
+            break
+    path = paths[used]
+    return posix_name(path) if path else None, METRES_PER_DEPTH_UNIT if unit is None else unit
 
 
 def _time(own: Record) -> float | None:

@@ -31,109 +31,79 @@ from pathlib import Path
 import numpy as np
 
 from bidnerf_core.camera import Camera, Intrinsics, folder_camera
-from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, images_there, present
-from bidnerf_core.datasets.file_names import FileNames, posix_name
-from bidnerf_core.datasets.reader import DatasetOptions, Reader
+from bidnerf_core.datasets.capture import Capture, DepthFile, Shot
+from bidnerf_core.datasets.file_names import FileNames
+from bidnerf_core.datasets.reader import DatasetOptions, Format
 from bidnerf_core.datasets.trajectories import (
     LARGEST_GAP,
     TimedRow,
     Trajectory,
-    read_timed_rows,
+    read_timed_files,
     read_trajectory,
-    require_distinct_times,
 )
 from bidnerf_core.depth import DepthReader
 from bidnerf_core.io import is_file
 
-COLOUR_LIST, DEPTHS, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
-METRES_PER_STEP = 1 / 5000
-LARGEST_DIFFERENCE = 0.02
-"""Maximum time (seconds) between a colour image and its depth image, as in the benchmark's own association."""
 CAMERAS = {
     "1": Intrinsics(517.3, 516.5, 319.1, 255.8, 640, 480, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "2": Intrinsics(520.9, 521.0, 325.6, 250.2, 640, 480, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     "3": Intrinsics(535.4, 539.2, 320.6, 248.1, 640, 480),
 }
 """The benchmark's calibrations of its three colour cameras, not its "ROS default"."""
-SENSORS = "freiburg1, freiburg2 and freiburg3"
-SENSOR = re.compile(r"(?:freiburg|fr)_?([123])(?!\d)", re.IGNORECASE)
 
 
-class TumReader(Reader):
-    """Reader for folders of the TUM RGB-D benchmark.
+def _read(path: Path, colour_list: Path, options: DatasetOptions) -> Capture:
+    """Read the lists, and associate them by time. Raises ``InputError`` if one is missing or malformed.
 
     A given camera (intrinsics, a file, or the name of one of the benchmark's sensors) takes precedence over
     all others; depth is registered if a sensor is given.
     """
-
-    accepts = ("camera", "register_depth", "depth_unit")
-    expected = "rgb.txt with depth.txt and groundtruth.txt (TUM RGB-D)"
-
-    def recognises(self, path: Path) -> bool:
-        return (path / COLOUR_LIST).is_file()
-
-    def read(self, path: Path, options: DatasetOptions) -> Capture:
-        """Read the lists, and associate them by time. Raises ``InputError`` if one is missing or malformed."""
-        names, colours, truth = FileNames(path), _listed(path / COLOUR_LIST), path / TRUTH
-        times = [row.time for row in colours]
-        trajectory = read_trajectory(truth, times) if truth.is_file() else None
-        given = options.given_camera
-        named = None if given is None else _named_camera(given) or given
-        unknown, ways = f"its name contains none of {SENSORS}", f"one of {SENSORS}, or a file"
-        camera = folder_camera(path, named, published_camera(path), unknown, ways)
-        sensor, unit = options.sensor(path), options.depth_unit or METRES_PER_STEP
-        listed = (
-            [(row.time, _file(row, names, path)) for row in _listed(path / DEPTHS)]
-            if is_file(path / DEPTHS)
-            else []
-        )
-        depths = present(
-            listed,
-            lambda depth: is_file(depth[1]),
-            path / DEPTHS,
-            lambda depth: depth[1].name,
-            noun="depth image",
-        )
-        partners = associate(times, [time for time, _ in depths], LARGEST_DIFFERENCE)
-        measured = {
-            index: DepthFile(file, partial(read_depth, file, unit), sensor)
-            for read_depth in [DepthReader(documented=("65535",))]
-            for index, (_, file) in ((index, depths[other]) for index, other in partners.items())
-        }
-        shots = [
+    names, colours, truth = FileNames(path), read_timed_files(colour_list), path / "groundtruth.txt"
+    times = [row.time for row in colours]
+    trajectory = read_trajectory(truth, times) if truth.is_file() else None
+    given: Camera | Path | None = options.given_camera
+    if isinstance(given, Path) and not given.exists():
+        given = _published(str(given), whole=True) or given
+    sensors = "freiburg1, freiburg2 and freiburg3"
+    unknown, ways = f"its name contains none of {sensors}", f"one of {sensors}, or a file"
+    camera = folder_camera(path, given, _published(path.resolve().name), unknown, ways)
+    sensor, unit = options.sensor(path), options.depth_unit or 1 / 5000
+    depths = read_timed_files(path / "depth.txt") if is_file(path / "depth.txt") else []
+    partners = associate(times, [row.time for row in depths], 0.02)  # as in the benchmark's own association
+    read_depth, shots = DepthReader(documented=("65535",)), list[Shot]()
+    for index, row in enumerate(colours):
+        depth = _file(depths[partners[index]], names) if index in partners else None
+        shots.append(
             Shot(
-                image=_file(row, names, path),
+                image=_file(row, names),
                 camera=camera,
                 T_world_camera=None if trajectory is None else trajectory.at(row.time),
                 time=row.time,
-                depth=measured.get(index),
+                depth=None if depth is None else DepthFile(depth, partial(read_depth, depth, unit), sensor),
             )
-            for index, row in enumerate(colours)
-        ]
-        samples = f"samples before and after the times of images, at most {LARGEST_GAP:g} s apart"
-        return Capture(
-            path, images_there(path / COLOUR_LIST, shots), options.colour, unit="metres", depth_unit=unit, pose_file=truth,
-            poses_expected="the poses of the frames of a dataset" if trajectory is None else samples,
-            unposed=_unposed(trajectory),
-        )  # fmt: skip
+        )
+    samples = f"samples before and after the times of images, at most {LARGEST_GAP:g} s apart"
+    return Capture(
+        path, shots, options.colour, unit="metres", depth_unit=unit, pose_file=truth,
+        poses_expected="the poses of the frames of a dataset" if trajectory is None else samples,
+        unposed=_unposed(trajectory),
+    )  # fmt: skip
 
 
-def published_camera(folder: Path) -> Intrinsics | None:
-    """Return the benchmark's calibration of the sensor in the folder's name, or None."""
-    found = SENSOR.search(folder.resolve().name)
+def _find(path: Path) -> Path | None:
+    return file if is_file(file := path / "rgb.txt") else None
+
+
+def _published(name: str, whole: bool = False) -> Intrinsics | None:
+    """Return the benchmark's calibration of the sensor that is, or is in, a name such as ``freiburg1``, or None."""
+    sensor = re.compile(r"(?:freiburg|fr)_?([123])(?!\d)", re.IGNORECASE)
+    found = sensor.fullmatch(name) if whole else sensor.search(name)
     return CAMERAS[found[1]] if found else None
 
 
-def _named_camera(given: Camera | Path) -> Intrinsics | None:
-    """Return the calibration of a sensor given by name, such as ``freiburg1``, or None."""
-    found = None if not isinstance(given, Path) or given.exists() else SENSOR.fullmatch(str(given))
-    return CAMERAS[found[1]] if found else None
-
-
-def _file(row: TimedRow, names: FileNames, folder: Path) -> Path:
+def _file(row: TimedRow, names: FileNames) -> Path:
     """Return the file that a row lists, whose name may contain spaces; it may be missing."""
-    found = (names.find(posix_name(name)) for name in (row.rest.strip("\"'"), row.words[0]))
-    return next((file for file in found if file is not None), folder / row.words[0])
+    return names.find(row.rest.strip("\"'")) or names.path(row.words[0])
 
 
 def _unposed(trajectory: Trajectory | None) -> str:
@@ -171,10 +141,9 @@ def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.where(np.abs(times - others[before]) <= np.abs(others[after] - times), before, after)
 
 
-def _listed(path: Path) -> list[TimedRow]:
-    rows = read_timed_rows(path, "filename")
-    require_distinct_times(rows)
-    return rows
-
-
-reader = TumReader()
+reader = Format(
+    "rgb.txt with depth.txt and groundtruth.txt (TUM RGB-D)",
+    _find,
+    _read,
+    ("camera", "register_depth", "depth_unit"),
+)

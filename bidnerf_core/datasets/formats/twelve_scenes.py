@@ -13,57 +13,23 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from bidnerf_core.camera import CameraSource, Intrinsics
 from bidnerf_core.datasets.capture import Capture, Shot
-from bidnerf_core.datasets.formats.seven_scenes import images_of, reading_frames
-from bidnerf_core.datasets.reader import DatasetOptions, OpenQuestion, Reader
-from bidnerf_core.depth import MILLIMETRE, DepthCamera
+from bidnerf_core.datasets.formats.seven_scenes import frames_of, images_of
+from bidnerf_core.datasets.pose_rows import camera_of
+from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.depth import MILLIMETRE, DepthCamera, DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import is_file, read_rows
 
-INFO = ("info.txt", "_info.txt")
-RANGE = re.compile(r"start\s*=\s*(\d+)\s*;\s*end\s*=\s*(\d+)")
-FOCAL_TOLERANCE = 1e-3
-"""Relative difference of two focal lengths below which depth needs no registration."""
 
-
-class TwelveScenesReader(Reader):
-    """Reader for 12-Scenes folders."""
-
-    accepts: tuple[OpenQuestion, ...] = ("camera", "register_depth", "depth_unit")
-    expected = "info.txt with data/frame-000000.color.jpg ... (12-Scenes)"
-
-    def recognises(self, path: Path) -> bool:
-        return _beside(path, *INFO) is not None and _data(path) is not None
-
-    def read(self, path: Path, options: DatasetOptions) -> Capture:
-        """Read the poses and splits. Raises ``InputError`` if a metadata file is invalid."""
-        folder, info = _data(path), _beside(path, *INFO)
-        assert folder is not None  # ensured by recognises
-        assert info is not None
-        colour, own = _cameras(info)
-        unit, sensor = options.depth_unit or MILLIMETRE, options.sensor(path, own)
-        shots = reading_frames(CameraSource(options.given_camera or colour), unit, sensor)(folder)
-        return Capture(
-            path, _in_splits(path, shots), options.colour, unit="metres", depth_unit=unit,
-            poses_expected="frame-000000.pose.txt of finite numbers",
-        )  # fmt: skip
-
-
-def _beside(path: Path, *names: str) -> Path | None:
-    files = (place / name for place in (path, path.parent) for name in names)
-    return next((file for file in files if is_file(file)), None)
-
-
-def _data(path: Path) -> Path | None:
-    return next((place for place in (path / "data", path) if place.is_dir() and images_of(place)), None)
-
-
-def _cameras(info: Path) -> tuple[Intrinsics, DepthCamera | None]:
-    """Return the colour camera, and the depth sensor if it is a different camera."""
+def _read(path: Path, found: tuple[Path, Path], options: DatasetOptions) -> Capture:
+    """Read the poses and splits. Raises ``InputError`` if a metadata file is invalid."""
+    folder, info = found
     values: dict[str, list[float]] = {}
     for row in read_rows(info, "12-Scenes' info.txt", "name = numbers"):
         name, _, text = row.text.partition("=")
@@ -71,14 +37,33 @@ def _cameras(info: Path) -> tuple[Intrinsics, DepthCamera | None]:
             values[name.strip()] = row.plain_numbers(text.split())
     colour, depth = (_camera(info, values, kind) for kind in ("Color", "Depth"))
     if colour is None:
-        raise InputError(
-            "no m_calibrationColorIntrinsic",
-            where=info,
-            expected="16 numbers, with m_colorWidth and m_colorHeight",
-        )
-    if depth is None or abs(depth.resized(colour.width, colour.height).fx / colour.fx - 1) < FOCAL_TOLERANCE:
-        return colour, None
-    return colour, DepthCamera(depth, SE3.identity())
+        expected = "16 numbers, with m_colorWidth and m_colorHeight"
+        raise InputError("no m_calibrationColorIntrinsic", where=info, expected=expected)
+    unit, sensor = options.depth_unit or MILLIMETRE, options.sensor(path, own_sensor(colour, depth))
+    read_depth = partial(DepthReader(documented=("65535",)), unit=unit)
+    shots = frames_of(folder, CameraSource(options.given_camera or colour), read_depth, sensor)
+    return Capture(
+        path, _in_splits(path, shots), options.colour, unit="metres", depth_unit=unit,
+        poses_expected="frame-000000.pose.txt of finite numbers",
+    )  # fmt: skip
+
+
+def _find(path: Path) -> tuple[Path, Path] | None:
+    """Return the folder of the frames, and the file of their cameras."""
+    folder = next((place for place in (path / "data", path) if images_of(place)), None)
+    info = _beside(path, "info.txt", "_info.txt")
+    return None if folder is None or info is None else (folder, info)
+
+
+def _beside(path: Path, *names: str) -> Path | None:
+    return next(filter(is_file, (place / name for place in (path, path.parent) for name in names)), None)
+
+
+def own_sensor(colour: Intrinsics, depth: Intrinsics | None) -> DepthCamera | None:
+    """Return the depth sensor if it is a different camera: the focal lengths of equal ones agree up to rounding."""
+    if depth is None or abs(depth.resized(colour.width, colour.height).fx / colour.fx - 1) < 1e-3:
+        return None
+    return DepthCamera(depth, SE3.identity())
 
 
 def _camera(info: Path, values: dict[str, list[float]], kind: str) -> Intrinsics | None:
@@ -87,17 +72,8 @@ def _camera(info: Path, values: dict[str, list[float]], kind: str) -> Intrinsics
     if len(matrix) not in (9, 16) or not all(size):
         return None
     row = 4 if len(matrix) == 16 else 3
-    try:
-        return Intrinsics(
-            matrix[0],
-            matrix[row + 1],
-            matrix[2] + 0.5,
-            matrix[row + 2] + 0.5,
-            int(size[0][0]),
-            int(size[1][0]),
-        )
-    except InputError as error:
-        raise InputError(error, where=info) from error
+    numbers = matrix[0], matrix[row + 1], matrix[2], matrix[row + 2]
+    return camera_of(info, numbers, (int(size[0][0]), int(size[1][0])))
 
 
 def _in_splits(path: Path, shots: list[Shot]) -> list[Shot]:
@@ -105,7 +81,8 @@ def _in_splits(path: Path, shots: list[Shot]) -> list[Shot]:
     file = _beside(path, "split.txt")
     if file is None:
         return shots
-    ranges = [RANGE.search(row.text) for row in read_rows(file, "a list of sequences", "start and end")]
+    rows = read_rows(file, "a list of sequences", "start and end")
+    ranges = (re.search(r"start\s*=\s*(\d+)\s*;\s*end\s*=\s*(\d+)", row.text) for row in rows)
     first = next((found for found in ranges if found is not None), None)
     if first is None:
         raise InputError("has no [start=0 ; end=356]", where=file, expected="the frames of each sequence")
@@ -118,4 +95,9 @@ def _in_splits(path: Path, shots: list[Shot]) -> list[Shot]:
     ]
 
 
-reader = TwelveScenesReader()
+reader = Format(
+    "info.txt with data/frame-000000.color.jpg ... (12-Scenes)",
+    _find,
+    _read,
+    ("camera", "register_depth", "depth_unit"),
+)

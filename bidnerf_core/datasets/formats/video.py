@@ -13,7 +13,7 @@ import torch
 
 from bidnerf_core.camera import CameraSource, Raster
 from bidnerf_core.datasets.capture import Capture, Colour, Shot
-from bidnerf_core.datasets.reader import DatasetOptions, OpenQuestion, Reader
+from bidnerf_core.datasets.reader import DatasetOptions, Format
 from bidnerf_core.datasets.video import VIDEO_SUFFIXES, Video, is_video, require_av
 from bidnerf_core.frames import BLACK, Frame
 from bidnerf_core.io import reduced
@@ -43,27 +43,19 @@ class VideoShot(Shot):
         )
 
 
-class VideoReader(Reader):
-    """Reader for video files, which finds no poses."""
+def _read(path: Path, found: bool, options: DatasetOptions) -> Capture:
+    """List the frames. Raises ``InputError`` if it is not a video, and if there is no camera."""
+    require_av(path)
+    source = options.camera_source
+    source.require(path, "a video does not record its focal length")
+    video = Video(path)
+    shots = [
+        VideoShot(video=video, number=number, camera=source, time=time, stem=f"{number:06d}")
+        for number, time in enumerate(video.times)
+    ]
+    return Capture(path, shots)
 
-    accepts: tuple[OpenQuestion, ...] = ("camera", "focal")
-    suffixes = VIDEO_SUFFIXES
-    expected = f"a video ({', '.join(VIDEO_SUFFIXES)})"
 
-    def recognises(self, path: Path) -> bool:
-        return is_video(path)
-
-    def read(self, path: Path, options: DatasetOptions) -> Capture:
-        """List the frames. Raises ``InputError`` if it is not a video, and if there is no camera."""
-        require_av(path)
-        options.camera_source.require(path, "a video does not record its focal length")
-        video = Video(path)
-        return Capture(
-            path,
-            [
-                VideoShot(
-                    video=video, number=number, camera=options.camera_source, time=time, stem=f"{number:06d}"
-                )
-                for number, time in enumerate(video.times)
-            ],
-        )
+reader = Format(
+    f"a video ({', '.join(VIDEO_SUFFIXES)})", is_video, _read, ("camera", "focal"), VIDEO_SUFFIXES
+)
