@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -19,54 +20,23 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from bidnerf_core.captures.pose_readings import SWAP, Y_AND_Z_REVERSED, Reading, readings, with_axes
+from bidnerf_core.captures.pose_readings import AS_GIVEN, SWAP, Y_AND_Z_REVERSED, Reading, changed, readings
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import LEAST_BASELINE, ImageKeypoints, likely_pairs_of_poses, squared_distances
 
 MOST_PAIRS = 40
 """Largest number of examined pairs among those suggested by poses and order, and among those suggested by
 image similarity."""
-COMPARED_IMAGES, COMPARED_KEYPOINTS = 60, 300
-"""Number of images whose pairs are all compared, and number of strongest keypoints used from each."""
-PARTNERS, SIMILAR_MATCHES = 2, 12
-"""Number of partners suggested per image, and smallest number of matches with each."""
 ENOUGH_PAIRS = 8
 """Smallest number of pairs with matches from which poses are judged."""
-RATIO = 0.8
-"""Largest ratio of a match's descriptor distance to that of the second nearest (Lowe 2004)."""
 ENOUGH_MATCHES = 40
 """Smallest number of inlier matches to an essential matrix for a pair."""
-MATCH_PIXELS, POSE_PIXELS = 1.0, 2.0
-"""Smallest thresholds (pixels) on a match's distance from its epipolar line: for its own essential matrix,
-and for given poses."""
 USUAL_FOCAL = 700.0
 """Focal length (pixels) beyond which the pixel size is scaled up: keypoints of large images are detected in
 downscaled ones."""
-POSE_ANGLE = 4 / USUAL_FOCAL
-"""Distance from the epipolar line, on the plane z = 1, that small errors of correct poses may cause."""
-NEAR_LINES, IN_FRONT = 0.7, 0.7
-"""Smallest fractions of a pair's matches near their epipolar lines and in front of both cameras for poses to
-agree with it."""
-PARALLAX_PIXELS, ENOUGH_PARALLAX = 3.0, 10
-"""Smallest parallax (pixels) that shows on which side of the cameras a point is, and smallest number of such
-matches."""
-HALF = 0.5
-"""Fraction of the pairs that given poses must agree with; otherwise they are rejected."""
-MOST = 0.7
-"""Fraction of the pairs that a reading must agree with to be suggested."""
-ALMOST_BEST = 0.9
-"""Fraction of the best reading's pairs with which a more common one must agree to be preferred."""
-NEARLY_ALL, NOT_ALL = 0.9, 0.75
-"""Fractions of the pairs: if the given poses agree with at most the second, a reading that agrees with the
-first is right, even if the given poses agree with the majority. Some mistakes hardly show when cameras move
-in a plane."""
-FIT_ROUNDS = 10
-"""Number of reweighting iterations when fitting the axes of positions."""
-PRIOR = 1e-4
-"""Weight of the identity in fitting the axes of positions, relative to that of the matches."""
-SIMILAR = 0.03
-"""Largest difference between entries of a fitted matrix, relative to its largest, that is attributed to
-noise."""
+AGREED = 0.7
+"""Smallest fraction of a pair's matches near their epipolar lines, of those in front of both cameras, and of the pairs for a
+reading to be suggested."""
 
 
 @dataclass(frozen=True)
@@ -108,14 +78,16 @@ def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | 
     poses = SE3.stack([image.T_ref_camera for image in images])
     agrees = [bool(pair.agreeing(poses[None])[0]) for pair in pairs]
     as_given = sum(agrees)
-    if as_given > NOT_ALL * len(pairs):
+    if as_given > 0.75 * len(pairs):
         return None
     tried = [*readings(len(images)), *_fitted_positions(pairs, poses)]
-    agreeing = _agreeing(pairs, SE3.stack([reading.understand(poses) for reading in tried]))
+    understood = SE3.stack([reading.understand(poses) for reading in tried])
+    agreeing = torch.stack([pair.agreeing(understood).double() for pair in pairs]).sum(0)
     best = int(agreeing.max())
-    refused = as_given < HALF * len(pairs)
-    if best >= (MOST if refused else NEARLY_ALL) * len(pairs):
-        number = int((agreeing >= ALMOST_BEST * best).nonzero()[0, 0])
+    refused = as_given < 0.5 * len(pairs)
+    # Some mistakes hardly show when cameras move in a plane: then given poses that most pairs agree with may be wrong, too.
+    if best >= (AGREED if refused else 0.9) * len(pairs):
+        number = int((agreeing >= 0.9 * best).nonzero()[0, 0])  # a more common one that is almost the best
         return PoseContradiction(len(pairs), as_given, tried[number], int(agreeing[number]))
     if not refused:
         return None
@@ -130,7 +102,7 @@ def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | 
         for i in (pair.first, pair.second)
     }
     alike = sum(both <= sound for both in disputes)
-    return PoseContradiction(len(pairs), as_given) if as_given < HALF * (len(pairs) - alike) else None
+    return PoseContradiction(len(pairs), as_given) if as_given < 0.5 * (len(pairs) - alike) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,43 +118,30 @@ class MatchedPair:
     def agreeing(self, T: SE3) -> Bool[Tensor, "h"]:
         """Return for which poses T_world_camera (h n) the matches are near their epipolar lines and in front
         of both cameras.
+
+        Only points with enough parallax show on which side of the cameras they are. Their depths solve
+        ``a seen = b rays + moved`` in the least-squares sense along the common normal of both rays.
         """
         R_second_world = T.rotation[:, self.second].mT
-        turned = R_second_world @ T.rotation[:, self.first]
-        moved = (R_second_world @ (T.translation[:, self.first] - T.translation[:, self.second])[..., None])[
-            ..., 0
-        ]
-        rays, seen = self.seen_by_first @ turned.mT, self.seen_by_second.expand(len(moved), -1, -1)
-        lines = torch.linalg.cross(moved[:, None].expand_as(rays), rays)
+        baseline = T.translation[:, self.first] - T.translation[:, self.second]
+        moved = (R_second_world @ baseline[..., None])[:, None, :, 0]
+        rays = self.seen_by_first @ (R_second_world @ T.rotation[:, self.first]).mT
+        seen, moved = self.seen_by_second.expand_as(rays), moved.expand_as(rays)
+        lines = torch.linalg.cross(moved, rays)
         away = (lines * seen).sum(-1) / torch.linalg.vector_norm(lines[..., :2], dim=-1)
+        # Without a baseline, there are no epipolar lines, and the directions must agree.
         still = torch.linalg.vector_norm(rays[..., :2] / rays[..., 2:] - seen[..., :2], dim=-1)
-        at_rest = (
-            torch.linalg.vector_norm(moved, dim=-1) < LEAST_BASELINE
-        )  # no epipolar lines: directions must agree
+        at_rest = torch.linalg.vector_norm(moved[:, 0], dim=-1) < LEAST_BASELINE
         away = torch.where(at_rest[:, None], still, away)
-        near = (away.abs() <= max(POSE_ANGLE, POSE_PIXELS * self.pixel)).double().mean(-1) >= NEAR_LINES
-        return near & (self._in_front(rays, seen, moved) | at_rest)
-
-    def _in_front(
-        self, rays: Float[Tensor, "h m 3"], seen: Float[Tensor, "h m 3"], moved: Float[Tensor, "h 3"]
-    ) -> Bool[Tensor, "h"]:
-        """Return whether most points are in front of both cameras, judged by those with enough parallax.
-
-        The depths solve ``a seen = b rays + moved`` in the least-squares sense along the common normal of
-        both rays.
-        """
-        normal, moved = torch.linalg.cross(seen, rays), moved[:, None].expand_as(rays)
+        # Two pixels; small errors of correct poses may cause four in usual images.
+        near = (away.abs() <= max(4 / USUAL_FOCAL, 2 * self.pixel)).double().mean(-1) >= AGREED
+        normal = torch.linalg.cross(seen, rays)
         a = (torch.linalg.cross(moved, rays) * normal).sum(-1)
         b = (torch.linalg.cross(moved, seen) * normal).sum(-1)
         lengths = torch.linalg.vector_norm(seen, dim=-1) * torch.linalg.vector_norm(rays, dim=-1)
-        shows = torch.linalg.vector_norm(normal, dim=-1) / lengths > PARALLAX_PIXELS * self.pixel
+        shows = torch.linalg.vector_norm(normal, dim=-1) / lengths > 3 * self.pixel
         front = ((a > 0) & (b > 0) & shows).sum(-1)
-        return (shows.sum(-1) < ENOUGH_PARALLAX) | (front >= IN_FRONT * shows.sum(-1))
-
-
-def _agreeing(pairs: Sequence[MatchedPair], T: SE3) -> Float[Tensor, "h"]:
-    """Return how many pairs each set of poses (h n) agrees with."""
-    return torch.stack([pair.agreeing(T).double() for pair in pairs]).sum(0)
+        return near & ((shows.sum(-1) < 10) | (front >= AGREED * shows.sum(-1)) | at_rest)
 
 
 def _fitted_positions(pairs: Sequence[MatchedPair], poses: SE3) -> list[Reading]:
@@ -192,24 +151,22 @@ def _fitted_positions(pairs: Sequence[MatchedPair], poses: SE3) -> list[Reading]
     They cover positions scaled along one axis, and positions and rotations from different world frames.
     """
     found = []
-    for swapped in (False, True):
-        T = with_axes(poses, torch.tensor(Y_AND_Z_REVERSED, dtype=torch.float64)) if swapped else poses
-        for B in _fitted(pairs, T):
-            apart = bool(((B - torch.diag(B.diagonal())).abs() < SIMILAR * B.abs().max()).all())
-            scales = ", ".join(f"{value:.3g}" for value in (B.diagonal() / B[0, 0]).tolist())
+    swaps = (
+        (AS_GIVEN, "", ""),
+        (Y_AND_Z_REVERSED, ", and their cameras' y and z axes are reversed", f", and {SWAP}"),
+    )
+    for axes, also, swap in swaps:
+        for B in _fitted(pairs, changed(poses, axes)):
             clause, remedy = (
                 "their positions are in a different frame from their rotations",
                 "take both from one source",
             )
-            if apart:
+            # Noise explains entries beside the diagonal of up to 3 % of the largest.
+            if bool(((B - torch.diag(B.diagonal())).abs() < 0.03 * B.abs().max()).all()):
+                scales = ", ".join(f"{value:.3g}" for value in (B.diagonal() / B[0, 0]).tolist())
                 clause = "the axes of their positions are scaled differently"
                 remedy = f"multiply the positions, not the rotations, by about diag({scales})"
-            more = ", and their cameras' y and z axes are reversed" if swapped else ""
-
-            def understand(_: SE3, T: SE3 = T, B: Tensor = B) -> SE3:
-                return SE3(T.rotation, T.translation @ B.mT)
-
-            found.append(Reading(clause + more, remedy + (f", and {SWAP}" if swapped else ""), understand))
+            found.append(Reading(clause + also, remedy + swap, partial(changed, axes=axes, positions=B)))
     return found
 
 
@@ -243,7 +200,7 @@ def _reweighted(
 ) -> Float[Tensor, "9"]:
     """Return a robust solution of ``A b = 0``; ``solve`` solves given normal equations (9x9)."""
     share = weight
-    for _ in range(FIT_ROUNDS):
+    for _ in range(10):
         solution = solve(A.mT @ (share[:, None] * A))
         off = (A @ solution).abs()
         share = weight / (1 + (off / off.median().clamp(min=1e-9)) ** 2)
@@ -253,7 +210,7 @@ def _reweighted(
 def _near_identity(H: Float[Tensor, "9 9"]) -> Float[Tensor, "9"]:
     """Minimize ``b H b + prior |b - 1|^2`` over matrices b of trace 3."""
     identity = torch.eye(3, dtype=H.dtype).flatten()
-    prior = PRIOR * H.diagonal().mean()
+    prior = 1e-4 * H.diagonal().mean()  # of the weight of the matches
     system = torch.zeros((10, 10), dtype=H.dtype)
     system[:9, :9] = H + prior * torch.eye(9, dtype=H.dtype)
     system[:9, 9] = system[9, :9] = identity
@@ -275,30 +232,29 @@ def _pairs(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
 
 
 def _similar(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
-    """Return pairs of images that probably show the same things, judging by their strongest keypoints, most
-    similar first.
+    """Return pairs of images that probably show the same things, most similar first: each of up to 60 images with the two that
+    have most matches with it among the 300 strongest keypoints, twelve at least.
     """
-    chosen = range(0, len(images), max(1, -(-len(images) // COMPARED_IMAGES)))
-    strongest = [images[i].keypoints.descriptors[:COMPARED_KEYPOINTS] for i in chosen]
-    found: dict[tuple[int, int], int] = {}
-    for a, b in itertools.combinations(range(len(strongest)), 2):
-        found[a, b] = len(_mutual(strongest[a], strongest[b])[0])
+    chosen = range(0, len(images), max(1, -(-len(images) // 60)))
+    strongest = [images[i].keypoints.descriptors[:300] for i in chosen]
+    pairs = itertools.combinations(range(len(chosen)), 2)
+    found = {(a, b): len(_mutual(strongest[a], strongest[b])[0]) for a, b in pairs}
     kept = set[tuple[int, int]]()
-    for number in range(len(strongest)):
+    for number in range(len(chosen)):
         own = sorted((pair for pair in found if number in pair), key=lambda pair: -found[pair])
-        kept |= {pair for pair in own[:PARTNERS] if found[pair] >= SIMILAR_MATCHES}
+        kept |= {pair for pair in own[:2] if found[pair] >= 12}
     return [(chosen[a], chosen[b]) for a, b in sorted(kept, key=lambda pair: -found[pair])]
 
 
 def _mutual(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
-    """Return the indices of descriptors that are mutual nearest neighbours and pass the ratio test."""
+    """Return the indices of descriptors that are mutual nearest neighbours and pass the ratio test of Lowe 2004."""
     if min(len(a), len(b)) < 2:
         return torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long)
     distance = squared_distances(a, b)
     nearest = distance.topk(2, largest=False)
     partner = nearest.indices[:, 0]
     mutual = distance.argmin(0)[partner] == torch.arange(len(partner))
-    rows = (mutual & (nearest.values[:, 0] < RATIO**2 * nearest.values[:, 1])).nonzero()[:, 0]
+    rows = (mutual & (nearest.values[:, 0] < 0.8**2 * nearest.values[:, 1])).nonzero()[:, 0]
     return rows, partner[rows]
 
 
@@ -314,7 +270,7 @@ def matched_pair(images: Sequence[ImageKeypoints], i: int, j: int) -> MatchedPai
     pixel = max(1.0, focal / USUAL_FOCAL) / focal
     cv2.setRNGSeed(0)
     found, mask = cv2.findEssentialMat(
-        first[:, :2].numpy(), second[:, :2].numpy(), np.eye(3), cv2.RANSAC, prob=0.999, threshold=MATCH_PIXELS * pixel
+        first[:, :2].numpy(), second[:, :2].numpy(), np.eye(3), cv2.RANSAC, prob=0.999, threshold=pixel
     )  # fmt: skip
     if found is None or len(mask) != len(rows):
         return None

@@ -15,12 +15,12 @@ from bidnerf_core.captures import pose_contradiction, prepared
 
 # Inside: every reading of poses is applied and taken back, also those that no message proposes
 from bidnerf_core.captures.pose_conventions import PoseContradiction
-from bidnerf_core.captures.pose_readings import AS_GIVEN, Y_AND_Z_REVERSED, readings, signed_permutations
+from bidnerf_core.captures.pose_readings import Y_AND_Z_REVERSED as REVERSED
+from bidnerf_core.captures.pose_readings import readings
 from bidnerf_core.mapping import ImageKeypoints, posed_keypoints
 from landmark_scene import Points, looking_in, ring
 from refusals import refused
 
-REVERSED = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
 COUNT = 150  # points: as many as tell all readings apart
 CYCLED = torch.tensor([[0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
 
@@ -44,45 +44,47 @@ def judged(poses: list[SE3], noise: float = 0.4, outliers: float = 0.2) -> PoseC
     return pose_contradiction(images(Points(COUNT, noise, outliers), poses))
 
 
-def test_right_poses_are_in_the_expected_convention() -> None:
-    assert judged(true_poses()) is None
-
-
-@pytest.mark.parametrize(
-    ("axes", "inverted"), [(REVERSED, False), (REVERSED, True), (REVERSED @ REVERSED, True)]
-)
-def test_axes_of_opengl_and_inverse_matrices_are_recognised(axes: Tensor, inverted: bool) -> None:
-    found = judged([with_axes(T, axes).inverse() if inverted else with_axes(T, axes) for T in true_poses()])
+def is_explained(found: PoseContradiction | None, given: list[SE3], truth: list[SE3]) -> bool:
+    """Return whether the reading turns the given poses into the true ones."""
     assert found is not None
     assert found.reading is not None
-    assert found.reading.inverted == inverted
-    if inverted:
-        assert "inverses" in found.sentence
-    else:
-        assert found.reading.axes == Y_AND_Z_REVERSED
-        assert found.agreeing == found.pairs
-        assert found.agreeing_as_given < 0.3 * found.pairs
-        assert "diag(1, -1, -1, 1)" in found.sentence
+    return torch.allclose(found.reading.understand(SE3.stack(given)).matrix(), SE3.stack(truth).matrix())
 
 
-def test_permuted_axes_are_named() -> None:
-    found = judged([with_axes(T, CYCLED) for T in true_poses()])
+WORLDS = [SE3.identity(), SE3.exp(torch.tensor([1.0, -2.0, 0.5, 0.7, -1.1, 2.0], dtype=torch.float64))]
+
+
+@pytest.mark.parametrize("T_world", WORLDS)
+def test_right_poses_are_in_the_expected_convention_in_any_world(T_world: SE3) -> None:
+    assert judged([T_world @ pose for pose in true_poses()]) is None
+
+
+@pytest.mark.parametrize("T_world", WORLDS)
+@pytest.mark.parametrize("axes", [REVERSED, CYCLED])
+def test_other_axes_are_recognised(axes: Tensor, T_world: SE3) -> None:
+    truth = [T_world @ pose for pose in true_poses()]
+    given = [with_axes(T, axes) for T in truth]
+    found = judged(given)
+    assert is_explained(found, given, truth)
     assert found is not None
-    assert found.reading is not None
-    assert not found.reading.inverted
+    assert found.agreeing == found.pairs
+    assert found.agreeing_as_given < 0.3 * found.pairs
     # The given camera looks along the true one's x axis, so the true one's right is its forward.
-    assert "right, down and forward are the given ones' forward, right and down" in found.sentence
-    axes = torch.tensor(found.reading.axes, dtype=torch.float64)
-    assert torch.equal(CYCLED @ axes, torch.eye(3, dtype=torch.float64))
+    cycled = "right, down and forward are the given ones' forward, right and down"
+    assert (cycled if axes is CYCLED else "diag(1, -1, -1, 1)") in found.sentence
 
 
-def test_a_moved_world_changes_nothing() -> None:
-    T = SE3.exp(torch.tensor([1.0, -2.0, 0.5, 0.7, -1.1, 2.0], dtype=torch.float64))
-    assert judged([T @ pose for pose in true_poses()]) is None
-    found = judged([T @ with_axes(pose, REVERSED) for pose in true_poses()])
+@pytest.mark.parametrize("height", [0.3, 0.0])
+@pytest.mark.parametrize("axes", [torch.eye(3, dtype=torch.float64), REVERSED])
+def test_inverse_matrices_are_recognised(axes: Tensor, height: float) -> None:
+    """Also of cameras that turn about one axis only: other axes explain their rotations as well as the inverses do."""
+    points = Points(COUNT, 0.4, 0.2)
+    truth = [looking_in(0.105 * i, height * (i % 3)) for i in range(14)]
+    seen = posed_keypoints([points.view(T, seed=i) for i, T in enumerate(truth)], points)
+    given = [with_axes(T, axes).inverse() for T in truth]
+    found = pose_contradiction([replace(p, T_ref_camera=T) for p, T in zip(seen, given, strict=True)])
     assert found is not None
-    assert found.reading is not None
-    assert found.reading.axes == Y_AND_Z_REVERSED
+    assert "inverses" in found.sentence
 
 
 def test_a_few_wrong_poses_are_accepted_and_random_ones_refused_without_a_reading() -> None:
@@ -120,28 +122,9 @@ def test_right_poses_before_a_wall_are_not_refused(seed: int) -> None:
     views = [points.view(T, seed=14 * seed + i) for i, T in enumerate(poses)]
     seen = posed_keypoints(views, points)
     assert pose_contradiction(seen) is None
-    found = pose_contradiction(
-        [replace(image, T_ref_camera=with_axes(T, REVERSED)) for image, T in zip(seen, poses, strict=True)]
-    )
-    assert found is None or found.reading is None or found.reading.axes == Y_AND_Z_REVERSED
-
-
-@pytest.mark.parametrize("axes", [torch.eye(3, dtype=torch.float64), REVERSED])
-def test_inverse_matrices_of_cameras_on_one_level_are_not_called_axes(axes: Tensor) -> None:
-    """Cameras that turn about one axis only: other axes explain their rotations as well as the inverses do."""
-    points = Points(COUNT, 0.4)
-    poses = [looking_in(0.105 * i, 0.0) for i in range(14)]
-    views = [points.view(T, seed=i) for i, T in enumerate(poses)]
-    seen = posed_keypoints(views, points)
-    found = pose_contradiction(
-        [
-            replace(image, T_ref_camera=with_axes(T, axes).inverse())
-            for image, T in zip(seen, poses, strict=True)
-        ]
-    )
-    assert found is not None
-    assert found.reading is not None
-    assert found.reading.inverted
+    given = [with_axes(T, REVERSED) for T in poses]
+    found = pose_contradiction([replace(p, T_ref_camera=T) for p, T in zip(seen, given, strict=True)])
+    assert found is None or found.reading is None or is_explained(found, given, poses)
 
 
 def test_pure_rotation_and_pure_translation_are_not_refused() -> None:
@@ -154,21 +137,12 @@ def test_pure_rotation_and_pure_translation_are_not_refused() -> None:
 
 
 def test_images_that_share_nothing_tell_nothing() -> None:
-    found = images(Points(), [with_axes(T, REVERSED) for T in true_poses()])
     generator = torch.Generator().manual_seed(0)
-    blind = [
-        replace(
-            image,
-            keypoints=replace(
-                image.keypoints,
-                descriptors=torch.randint(
-                    0, 256, image.keypoints.descriptors.shape, generator=generator, dtype=torch.uint8
-                ),
-            ),
-        )
-        for image in found
-    ]
-    assert pose_contradiction(blind) is None
+    points = Points(COUNT)
+    found = images(points, [with_axes(T, REVERSED) for T in true_poses()])
+    for image in found:
+        image.keypoints.descriptors.random_(0, 256, generator=generator)
+    assert pose_contradiction(found) is None
     assert pose_contradiction([]) is None
 
 
@@ -253,15 +227,12 @@ def test_images_in_no_order_are_judged_as_well() -> None:
     assert contradiction.agreeing_as_given < 0.5 * contradiction.pairs
 
 
-def test_every_reading_has_words_and_moves_with_the_world() -> None:
+def test_every_reading_has_words_and_keeps_the_number_of_poses() -> None:
     T = SE3.stack(irregular_poses())
     for reading in readings(14):
         assert reading.clause
         assert reading.remedy
         assert reading.understand(T).rotation.shape == (14, 3, 3)
-    assert len(signed_permutations(1)) == len(set(signed_permutations(1))) == 24
-    assert AS_GIVEN in signed_permutations(1)
-    assert AS_GIVEN not in signed_permutations(-1)
 
 
 def test_training_refuses_contradicting_poses_unless_they_are_trusted() -> None:
