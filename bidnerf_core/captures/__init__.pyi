@@ -2,7 +2,6 @@ from .advice import sentences as sentences
 from .advice import summary as summary
 from .cameras import MatrixRows as MatrixRows
 from .cameras import MovedCamera as MovedCamera
-from .cameras import PoseConsistency as PoseConsistency
 from .cameras import PoseRefinement as PoseRefinement
 from .cameras import RowMotion as RowMotion
 from .cameras import StoredCamera as StoredCamera

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 
@@ -15,10 +15,6 @@ from bidnerf_core.camera import Intrinsics, Orientation
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, multiplied
-
-LARGEST_NOISE = 1e6  # pixels
-MOST_NAMED = 6
-"""Largest number of images named in a sentence."""
 
 MatrixRows = tuple[tuple[float, float, float, float], ...]
 """The rows of a 4x4 matrix."""
@@ -47,22 +43,20 @@ class StoredCamera:
 
     def translated(self, offset: Float[Tensor, "3"]) -> StoredCamera:
         """Return the camera in a parallel world frame in which positions have ``offset`` added."""
-        given = self.given_T_world_camera
-        moved = None if given is None else _rows(_pose(given).translated(offset))
-        return replace(self, T_world_camera=_rows(self.pose.translated(offset)), given_T_world_camera=moved)
+        return self._mapped(lambda rows: _rows(_pose(rows).translated(offset)))
 
     def scaled(self, factor: float) -> StoredCamera:
         """Return the camera in a world with lengths multiplied by ``factor``."""
+        motion = self.motion and (*multiplied(self.motion[:3], factor), *self.motion[3:])
+        scaled = self._mapped(lambda rows: (*((a, b, c, t * factor) for a, b, c, t in rows[:3]), rows[3]))
+        return replace(scaled, motion=motion)
 
-        def rows(matrix: MatrixRows) -> MatrixRows:
-            return (*((a, b, c, t * factor) for a, b, c, t in matrix[:3]), matrix[3])
-
-        given, motion = self.given_T_world_camera, self.motion
+    def _mapped(self, change: Callable[[MatrixRows], MatrixRows]) -> StoredCamera:
+        given = self.given_T_world_camera
         return replace(
             self,
-            T_world_camera=rows(self.T_world_camera),
-            given_T_world_camera=None if given is None else rows(given),
-            motion=None if motion is None else (*multiplied(motion[:3], factor), *motion[3:]),
+            T_world_camera=change(self.T_world_camera),
+            given_T_world_camera=None if given is None else change(given),
         )
 
     def posed(self, view: View) -> View:
@@ -83,29 +77,23 @@ class MovedCamera:
 
 
 @dataclass(frozen=True)
-class PoseConsistency:
-    """How well the given and the adjusted poses fit the keypoints that images share."""
+class PoseRefinement:
+    """How well the given and the adjusted poses fit the keypoints that images share, and which poses training used."""
 
     noise_before: float  # pixels: standard deviation of reprojection errors at the given poses
     noise_after: float
+    refined: bool = False  # whether training used the adjusted poses
+    replaced: tuple[str, ...] = ()  # images with a wrong given pose, localized with the others' landmarks
 
     def __post_init__(self) -> None:
         for value in (self.noise_before, self.noise_after):
-            if not 0 <= value <= LARGEST_NOISE:
-                raise InputError(f"the keypoint noise is {value}", expected=f"0 to {LARGEST_NOISE:g} pixels")
+            if not 0 <= value <= 1e6:
+                raise InputError(f"the keypoint noise is {value}", expected="0 to 1e+06 pixels")
 
     @property
     def inconsistency(self) -> float:
         """Standard deviation (pixels) that errors of the given poses add to the keypoints' own noise."""
         return max(0.0, self.noise_before**2 - self.noise_after**2) ** 0.5
-
-
-@dataclass(frozen=True)
-class PoseRefinement(PoseConsistency):
-    """Consistency of the given poses of a map's images, and which poses training used."""
-
-    refined: bool  # whether training used the adjusted poses
-    replaced: tuple[str, ...] = ()  # images with a wrong given pose, localized with the others' landmarks
 
 
 def poses_of(cameras: Sequence[StoredCamera]) -> SE3:
@@ -116,7 +104,12 @@ def poses_of(cameras: Sequence[StoredCamera]) -> SE3:
 def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
     """Convert training views to cameras as stored in ``map.json``."""
     return tuple(
-        StoredCamera(v.frame.name, v.frame.intrinsics, _rows(v.T_ref_camera), motion=_six(v.motion))
+        StoredCamera(
+            v.frame.name,
+            v.frame.intrinsics,
+            _rows(v.T_ref_camera),
+            motion=None if v.motion is None else (*v.motion.tolist(),),
+        )
         for v in views
     )
 
@@ -142,90 +135,63 @@ def moved_from(
 
 def with_wrong_pose(cameras: Sequence[StoredCamera]) -> list[str]:
     """Return the names of cameras whose given or refined pose is not a rigid transform."""
-    poses = [
-        (c.name, rows)
+    return [
+        c.name
         for c in cameras
-        for rows in (c.T_world_camera, c.given_T_world_camera)
-        if rows is not None
+        for rows in {c.T_world_camera, c.given_T_world_camera or c.T_world_camera}
+        if len(rows) != 4 or not bool(_pose(rows).is_rigid())
     ]
-    wrong = {name for name, rows in poses if len(rows) != 4}
-    if poses and not wrong:
-        rigid = _pose([rows for _, rows in poses]).is_rigid().tolist()
-        wrong = {name for (name, _), sound in zip(poses, rigid, strict=True) if not sound}
-    return [camera.name for camera in cameras if camera.name in wrong]
 
 
 def pose_updates(cameras: Sequence[StoredCamera]) -> list[Float[Tensor, "6"] | None]:
     """Return the right updates (translation in metres first) from given to refined poses; None for unchanged
     poses.
     """
-    pairs = [
-        (c.given_T_world_camera, c.T_world_camera) for c in cameras if c.given_T_world_camera is not None
+    return [
+        None if c.given_T_world_camera is None else (_pose(c.given_T_world_camera).inverse() @ c.pose).log()
+        for c in cameras
     ]
-    if not pairs:
-        return [None] * len(cameras)
-    given, refined = (_pose([pair[i] for pair in pairs]) for i in (0, 1))
-    updates = iter((given.inverse() @ refined).log())
-    return [None if camera.given_T_world_camera is None else next(updates) for camera in cameras]
 
 
 def moved_cameras(cameras: Sequence[StoredCamera]) -> list[MovedCamera]:
     """Return how far refinement moved the cameras whose poses it changed."""
-    found = []
-    for camera, update in zip(cameras, pose_updates(cameras), strict=True):
-        if update is not None:
-            metres, radians = torch.linalg.vector_norm(update.reshape(2, 3), dim=-1).tolist()
-            found.append(
-                MovedCamera(
-                    camera.name, metres, math.degrees(radians), camera.moved_pixels or 0.0, camera.motion
-                )
-            )
-    return found
+    return [
+        MovedCamera(c.name, float(u[:3].norm()), math.degrees(u[3:].norm()), c.moved_pixels or 0.0, c.motion)
+        for c, u in zip(cameras, pose_updates(cameras), strict=True)
+        if u is not None
+    ]
 
 
 def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> list[str]:
     """Return a sentence or two on the consistency of the given poses and how far they were moved."""
-    moved = moved_cameras(cameras)
+    moved = sorted(moved_cameras(cameras), key=lambda m: m.pixels, reverse=True)
     wrong = [m for m in moved if m.name in found.replaced]
     motions = [camera.motion for camera in cameras if camera.motion is not None]
-    cause = (
-        "errors of the given poses and camera motion during readout"
-        if motions
-        else "errors of the given poses"
-    )
-    error = f"{cause} add {found.inconsistency:.2f} px to the {found.noise_after:.2f} px of keypoints"
-    refined = found.refined and moved
-    kept = "the other poses are kept" if wrong else "the poses are kept"
-    lines = [f"{error}; {_typical_motion(moved)}" if refined else f"{error}; {kept}"]
+    cause = "errors of the given poses" + (" and camera motion during readout" if motions else "")
+    result = "the other poses are kept" if wrong else "the poses are kept"
+    if found.refined and moved:
+        metres, degrees, pixels = (
+            median(getattr(m, name) for m in moved) for name in ("translation", "rotation_deg", "pixels")
+        )
+        most = moved[0]
+        result = (
+            f"the poses are refined by {metres:.3g} and {degrees:.2g}° or {pixels:.1f} px (median), {most.name} most,"
+            f" by {most.translation:.3g} and {most.rotation_deg:.2g}° or {most.pixels:.1f} px"
+        )
+    lines = [
+        f"{cause} add {found.inconsistency:.2f} px to the {found.noise_after:.2f} px of keypoints; {result}"
+    ]
     if motions:
-        metres, degrees = _sizes(motions)
+        metres, radians = (median(math.hypot(*m[part]) for m in motions) for part in (slice(3), slice(3, 6)))
         lines.append(
             f"the images have a rolling shutter: during the readout the camera moved by {metres:.2g} and"
-            f" {degrees:.2g}° (median)"
+            f" {math.degrees(radians):.2g}° (median)"
         )
     if wrong:
-        most = sorted(wrong, key=lambda m: m.pixels, reverse=True)[:MOST_NAMED]
-        listed = ", ".join(f"{m.name} by {m.translation:.3g} and {m.rotation_deg:.2g}°" for m in most)
-        listed += f" and {len(wrong) - MOST_NAMED} more" if len(wrong) > MOST_NAMED else ""
+        listed = ", ".join(f"{m.name} by {m.translation:.3g} and {m.rotation_deg:.2g}°" for m in wrong[:6])
+        listed += f" and {len(wrong) - 6} more" if len(wrong) > 6 else ""
         lines.append(f"moved to the poses given by the landmarks of the other images: {listed}")
     return lines
-
-
-def _sizes(motions: Sequence[RowMotion]) -> tuple[float, float]:
-    """Return the median translation (metres) and rotation (degrees)."""
-    lengths = torch.linalg.vector_norm(torch.tensor(motions).unflatten(-1, (2, 3)), dim=-1)
-    return median(lengths[:, 0].tolist()), math.degrees(median(lengths[:, 1].tolist()))
-
-
-def _typical_motion(moved: Sequence[MovedCamera]) -> str:
-    typical = [
-        median(part) for part in zip(*((m.translation, m.rotation_deg, m.pixels) for m in moved), strict=True)
-    ]
-    most = max(moved, key=lambda m: m.pixels)
-    return (
-        f"the poses are refined by {typical[0]:.3g} and {typical[1]:.2g}° or {typical[2]:.1f} px (median), {most.name} most,"
-        f" by {most.translation:.3g} and {most.rotation_deg:.2g}° or {most.pixels:.1f} px"
-    )
 
 
 def at_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -> list[View]:
@@ -236,13 +202,6 @@ def at_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -> l
     known = {(c.name, c.given_T_world_camera): c for c in cameras if c.given_T_world_camera}
     found = [known.get((view.frame.name, _rows(view.T_ref_camera))) for view in views]
     return [view if c is None else c.posed(view) for view, c in zip(views, found, strict=True)]
-
-
-def _six(motion: Float[Tensor, "6"] | None) -> RowMotion | None:
-    if motion is None:
-        return None
-    a, b, c, d, e, f = motion.tolist()
-    return a, b, c, d, e, f
 
 
 def _rows(T: SE3) -> MatrixRows:

@@ -56,7 +56,14 @@ def readings(count: int) -> tuple[Reading, ...]:
     """Return the readings of ``count`` poses, common ones first: among those that fit equally well, the first
     is preferred.
     """
-    return (*_of_axes(), *_of_parts(), *_of_quaternions(), *_of_worlds(), *_of_positions(), *_of_orders(count))
+    return (
+        *_of_axes(),
+        *_of_parts(),
+        *_of_quaternions(),
+        *_of_worlds(),
+        *_of_positions(),
+        *_of_orders(count),
+    )
 
 
 def _of_axes() -> Iterator[Reading]:
@@ -177,9 +184,7 @@ def _of_orders(count: int) -> Iterator[Reading]:
     orders = [(f"each is that of {words}", range(-by, count - by)) for by, words in shifts.items()]
     orders.append(("they are in the reverse order of the images", range(count)[::-1]))
     for clause, order in [*orders, *_text_orders(count)]:
-        yield from _in_file_axes(
-            clause, "reassign the poses to the images", partial(understand, order=order)
-        )
+        yield from _in_file_axes(clause, "reassign the poses to the images", partial(understand, order=order))
 
 
 def _text_orders(count: int) -> Iterator[tuple[str, Sequence[int]]]:
@@ -203,9 +208,7 @@ def _in_file_axes(clause: str, remedy: str, understand: Understand) -> Iterator[
         yield Reading(clause, remedy, partial(whole, before=axes[0], after=axes[1]))
     for axes in ((AS_GIVEN, Y_AND_Z_REVERSED), (Y_AND_Z_REVERSED, AS_GIVEN)):
         also = ", and their cameras' y and z axes are reversed"
-        yield Reading(
-            clause + also, f"{remedy}, then {SWAP}", partial(whole, before=axes[0], after=axes[1])
-        )
+        yield Reading(clause + also, f"{remedy}, then {SWAP}", partial(whole, before=axes[0], after=axes[1]))
 
 
 def signed_permutations(determinant: int) -> list[Float[Tensor, "3 3"]]:

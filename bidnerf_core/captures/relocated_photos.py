@@ -1,4 +1,6 @@
-"""Photos of a capture with suspicious poses, localized with the landmarks of the other photos."""
+"""Links between the photos of a capture that show the same things, and photos with suspicious poses, localized with the
+landmarks of the others.
+"""
 
 from __future__ import annotations
 
@@ -6,38 +8,48 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from bidnerf_core.captures.links import LEAST_GROUP, groups
 from bidnerf_core.captures.pose_conventions import matched_pair
 from bidnerf_core.captures.report import PhotoProblem, PhotoRecord
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import MIRROR, Answer, LandmarkMatcher, Loop, Outcome
+from bidnerf_core.localization import MIRROR, LandmarkMatcher, Loop, Outcome
 from bidnerf_core.mapping import ImageKeypoints, LandmarkConfig, TrackedKeypoints, TrackedViews
 
-TELLING = (Outcome.CONVERGED, Outcome.AMBIGUOUS, Outcome.MIRRORED)
-"""Outcomes of a localization that determine the pose, or which poses look the same."""
-SUSPECT = 0.5
-"""A photo is suspect if the fraction of its keypoints that are landmarks is below this multiple of the median
-of its group."""
-MOST_SUSPECTS = 32
-"""Largest number of photos that are relocalized."""
-POSE_DEVIATIONS, POSE_PIXELS = 6.0, 4.0
-"""Standard deviations, and pixels of image motion, by which a bad pose differs at least from the pose given
-by landmarks.
+LEAST_GROUP = 3
+"""Smallest number of linked photos that form a group."""
 
-The latter is twice as far as a match may lie from its epipolar line.
-"""
-TURNED_ANGLE = 60.0
-"""Smallest rotation about the optical axis, in degrees, at which a photo counts as rotated rather than badly
-posed."""
-ALONG_AXIS = 0.9
-"""Smallest cosine between that rotation's axis and the optical axis."""
+
+def linked(seen: TrackedKeypoints) -> csr_array:
+    """Return the pairs of images that share enough landmarks, in both directions, as a sparse matrix (v, v).
+
+    ``seen`` are the keypoints consistent with their points. Five landmarks link two photos: photos of different places share
+    one by chance, seldom two, as a match has to lie on the epipolar line, stand out from all others, and agree on a point
+    in front of both cameras.
+    """
+    shape = (len(seen.images), max(1, seen.count))
+    ones = np.ones(len(seen.point), np.int32)
+    shows = csr_array((ones, (seen.image.numpy(), seen.point.numpy())), shape=shape)
+    shared = (shows @ shows.T).tocoo()
+    row, column = shared.coords
+    enough = (shared.data >= 5) & (row != column)
+    links = np.ones(int(enough.sum()), bool), (row[enough], column[enough])
+    return csr_array(links, shape=(len(seen.images),) * 2)
+
+
+def groups(links: csr_array) -> Int[Tensor, "v"]:
+    """Return the group of each image, 0 for the largest; -1 if too few images are linked to form one."""
+    label = torch.from_numpy(connected_components(links, directed=False)[1]).long()
+    sizes = torch.bincount(label)
+    rank = sizes.argsort(descending=True, stable=True).argsort()
+    return torch.where(sizes >= LEAST_GROUP, rank, -1)[label]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +63,16 @@ class Relocation:
 
     @property
     def problem(self) -> PhotoProblem | None:
+        """What is wrong with the given pose: it is off by at least six standard deviations, and by four pixels, which is twice
+        as far as a match may lie from its epipolar line.
+        """
         angle = float(torch.linalg.vector_norm(self.update[3:]))
         if self.mirrored:
             return "mirrored"
-        if self.deviations < POSE_DEVIATIONS or self.pixels < POSE_PIXELS:
+        if self.deviations < 6 or self.pixels < 4:
             return None
-        about_axis = abs(float(self.update[5])) >= ALONG_AXIS * angle
-        return "turned" if about_axis and math.degrees(angle) >= TURNED_ANGLE else "badly posed"
+        about_axis = abs(float(self.update[5])) >= 0.9 * angle  # the optical axis
+        return "turned" if about_axis and math.degrees(angle) >= 60 else "badly posed"
 
     def onto(self, record: PhotoRecord) -> PhotoRecord:
         """Return the record with the error of its given pose filled in; a mirrored photo's pose cannot be
@@ -73,10 +88,10 @@ class Relocation:
 
 
 def suspects(seen: TrackedKeypoints, links: csr_array) -> list[int]:
-    """Return the photos whose given poses the others do not support; ``links`` are those of ``linked``.
+    """Return the photos whose given poses the others do not support, 32 at most; ``links`` are those of ``linked``.
 
-    A photo is suspect if it belongs to no group, or shows far fewer landmarks than is usual in its group,
-    unless enough photos agree with its pose. Photos that agree among themselves are not suspect even if they
+    A photo is suspect if it belongs to no group, or fewer of its keypoints are landmarks than half the fraction that is usual
+    in its group, unless enough photos agree with its pose. Photos that agree among themselves are not suspect even if they
     are linked to none of the others: a place that looks like another is more likely than the same error in
     all of them.
     """
@@ -88,10 +103,9 @@ def suspects(seen: TrackedKeypoints, links: csr_array) -> list[int]:
     doubtful = group < 0
     for number in range(int(group.max()) + 1):
         own = group == number
-        doubtful |= own & (share < SUSPECT * share[own].median())
+        doubtful |= own & (share < 0.5 * share[own].median())
     found = [i for i in doubtful.nonzero()[:, 0].tolist() if not _has_support(seen.images, links, i)]
-    step = max(1.0, len(found) / MOST_SUSPECTS)
-    return [found[int(i * step)] for i in range(min(len(found), MOST_SUSPECTS))]
+    return [found[int(i * max(1.0, len(found) / 32))] for i in range(min(len(found), 32))]
 
 
 def _has_support(images: Sequence[ImageKeypoints], links: csr_array, number: int) -> bool:
@@ -127,20 +141,21 @@ def relocated(
         return {}
     answers: dict[int, Relocation] = {}
     for number in numbers:
-        features = tracked.detector_of(views[number], number)
-        found = Loop([View(views[number].frame, SE3.identity())], matcher, features=features)()
-        if found is not None and found.verdict.outcome in TELLING:
-            answers[number] = _compared(found, views[number])
+        view, features = views[number], tracked.detector_of(views[number], number)
+        found = Loop([View(view.frame, SE3.identity())], matcher, features=features)()
+        # Only these outcomes determine the pose, or which poses look the same.
+        telling = (Outcome.CONVERGED, Outcome.AMBIGUOUS, Outcome.MIRRORED)
+        if found is None or found.verdict.outcome not in telling:
+            continue
+        mirrored = found.verdict.outcome is Outcome.MIRRORED
+        others = [found.posterior.place(g) for g, mode in enumerate(found.modes) if mode.name != MIRROR]
+        given = view.T_ref_camera.to("cpu", torch.float64).inverse()
+        updates = [(given @ T).log() for T in (found.T_world_rig, *([] if mirrored else others))]
+        update = min(updates, key=lambda each: float(each[:3].norm()))
+        deviations = float((update @ torch.linalg.solve(found.covariance, update)).clamp(min=0).sqrt())
+        pixels = image_motion(update, view, found.distance)
+        answers[number] = Relocation(update, deviations, pixels, mirrored)
     return answers
-
-
-def _compared(found: Answer, view: View) -> Relocation:
-    T, mirrored = view.T_ref_camera.to("cpu", torch.float64), found.verdict.outcome is Outcome.MIRRORED
-    places = [found.posterior.place(g) for g, mode in enumerate(found.modes) if mode.name != MIRROR]
-    poses = [found.T_world_rig] if mirrored else [found.T_world_rig, *places]
-    update = min(((T.inverse() @ pose).log() for pose in poses), key=lambda each: float(each[:3].norm()))
-    deviations = float((update @ torch.linalg.solve(found.covariance, update)).clamp(min=0).sqrt())
-    return Relocation(update, deviations, image_motion(update, view, found.distance), mirrored)
 
 
 def image_motion(update: Float[Tensor, "6"], view: View, distance: float) -> float:

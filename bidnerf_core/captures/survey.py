@@ -9,7 +9,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from bidnerf_core.captures.coverage import coverage
-from bidnerf_core.captures.links import groups, linked
 from bidnerf_core.captures.photos import (
     LEAST_BLUR,
     Nearby,
@@ -20,7 +19,14 @@ from bidnerf_core.captures.photos import (
     photo_measures,
     standing_out,
 )
-from bidnerf_core.captures.relocated_photos import Relocation, image_motion, relocated, suspects
+from bidnerf_core.captures.relocated_photos import (
+    Relocation,
+    groups,
+    image_motion,
+    linked,
+    relocated,
+    suspects,
+)
 from bidnerf_core.captures.report import CaptureReport, PhotoProblem, PhotoRecord
 from bidnerf_core.captures.up_direction import UpDirection
 from bidnerf_core.frames import View

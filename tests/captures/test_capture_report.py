@@ -28,8 +28,8 @@ from bidnerf_core.captures import (
 
 # Inside: the measures of single photos and pairs, of which a report gives only the remarks
 from bidnerf_core.captures.advice import SUMMARY_LINES
-from bidnerf_core.captures.links import groups
 from bidnerf_core.captures.photos import exposures, nearby, photo_measures
+from bidnerf_core.captures.relocated_photos import groups
 from bidnerf_core.fields import render_image
 from bidnerf_core.geometry import look_at
 from bidnerf_core.io import from_plain, to_plain

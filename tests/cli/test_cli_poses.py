@@ -14,7 +14,7 @@ import torch
 
 import tiny
 from bidnerf_core import SE3, View
-from bidnerf_core.captures import PoseConsistency, TrainingPoses, as_given, stored_cameras
+from bidnerf_core.captures import PoseRefinement, TrainingPoses, as_given, stored_cameras
 from bidnerf_core.captures import prepared as prepared_for_training
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import DatasetOptions, open_dataset
@@ -35,7 +35,7 @@ def refine_poses(patch: pytest.MonkeyPatch) -> None:
         pixels = torch.full((len(views),), 0.9, dtype=torch.float64)
         pixels[2] = 1.4
         there = tracked.at(tracked.T_world_camera.retract(UPDATE))
-        return TrainingPoses(there, pixels, [1], True, PoseConsistency(0.7, 0.36))
+        return TrainingPoses(there, pixels, [1], True, PoseRefinement(0.7, 0.36))
 
     patch.setattr("bidnerf_core.captures.training_views.training_poses", moved)
 
