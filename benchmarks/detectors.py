@@ -40,11 +40,11 @@ from _lab import (
 from query_conditions import resized
 
 from bidnerf_core import SE3, Frame, View
-from bidnerf_core.captures import build_tried_landmarks
+from bidnerf_core.captures import tried_landmarks
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.evaluation import RowStore
 from bidnerf_core.localization import LandmarkMatcher, Loop
-from bidnerf_core.mapping import Features, find_features
+from bidnerf_core.mapping import Features, find_features, tracked_views
 from bidnerf_core.results import normalized_error_squared, pose_error
 
 EVERY = (2, 4, 8, 16)
@@ -112,7 +112,7 @@ class Maps:
     def __getitem__(self, name: str) -> LandmarkMatcher:
         if name not in self._built:
             views = self._data.views("train", self._names)
-            self._built[name] = LandmarkMatcher(build_tried_landmarks(views, detector(name)))
+            self._built[name] = LandmarkMatcher(tried_landmarks(tracked_views(views, detector(name)), views))
         return self._built[name]
 
 

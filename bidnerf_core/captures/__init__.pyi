@@ -29,7 +29,6 @@ from .training_poses import TrainingPoses as TrainingPoses
 from .training_views import RefinementChoice as RefinementChoice
 from .training_views import located as located
 from .training_views import prepared as prepared
-from .trial import build_tried_landmarks as build_tried_landmarks
 from .trial import tried_landmarks as tried_landmarks
 from .up_direction import UpDirection as UpDirection
 from .up_direction import given_up as given_up

@@ -182,7 +182,10 @@ def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> li
         f"{cause} add {found.inconsistency:.2f} px to the {found.noise_after:.2f} px of keypoints; {result}"
     ]
     if motions:
-        metres, radians = (median(math.hypot(*m[part]) for m in motions) for part in (slice(3), slice(3, 6)))
+        metres, radians = (
+            median(math.hypot(*m[:3]) for m in motions),
+            median(math.hypot(*m[3:]) for m in motions),
+        )
         lines.append(
             f"the images have a rolling shutter: during the readout the camera moved by {metres:.2g} and"
             f" {math.degrees(radians):.2g}° (median)"

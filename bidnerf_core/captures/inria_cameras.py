@@ -25,12 +25,19 @@ def write_inria_cameras(folder: Path, cameras: Sequence[StoredCamera]) -> list[P
     """
     if not cameras:
         return []
-    rows = []
-    for number, camera in enumerate(cameras):
-        lens, pose = camera.intrinsics, camera.pose
-        row = {"id": number, "img_name": camera.name, "width": lens.width, "height": lens.height}
-        place = {"position": pose.translation.tolist(), "rotation": pose.rotation.tolist()}
-        rows.append({**row, **place, "fx": lens.fx, "fy": lens.fy})
+    rows = [
+        {
+            "id": number,
+            "img_name": camera.name,
+            "width": camera.intrinsics.width,
+            "height": camera.intrinsics.height,
+            "position": camera.pose.translation.tolist(),
+            "rotation": camera.pose.rotation.tolist(),
+            "fx": camera.intrinsics.fx,
+            "fy": camera.intrinsics.fy,
+        }
+        for number, camera in enumerate(cameras)
+    ]
     write_file(folder / NAME, (json.dumps(rows) + "\n").encode())
     return [folder / NAME]
 

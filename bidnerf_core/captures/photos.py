@@ -18,47 +18,19 @@ from bidnerf_core.mapping import TrackedKeypoints, likely_pairs
 
 LARGEST = 800
 """Pixels along the longer side to which photos are downscaled: finer detail is of no use to a map."""
-FINE, COARSE = 1.0, 4.0
-"""Standard deviations (pixels) of the Gaussians for the two scales whose energies are compared. The finer one
-suppresses noise, which would be mistaken for detail.
+COARSE = 4
+"""Standard deviation (pixels) of the Gaussian for the coarser of the two scales whose energies are compared. That of the finer is
+one, which suppresses noise that would be mistaken for detail.
 """
-SHARPNESS_STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))
-"""Directions (rows, columns) of the second differences; motion blur affects only one of them."""
-DARKEST = 2 / 255
-"""Brightness below which pixels count as equally dark, since quantization leaves nothing to compare."""
-OVEREXPOSED, UNDEREXPOSED = 254 / 255, 4 / 255
-"""Brightness of the brightest channel from which up, or from which down, a pixel is clipped."""
-GAMMA = 2.2
-"""Exponent that converts image values to linear light, approximately that of sRGB."""
-ENOUGH_SHARED = 10
-"""Smallest number of landmarks from which a photo's exposure is estimated; with fewer, whole images are
-compared."""
-BRIGHTNESS_ROUNDS = 20
-"""Number of alternations between the brightness of landmarks and the exposure of photos."""
-NEIGHBOURS = 8
-"""Number of nearby photos with which a photo is compared."""
-LEAST_SHOWN = 0.02
-"""Smallest fraction of a photo's pixels, away from masked ones, that suffices to measure its sharpness."""
-LEAST_BLUR = 0.5
-"""Smallest lack of fine detail, in octaves of its energy, at which a photo counts as blurred."""
-OUTLYING = 4.0
-"""Robust standard deviations from the other photos of the capture beyond which a photo is an outlier."""
 
 
-@dataclass(frozen=True, eq=False)
-class PhotoMeasures:
-    """Measurements of photos, one of each kind per photo."""
+def photo_measures(views: Sequence[View]) -> Float[Tensor, "4 v"]:
+    """Measure each photo on its own.
 
-    sharpness: Float[Tensor, "v"]  # log2 of fine over coarse energy, in the direction where it is smallest
-    brightness: Float[Tensor, "v"]  # log2 of the median linear brightness
-    overexposed: Float[Tensor, "v"]  # fraction of the pixels
-    underexposed: Float[Tensor, "v"]
-
-
-def photo_measures(views: Sequence[View]) -> PhotoMeasures:
-    """Measure each photo on its own."""
-    rows = torch.tensor([_measured(view.frame) for view in views], dtype=torch.float64).reshape(-1, 4)
-    return PhotoMeasures(*rows.unbind(-1))
+    Returns the sharpness (see ``sharpness``), the brightness (log2 of the median linear brightness), and the fractions of the
+    pixels that are overexposed and underexposed: with the brightest channel at either end of its range.
+    """
+    return torch.tensor([_measured(view.frame) for view in views], dtype=torch.float64).reshape(-1, 4).mT
 
 
 def detail_kept(views: Sequence[View]) -> Float[Tensor, "v"]:
@@ -67,15 +39,18 @@ def detail_kept(views: Sequence[View]) -> Float[Tensor, "v"]:
     It is 1 for all photos except outliers that are blurred.
     """
     found = torch.tensor([sharpness(_clean(v.frame.rgb).mean(-1), v.frame.hidden) for v in views])
-    lacking = -above_neighbours(found, nearby(views))
-    return torch.where(standing_out(lacking, LEAST_BLUR), torch.exp2(-lacking), 1.0)
+    lacking = -nearby(views).excess(found)
+    return torch.where(blurred(lacking), torch.exp2(-lacking), 1.0)
+
+
+def blurred(lacking: Float[Tensor, "v"]) -> Bool[Tensor, "v"]:
+    """Return which photos lack fine detail (octaves of its energy) compared with nearby ones, and with most others."""
+    return standing_out(lacking, 0.5)
 
 
 def standing_out(values: Float[Tensor, "v"], least: float) -> Bool[Tensor, "v"]:
-    """Return which values exceed both ``least`` and ``OUTLYING`` robust standard deviations (about zero) of
-    all values.
-    """
-    return values > max(least, OUTLYING * mad_deviation(values))
+    """Return which values exceed both ``least`` and four robust standard deviations (about zero) of all values."""
+    return values > max(least, 4 * mad_deviation(values))
 
 
 def _measured(frame: Frame) -> tuple[float, float, float, float]:
@@ -85,58 +60,52 @@ def _measured(frame: Frame) -> tuple[float, float, float, float]:
     shown = image[inside] if inside.any() else image.reshape(-1, 3)
     brightest = shown.max(-1)
     light = float(np.median(log_light(shown.mean(-1))))
-    return sharpness(image.mean(-1), frame.hidden), light, float((brightest >= OVEREXPOSED).mean()), float(
-        (brightest <= UNDEREXPOSED).mean()
+    return sharpness(image.mean(-1), frame.hidden), light, float((brightest >= 254 / 255).mean()), float(
+        (brightest <= 4 / 255).mean()
     )  # fmt: skip
 
 
 def log_light(values: np.ndarray) -> np.ndarray:
-    """Return log2 of the linear light of image values in [0, 1]."""
-    return GAMMA * np.log2(np.maximum(values, DARKEST))
+    """Return log2 of the linear light of image values in [0, 1].
+
+    The exponent is approximately that of sRGB. Quantization makes the darkest pixels incomparable: they count as equal.
+    """
+    return 2.2 * np.log2(np.maximum(values, 2 / 255))
 
 
 def sharpness(grey: np.ndarray, hidden: Bool[Tensor, "h w"] | None = None) -> float:
-    """Return log2 of the ratio of fine to coarse energy, in which contrast cancels; the smallest of four
-    directions.
+    """Return log2 of the ratio of fine to coarse energy, in which contrast cancels.
 
-    Pixels affected by ``hidden`` ones are ignored, unless no others are left.
+    It is the smallest of four directions, as motion blur affects only one of them. Pixels affected by ``hidden`` ones are
+    ignored, unless hardly any others are left.
     """
-    shown: np.ndarray | None = None if hidden is None else (~hidden.cpu().numpy()).astype(np.float32)
     size = reduced_size(grey.shape[1], grey.shape[0], LARGEST)
     if size != grey.shape[::-1]:
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-        shown = None if shown is None else cv2.resize(shown, size, interpolation=cv2.INTER_AREA)
-    counted = None if shown is None else _away_from_hidden(shown)
-    fine, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (FINE, COARSE))
+    counted = None
+    if hidden is not None:
+        shown = cv2.resize((~hidden.cpu().numpy()).astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        reach = np.ones((6 * COARSE + 1,) * 2, np.uint8)  # of the blur, to both sides, plus the differences
+        away = cv2.erode((shown >= 1).astype(np.uint8), reach) > 0
+        counted = away if away.mean() >= 0.02 else None
+    fine, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1.0, COARSE))
     ratios = [
-        _energy(fine, step, 1, counted) / max(_energy(coarse, step, int(COARSE), counted), 1e-12)
-        for step in SHARPNESS_STEPS
+        _energy(fine, rows, columns, 1, counted) / max(_energy(coarse, rows, columns, COARSE, counted), 1e-12)
+        for rows, columns in ((0, 1), (1, 0), (1, 1), (1, -1))
     ]
     return float(np.log2(max(min(ratios), 1e-12)))
 
 
-def _away_from_hidden(shown: np.ndarray) -> np.ndarray | None:
-    """Return which pixels are unaffected by hidden ones, given how visible each is; None if these are too
-    few.
-    """
-    reach = 2 * int(2 * COARSE + COARSE) + 1  # of the blur, to both sides, plus the differences
-    away: np.ndarray = cv2.erode((shown >= 1).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
-    return away if away.mean() >= LEAST_SHOWN else None
-
-
-def _energy(image: np.ndarray, direction: tuple[int, int], step: int, counted: np.ndarray | None) -> float:
+def _energy(image: np.ndarray, rows: int, columns: int, step: int, counted: np.ndarray | None) -> float:
     """Return the mean squared second difference along a direction, over the ``counted`` pixels (None for
     all).
     """
-    rows, columns = direction[0] * step, direction[1] * step
-    ahead = np.roll(image, (-rows, -columns), (0, 1))
-    behind = np.roll(image, (rows, columns), (0, 1))
+    ahead = np.roll(image, (-rows * step, -columns * step), (0, 1))
+    behind = np.roll(image, (rows * step, columns * step), (0, 1))
     inner = (ahead + behind - 2 * image)[step:-step, step:-step]
-    if not inner.size:
-        return 0.0
     if counted is not None and (some := counted[step:-step, step:-step]).any():
         inner = inner[some]
-    return float(np.square(inner).mean())
+    return float(np.square(inner).mean()) if inner.size else 0.0
 
 
 def _clean(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
@@ -166,16 +135,15 @@ class Nearby:
         there = torch.bincount(self.photo, minlength=self.count) > 0
         return torch.where(there, _medians(values[self.other], self.photo, self.count), torch.nan)
 
+    def excess(self, values: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+        """Return how much each photo's value exceeds the median of those near it; 0 if there are none."""
+        return (values - self.medians(values)).nan_to_num(0.0)
+
 
 def nearby(views: Sequence[View]) -> Nearby:
-    """Return which photos were taken from nearby places in similar directions."""
-    i, j = likely_pairs(views, NEIGHBOURS).unbind(-1) if len(views) > 1 else torch.zeros(2, 0).long()
+    """Return which photos were taken from nearby places in similar directions: up to eight for each."""
+    i, j = likely_pairs(views, 8).unbind(-1) if len(views) > 1 else torch.zeros(2, 0).long()
     return Nearby(len(views), torch.cat([i, j]), torch.cat([j, i]))
-
-
-def above_neighbours(values: Float[Tensor, "v"], near: Nearby) -> Float[Tensor, "v"]:
-    """Return how much each value exceeds the median of its neighbours; 0 if there are none."""
-    return (values - near.medians(values)).nan_to_num(0.0)
 
 
 def exposures(
@@ -184,46 +152,36 @@ def exposures(
     """Return the exposure of each photo (stops) relative to the median of all.
 
     The brightness of a landmark in a photo is the landmark's own brightness times the photo's exposure. Both
-    are estimated alternately, as medians. Photos that show too few landmarks are compared with their
+    are estimated alternately, as medians. Photos that show fewer than ten landmarks are compared with their
     neighbours as a whole.
     """
-    image, point = seen.image, seen.point
-    light = _light_of_keypoints(views, seen)
-    enough = torch.bincount(image, minlength=len(views)) >= ENOUGH_SHARED
-    found = torch.zeros(len(views), dtype=torch.float64)
-    for _ in range(BRIGHTNESS_ROUNDS):
-        of_points = _medians(light - found[image], point, seen.count)
-        of_images = _medians(light - of_points[point], image, len(views))
-        found = torch.where(enough, of_images, 0.0)
-        found = found - found[enough].median() if bool(enough.any()) else found
-    own = brightness - found
-    compared = near[enough[near.other]] if bool(enough.any()) else near
-    around = compared.medians(own)
-    everywhere = own[enough].median() if bool(enough.any()) else brightness.median()
-    whole = brightness - around.nan_to_num(float(everywhere))
-    return torch.where(enough, found, whole)
-
-
-def _light_of_keypoints(views: Sequence[View], seen: TrackedKeypoints) -> Float[Tensor, "m"]:
-    """Return log2 of the linear light around each keypoint."""
-    image, number = seen.image, seen.number
-    pixels = torch.cat([p.keypoints.pixels for p in seen.images])[number]
-    found = torch.zeros(len(image), dtype=torch.float64)
+    image, point, count = seen.image, seen.point, len(views)
+    light = torch.zeros(len(image), dtype=torch.float64)  # log2 of the linear light around each keypoint
     for index in image.unique().tolist():
         own = image == index
         smooth = cv2.blur(_clean(views[index].frame.rgb).mean(-1), (5, 5))
-        u, v = pixels[own].floor().long().unbind(-1)
+        u, v = seen.pixels[own].floor().long().unbind(-1)
         rows, columns = v.clamp(0, smooth.shape[0] - 1).numpy(), u.clamp(0, smooth.shape[1] - 1).numpy()
-        found[own] = torch.from_numpy(log_light(smooth[rows, columns])).double()
-    return found
+        light[own] = torch.from_numpy(log_light(smooth[rows, columns])).double()
+    enough = torch.bincount(image, minlength=count) >= 10
+    if not bool(enough.any()):
+        return brightness - near.medians(brightness).nan_to_num(float(brightness.median()))
+    found = torch.zeros(count, dtype=torch.float64)
+    for _ in range(20):
+        of_points = _medians(light - found[image], point, seen.count)
+        found = torch.where(enough, _medians(light - of_points[point], image, count), 0.0)
+        found = found - found[enough].median()
+    own_light = brightness - found
+    around = near[enough[near.other]].medians(own_light)
+    whole = brightness - around.nan_to_num(float(own_light[enough].median()))
+    return torch.where(enough, found, whole)
 
 
 def _medians(values: Float[Tensor, "m"], index: Int[Tensor, "m"], count: int) -> Float[Tensor, "n"]:
     """Return the lower median of the values with each index; 0 if there are none."""
-    order = torch.from_numpy(np.lexsort((values.numpy(), index.numpy())))
-    number = torch.bincount(index, minlength=count)
-    first = number.cumsum(0) - number
-    middle = (first + (number - 1).clamp(min=0) // 2).clamp(max=max(0, len(values) - 1))
     if not len(values):
         return torch.zeros(count, dtype=torch.float64)
-    return torch.where(number > 0, values[order][middle], 0.0)
+    order = torch.from_numpy(np.lexsort((values.numpy(), index.numpy())))
+    number = torch.bincount(index, minlength=count)
+    middle = number.cumsum(0) - number + (number - 1).clamp(min=0) // 2
+    return torch.where(number > 0, values[order][middle.clamp(max=len(values) - 1)], 0.0)

@@ -41,15 +41,8 @@ RefinementChoice = Literal["auto", "always", "never"]
 """When to refine the given poses: ``auto`` refines them if they are inconsistent."""
 
 
-RUN, MOST_RUNS = 5, 12
-"""Number of consecutive views in a run, and largest number of runs, used to check poses when keypoints are
-not needed otherwise."""
 UNUSUAL_RATIO = 0.05
 """Smallest relative error of measured depth, compared with triangulated points, that is reported."""
-USUAL_UNITS = (1.0, 0.01, 0.001, 1e-4, 1 / 4000, 1 / 5000)
-"""Metres per step of depth images: floats, and integers of sensors and datasets."""
-OTHER_UNIT = 2.0
-"""Ratio between measured and triangulated depth, in either direction, that only a different unit explains."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,33 +69,34 @@ def prepared(
     if refinement == "never":
         tracked, seeing = located(views, features, trust_poses, depth_unit)
         if tracked is None and not trust_poses:
-            _check_poses(posed_keypoints(_sample(views), SIFT))
+            # Up to twelve evenly spread runs of five consecutive views suffice to check the poses.
+            every = 5 * max(1, math.ceil(len(views) / 60))
+            some = [view for number, view in enumerate(views) if number % every < 5]
+            _check_poses(posed_keypoints(some, SIFT))
         return TrainingViews(
             seeing, tracked, stored_cameras(views), distances=shows_distances(views, tracked)
         )
     tracked = _tracked(views, features, trust_poses, depth_unit)
-    least = 0.0 if refinement == "always" else INCONSISTENT
-    found = training_poses(tracked, views, least)
+    found = training_poses(tracked, views, 0.0 if refinement == "always" else INCONSISTENT)
     poses, motion = found.tracked.T_world_camera, found.tracked.motion
-    moved = [replace(view, T_ref_camera=poses[i]) for i, view in enumerate(views)]
-    if bool(motion.any()):
-        moved = [replace(view, motion=motion[i]) for i, view in enumerate(moved)]
-    if not (found.refined or found.replaced):
-        moved = list(views)
+    moved = list(views)
+    if found.refined or found.replaced:
+        moved = [replace(view, T_ref_camera=poses[i]) for i, view in enumerate(views)]
+        if bool(motion.any()):
+            moved = [replace(view, motion=motion[i]) for i, view in enumerate(moved)]
     cameras = moved_from(views, stored_cameras(moved), found.pixels.tolist())
-    names = tuple(views[number].frame.name for number in found.replaced)
     summary = None
     if found.consistency is not None:
-        before, after = found.consistency.noise_before, found.consistency.noise_after
-        summary = PoseRefinement(before, after, found.refined, names)
-    if summary is None and (refinement == "always" or len(views) >= ENOUGH_IMAGES):
+        names = tuple(views[number].frame.name for number in found.replaced)
+        summary = replace(found.consistency, refined=found.refined, replaced=names)
+        for line in pose_sentences(cameras, summary):
+            log.info(line)
+    elif refinement == "always" or len(views) >= ENOUGH_IMAGES:
         log.info(
             f"the poses are kept: refining them takes at least {ENOUGH_IMAGES} images with"
             f" {LEAST_VISIBLE_POINTS} triangulated points each; if these images overlap, check the order and"
             " the axes of their poses"
         )
-    for line in [] if summary is None else pose_sentences(cameras, summary):
-        log.info(line)
     seeing, distances = _with_landmarks(moved, found.tracked), shows_distances(views, tracked)
     return TrainingViews(seeing, found.tracked, cameras, summary, distances)
 
@@ -148,13 +142,6 @@ def _tracked(
     return tracked
 
 
-def _sample(views: Sequence[View]) -> list[View]:
-    """Return evenly spread runs of consecutive views that suffice to check the poses."""
-    runs = max(1, math.ceil(len(views) / RUN))
-    every = max(1, math.ceil(runs / MOST_RUNS))
-    return [view for run in range(0, runs, every) for view in views[RUN * run : RUN * (run + 1)]]
-
-
 def _check_poses(images: Sequence[ImageKeypoints]) -> None:
     """Raise ``InputError`` if the poses contradict most pairs of images."""
     if (found := pose_contradiction(images)) is not None:
@@ -172,13 +159,17 @@ def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> 
     if ratio is None or abs(ratio - 1) < UNUSUAL_RATIO:
         return
     remark = f"measured depth is {ratio:.3g} times the depth that the poses and photos imply"
-    if 1 / OTHER_UNIT < ratio < OTHER_UNIT:
+    if 1 / 2 < ratio < 2:
         log.info(f"{remark}; training takes both as they are")
         return
-    if depth_unit is None:
-        remedy = "check the unit of the depth images (depth_unit_scale_factor in a transforms.json)"
-    else:
-        right = usual_unit(depth_unit / ratio)
+    remedy = "check the unit of the depth images (depth_unit_scale_factor in a transforms.json)"
+    if depth_unit is not None:
+        right = depth_unit / ratio
+        # Metres per step of depth images: floats, and integers of sensors and datasets.
+        usual = min(
+            (1.0, 0.01, 0.001, 1e-4, 1 / 4000, 1 / 5000), key=lambda unit: abs(math.log(unit / right))
+        )
+        right = usual if abs(usual / right - 1) < UNUSUAL_RATIO else right
         remedy = (
             f"if the poses are in metres, a step of the depth images is {right:.3g} m and not {depth_unit:.3g} m (--depth-unit"
             f" {right:.3g}, depth_unit in Python, or depth_unit_scale_factor in a transforms.json)"
@@ -187,12 +178,6 @@ def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> 
         f"{remark};",
         expected=f"depth and poses in the same unit: {remedy}; otherwise scale the poses by {ratio:.3g}",
     )
-
-
-def usual_unit(estimated: float) -> float:
-    """Return the common unit of depth images (metres per step) closest to the estimate, or the estimate itself if none is close."""
-    nearest = min(USUAL_UNITS, key=lambda unit: abs(math.log(unit / estimated)))
-    return nearest if abs(nearest / estimated - 1) < UNUSUAL_RATIO else estimated
 
 
 def _with_landmarks(views: Sequence[View], tracked: TrackedViews) -> list[View]:

@@ -8,7 +8,7 @@ keypoints of an image share.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -20,52 +20,18 @@ from bidnerf_core.geometry import SE3, chi_squared_quantile
 from bidnerf_core.localization import HEAVY_TAILS, Answer, LandmarkMatcher, Loop
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
-    USUAL_FEATURES,
-    Features,
     HeldOutTrial,
     LandmarkConfig,
     LandmarkMap,
     TrackedViews,
     concatenated,
-    tracked_views,
 )
 
-HELD_OUT, MOST_HELD_OUT = 8, 24
-"""One in ``HELD_OUT`` images is held out, ``MOST_HELD_OUT`` in all at most."""
-MANY_IMAGES = 200
-"""Number of images above which most landmarks are in none of the held-out ones, which are ``MOST_HELD_OUT``."""
-ENOUGH_ANSWERS = 6
-"""Smallest number of localized images from which scatter is estimated."""
-LARGEST_SHARE = 3
-"""One in ``LARGEST_SHARE`` of few images is held out, up to ``HELD_OUT``; fewer would leave the scatter unknown."""
 QUANTILE = 0.9
 """Quantile at which the error model is fitted: it covers the tails, and allows one image in ten to have a
 wrong pose."""
-CORRELATIONS = (1.0, 300.0)
-"""Range of the number of keypoints that count as one measurement."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Answer:
-    found: Answer
-    update: Float[Tensor, "6"]  # right update from the given pose to the one found
-
-    @property
-    def matches(self) -> int:
-        """The number of correspondences used to refine the pose."""
-        return len(self.found.mode.matches)
-
-
-def build_tried_landmarks(
-    views: Sequence[View],
-    features: str | Features = USUAL_FEATURES,
-    config: LandmarkConfig = DEFAULT_LANDMARKS,
-    report: Callable[[str], None] = lambda sentence: None,
-) -> LandmarkMap:
-    """Build landmarks like ``mapping.landmarks.building.build_landmarks``, and validate them: see
-    ``tried_landmarks``.
-    """
-    return tried_landmarks(tracked_views(views, features, config), views, config, report)
+MOST_CORRELATED = 300.0
+"""Largest number of keypoints that count as one measurement."""
 
 
 def tried_landmarks(
@@ -81,23 +47,28 @@ def tried_landmarks(
     because many given poses are wrong. Raises ``InputError`` if there are no landmarks.
     """
     landmarks = tracked.landmarks(config, report)
-    held_out = _held_out(len(views))
-    answers = _answers(tracked, views, held_out, config, landmarks)
-    landmarks = replace(landmarks, trial=_trial(answers, len(held_out)))
-    if len(answers) < ENOUGH_ANSWERS:
+    # One in eight images is held out, evenly spread, 24 at most; of few images, one in three, but no more than eight, as fewer
+    # would leave the scatter unknown.
+    wanted = max(min(len(views) // 8, 24), min(len(views) // 3, 8))
+    held_out = [int((i + 0.5) * len(views) / wanted) for i in range(wanted)]
+    answers, updates = _answers(tracked, views, held_out, config, landmarks)
+    if not answers:
+        return replace(landmarks, trial=HeldOutTrial(wanted))
+    translation, rotation = (
+        torch.linalg.vector_norm(part, dim=-1).quantile(0.5) for part in updates.split(3, dim=-1)
+    )
+    trial = HeldOutTrial(wanted, len(answers), float(translation), float(rotation.rad2deg()))
+    landmarks = replace(landmarks, trial=trial)
+    if len(answers) < 6:  # too few for an estimate of scatter
         return landmarks
-    usual = float(torch.tensor([float(answer.matches) for answer in answers]).median())
-    landmarks = replace(landmarks, usual_matches=usual)
-    landmarks = replace(landmarks, correlation=_correlation(answers, landmarks))
-    if landmarks.correlation > 0.99 * CORRELATIONS[1]:
-        landmarks = replace(landmarks, pose_covariance=landmarks.pose_covariance + _unexplained(answers))
-    return replace(landmarks, calibration_scatter=_calibration_scatter(answers, landmarks))
-
-
-def _held_out(count: int) -> list[int]:
-    """Return the indices of the held-out images, evenly spread."""
-    wanted = max(min(count // HELD_OUT, MOST_HELD_OUT), min(count // LARGEST_SHARE, HELD_OUT))
-    return [int((i + 0.5) * count / wanted) for i in range(wanted)]
+    matches = [len(answer.mode.matches) for answer in answers]
+    landmarks = replace(landmarks, usual_matches=float(torch.tensor(matches).float().median()))
+    landmarks = replace(landmarks, correlation=_correlation(answers, updates, matches, landmarks))
+    if landmarks.correlation > 0.99 * MOST_CORRELATED:
+        unexplained = updates.square().quantile(QUANTILE, dim=0) / chi_squared_quantile(QUANTILE, 1)
+        landmarks = replace(landmarks, pose_covariance=landmarks.pose_covariance + torch.diag(unexplained))
+    factors = _factors(matches, landmarks)
+    return replace(landmarks, calibration_scatter=_calibration_scatter(answers, factors))
 
 
 def _answers(
@@ -106,15 +77,17 @@ def _answers(
     held_out: Sequence[int],
     config: LandmarkConfig,
     landmarks: LandmarkMap,
-) -> list[_Answer]:
-    """Localize the held-out images by the landmarks of the others, and return the accepted answers.
+) -> tuple[list[Answer], Float[Tensor, "n 6"]]:
+    """Localize the held-out images by the landmarks of the others, and return the accepted answers, and the right updates from
+    the given poses to them.
 
     In a map of many images, those of its ``landmarks`` that the held-out images do not show are not built anew.
     """
+    answers, updates = list[Answer](), [torch.zeros((0, 6), dtype=torch.float64)]
     if not held_out:
-        return []
+        return answers, updates[0]
     try:
-        if len(views) <= MANY_IMAGES or landmarks.tracks is None:
+        if len(views) <= 200 or landmarks.tracks is None:
             landmarks = tracked.without(held_out).landmarks(config)
         else:
             seen = torch.isin(landmarks.tracks.image, torch.tensor(held_out))
@@ -123,9 +96,9 @@ def _answers(
             anew = tracked.of_points_in(held_out).without(held_out).landmarks(config)
             landmarks = concatenated([landmarks[others], anew])
     except InputError:  # the rest has no overlap
-        return []
+        return answers, updates[0]
     plain = replace(landmarks, correlation=1.0, pose_covariance=torch.zeros_like(landmarks.pose_covariance))
-    matcher, answers = LandmarkMatcher(plain), []
+    matcher = LandmarkMatcher(plain)
     for number in held_out:
         T = views[number].T_ref_camera.to("cpu", torch.float64)
         view = View(views[number].frame, SE3.identity())
@@ -133,56 +106,40 @@ def _answers(
         features, moving = tracked.detector_of(view, number), views[number].motion is not None
         found = Loop([view], matcher, features=features, moving=moving)()
         if found is not None and found.verdict.accepted:
-            answers.append(_Answer(found, (T.inverse() @ found.T_world_rig).log()))
-    return answers
+            answers.append(found)
+            updates.append((T.inverse() @ found.T_world_rig).log()[None])
+    return answers, torch.cat(updates)
 
 
-def _trial(answers: Sequence[_Answer], images: int) -> HeldOutTrial:
-    if not answers:
-        return HeldOutTrial(images)
-    updates = torch.stack([answer.update for answer in answers])
-    translation, rotation = (torch.linalg.vector_norm(part, dim=-1) for part in updates.split(3, dim=-1))
-    return HeldOutTrial(
-        images, len(answers), float(translation.quantile(0.5)), float(rotation.rad2deg().quantile(0.5))
-    )
-
-
-def _correlation(answers: Sequence[_Answer], landmarks: LandmarkMap) -> float:
+def _correlation(
+    answers: Sequence[Answer], updates: Float[Tensor, "n 6"], matches: Sequence[int], landmarks: LandmarkMap
+) -> float:
     """Return the ``correlation`` for which the errors are as large as the covariances of the fits predict."""
-    updates = torch.stack([answer.update for answer in answers])
-    covariances = torch.stack([answer.found.covariance / HEAVY_TAILS for answer in answers])
-    expected = chi_squared_quantile(QUANTILE, 6)
-    low, high = CORRELATIONS
+    covariances = torch.stack([answer.covariance / HEAVY_TAILS for answer in answers])
+    low, high = 1.0, MOST_CORRELATED
     for _ in range(30):  # bisection, geometrically
         middle = (low * high) ** 0.5
-        factors = _factors(answers, replace(landmarks, correlation=middle))
+        factors = _factors(matches, replace(landmarks, correlation=middle))
         information = torch.linalg.inv(factors[:, None, None] * covariances + landmarks.pose_covariance)
         squared = torch.einsum("ni,nij,nj->n", updates, information, updates)
-        low, high = (middle, high) if float(squared.quantile(QUANTILE)) > expected else (low, middle)
+        above = float(squared.quantile(QUANTILE)) > chi_squared_quantile(QUANTILE, 6)
+        low, high = (middle, high) if above else (low, middle)
     return (low * high) ** 0.5
 
 
-def _unexplained(answers: Sequence[_Answer]) -> Float[Tensor, "6 6"]:
-    """Return a diagonal covariance that would explain the answers' errors along each axis."""
-    squared = torch.stack([answer.update for answer in answers]).square()
-    return torch.diag(squared.quantile(QUANTILE, dim=0) / chi_squared_quantile(QUANTILE, 1))
-
-
-def _factors(answers: Sequence[_Answer], landmarks: LandmarkMap) -> Float[Tensor, "n"]:
+def _factors(matches: Sequence[int], landmarks: LandmarkMap) -> Float[Tensor, "n"]:
     """Return the factors that scale the covariances of answers that treat keypoints as independent."""
-    return torch.tensor([landmarks.correlation_of(answer.matches) for answer in answers], dtype=torch.float64)
+    return torch.tensor([landmarks.correlation_of(count) for count in matches], dtype=torch.float64)
 
 
-def _calibration_scatter(answers: Sequence[_Answer], landmarks: LandmarkMap) -> Float[Tensor, "4"]:
+def _calibration_scatter(answers: Sequence[Answer], factors: Float[Tensor, "n"]) -> Float[Tensor, "4"]:
     """Return the standard deviations of the corrections estimated for intrinsics that are in fact right.
 
     The part explained by the uncertainty of each fit is subtracted.
     """
-    widest = [
-        found.posterior.camera_of(found.explanations.widest) for found in (each.found for each in answers)
-    ]
+    widest = [found.posterior.camera_of(found.explanations.widest) for found in answers]
     apparent, noise = (torch.stack([camera[part][:4] for camera in widest]) for part in (0, 1))
-    explained = _factors(answers, landmarks)[:, None] * noise.square()
+    explained = factors[:, None] * noise.square()
     low, high = torch.full((4,), 1e-5, dtype=torch.float64), torch.ones(4, dtype=torch.float64)
     for _ in range(30):
         middle = (low * high).sqrt()

@@ -23,22 +23,16 @@ from bidnerf_core.geometry import SE3
 UpSource = Literal["gravity", "planes", "cameras"]
 """Where an upward direction comes from."""
 
-ROLL_DEG = 6.0
-"""Standard deviation of the roll of hand-held cameras relative to the horizon."""
+ROLL = math.sin(math.radians(6.0)) ** 2
+"""Variance (of the sine) of the roll of hand-held cameras relative to the horizon."""
 INDEPENDENT = 8
 """Largest number of cameras whose rolls count as independent, since many frames of a video share one."""
-SIDEWAYS = 2.0
-"""Log odds of upright against sideways images, as stored by phones that are held upright."""
-LOOKING_UP = 3.0
-"""Log odds against all cameras looking straight up, proportional to the sine of the angle."""
 ALIKE_DEG = 8.0
 """Angle within which normals belong to one plane or to parallel ones."""
 CHANCE = 1 - math.cos(math.radians(ALIKE_DEG))
 """Fraction of randomly oriented surfels whose normals agree with a direction."""
-CLEAR = 3 * CHANCE
-"""Smallest fraction of the surfels, beyond chance, that makes a plane."""
-DIRECTIONS, SAMPLED, PLANES = 1500, 20_000, 6
-"""Number of directions tried, of surfels sampled, and of candidate planes."""
+DIRECTIONS = 1500
+"""Number of directions tried."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +49,8 @@ class UpDirection:
 
 def given_up(direction: Sequence[float]) -> UpDirection:
     """Return the upward direction that a capture measured; its length does not matter."""
-    return _found(normalize(torch.tensor(tuple(direction), dtype=torch.float64), dim=0), "gravity")
+    unit = normalize(torch.tensor(tuple(direction), dtype=torch.float64), dim=0)
+    return UpDirection((*unit.tolist(),), "gravity")
 
 
 def up_direction(poses: SE3, normals: Float[Tensor, "n 3"] | None = None) -> UpDirection:
@@ -66,90 +61,68 @@ def up_direction(poses: SE3, normals: Float[Tensor, "n 3"] | None = None) -> UpD
     """
     rotations = poses.rotation.detach().cpu().double()
     planes = _planes(normals)
-    best: tuple[float, Tensor, UpSource] | None = None
+    weight = min(len(rotations), INDEPENDENT)
+    tried = list[tuple[float, Tensor, UpSource]]()
+    # Phones that are held upright store images that are sideways, with the camera mostly at the top.
     for up_axis, level_axis, prior in (
         (-rotations[:, :, 1], rotations[:, :, 0], 0.0),
-        (-rotations[:, :, 0], rotations[:, :, 1], -SIDEWAYS),
-        (rotations[:, :, 0], rotations[:, :, 1], -SIDEWAYS - 1),  # phones have the camera at the top
+        (-rotations[:, :, 0], rotations[:, :, 1], -2.0),
+        (rotations[:, :, 0], rotations[:, :, 1], -3.0),
     ):
-        for direction, support, source in [*planes, *_level(up_axis, level_axis)]:
+        for direction, support, source in [*planes, (_level(up_axis, level_axis), 0.0, "cameras")]:
             direction = direction if float((up_axis @ direction).mean()) >= 0 else -direction
             looking_up = max(0.0, float((rotations[:, :, 2] @ direction).mean()))  # which is rare
-            tilt = (level_axis @ direction).square().mean() / math.sin(math.radians(ROLL_DEG)) ** 2
-            score = prior + math.log(CHANCE + support) - 0.5 * min(len(rotations), INDEPENDENT) * float(tilt)
-            score -= LOOKING_UP * looking_up
-            if best is None or score > best[0]:
-                best = score, direction, source
-    assert best is not None  # cameras always give a direction
-    return _snapped(best[1], best[2], planes)
+            tilt = (level_axis @ direction).square().mean() / ROLL
+            score = prior + math.log(CHANCE + support) - 0.5 * weight * float(tilt)
+            tried.append((score - 3 * looking_up, direction, source))
+    _, up, source = max(tried, key=lambda one: one[0])
+    near = [(share, axis) for axis, share, _ in planes if abs(float(axis @ up)) > 1 - CHANCE]
+    if source == "cameras" and near:  # snapped to the normal of a plane that is nearly perpendicular to it
+        axis = max(near, key=lambda one: one[0])[1]
+        up, source = axis * torch.sign(axis @ up), "planes"
+    return UpDirection((*up.tolist(),), source)
 
 
-def _snapped(
-    up: Float[Tensor, "3"], source: UpSource, planes: Sequence[tuple[Tensor, float, UpSource]]
-) -> UpDirection:
-    """Snap the direction to the normal of a plane that is nearly perpendicular to it."""
-    if source == "cameras":
-        cosine = math.cos(math.radians(ALIKE_DEG))
-        near = [(share, axis) for axis, share, _ in planes if abs(float(axis @ up)) > cosine]
-        if near:
-            axis = max(near, key=lambda found: found[0])[1]
-            return _found(axis * torch.sign(axis @ up), "planes")
-    return _found(up, source)
-
-
-def _level(
-    up_axis: Float[Tensor, "v 3"], level_axis: Float[Tensor, "v 3"]
-) -> list[tuple[Tensor, float, UpSource]]:
+def _level(up_axis: Float[Tensor, "v 3"], level_axis: Float[Tensor, "v 3"]) -> Float[Tensor, "3"]:
     """Return the direction most nearly perpendicular to all horizontal image axes, nearest to the mean upward
     axis.
 
     If all cameras face the same way, only the plane of such directions is known, and the one nearest to the mean is
-    chosen.
+    chosen; the deviation of the tilt is about 20 degrees.
     """
     mean = normalize(up_axis.mean(0), dim=0)
     spread = level_axis.mT @ level_axis / len(level_axis)
-    prior = 0.1 * (
-        torch.eye(3, dtype=torch.float64) - torch.outer(mean, mean)
-    )  # a tilt of 20 degrees is common
-    roll = math.sin(math.radians(ROLL_DEG)) ** 2
-    weight = min(len(up_axis), INDEPENDENT)
-    return [(torch.linalg.eigh(weight * spread / roll + prior / 0.1 / 0.35**2)[1][:, 0], 0.0, "cameras")]
+    prior = (torch.eye(3, dtype=torch.float64) - torch.outer(mean, mean)) / 0.35**2
+    return torch.linalg.eigh(min(len(up_axis), INDEPENDENT) * spread / ROLL + prior)[1][:, 0]
 
 
 def _planes(normals: Float[Tensor, "n 3"] | None) -> list[tuple[Tensor, float, UpSource]]:
-    """Return the directions with which most normals agree, and the fraction of normals, beyond chance, that
+    """Return up to six directions with which most normals agree, and the fraction of normals, beyond chance, that
     do.
     """
     if normals is None or not len(normals):
         return []
-    some = normals.detach().cpu().double()[:: max(1, len(normals) // SAMPLED)]
+    some = normals.detach().cpu().double()[:: max(1, len(normals) // 20_000)]
     number = torch.arange(DIRECTIONS, dtype=torch.float64) + 0.5  # a Fibonacci lattice on the half sphere
     down, around = torch.acos(1 - number / DIRECTIONS), math.pi * (1 + math.sqrt(5)) * number
     tried = torch.stack([around.cos() * down.sin(), around.sin() * down.sin(), down.cos()], dim=-1)
-    cosine = math.cos(math.radians(ALIKE_DEG))
-    share = ((some.float() @ tried.float().mT).abs() > cosine).double().mean(0)
+    share = ((some.float() @ tried.float().mT).abs() > 1 - CHANCE).double().mean(0)
     found = list[tuple[Tensor, float, UpSource]]()
-    for _ in range(PLANES):
-        best = int(share.argmax())
-        axis = _mean_axis(some, tried[best])
-        support = float(((some @ axis).abs() > cosine).double().mean()) - CHANCE
-        if support >= CLEAR:
+    for _ in range(6):
+        start = axis = tried[int(share.argmax())]
+        for degrees in (
+            ALIKE_DEG,
+            ALIKE_DEG,
+            ALIKE_DEG / 2,
+            ALIKE_DEG / 4,
+        ):  # the mean of the normals near it
+            along = some @ axis
+            near = along.abs() > math.cos(math.radians(degrees))
+            if not bool(near.any()):
+                break
+            axis = normalize((some[near] * torch.sign(along[near])[:, None]).sum(0), dim=0)
+        support = float(((some @ axis).abs() > 1 - CHANCE).double().mean()) - CHANCE
+        if support >= 3 * CHANCE:
             found.append((axis, support, "planes"))
-        share[(tried @ tried[best]).abs() > math.cos(2 * math.radians(ALIKE_DEG))] = 0
+        share[(tried @ start).abs() > math.cos(2 * math.radians(ALIKE_DEG))] = 0
     return found
-
-
-def _mean_axis(normals: Float[Tensor, "n 3"], axis: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-    """Return the mean direction of the normals near an axis, refined iteratively."""
-    for degrees in (ALIKE_DEG, ALIKE_DEG, ALIKE_DEG / 2, ALIKE_DEG / 4):
-        along = normals @ axis
-        near = along.abs() > math.cos(math.radians(degrees))
-        if not bool(near.any()):
-            return axis
-        axis = normalize((normals[near] * torch.sign(along[near])[:, None]).sum(0), dim=0)
-    return axis
-
-
-def _found(direction: Float[Tensor, "3"], source: UpSource) -> UpDirection:
-    x, y, z = direction.tolist()
-    return UpDirection((x, y, z), source)

@@ -250,8 +250,7 @@ def scored(view: View) -> torch.Tensor:
 
 
 def measured(view: View) -> torch.Tensor:
-    found = photo_measures([view])
-    return torch.stack([found.brightness, found.overexposed, found.underexposed])
+    return photo_measures([view])[1:]
 
 
 INFLUENCED: dict[str, Callable[[View], torch.Tensor]] = {
