@@ -484,7 +484,7 @@ def risk(records: Records) -> str:
 @table
 def gpu(records: Records) -> str:
     """What a GPU takes."""
-    found, rows = records["gpu"], []
+    found, rows = dict(records["gpu"]) | dict(records["gpu_queries"]), []
     for scene, levels in found["steps"].items():
         for level, m in levels.items():
             coarse = "coarse level" if level == "level 0" and len(levels) > 1 else "full detail"
@@ -494,19 +494,10 @@ def gpu(records: Records) -> str:
     for scene, sizes in found["search"].items():
         for size, m in sizes.items():
             rows.append((f"5 Gauss-Newton steps of {size}", SCENES[scene], f"{m['ms']:.1f} ms", ""))
-    for scene, modes in found.get("queries", {}).items():
+    for scene, modes in found["queries"].items():
         for mode, m in modes.items():
             same = f"right {m['right']} of {m['frames']}, on the CPU {m['right_on_cpu']}"
             rows.append((f"query without a start, {mode}", SCENES[scene], f"{m['ms']:.0f} ms", same))
-            if "many_per_second" in m:
-                rows.append(
-                    (
-                        "queries with `Localizer.many`",
-                        SCENES[scene],
-                        f"{m['many_per_second']:.0f} a second",
-                        "",
-                    )
-                )
     for scene, m in found["training"].items():
         rest = f"{m['steps']} steps of {m['ms_a_step']:.1f} ms after {m['seconds_before_first_steps']:.0f} s"
         rows.append((f"training to {m['psnr']:.1f} dB", SCENES[scene], f"{m['seconds']:.0f} s", rest))

@@ -115,6 +115,8 @@ def stopped_by_ctrl_c(announcement: str = STEP) -> Iterator[Cancel]:
         with job_context(cancel=cancel):
             yield cancel
     except Cancelled as stopped:
+        if not pressed.is_set():  # something else stopped it
+            raise
         say(str(stopped))
         raise KeyboardInterrupt from stopped
     finally:
