@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -18,8 +20,8 @@ from torch.nn import functional
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame, View
 
-LONGEST_SIDE = 400
-"""Images are shrunk (by whole factors) to at most this many pixels a side: cells are coarse, and this bounds the time."""
+AROUND = np.ones((3, 3), np.uint8)
+"""A pixel and its eight neighbours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,13 +37,20 @@ class FreeSpace:
 
     @staticmethod
     def seen_by(view: View, tolerance: float = 0.02, footprint: int = 8) -> FreeSpace:
-        free = _free_depth(view.frame, tolerance)
-        factor = math.ceil(max(free.shape) / LONGEST_SIDE)
-        levels = [_shrunk(free, factor)]
+        """Return the free space of a view: its image is shrunk by a whole factor to at most 400 pixels a side, which bounds the time,
+        as cells are coarse. In a block of pixels, the smallest depth counts.
+        """
+        free, camera = _free_depth(view.frame, tolerance), view.frame.intrinsics
+        height, width = free.shape
+        factor = math.ceil(max(free.shape) / 400)
+        padded = functional.pad(free, (0, -width % factor, 0, -height % factor))
+        levels = [-functional.max_pool2d(-padded[None], factor)[0].cpu().numpy()]
         for _ in range(footprint):  # nothing is known beyond the image's edge
-            levels.append(-functional.max_pool2d(-functional.pad(levels[-1], (1, 1, 1, 1))[None], 3, 1)[0])
-        camera = _shrunk_camera(view.frame.intrinsics, factor, levels[0])
-        return FreeSpace(camera, torch.stack(levels), free.amax().item(), _edges(view.frame.intrinsics))
+            levels.append(cv2.erode(levels[-1], AROUND, borderType=cv2.BORDER_CONSTANT, borderValue=0.0))
+        fx, fy, cx, cy = (value / factor for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+        height, width = levels[0].shape
+        small = Intrinsics(fx, fy, cx, cy, width, height, camera.distortion)
+        return FreeSpace(small, torch.from_numpy(np.stack(levels)), free.amax().item(), _edges(camera))
 
     def may_free(self, points: Float[Tensor, "3 n"], radius: float) -> Bool[Tensor, "n"]:
         """Return whether the view sees any part of the sphere around each point (camera frame) within its free depth."""
@@ -92,18 +101,6 @@ def _free_depth(frame: Frame, tolerance: float) -> Float[Tensor, "h w"]:
     if frame.hidden is not None:
         free = torch.where(frame.hidden, 0.0, free)
     return free
-
-
-def _shrunk(free: Float[Tensor, "h w"], factor: int) -> Float[Tensor, "h2 w2"]:
-    """Return the smallest value of each block of pixels; a block that reaches beyond the edge is unknown."""
-    height, width = free.shape
-    padded = functional.pad(free, (0, -width % factor, 0, -height % factor))
-    return -functional.max_pool2d(-padded[None], factor)[0]
-
-
-def _shrunk_camera(camera: Intrinsics, factor: int, free: Float[Tensor, "h w"]) -> Intrinsics:
-    fx, fy, cx, cy = (value / factor for value in (camera.fx, camera.fy, camera.cx, camera.cy))
-    return Intrinsics(fx, fy, cx, cy, free.shape[1], free.shape[0], camera.distortion)
 
 
 def _edges(camera: Intrinsics) -> Float[Tensor, "4 3"]:

@@ -18,7 +18,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.carving import FreeSpace, estimate_bounds, occupied_cells
 
 # Inside: the constants and measured points from which bounds are computed, to compare the bounds with
-from bidnerf_core.carving.bounds import ONE_PLACE, ROOM, measured_points
+from bidnerf_core.carving.bounds import measured_points
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds
@@ -332,7 +332,7 @@ def test_views_from_one_place_have_an_assumed_scale_and_matter_beyond() -> None:
     assert bounds.contracted
     inside = torch.tensor(bounds.lower) <= torch.tensor([4.0, 0.0, 0.0])
     assert bool((inside & (torch.tensor([4.0, 0.0, 0.0]) <= torch.tensor(bounds.upper))).all())
-    assert bounds.side == pytest.approx(ROOM * ONE_PLACE, rel=0.8)
+    assert bounds.side == pytest.approx(4 * 1, rel=0.8)
 
 
 # Recorded scenes
