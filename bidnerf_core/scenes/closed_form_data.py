@@ -11,8 +11,8 @@ import difflib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import torch
 
@@ -29,12 +29,8 @@ from bidnerf_core.scenes.trajectories import look_around, orbit
 
 PREFIX = "demo:"
 DEMO_CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
-FRAMES, TRAINING_FRAMES = 24, 40
-BLOBS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 12.0, (1.0, 1.0, 1.0))
-ANGLE = re.compile(r"-?\d+(?:\.\d+)?")
-"""The angle in degrees by which a frame of a sequence is rotated, after its number and @."""
+FRAMES = 24
 
-Scene = TypeVar("Scene")
 Render = Callable[[SE3, str], Frame]
 
 
@@ -60,23 +56,6 @@ class ClosedFormData(Capture):
 
     middle: tuple[float, float, float] = (0.0, 0.0, 0.0)  # metres, world
 
-    @staticmethod
-    def rendered(
-        name: str,
-        poses: Sequence[SE3],
-        render: Render,
-        background: tuple[float, float, float],
-        middle: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        training: Sequence[SE3] = (),
-    ) -> ClosedFormData:
-        """Return the frames of the scene ``name`` at ``poses`` and ``training`` (T_world_camera)."""
-        shots = [
-            RenderedShot(render=render, T_world_camera=pose, splits=(split,), stem=f"{place:04d}")
-            for split, group in (("train", training), ("test", poses))
-            for place, pose in enumerate(group)
-        ]
-        return ClosedFormData(Path(PREFIX + name), shots, background, middle=middle)
-
     def select(self, split: str, names: Sequence[str] | None = None) -> list[Shot]:
         """Return the frames with these names, by default all of the split."""
         listed = super().select(split)
@@ -91,7 +70,7 @@ class ClosedFormData(Capture):
 
     def _turned(self, by_name: Mapping[str, Shot], name: str) -> Shot:
         own, _, angle = name.partition("@")
-        if own not in by_name or (angle and ANGLE.fullmatch(angle) is None):
+        if own not in by_name or (angle and re.fullmatch(r"-?\d+(?:\.\d+)?", angle) is None):
             first, *_, last = by_name
             expected = f"{first} to {last} or a name such as {first}@15"
             raise InputError(f"no frame {name!r}", where=self.path, expected=expected)
@@ -108,72 +87,52 @@ def is_closed_form(name: str) -> bool:
 
 def closed_form_data(name: str) -> ClosedFormData:
     """Return the data of ``demo:NAME``. Raises ``InputError`` for an unknown name."""
-    return _found(name, DATA, "data")()
+    _check(name, ("blobs", "object", "room"), "data")
+    training, middle = list[SE3](), (0.0, 0.0, 0.0)
+    if name == "demo:blobs":
+        poses, render, background = orbit(3.5, FRAMES, seed=1), _render_blobs, BLOBS.background
+    else:
+        is_room = name == "demo:room"
+        scene = demo_room() if is_room else demo_object()
+        poses, training = orbit(3.5, FRAMES, elevation=(15.0, 50.0), seed=1), orbit(3.5, 40)
+        if is_room:
+            poses, training = look_around(scene.bounds, FRAMES, seed=1), look_around(scene.bounds, 40)
+            middle = (0.0, 0.0, 1.25)
+        render, background = partial(scene.render, DEMO_CAMERA), scene.bounds.background
+    shots = [
+        RenderedShot(render=render, T_world_camera=pose, splits=(split,), stem=f"{place:04d}")
+        for split, group in (("train", training), ("test", poses))
+        for place, pose in enumerate(group)
+    ]
+    return ClosedFormData(Path(name), shots, background, middle=middle)
 
 
 def closed_form_map(name: str) -> Map:
     """Return the map of ``demo:NAME``. Raises ``InputError`` for a name whose field is not known in closed form."""
-    return _found(name, MAPS, "map")()
+    _check(name, ("blobs",), "map")
+    info = MapInfo("closed-form", {}, BLOBS, 0, True, "demo:blobs", weights="exact", unit="metres")
+    return Map(info, _blob_field())
 
 
-def _found(name: str, known: dict[str, Callable[[], Scene]], what: str) -> Callable[[], Scene]:
+def _check(name: str, known: Sequence[str], what: str) -> None:
     own = name.removeprefix(PREFIX)
-    if own in known:
-        return known[own]
     listed = " or ".join(PREFIX + one for one in known)
-    if own in DATA:
+    if own in ("object", "room") and own not in known:
         raise InputError(f"has no map; train one with 'bidnerf demo', or use {listed}", where=name)
-    near = difflib.get_close_matches(own, known, n=1)
-    raise InputError(f"no closed-form {what} {name!r}", expected=PREFIX + near[0] if near else listed)
+    if own not in known:
+        near = difflib.get_close_matches(own, known, n=1)
+        raise InputError(f"no closed-form {what} {name!r}", expected=PREFIX + near[0] if near else listed)
 
 
-def _object() -> ClosedFormData:
-    scene = demo_object()
-    poses = tuple(orbit(3.5, FRAMES, elevation=(15.0, 50.0), seed=1))
-    training = tuple(orbit(3.5, TRAINING_FRAMES))
-    return ClosedFormData.rendered(
-        "object",
-        poses,
-        lambda T, name: scene.render(DEMO_CAMERA, T, name),
-        scene.bounds.background,
-        training=training,
-    )
-
-
-def _room() -> ClosedFormData:
-    scene = demo_room()
-    middle = (0.0, 0.0, 1.25)
-    poses = tuple(look_around(scene.bounds, FRAMES, seed=1))
-    training = tuple(look_around(scene.bounds, TRAINING_FRAMES))
-    return ClosedFormData.rendered(
-        "room",
-        poses,
-        lambda T, name: scene.render(DEMO_CAMERA, T, name),
-        scene.bounds.background,
-        middle,
-        training,
-    )
-
-
-def _blobs() -> ClosedFormData:
-    field, half = _blob_field(), Intrinsics(87.5, 87.5, 32.0, 32.0, 64, 64)
-
-    def render(T: SE3, name: str) -> Frame:
-        image = render_image(field, half, T, BLOBS)
-        depth = torch.where(image.opacity > 0.99, image.depth, 0)  # only nearly opaque pixels have depth
-        return Frame(name, image.rgb, half, depth, image.opacity)
-
-    return ClosedFormData.rendered("blobs", tuple(orbit(3.5, FRAMES, seed=1)), render, BLOBS.background)
+BLOBS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 12.0, (1.0, 1.0, 1.0))
 
 
 def _blob_field() -> GaussianBlobs:
     return GaussianBlobs.random(count=7, seed=3, density=400.0)
 
 
-def _blob_map() -> Map:
-    info = MapInfo("closed-form", {}, BLOBS, 0, True, "demo:blobs", weights="exact", unit="metres")
-    return Map(info, _blob_field())
-
-
-DATA: dict[str, Callable[[], ClosedFormData]] = {"blobs": _blobs, "object": _object, "room": _room}
-MAPS: dict[str, Callable[[], Map]] = {"blobs": _blob_map}
+def _render_blobs(T: SE3, name: str) -> Frame:
+    half = Intrinsics(87.5, 87.5, 32.0, 32.0, 64, 64)
+    image = render_image(_blob_field(), half, T, BLOBS)
+    depth = torch.where(image.opacity > 0.99, image.depth, 0)  # only nearly opaque pixels have depth
+    return Frame(name, image.rgb, half, depth, image.opacity)

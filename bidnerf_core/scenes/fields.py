@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.errors import InputError
 from bidnerf_core.fields import FieldValues, Rays, RaySampler, Stratified
 from bidnerf_core.geometry import SE3
 from bidnerf_core.scenes.primitives import Sphere
@@ -32,8 +31,6 @@ class GaussianBlobs:
     @staticmethod
     def random(count: int = 5, seed: int = 0, samples: int = 64, density: float = 12.0) -> GaussianBlobs:
         """Return ``count`` different blobs within the cube from -1 to 1 (float64)."""
-        if count < 1:
-            raise InputError(f"{count} blobs", expected="at least 1")
         generator = torch.Generator().manual_seed(seed)
         centres = torch.rand((count, 3), generator=generator, dtype=torch.float64) * 1.3 - 0.65
         widths = 0.12 + 0.13 * torch.rand(count, generator=generator, dtype=torch.float64)

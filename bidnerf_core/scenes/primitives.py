@@ -8,40 +8,14 @@ times as fast as (n 3).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import TypeAlias
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.scenes.textures import Texture, dominant_axis
-
-PARALLEL_BELOW = 1e-12
-"""Direction components below this are replaced by it, to avoid division by zero; the change of the ray is negligible."""
-
-
-@runtime_checkable
-class Shape(Protocol):
-    """A convex solid around the origin of its own frame; metres."""
-
-    @property
-    def reach(self) -> float:
-        """Radius (metres) of a ball around the origin that contains the shape."""
-        ...
-
-    def interval(
-        self, origins: Float[Tensor, "3 #n"], directions: Float[Tensor, "3 n"]
-    ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-        """Return where lines enter and leave (metres along ``directions``, possibly negative); leave < enter
-        means a miss.
-        """
-        ...
-
-    def normals(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Return outward unit normals at points of the surface."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -49,9 +23,6 @@ class Sphere:
     """A ball."""
 
     radius: float
-
-    def __post_init__(self) -> None:
-        _require_positive("sphere radius", self.radius)
 
     @property
     def reach(self) -> float:
@@ -73,9 +44,6 @@ class Box:
     """A cuboid with its corners at plus and minus ``half`` (metres)."""
 
     half: tuple[float, float, float]
-
-    def __post_init__(self) -> None:
-        _require_positive("half size of a box", *self.half)
 
     @property
     def reach(self) -> float:
@@ -104,9 +72,6 @@ class Cylinder:
     radius: float
     half: float
 
-    def __post_init__(self) -> None:
-        _require_positive("cylinder radius and half height", self.radius, self.half)
-
     @property
     def reach(self) -> float:
         return (self.radius**2 + self.half**2) ** 0.5
@@ -128,6 +93,13 @@ class Cylinder:
         across = torch.linalg.vector_norm(flat, dim=-1, keepdim=True)
         on_cap = up.abs().amax(-1, keepdim=True) / self.half > across / self.radius
         return torch.nn.functional.normalize(torch.where(on_cap, up, flat), dim=-1)
+
+
+Shape: TypeAlias = Sphere | Box | Cylinder
+"""A convex solid around the origin of its own frame (metres): ``reach``, the radius of a ball that contains it; ``interval``, where
+lines enter and leave it, along their directions, possibly negative (leave < enter means a miss); and the outward unit ``normals`` at
+points of its surface.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,9 +140,5 @@ def _chord(middle: Tensor, squared: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _tilted(directions: Tensor) -> Tensor:
-    return torch.where(directions.abs() < PARALLEL_BELOW, PARALLEL_BELOW, directions)
-
-
-def _require_positive(what: str, *values: float) -> None:
-    if not all(value > 0 and value < float("inf") for value in values):
-        raise InputError(f"expected positive numbers of metres, got {values}", where=what)
+    """Return directions whose components are not so near 0 that divisions overflow; the change of the ray is negligible."""
+    return torch.where(directions.abs() < 1e-12, 1e-12, directions)

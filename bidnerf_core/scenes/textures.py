@@ -19,9 +19,6 @@ Vector = tuple[float, float, float]
 Texture = Callable[[Tensor, Tensor], Tensor]
 """A function from points (n 3; metres, frame of the shape) and outward unit normals (n 3) to colours (n 3) in [0, 1]."""
 
-DRIFT = ((2.3, 1.1, -1.7), (-1.3, 2.1, 1.9), (1.6, -1.9, 2.2))
-"""Wave vectors (radians per metre) of the slow drift of red, green and blue: periods of about two metres."""
-
 
 @dataclass(frozen=True)
 class Waves:
@@ -35,25 +32,18 @@ class Waves:
     second: Colour
     waves: tuple[Vector, ...]
     phases: tuple[float, ...]
-    hardness: float = 2.5  # slope of the edges: higher is sharper
-    drift: float = 0.07  # amplitude in each colour
+    hardness: float  # slope of the edges: higher is sharper
+    summed: bool = False  # instead of multiplied: irregular spots and veins
 
     def __call__(self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        weight = self._pattern(_phase(points, self.waves, self.phases).sin_())[:, None]
+        waves = _phase(points, self.waves, self.phases).sin_()
+        level = waves.sum(0) / math.sqrt(len(self.waves)) if self.summed else waves.prod(0)
+        weight = (0.5 + 0.5 * torch.tanh(self.hardness * level))[:, None]
         first, second = points.new_tensor(self.first), points.new_tensor(self.second)
-        slow = _phase(points, DRIFT, (self.phases[0], 1.0, 2.0)).sin_().T
-        return (second + weight * (first - second) + self.drift * slow).clamp_(0, 1)
-
-    def _pattern(self, waves: Float[Tensor, "k n"]) -> Float[Tensor, " n"]:
-        return 0.5 + 0.5 * torch.tanh(self.hardness * waves.prod(0))
-
-
-@dataclass(frozen=True)
-class Blotches(Waves):
-    """Two colours mixed by the sum of plane waves: irregular spots and veins."""
-
-    def _pattern(self, waves: Float[Tensor, "k n"]) -> Float[Tensor, " n"]:
-        return 0.5 + 0.5 * torch.tanh(self.hardness * waves.sum(0) / math.sqrt(len(self.waves)))
+        # The slow drift of red, green and blue has periods of about two metres.
+        drift = ((2.3, 1.1, -1.7), (-1.3, 2.1, 1.9), (1.6, -1.9, 2.2))
+        slow = _phase(points, drift, (self.phases[0], 1.0, 2.0)).sin_().T
+        return (second + weight * (first - second) + 0.07 * slow).clamp_(0, 1)
 
 
 @dataclass(frozen=True)
@@ -88,14 +78,14 @@ def stripes(first: Colour, second: Colour, across: Vector, period: float, phase:
     return Waves(first, second, ((x, y, z),), (phase,), hardness=4.0)
 
 
-def blotches(first: Colour, second: Colour, period: float, seed: int) -> Blotches:
+def blotches(first: Colour, second: Colour, period: float, seed: int) -> Waves:
     """Return spots about half a ``period`` (metres) wide that do not visibly repeat."""
     generator = torch.Generator().manual_seed(seed)
     directions = torch.nn.functional.normalize(torch.randn((7, 3), generator=generator), dim=-1)
     lengths = 2 * math.pi / period * torch.linspace(0.7, 1.5, 7)[:, None]
     x = (directions * lengths).tolist()
     phases = (2 * math.pi * torch.rand(7, generator=generator)).tolist()
-    return Blotches(first, second, tuple((a, b, c) for a, b, c in x), tuple(phases), hardness=3.0)
+    return Waves(first, second, tuple((a, b, c) for a, b, c in x), tuple(phases), 3.0, summed=True)
 
 
 def dominant_axis(vectors: Float[Tensor, "n 3"]) -> Bool[Tensor, "n 3"]:
