@@ -13,7 +13,6 @@ from .intrinsics import centre_crop_cameras as centre_crop_cameras
 from .intrinsics import reduced_size as reduced_size
 from .intrinsics import same_aspect as same_aspect
 from .intrinsics import stretched_cameras as stretched_cameras
-from .lenses import MODEL_IDS as MODEL_IDS
 from .lenses import MODELS as MODELS
 from .lenses import PANORAMA as PANORAMA
 from .lenses import PANORAMA_FACES as PANORAMA_FACES

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,6 @@ from PIL.ExifTags import IFD, Base
 from torch import Tensor
 
 from bidnerf_core.io import open_image
-
-MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-"""Length of the unit of FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +49,6 @@ CODES = {
     7: (True, True, True),
     8: (True, False, True),
 }
-QUARTER_TURNS = tuple(Orientation(*CODES[code]) for code in (6, 8))
-"""The orientations of a camera turned by 90 degrees to one side and to the other."""
 
 
 @dataclass(frozen=True)
@@ -82,24 +76,29 @@ def read_exif(path: Path) -> Exif:
     """
     with open_image(path) as image:
         try:
-            tags = image.getexif()
-            return _exif({**tags, **tags.get_ifd(IFD.Exif)})
+            found = image.getexif()
+            tags: dict[int, Any] = {**found, **found.get_ifd(IFD.Exif)}
+            code = tags.get(Base.Orientation, 1)
+            # Millimetres of the resolution's unit: inch, centimetre, millimetre, micrometre.
+            units = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+            unit = units.get(tags.get(Base.FocalPlaneResolutionUnit, 2))
+            keys = (
+                Base.ExifImageWidth,
+                Base.ExifImageHeight,
+                Base.FocalPlaneXResolution,
+                Base.FocalPlaneYResolution,
+            )
+            width, height, x, y = (_positive(tags.get(key)) for key in keys)
+            return Exif(
+                Orientation.from_exif(code) if isinstance(code, int) else UPRIGHT,
+                (int(width), int(height)) if width and height and min(width, height) >= 1 else None,
+                _positive(tags.get(Base.FocalLengthIn35mmFilm)),
+                _positive(tags.get(Base.FocalLength)),
+                (x / unit, (y or x) / unit) if x and unit else None,
+                _positive(tags.get(Base.DigitalZoomRatio)) or 1.0,  # 0 means that no digital zoom was used
+            )
         except Exception:  # Pillow's parser may raise anything; EXIF is optional
             return Exif()
-
-
-def _exif(tags: Mapping[int, Any]) -> Exif:
-    code, unit = tags.get(Base.Orientation, 1), MILLIMETRES.get(tags.get(Base.FocalPlaneResolutionUnit, 2))
-    keys = (Base.ExifImageWidth, Base.ExifImageHeight, Base.FocalPlaneXResolution, Base.FocalPlaneYResolution)
-    width, height, x, y = (_positive(tags.get(key)) for key in keys)
-    return Exif(
-        Orientation.from_exif(code) if isinstance(code, int) else UPRIGHT,
-        (int(width), int(height)) if width and height and min(width, height) >= 1 else None,
-        _positive(tags.get(Base.FocalLengthIn35mmFilm)),
-        _positive(tags.get(Base.FocalLength)),
-        (x / unit, (y or x) / unit) if x and unit else None,
-        _positive(tags.get(Base.DigitalZoomRatio)) or 1.0,  # 0 means that no digital zoom was used
-    )
 
 
 def _positive(value: Any) -> float | None:

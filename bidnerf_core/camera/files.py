@@ -28,21 +28,25 @@ from bidnerf_core.camera.lenses import (
     colmap_camera,
 )
 from bidnerf_core.errors import InputError
-from bidnerf_core.io import Record, Row, parse_json, parse_record, parse_rows, parse_yaml, read_file
+from bidnerf_core.io import Record, parse_json, parse_record, parse_rows, parse_yaml, read_file
 
-LENSES = tuple(name for name, (_, kind, _) in MODELS.items() if kind != PERSPECTIVE)
-PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
-MATRICES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "K", "k", "M1", "M")
-COEFFICIENTS = (
-    "distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs", "distortion", "D", "d", "D1",
-)  # fmt: skip
-WIDTHS = ("image_width", "image_Width", "width", "Camera.width", "img_width")
-HEIGHTS = ("image_height", "image_Height", "height", "Camera.height", "img_height")
-SIZES = ("image_size", "imageSize", "resolution", "size")
-FISHEYES = ("equidistant", "fisheye", "kannalabrandt8", "kannala_brandt", "opencv_fisheye")
-UNDISTORTED = (
-    "plumb_bob", "rational_polynomial", "radtan", "none", "pinhole", "perspective", "opencv", "thin_prism", "",
-)  # fmt: skip
+KEYS = {
+    "K": ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "K", "k", "M1", "M"),
+    "coefficients": (
+        "distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs", "distortion", "D", "d", "D1",
+    ),
+    "width": ("image_width", "image_Width", "width", "Camera.width", "img_width"),
+    "height": ("image_height", "image_Height", "height", "Camera.height", "img_height"),
+    "size": ("image_size", "imageSize", "resolution", "size"),
+}  # fmt: skip
+"""The keys of calibrations in YAML and JSON, by their meaning."""
+DISTORTIONS = {
+    FISHEYE: ("equidistant", "fisheye", "kannalabrandt8", "kannala_brandt", "opencv_fisheye"),
+    PERSPECTIVE: (
+        "plumb_bob", "rational_polynomial", "radtan", "none", "pinhole", "perspective", "opencv", "thin_prism", "",
+    ),
+}  # fmt: skip
+"""The names of distortion models in calibrations, in lower case, by our kind of model."""
 EXPECTED = "YAML from ROS (camera_info), OpenCV, ORB-SLAM or Kalibr with the intrinsics of one camera"
 
 
@@ -55,36 +59,33 @@ class CameraRecord:
     record: Record
     width: int | None
     height: int | None
-    lens: str | None = None  # the model of a lens that is not perspective
-    fx: tuple[float, bool] = (0.0, False)
-    fy: tuple[float, bool] | None = None  # None: that of x
-    centre: tuple[float | None, float | None] = (None, None)
-    coefficients: tuple[float, ...] = ()
-    face: str | None = None  # of a panorama
+    model: str  # from ``MODELS``, or ``PERSPECTIVE``
+    focals: tuple[tuple[float, bool] | None, ...]  # of x and y; None: that of x
+    centre: tuple[float | None, float | None]
+    coefficients: tuple[float, ...]
 
     def intrinsics(self, width: int, height: int) -> Camera:
         """Return the camera for an image of this size; the principal point defaults to the image centre.
 
-        Raises ``InputError`` for implausible values.
+        A panorama becomes its front face. Raises ``InputError`` for implausible values.
         """
         try:
-            if self.lens == PANORAMA:
-                return PanoramaFace(self.face or "front", (width, height))
-            fx = _pixels(self.fx, width)
-            fy = fx if self.fy is None else _pixels(self.fy, height)
+            if self.model == PANORAMA:
+                return PanoramaFace("front", (width, height))
+            fx, fy = (
+                focal and (focal_length(size, focal[0]) if focal[1] else focal[0])
+                for focal, size in zip(self.focals, (width, height), strict=True)
+            )
             cx, cy = (
                 size / 2 if c is None else c for size, c in zip((width, height), self.centre, strict=True)
             )
-            flat = Intrinsics(fx, fy, cx, cy, width, height, self.coefficients if self.lens is None else ())
-            question_focal(fx, width, height)
-            return flat if self.lens is None else CentralLens(self.lens, flat, self.coefficients)
+            is_lens = self.model != PERSPECTIVE
+            numbers = (fx or 0.0, fx or 0.0 if fy is None else fy, cx, cy, width, height)
+            flat = Intrinsics(*numbers, () if is_lens else self.coefficients)
+            question_focal(flat.fx, width, height)
+            return CentralLens(self.model, flat, self.coefficients) if is_lens else flat
         except InputError as error:
             raise self.record.error(error) from error
-
-
-def _pixels(focal: tuple[float, bool], size: int) -> float:
-    value, is_angle = focal
-    return focal_length(size, value) if is_angle else value
 
 
 def camera_record(record: Record) -> CameraRecord:
@@ -92,35 +93,30 @@ def camera_record(record: Record) -> CameraRecord:
 
     Raises ``InputError`` for an unknown camera model and for a focal length that is missing or not positive.
     """
-    lens, width, height = _lens(record), record.size("w"), record.size("h")
-    if lens == PANORAMA:
-        return CameraRecord(record, width, height, lens)
-    fx, fy = _focal(record, "x"), _focal(record, "y")
-    if fx is None:
-        raise record.error("no focal length", expected="fl_x (pixels) or camera_angle_x (radians)")
-    centre = record.number("cx"), record.number("cy")
-    coefficients = _distortion(record) if lens is None else _coefficients(record, len(MODELS[lens][2]) - 4)
-    return CameraRecord(record, width, height, lens, fx, fy, centre, coefficients)
-
-
-def _lens(record: Record) -> str | None:
-    """Return the name of a model that is not perspective, from ``LENSES``; None for perspective ones."""
-    model = (record.text("camera_model") or "").upper()
-    if record.value("is_fisheye") and model in ("", *PERSPECTIVE_MODELS):  # some programs write 1 for true
-        return "OPENCV_FISHEYE"
-    if model in LENSES:
-        return model
-    if model and model not in PERSPECTIVE_MODELS:
-        expected = ", ".join((*PERSPECTIVE_MODELS, *LENSES))
-        raise record.error(f"camera_model is {model}", expected=f"one of {expected}")
-    return None
-
-
-def _coefficients(record: Record, count: int) -> tuple[float, ...]:
-    """Return the coefficients of a fisheye or division lens; a single one may be called k."""
-    found = [record.number(key) for key in ("k1", "k2", "k3", "k4")]
-    first = record.number("k") if found[0] is None else found[0]
-    return tuple(value or 0.0 for value in (first, *found[1:]))[:count]
+    model, width, height = record.text("camera_model") or "", record.size("w"), record.size("h")
+    kinds = {name: kind for name, (_, kind, _) in MODELS.items() if name != "FULL_OPENCV"}
+    kinds[PERSPECTIVE] = PERSPECTIVE
+    kind = kinds.get(model.upper()) if model else PERSPECTIVE
+    if kind is None:
+        raise record.error(f"camera_model is {model.upper()}", expected=f"one of {', '.join(kinds)}")
+    if kind == PERSPECTIVE:  # some programs write 1 for true
+        model = FISHEYE if record.value("is_fisheye") else PERSPECTIVE
+    model, focals, lens = model.upper(), (None, None), tuple[float, ...]()
+    if model != PANORAMA:
+        focals = (_focal(record, "x"), _focal(record, "y"))
+        if focals[0] is None:
+            raise record.error("no focal length", expected="fl_x (pixels) or camera_angle_x (radians)")
+        k1, k2, k3, k4, p1, p2 = (record.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+        lens = (k1 if record.number("k1") is not None else record.number("k") or 0.0, k2, k3, k4)
+        if model != PERSPECTIVE:
+            lens = lens[: len(MODELS[model][2]) - 4]
+        elif k4:
+            raise record.error("k4 is not 0", expected="no distortion beyond k1 k2 p1 p2 k3")
+        else:  # in OpenCV's order; an ideal lens has none
+            lens = (k1, k2, p1, p2, k3) if k3 else (k1, k2, p1, p2) if any((k1, k2, p1, p2)) else ()
+    return CameraRecord(
+        record, width, height, model, focals, (record.number("cx"), record.number("cy")), lens
+    )
 
 
 def _focal(record: Record, axis: str) -> tuple[float, bool] | None:
@@ -140,16 +136,6 @@ def _focal(record: Record, axis: str) -> tuple[float, bool] | None:
     return None
 
 
-def _distortion(record: Record) -> tuple[float, ...]:
-    """Return the coefficients in OpenCV's order; an ideal lens has none."""
-    if record.number("k4"):
-        raise record.error("k4 is not 0", expected="no distortion beyond k1 k2 p1 p2 k3")
-    values = tuple(record.number(key) or 0.0 for key in ("k1", "k2", "p1", "p2", "k3"))
-    if not any(values):
-        return ()
-    return values if values[4] else values[:4]
-
-
 def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> Camera:
     """Read the camera from a file in one of the formats above.
 
@@ -159,11 +145,9 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
     """
     content = read_file(path, "a camera file (JSON, YAML, COLMAP's cameras.txt or a list of images)")
     start = content.lstrip(b"\xef\xbb\xbf \t\r\n")
-    if start[:1] == b"{":
-        return _json_camera(parse_record(str(path), content), size)
     if start[:1] == b"[" and start[1:].lstrip()[:1] == b"{":
         return _chosen(path, _splat_cameras(path, content), photo)
-    if start[:1] == b"[":
+    if start[:1] in (b"{", b"["):
         return _json_camera(parse_record(str(path), content), size)
     if start.startswith((b"%YAML", b"---")) or path.suffix.lower() in (".yaml", ".yml"):
         values = parse_yaml(content, str(path), EXPECTED)
@@ -192,16 +176,13 @@ def _splat_cameras(path: Path, content: bytes) -> dict[str, Camera]:
     entries = parse_json(content, str(path), "a camera, or a list of cameras")
     found: dict[str, Camera] = {}
     for number, entry in enumerate(entries):
-        if not isinstance(entry, Mapping):
-            raise InputError(
-                f"entry {number} is not a camera", where=path, expected="img_name, width, height, fx and fy"
-            )
-        where = f"{path}: entry {number}"
-        fx, fy, *sides = (
-            float(_array(where, entry.get(key, "none"))) for key in ("fx", "fy", "width", "height")
+        record = Record(f"{path}: entry {number}", entry if isinstance(entry, Mapping) else {})
+        fx, fy, width, height = (
+            record.checked_number(record.value(key), key) for key in ("fx", "fy", "width", "height")
         )
-        K = ((fx, 0, sides[0] / 2 - 0.5), (0, fy, sides[1] / 2 - 0.5), (0, 0, 1))
-        found[str(entry.get("img_name", number))] = _opencv_camera(where, K, (), "", tuple(map(int, sides)))
+        K = ((fx, 0, width / 2 - 0.5), (0, fy, height / 2 - 0.5), (0, 0, 1))
+        name = str(record.value("img_name") or number)
+        found[name] = _opencv_camera(record.where, K, (), "", (int(width), int(height)))
     return found
 
 
@@ -234,21 +215,19 @@ def _text_cameras(path: Path, content: bytes, named: bool = True) -> dict[str, C
     expected = "transforms.json or cameras.txt (COLMAP's model_converter makes it from cameras.bin)"
     found: dict[str, Camera] = {}
     for row in parse_rows(content, path, expected, "CAMERA_ID MODEL WIDTH HEIGHT and parameters"):
-        key, camera = _text_camera(row, named)
+        words = row.words
+        if len(words) < 5:
+            raise row.error(f" has {len(words)} entries")
+        if words[1] not in MODELS:
+            raise InputError(
+                f"camera model {words[1]}", where=row.where, expected=f"one of {', '.join(MODELS)}"
+            )
+        key = words[0] if named and not words[0].lstrip("-").isdecimal() else str(row.integer(words[0]))
+        size = row.integer(words[2]), row.integer(words[3])
+        camera = colmap_camera(row.where, words[1], *size, row.numbers(words[4:]))
         if found.setdefault(key, camera) != camera:
             raise InputError(f"camera {key} is repeated", where=row.where, expected="each id once")
     return found
-
-
-def _text_camera(row: Row, named: bool) -> tuple[str, Camera]:
-    words = row.words
-    if len(words) < 5:
-        raise row.error(f" has {len(words)} entries")
-    if words[1] not in MODELS:
-        raise InputError(f"camera model {words[1]}", where=row.where, expected=f"one of {', '.join(MODELS)}")
-    width, height = (row.integer(words[place]) for place in (2, 3))
-    key = words[0] if named and not words[0].lstrip("-").isdecimal() else str(row.integer(words[0]))
-    return key, colmap_camera(row.where, words[1], width, height, row.numbers(words[4:]))
 
 
 def calibrated_camera(where: str, values: Mapping[str, Any], size: tuple[int, int]) -> Camera:
@@ -259,71 +238,72 @@ def calibrated_camera(where: str, values: Mapping[str, Any], size: tuple[int, in
     """
     inner = [value for key, value in values.items() if re.fullmatch(r"cam\d+", str(key))]
     if len(inner) > 1:
-        raise InputError(
-            f"holds {len(inner)} cameras",
-            where=where,
-            expected="one; keep only the lines of this photo's camera",
-        )
+        expected = "one; keep only the lines of this photo's camera"
+        raise InputError(f"holds {len(inner)} cameras", where=where, expected=expected)
     if isinstance(values.get("intrinsic"), Mapping):  # a view in Open3D
         return calibrated_camera(where, values["intrinsic"], size)
     orb_slam = next((name for name in ("Camera", "Camera1") if f"{name}.fx" in values), None)
+    numbers: list[float] = []  # fx, fy, cx, cy and, for ORB-SLAM, the coefficients
     if inner and isinstance(inner[0], Mapping):  # Kalibr
-        values = inner[0]
-        four, kind = _array(where, values.get("intrinsics", [])), str(values.get("camera_model", "pinhole"))
-        if kind != "pinhole" or four.size != 4:
-            found = f"camera_model is {kind} with {four.size} intrinsics"
+        values, kind = inner[0], str(inner[0].get("camera_model", "pinhole"))
+        numbers = _array(where, values.get("intrinsics", [])).ravel().tolist()
+        if kind != "pinhole" or len(numbers) != 4:
+            found = f"camera_model is {kind} with {len(numbers)} intrinsics"
             raise InputError(found, where=where, expected="pinhole with 4")
-        fx, fy, cx, cy = four.ravel().tolist()
-        K: Any = ((fx, 0, cx), (0, fy, cy), (0, 0, 1))
         lens = _array(where, values.get("distortion_coeffs", []))
         model = str(values.get("distortion_model", "none"))
     elif orb_slam is not None:
         model = str(values.get("Camera.type", "pinhole"))
-        keys = ("k1", "k2", "k3", "k4") if model.lower() in FISHEYES else ("k1", "k2", "p1", "p2", "k3")
-        fx, fy, cx, cy, *rest = (
-            float(_array(where, values.get(f"{orb_slam}.{key}", 0.0)))
-            for key in ("fx", "fy", "cx", "cy", *keys)
+        is_fisheye = model.lower() in DISTORTIONS[FISHEYE]
+        names = (
+            "fx",
+            "fy",
+            "cx",
+            "cy",
+            *(("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2", "k3")),
         )
-        K, lens = ((fx, 0, cx), (0, fy, cy), (0, 0, 1)), np.array(rest)
+        numbers = [float(_array(where, values.get(f"{orb_slam}.{name}", 0.0))) for name in names]
+        lens = np.array(numbers[4:])
     else:
-        given = _first(values, MATRICES)
+        given = _first(values, "K")
         if given is None:
             raise InputError(
-                f"no camera matrix ({', '.join(MATRICES[:3])} or K)", where=where, expected=EXPECTED
+                f"no camera matrix ({', '.join(KEYS['K'][:3])} or K)", where=where, expected=EXPECTED
             )
-        K, lens = _array(where, given), _array(where, _first(values, COEFFICIENTS) or [])
+        K, lens = _array(where, given), _array(where, _first(values, "coefficients") or [])
         if "intrinsic_matrix" in values and not isinstance(given, Mapping) and K.shape == (9,):  # by columns
             K = K.reshape(3, 3).T
         model = str(values.get("distortion_model", values.get("camera_model", "")))
-    pair = _first(values, SIZES)
-    sides = _array(
-        where, pair if pair is not None else [_first(values, keys) or 0 for keys in (WIDTHS, HEIGHTS)]
-    )
+    if numbers:
+        fx, fy, cx, cy = numbers[:4]
+        K = np.array(((fx, 0, cx), (0, fy, cy), (0, 0, 1)))
+    pair = _first(values, "size")
+    if pair is None:
+        pair = [_first(values, key) or 0 for key in ("width", "height")]
+    sides = _array(where, pair)
     if sides.size != 2 or not np.isfinite(sides).all():
         raise InputError(f"size is {str(pair)[:60]!r}", where=where, expected="width and height in pixels")
     width, height = (int(value) for value in sides.ravel())
-    return _opencv_camera(
-        where, K, tuple(lens.ravel().tolist()), model, (width, height) if width > 0 and height > 0 else size
-    )
+    known = (width, height) if width > 0 and height > 0 else size
+    return _opencv_camera(where, K, tuple(lens.ravel().tolist()), model, known)
 
 
-def _opencv_camera(where: str, K: Any, lens: tuple[float, ...], model: str, size: tuple[int, ...]) -> Camera:
+def _opencv_camera(where: str, K: Any, lens: tuple[float, ...], model: str, size: tuple[int, int]) -> Camera:
     """Return the camera of a matrix and coefficients, as ``Intrinsics.from_opencv`` does, or a fisheye lens."""
-    kind = model.lower()
-    if kind not in (*FISHEYES, *UNDISTORTED):
+    kind = next((kind for kind, names in DISTORTIONS.items() if model.lower() in names), None)
+    if kind is None:
         expected = "plumb_bob, rational_polynomial or equidistant"
         raise InputError(f"distortion model {model}", where=where, expected=expected)
     try:
-        if kind not in FISHEYES:
-            return Intrinsics.from_opencv(K, lens or None, size)  # type: ignore[arg-type]
-        flat = Intrinsics.from_opencv(K, None, size)  # type: ignore[arg-type]
-        return CentralLens(FISHEYE, flat, (*lens, 0.0, 0.0, 0.0, 0.0)[:4])
+        if kind == PERSPECTIVE:
+            return Intrinsics.from_opencv(K, lens or None, size)
+        return CentralLens(FISHEYE, Intrinsics.from_opencv(K, None, size), (*lens, 0.0, 0.0, 0.0, 0.0)[:4])
     except InputError as error:
         raise InputError(error, where=where) from error
 
 
-def _first(values: Mapping[str, Any], keys: tuple[str, ...]) -> Any:
-    return next((values[key] for key in keys if values.get(key) is not None), None)
+def _first(values: Mapping[str, Any], what: str) -> Any:
+    return next((values[key] for key in KEYS[what] if values.get(key) is not None), None)
 
 
 def _array(where: str, given: Any) -> np.ndarray:

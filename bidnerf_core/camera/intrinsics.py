@@ -19,26 +19,18 @@ from jaxtyping import Bool, Float, Int
 from kornia.geometry.calibration import distort_points, undistort_points
 from torch import Tensor
 
-from bidnerf_core.camera.exif import QUARTER_TURNS, Orientation
+from bidnerf_core.camera.exif import Orientation
 from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
 
-FOCAL = (Real, 1e-6, 1e9, "a positive number, at least 1e-06 pixels and at most 1e+09 pixels")
-PRINCIPAL_POINT = (Real, -1e9, 1e9, "pixels near the image")
-SIZE = (Integral, 1, 1_000_000, "a whole number of pixels from 1 to 1000000")
-COEFFICIENT = (Real, -1e6, 1e6, "coefficients of a real lens")
+LIMITS: dict[str, tuple[type, float, float, str]] = {
+    "focal length": (Real, 1e-6, 1e9, "a positive number, at least 1e-06 pixels and at most 1e+09 pixels"),
+    "principal point": (Real, -1e9, 1e9, "pixels near the image"),
+    "size": (Integral, 1, 1_000_000, "a whole number of pixels from 1 to 1000000"),
+    "coefficient": (Real, -1e6, 1e6, "coefficients of a real lens"),
+}
 """The types and limits of a camera's numbers. Beyond them, float32 overflows; coefficients of rational models reach
 some hundreds."""
-LARGEST_FOCAL = 1000
-"""Largest focal length, in image widths or heights: that of a telescope with a field of view of 0.06 degrees."""
-SHORTEST_FOCAL, PHOTO, MILLIMETRE = 0.1, 240, 1.0
-"""Smallest focal length relative to the image size (a view of 157 degrees), for images of at least ``PHOTO``
-pixels along a side. A shorter one above ``MILLIMETRE`` is probably given in millimetres: a phone's lens has
-about 4.2 mm."""
-SKEW = 1e-6
-"""Maximum skew of a camera matrix, as a fraction of its focal length."""
-ASPECT_TOLERANCE = 0.005
-"""Relative difference between two aspect ratios that is attributed to rounding when an image was resized."""
 
 
 @dataclass(frozen=True)
@@ -57,16 +49,17 @@ class Intrinsics:
         given: Any = self.distortion
         if isinstance(given, np.ndarray | Tensor):
             object.__setattr__(self, "distortion", tuple(_numbers("distortion", given).ravel().tolist()))
-        for name in ("fx", "fy"):
-            check_number(f"focal length {name}", getattr(self, name), *FOCAL)
-        for name in ("cx", "cy"):
-            check_number(f"principal point {name}", getattr(self, name), *PRINCIPAL_POINT)
-        for name in ("width", "height"):
-            check_number(name, getattr(self, name), *SIZE)
+        for names, what in (
+            ("fx fy", "focal length"),
+            ("cx cy", "principal point"),
+            ("width height", "size"),
+        ):
+            for name in names.split():
+                check_number(name if what == "size" else f"{what} {name}", getattr(self, name), *LIMITS[what])
         if not isinstance(self.distortion, tuple | list):
             raise InputError(f"distortion is a {type(self.distortion).__name__}", expected="coefficients")
         for value in self.distortion:
-            check_number("distortion", value, *COEFFICIENT)
+            check_number("distortion", value, *LIMITS["coefficient"])
         if len(self.distortion) not in (0, 4, 5, 8, 12, 14):
             raise InputError(
                 f"distortion has {len(self.distortion)} coefficients", expected="0, 4, 5, 8, 12 or 14"
@@ -75,16 +68,14 @@ class Intrinsics:
     @staticmethod
     def from_focal(focal: float, width: int, height: int) -> Intrinsics:
         """Return an undistorted camera; ``focal`` is in pixels, and the principal point is the image centre."""
-        kind, least, _, expected = FOCAL
+        kind, least, _, expected = LIMITS["focal length"]
         check_number("fx", focal, kind, least, math.inf, expected)
-        check_number("width", width, *SIZE)
-        check_number("height", height, *SIZE)
+        check_number("width", width, *LIMITS["size"])
+        check_number("height", height, *LIMITS["size"])
         question_focal(focal, width, height)
-        if focal > LARGEST_FOCAL * max(width, height):
-            raise InputError(
-                f"focal length is {focal} px for an image of {width}x{height}",
-                expected=f"at most {LARGEST_FOCAL} times its longer side",
-            )
+        if focal > 1000 * max(width, height):  # a telescope's field of view of 0.06 degrees
+            found = f"focal length is {focal} px for an image of {width}x{height}"
+            raise InputError(found, expected="at most 1000 times its longer side")
         return Intrinsics(focal, focal, width / 2, height / 2, width, height)
 
     @staticmethod
@@ -92,7 +83,7 @@ class Intrinsics:
         """Return an undistorted camera with a horizontal field of view of ``degrees``."""
         expected = "degrees between 0 and 180 (both excluded)"
         check_number("horizontal field of view", degrees, Real, 1e-9, math.nextafter(180, 0), expected)
-        check_number("width", width, *SIZE)
+        check_number("width", width, *LIMITS["size"])
         return Intrinsics.from_focal(focal_length(width, math.radians(degrees)), width, height)
 
     @staticmethod
@@ -110,7 +101,7 @@ class Intrinsics:
         if matrix.size != 9:
             raise InputError(f"K has shape {matrix.shape}", expected="the 3 x 3 matrix of a camera")
         (fx, skew, cx), (zero, fy, cy), last = matrix.reshape(3, 3).tolist()
-        if abs(skew) > SKEW * abs(fx) or zero != 0 or last != [0, 0, 1]:
+        if abs(skew) > 1e-6 * abs(fx) or zero != 0 or last != [0, 0, 1]:
             raise InputError(
                 f"K is {matrix.reshape(3, 3).tolist()}",
                 expected="rows (fx 0 cx), (0 fy cy), (0 0 1) in pixels",
@@ -192,7 +183,8 @@ class Intrinsics:
         """Return this camera rotated by 90 degrees to either side; none if its sensor is tilted (14
         coefficients).
         """
-        return () if any(self.distortion[TAU_X:]) else tuple(map(self.upright, QUARTER_TURNS))
+        tilted = any(self.distortion[12:])
+        return () if tilted else tuple(self.upright(Orientation.from_exif(code)) for code in (6, 8))
 
     def centre_crop(self, width: int, height: int) -> Intrinsics:
         """Return the camera of the largest centred crop with the aspect ratio of the given size, resized to
@@ -210,21 +202,19 @@ class Intrinsics:
         Raises ``InputError`` if an image with a tilted sensor (14 distortion coefficients) would be
         transposed.
         """
-        camera = self
-        if orientation.mirrors_columns:
-            distortion = _negated(camera.distortion, P2, S1, S2, TAU_Y)
-            camera = replace(camera, cx=camera.width - camera.cx, distortion=distortion)
-        if orientation.mirrors_rows:
-            distortion = _negated(camera.distortion, P1, S3, S4, TAU_X)
-            camera = replace(camera, cy=camera.height - camera.cy, distortion=distortion)
-        return camera._transposed() if orientation.transposes else camera
-
-    def _transposed(self) -> Intrinsics:
-        if any(self.distortion[TAU_X:]):
+        if orientation.transposes and any(self.distortion[12:]):
             raise InputError("a camera with a tilted sensor cannot be rotated", expected="an upright image")
-        order = [TRANSPOSED.get(place, place) for place in range(len(self.distortion))]
-        distortion = tuple(self.distortion[place] for place in order)
-        return Intrinsics(self.fy, self.fx, self.cy, self.cx, self.height, self.width, distortion)
+        # Coefficients that depend on the axes: tangential p1 p2 (2 3), thin prism s1 to s4 (8 to 11), tilt tau_x tau_y (12 13).
+        fx, fy, cx, cy, k = self.fx, self.fy, self.cx, self.cy, self.distortion
+        width, height = self.width, self.height
+        if orientation.mirrors_columns:
+            cx, k = width - cx, _negated(k, 3, 8, 9, 13)
+        if orientation.mirrors_rows:
+            cy, k = height - cy, _negated(k, 2, 10, 11, 12)
+        if orientation.transposes:
+            order = (0, 1, 3, 2, 4, 5, 6, 7, 10, 11, 8, 9, 12, 13)[: len(k)]
+            return Intrinsics(fy, fx, cy, cx, height, width, tuple(k[place] for place in order))
+        return Intrinsics(fx, fy, cx, cy, width, height, k)
 
     def _distortion_at(self, points: Float[Tensor, "n 2"]) -> tuple[Tensor, Tensor]:
         """Return the camera matrix (3 3) and the distortion coefficients, on the device of ``points``."""
@@ -260,9 +250,14 @@ class CameraBatch:
 
 
 def question_focal(focal: float, width: int, height: int) -> None:
-    """Raise ``InputError`` for a focal length that cannot be in pixels because no lens has such a wide view."""
-    if MILLIMETRE <= focal < SHORTEST_FOCAL * max(width, height) and max(width, height) >= PHOTO:
-        angle = 2 * math.degrees(math.atan(max(width, height) / 2 / focal))
+    """Raise ``InputError`` for a focal length that cannot be in pixels because no lens has such a wide view.
+
+    Below a tenth of the image's longer side, that is a view of 157 degrees. A shorter one, from 1 on, is probably given in
+    millimetres: a phone's lens has about 4.2 mm. Images of less than 240 pixels may have any.
+    """
+    side = max(width, height)
+    if 1 <= focal < side / 10 and side >= 240:
+        angle = 2 * math.degrees(math.atan(side / 2 / focal))
         raise InputError(
             f"focal length is {focal:g} px for an image of {width}x{height}, which would see {angle:.0f} degrees: is that"
             f" millimetres? Expected pixels, usually 0.5 to 2 times the width ({0.5 * width:.0f} to {2 * width:.0f})"
@@ -285,11 +280,6 @@ def check_number(what: str, value: Any, kind: type, least: float, most: float, e
         raise InputError(f"{what} is {value!r:.60}", expected=expected)
 
 
-P1, P2, S1, S2, S3, S4, TAU_X, TAU_Y = 2, 3, 8, 9, 10, 11, 12, 13
-"""Indices of the distortion coefficients that depend on the directions of the axes."""
-TRANSPOSED = {P1: P2, P2: P1, S1: S3, S2: S4, S3: S1, S4: S2}
-
-
 def _negated(distortion: tuple[float, ...], *places: int) -> tuple[float, ...]:
     return tuple(-value if place in places else value for place, value in enumerate(distortion))
 
@@ -302,7 +292,7 @@ def focal_length(pixels: int, angle: float) -> float:
 def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Whether two sizes (width, height) may belong to one image at two resolutions."""
     ratio = size[0] * other[1] / (size[1] * other[0])
-    return abs(ratio - 1) <= ASPECT_TOLERANCE
+    return abs(ratio - 1) <= 0.005  # sizes are rounded when an image is resized
 
 
 def reduced_size(width: int, height: int, largest: int) -> tuple[int, int]:
@@ -367,6 +357,6 @@ def _oriented(cameras: CameraGroup, width: int, height: int) -> tuple[CameraGrou
         (camera,) if (camera.width - camera.height) * (width - height) >= 0 else camera.quarter_turns()
         for camera in cameras
     ]
-    ways = [way for way in ways if way]
+    ways = list(filter(None, ways))
     sides = max(map(len, ways), default=0)
     return tuple(tuple(way[side % len(way)] for way in ways) for side in range(sides))

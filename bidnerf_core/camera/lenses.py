@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float
 
 from bidnerf_core.camera.exif import UPRIGHT, Orientation
-from bidnerf_core.camera.intrinsics import COEFFICIENT, Intrinsics, check_number, same_aspect
+from bidnerf_core.camera.intrinsics import LIMITS, Intrinsics, check_number, same_aspect
 from bidnerf_core.errors import InputError
 
 WIDEST = math.radians(60)
@@ -46,10 +46,6 @@ MODELS: dict[str, tuple[int, str, tuple[int, ...]]] = {
     PANORAMA: (17, PANORAMA, (0, 1)),
 }
 """COLMAP's models by name; a panorama has its size as parameters."""
-MODEL_IDS = {number: name for name, (number, _, _) in MODELS.items()}
-"""The names of the models by their ids."""
-MOST_TERMS = 8
-"""Number of distortion coefficients in COLMAP's largest perspective model, in OpenCV's order."""
 PANORAMA_FACES = {  # name: yaw to the right and pitch upwards, degrees
     "front": (0, 0), "right": (90, 0), "back": (180, 0), "left": (270, 0), "up": (0, 90), "down": (0, -90),
 }  # fmt: skip
@@ -136,7 +132,7 @@ class CentralLens(Lens):
 
     def __post_init__(self) -> None:
         for value in self.coefficients:
-            check_number(f"a coefficient of {self.model}", value, *COEFFICIENT)
+            check_number(f"a coefficient of {self.model}", value, *LIMITS["coefficient"])
         if not all(map(math.isfinite, self._angles)):
             raise InputError(
                 f"{self.model} with coefficients {self.coefficients} maps no ray to a side of its image",
@@ -324,13 +320,8 @@ def colmap_model(camera: Intrinsics) -> tuple[str, list[float]]:
     Raises ``InputError`` for thin prism distortion or a tilted sensor, which no COLMAP model has.
     """
     k = camera.distortion
-    if any(k[MOST_TERMS:]):
-        raise InputError(
-            "a camera with thin prism distortion or a tilted sensor",
-            expected="one that a COLMAP model describes",
-        )
-    model, count = (
-        ("PINHOLE", 0) if not any(k) else ("OPENCV", 4) if not any(k[4:]) else ("FULL_OPENCV", MOST_TERMS)
-    )
-    lens = [*k, *[0.0] * MOST_TERMS][:count]
-    return model, [camera.fx, camera.fy, camera.cx, camera.cy, *lens]
+    if any(k[8:]):
+        found = "a camera with thin prism distortion or a tilted sensor"
+        raise InputError(found, expected="one that a COLMAP model describes")
+    model, count = ("PINHOLE", 0) if not any(k) else ("OPENCV", 4) if not any(k[4:]) else ("FULL_OPENCV", 8)
+    return model, [camera.fx, camera.fy, camera.cx, camera.cy, *(*k, *[0.0] * 8)[:count]]

@@ -16,11 +16,6 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.geometry import SE3
 
-MOVE, TURN = 0.005, 0.01
-"""Typical motion of a hand-held camera during readout (a few hundredths of a second): translation along each
-axis relative to the viewing distance, and rotation about each axis in radians.
-"""
-
 
 @dataclass(frozen=True)
 class MotionPrior:
@@ -35,8 +30,11 @@ class MotionPrior:
 
     @staticmethod
     def usual(distance: float) -> MotionPrior:
-        """Return the prior of a hand-held camera whose scene is at ``distance`` (metres)."""
-        return MotionPrior(MOVE * distance, TURN)
+        """Return the prior of a hand-held camera whose scene is at ``distance`` (metres).
+
+        The readout takes a few hundredths of a second.
+        """
+        return MotionPrior(0.005 * distance, 0.01)
 
 
 AT_REST = torch.zeros(6, dtype=torch.float64)

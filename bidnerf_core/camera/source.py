@@ -24,14 +24,7 @@ from bidnerf_core.camera.intrinsics import (
 from bidnerf_core.camera.lenses import Camera, Lens
 from bidnerf_core.errors import InputError
 
-FILM_DIAGONAL = math.hypot(36.0, 24.0)
-"""Millimetres; 35 mm-equivalent focal lengths refer to it (CIPA DCG-001)."""
-LEAST_CROP = 0.5
-"""Smallest fraction of the width or height at which a cropped photo is assumed to have kept its resolution."""
-CAMERA_FILES = ("camera.json", "cameras.txt")
-"""Files in a recording's folder that may hold its camera, in the formats of ``read_camera``."""
 CameraKind = TypeVar("CameraKind", Intrinsics, Lens, Camera)
-NO_EXIF = Exif()
 WAYS = "--camera FILE, --focal PX or --hfov DEG (camera=, focal=, hfov= in Python)"
 WAYS_OF_PHOTO = "--camera FILE, --focal PX or --hfov DEG (in Python camera=, focal=, hfov=, or assumed= with a map's cameras)"
 
@@ -138,7 +131,7 @@ class CameraSource:
         if not self.is_given and not self.assumed:
             raise InputError(why, where=path, expected=f"a camera: {WAYS}")
 
-    def find(self, where: Path | str, raster: Raster, exif: Exif = NO_EXIF) -> FoundCamera:
+    def find(self, where: Path | str, raster: Raster, exif: Exif | None = None) -> FoundCamera:
         """Return the camera of an upright image: the given one, else the one in EXIF, else one of the
         ``assumed`` ones.
 
@@ -146,6 +139,7 @@ class CameraSource:
         known, and if the camera has another aspect ratio than the image.
         """
         camera, focal, hfov, size = self.camera, self.focal, self.hfov, raster.upright_size
+        exif = exif or Exif()
         if sum(given is not None for given in (camera, focal, hfov)) > 1:
             raise InputError("several cameras are given", where=where, expected=f"one of {WAYS}")
         try:
@@ -164,16 +158,12 @@ class CameraSource:
         if isinstance(camera, Intrinsics | Lens):
             return _fitted(str(where), raster, camera, "camera as given")
         if not isinstance(camera, str | Path):
-            raise InputError(
-                f"camera is a {type(camera).__name__}",
-                where=where,
-                expected="Intrinsics or the path of a camera file"
-                + (
+            expected = "Intrinsics or the path of a camera file"
+            if getattr(camera, "shape", None) == (3, 3):
+                expected += (
                     "; Intrinsics.from_opencv(K, distortion, (width, height)) makes them from a matrix"
-                    if getattr(camera, "shape", None) == (3, 3)
-                    else ""
-                ),
-            )
+                )
+            raise InputError(f"camera is a {type(camera).__name__}", where=where, expected=expected)
         return _fitted(str(where), raster, read_camera(Path(camera), size, str(where)), f"camera of {camera}")
 
     def at(self, image: Path) -> Callable[[int, int], Camera]:
@@ -190,23 +180,19 @@ def folder_camera(
 ) -> CameraSource:
     """Return the single camera of a recording whose format stores none.
 
-    It is the ``given`` one (intrinsics or a file), the one in ``CAMERA_FILES`` in ``folder``, or the
+    It is the ``given`` one (intrinsics or a file), the file ``camera.json`` or ``cameras.txt`` in ``folder``, or the
     ``published`` one of the format. Raises ``InputError`` if there is none, with the reason ``unknown`` and
     the ``ways`` to give one, and for a given file that does not exist.
     """
     if isinstance(given, Path) and not given.exists():
         raise InputError("no such file", where=given, expected=f"the camera of {folder}: {ways}")
-    beside = next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
+    beside = next(
+        (file for name in ("camera.json", "cameras.txt") if (file := folder / name).is_file()), None
+    )
     found = given or beside or published
     if found is None:
-        raise InputError(
-            f"{unknown};",
-            where=folder,
-            expected=(
-                f"its camera: {' or '.join(CAMERA_FILES)} in the folder, or --camera with {ways} (camera= in"
-                " Python)"
-            ),
-        )
+        expected = f"its camera: camera.json or cameras.txt in the folder, or --camera with {ways} (camera= in Python)"
+        raise InputError(f"{unknown};", where=folder, expected=expected)
     return CameraSource(found)
 
 
@@ -238,7 +224,7 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: boo
     """Return the camera that EXIF describes, accurate to a few percent and assumed to be free of distortion.
 
     An image that was cropped after it was taken, if it may be, is assumed to have kept its resolution unless its size
-    differs greatly; then it is treated as a resized centre crop. Raises ``InputError`` if there is no focal length, and for
+    differs by more than half; then it is treated as a resized centre crop. Raises ``InputError`` if there is no focal length, and for
     any other cropped image.
     """
     taken, whole = exif.size, raster.size  # ``whole`` is the size before the image was cropped
@@ -252,11 +238,11 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: boo
             )
         ratio = max(raster.width / taken[0], raster.height / taken[1])
         fits = raster.width <= taken[0] and raster.height <= taken[1]
-        scale = 1.0 if fits and ratio >= LEAST_CROP else ratio
+        scale = 1.0 if fits and ratio >= 0.5 else ratio
         whole = round(taken[0] * scale), round(taken[1] * scale)
         part = f"; cropped from a photo of {taken[0]}x{taken[1]}"
     if exif.equivalent_mm is not None:
-        focal = exif.equivalent_mm / FILM_DIAGONAL * math.hypot(*whole)
+        focal = exif.equivalent_mm / math.hypot(36, 24) * math.hypot(*whole)  # CIPA DCG-001: of film
         origin = f"{exif.equivalent_mm:g} mm equivalent in EXIF"
     elif exif.focal_mm is not None and exif.pixels_per_mm is not None:
         # ``pixels_per_mm`` refers to the image as it was taken.

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bidnerf_core.camera import MODEL_IDS, MODELS, Camera, colmap_camera, read_text_cameras
+from bidnerf_core.camera import MODELS, Camera, colmap_camera, read_text_cameras
 from bidnerf_core.depth import DepthImage, depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
@@ -122,9 +122,9 @@ def depth_map_of(model: Path, name: str) -> Path | None:
 
 def _binary_camera(file: _Bytes) -> tuple[int, Camera]:
     number, model, width, height = file.take("<IiQQ")
-    name = MODEL_IDS.get(model)
+    name = next((name for name, (found, _, _) in MODELS.items() if found == model), None)
     if name is None:
-        expected = ", ".join(MODEL_IDS.values())
+        expected = ", ".join(MODELS)
         raise InputError(
             f"camera {number} has the model {model}",
             where=file.path,
