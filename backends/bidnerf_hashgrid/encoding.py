@@ -1,19 +1,17 @@
 """Multiresolution hash encoding (Mueller et al. 2022, "Instant Neural Graphics Primitives", section 3).
 
-Pure torch, laid out for the cores of a CPU; on a GPU, all levels take few operations:
+Pure torch, laid out for the cores of a CPU; on a GPU, ``fused`` has a kernel for it:
 
 * arrays are (corner, point), so that all arithmetic runs along contiguous points;
 * a pair of features is read and accumulated as one complex number (a "unit" below): one memory access per corner;
 * the points go through a level in chunks whose temporaries stay in the cache, and so does the table of the level;
-* levels are computed on several threads at once, because torch gathers and scatters on one; on a GPU, where launching
-  an operation often takes longer than computing a level, levels of the same kind are computed together (``LevelGroup``);
+* levels are computed on several threads at once, because torch gathers and scatters on one;
 * the backward pass is written by hand: gradients to a table are scattered to recomputed corner indices, and the
   derivative with respect to position is kept from the forward pass, where the corner values are at hand anyway.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -26,12 +24,11 @@ from torch.autograd.function import once_differentiable
 from bidnerf_core.errors import InputError
 from bidnerf_core.settings import Range, Settings
 from bidnerf_hashgrid import fused
-from bidnerf_hashgrid.levels import Level, LevelGroup, make_levels, one_by_one, together
+from bidnerf_hashgrid.levels import Level, make_levels
 from bidnerf_hashgrid.threads import concurrently, slices, threads_for
 
-CPU_CHUNK = 32768
-GPU_CHUNK = 2**22
-"""Number of points times levels computed at once: a quarter of a gigabyte for the features of their corners."""
+CHUNK = 32768
+"""Number of points computed at once."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +57,9 @@ class HashEncodingConfig(Settings):
             )
 
 
-def _weights(fraction: Float[Tensor, "3 k m"], smooth: bool, unit: int) -> Float[Tensor, "3 w"]:
+def _weights(fraction: Float[Tensor, "3 m"], smooth: bool, unit: int) -> Float[Tensor, "3 w"]:
     """Return the weight of the upper vertex along each axis (the fraction, or its smoothstep), repeated within a unit."""
-    return _repeat(fraction * fraction * (3 - 2 * fraction) if smooth else fraction, unit).flatten(1)
+    return _repeat(fraction * fraction * (3 - 2 * fraction) if smooth else fraction, unit)
 
 
 def _repeat(values: Float[Tensor, "*shape m"], unit: int) -> Float[Tensor, "*shape w"]:
@@ -112,81 +109,45 @@ def _spread(gradient: Float[Tensor, " w"], weights: Float[Tensor, "3 w"]) -> Flo
     return gradient
 
 
-def _chunks(points: Float[Tensor, "3 n"], group: LevelGroup) -> list[slice]:
-    """Return slices of the points, so short that their temporaries fit in a CPU's cache or take little of a GPU's memory."""
-    size = CPU_CHUNK if points.device.type == "cpu" else max(1, GPU_CHUNK // len(group))
-    return slices(points.shape[1], size)
-
-
-def _encode_group(
-    points: Float[Tensor, "3 n"],
-    table: Float[Tensor, "t f"],
-    group: LevelGroup,
-    smooth: bool,
-    values: Float[Tensor, "k c w"],
-    slopes: Float[Tensor, "k c 3 w"] | None,
-) -> None:
-    """Write the levels' features to ``values``, and their derivatives with respect to position (in cells) to
-    ``slopes``.
-    """
-    unit, count = _unit(table.shape[1]), len(group)
+def _encode_level(
+    points: Float[Tensor, "3 n"], table: Float[Tensor, "t f"], level: Level, smooth: bool, values: Float[Tensor, "c w"],
+    slopes: Float[Tensor, "c 3 w"] | None,
+) -> None:  # fmt: skip
+    """Write a level's features to ``values``, and their derivatives with respect to position (in cells) to ``slopes``."""
+    unit = _unit(table.shape[1])
     columns = _as_units(table, unit).unbind(1)
-    for chunk in _chunks(points, group):
+    for chunk in slices(points.shape[1], CHUNK):
         wide = slice(chunk.start * unit, chunk.stop * unit)
-        terms, fraction = group.vertices(points[:, chunk])
+        terms, fraction = level.vertices(points[:, chunk])
         weights = _weights(fraction, smooth, unit)
-        index = group.corner_indices(terms)
+        index = level.corner_indices(terms)
         for k, column in enumerate(columns):
             corners = _as_floats(column.index_select(0, index)).view(2, 2, 2, -1)
             if slopes is None:
-                values[:, k, wide] = _interpolate(corners, weights).view(count, -1)
+                values[k, wide] = _interpolate(corners, weights)
             else:
-                value, by_axis = _interpolate_with_slopes(corners, weights)
-                values[:, k, wide] = value.view(count, -1)
+                values[k, wide], by_axis = _interpolate_with_slopes(corners, weights)
                 for axis, slope in enumerate(by_axis):
-                    slopes[:, k, axis, wide] = slope.view(count, -1)
+                    slopes[k, axis, wide] = slope
         if slopes is not None and smooth:
-            slopes[:, :, :, wide] *= _repeat(6 * fraction * (1 - fraction), unit).movedim(1, 0)[:, None]
-
-
-def _add_position_gradient(
-    slopes: Float[Tensor, "k c 3 w"],
-    gradient: Float[Tensor, "k c w"],
-    group: LevelGroup,
-    total: Float[Tensor, "3 w"],
-) -> None:
-    """Backpropagate the gradient of the levels' features to the points, and add the result to ``total``."""
-    if len(group) == 1:
-        for slope, row in zip(slopes[0], gradient[0], strict=True):
-            total.addcmul_(slope, row, value=group.levels[0].resolution)
-    else:
-        scaled = gradient * group.resolutions(gradient)[:, None, None]
-        total += (slopes * scaled[:, :, None]).sum((0, 1))
+            slopes[:, :, wide] *= _repeat(6 * fraction * (1 - fraction), unit)
 
 
 def _write_table_gradient(
-    points: Float[Tensor, "3 n"],
-    gradient: Float[Tensor, "k c w"],
-    group: LevelGroup,
-    smooth: bool,
-    table: Float[Tensor, "t f"],
-) -> None:
-    """Backpropagate the gradient of the levels' features to the table's entries, and write the result to ``table``."""
+    points: Float[Tensor, "3 n"], gradient: Float[Tensor, "c w"], level: Level, smooth: bool, table: Float[Tensor, "t f"]
+) -> None:  # fmt: skip
+    """Backpropagate the gradient of a level's features to the table's entries, and write the result to ``table``."""
     unit = _unit(table.shape[1])
     table.zero_()
-    for chunk in _chunks(points, group):
+    for chunk in slices(points.shape[1], CHUNK):
         wide = slice(chunk.start * unit, chunk.stop * unit)
-        terms, fraction = group.vertices(points[:, chunk])
+        terms, fraction = level.vertices(points[:, chunk])
         weights = _weights(fraction, smooth, unit)
         # scatter_add_ takes int64 only, and is still twice as fast as index_add_ with int32.
-        index = group.corner_indices(terms).long()
+        index = level.corner_indices(terms).long()
         for k, target in enumerate(_as_units(table, unit).unbind(1)):
-            corners = _spread(gradient[:, k, wide].reshape(-1), weights).view(-1)
+            corners = _spread(gradient[k, wide], weights).view(-1)
             target.scatter_add_(0, index, _as_units(corners, unit))
-
-
-def _laid_end_to_end(tables: Sequence[Float[Tensor, "_ f"]]) -> Float[Tensor, "t f"]:
-    return tables[0] if len(tables) == 1 else torch.cat(list(tables))
 
 
 class _Encode(torch.autograd.Function):
@@ -208,20 +169,18 @@ class _Encode(torch.autograd.Function):
     ) -> Float[Tensor, "n width"]:
         count, features = points.shape[1], tables[0].shape[1]
         unit = _unit(features)
-        groups = one_by_one(levels) if points.device.type == "cpu" else together(levels)
         rows = points.new_empty(total, features // unit, count * unit)
         rows[len(levels) :] = 0
         slopes = [
-            points.new_empty(len(group), features // unit, 3, count * unit) if want_slopes else None
-            for group in groups
+            points.new_empty(features // unit, 3, count * unit) if want_slopes else None for _ in levels
         ]
         tasks = [
-            partial(_encode_group, points, _laid_end_to_end(tables[group.span]), group, smooth, rows[group.span], slope)
-            for group, slope in zip(groups, slopes, strict=True)
-        ]  # fmt: skip
+            partial(_encode_level, points, table, level, smooth, row, slope)
+            for table, level, row, slope in zip(tables, levels, rows, slopes, strict=False)
+        ]
         concurrently(tasks, threads_for(count, points.device))
         ctx.save_for_backward(points, *(slope for slope in slopes if slope is not None))
-        ctx.groups, ctx.features, ctx.smooth = groups, features, smooth
+        ctx.levels, ctx.features, ctx.smooth = levels, features, smooth
         encoded = rows.new_empty(count, total * features)
         _as_units(encoded, unit)[:] = _as_units(rows, unit).flatten(0, 1).t()
         return encoded
@@ -238,22 +197,22 @@ class _Encode(torch.autograd.Function):
         rows = rows.unflatten(0, (-1, ctx.features // unit))
         to_points: Tensor | None = None
         if ctx.needs_input_grad[0]:
-            to_points = torch.zeros_like(slopes[0][0, 0])
-            for group, slope in zip(ctx.groups, slopes, strict=True):
-                _add_position_gradient(slope, rows[group.span], group, to_points)
+            to_points = torch.zeros_like(slopes[0][0])
+            for level, slope, row in zip(ctx.levels, slopes, rows, strict=False):
+                for by_position, part in zip(slope, row, strict=True):
+                    to_points.addcmul_(by_position, part, value=level.resolution)
             to_points = to_points.unflatten(1, (-1, unit)).sum(-1)
-        needed, tasks = ctx.needs_input_grad[5:], []
-        to_tables: list[Tensor | None] = []
-        for group in ctx.groups:
-            if not any(needed[group.span]):
-                to_tables += [None] * len(group)
-                continue
-            table = points.new_empty(sum(group.entries), ctx.features)
-            tasks.append(partial(_write_table_gradient, points, rows[group.span], group, ctx.smooth, table))
-            to_tables += table.split(group.entries)
+        to_tables = [
+            points.new_empty(level.entries, ctx.features) if wanted else None
+            for level, wanted in zip(ctx.levels, ctx.needs_input_grad[5:], strict=True)
+        ]
+        tasks = [
+            partial(_write_table_gradient, points, row, level, ctx.smooth, table)
+            for table, level, row in zip(to_tables, ctx.levels, rows, strict=False)
+            if table is not None
+        ]
         concurrently(tasks, threads_for(points.shape[1], points.device))
-        found = [part if wanted else None for part, wanted in zip(to_tables, needed, strict=True)]
-        return to_points, None, None, None, None, *found
+        return to_points, None, None, None, None, *to_tables
 
 
 class HashEncoding(nn.Module):
@@ -292,8 +251,6 @@ class HashEncoding(nn.Module):
         want_slopes = torch.is_grad_enabled() and points.requires_grad
         tables = list(self.tables)[: len(levels)]
         smooth = self.config.interpolation == "smooth"
-        function = (
-            fused.Encode if fused.available(points.device) and points.dtype == torch.float32 else _Encode
-        )
+        function = fused.Encode if fused.fits(tables) else _Encode
         encoded: Tensor = function.apply(points, levels, self.config.levels, smooth, want_slopes, *tables)
         return encoded

@@ -161,9 +161,9 @@ class HashGridField(nn.Module):
 
     def _kernel(self, active: int | None) -> tuple[Any, ...] | None:
         """Return the arguments of ``fused.query`` if a kernel computes the field; it gives no gradients of the parameters."""
-        encoding, device = self.encoding, self.encoding.tables[0].device
+        encoding = self.encoding
         levels = encoding.levels[:active]
-        if not (levels and fused.available(device) and encoding.tables[0].dtype == torch.float32):
+        if not (levels and fused.fits(encoding.tables)):
             return None
         if torch.is_grad_enabled() and any(part.requires_grad for part in self.parameters()):
             return None

@@ -1,5 +1,6 @@
 """The encoding, the whole field and its sampler in one kernel each, where torch brings Triton and the field is on a GPU.
 
+Kernels are imported where they are launched, since Triton may be missing.
 Triton launches on the current device, which may be another than that of the field.
 """
 
@@ -26,49 +27,34 @@ MOST = 96
 """Maximum number of samples per ray if the host must not wait to count them; the nearest ones in occupied cells are kept."""
 WIDEST = 128
 """Features of the encoding, and units of a layer, up to which a field's tiles fit into the registers of a GPU."""
-POINTS, VALUE_POINTS, FIELD_POINTS, MARCHED = 64, 128, 64, 128
-"""Points of a tile of the encoding, of the field's values, and with derivatives; and steps of a ray that are looked up at once."""
-PRECISION = "tf32"
-"""The precision of the derivatives' products; those of the values are as exact as single precision."""
+POINTS = 64
+"""Points of a tile; twice as many of the field's values alone, and twice as many steps of a ray are looked up at once."""
 
 
-@lru_cache(maxsize=1)
-def _has_triton() -> bool:
-    return find_spec("triton") is not None
-
-
+@lru_cache(maxsize=4)
 def available(device: torch.device) -> bool:
     """Return whether the kernels run on ``device``."""
-    return device.type == "cuda" and _has_triton()
+    return device.type == "cuda" and find_spec("triton") is not None
 
 
-@lru_cache(maxsize=1)
-def kernels() -> Any:
-    """Return the module of kernels, which imports Triton."""
-    from bidnerf_hashgrid import kernels as found
-
-    return found
-
-
-@lru_cache(maxsize=1)
-def marches() -> Any:
-    """Return the module of the sampler's kernels."""
-    from bidnerf_hashgrid import march as found
-
-    return found
+def fits(tables: Sequence[Tensor]) -> bool:
+    """Return whether the kernels compute an encoding by these tables, whose numbers they count in 32 bits."""
+    small = all(table.dtype == torch.float32 and table.numel() < 2**31 for table in tables)
+    return small and available(tables[0].device)
 
 
 def _power_of_two(size: int) -> int:
     return max(16, 1 << (size - 1).bit_length())
 
 
-def _constants(levels: Sequence[Level], tables: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Return the numbers of the levels, and where their tables begin relative to the first one, in elements."""
+def _launched(levels: Sequence[Level], tables: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the numbers of the levels, the first table, and where the tables begin relative to it, in elements."""
     columns = zip(*((a.resolution, a.entries, int(a.hashed), *a.strides[1:]) for a in levels), strict=True)
     first, size = tables[0].data_ptr(), tables[0].element_size()
     offsets = tuple((table.data_ptr() - first) // size for table in tables)
     ints = torch.empty(0, dtype=torch.int32, device=tables[0].device)
-    return constant(tuple(number for row in columns for number in row), ints), constant(offsets, ints.long())
+    meta = constant(tuple(number for row in columns for number in row), ints)
+    return meta, tables[0], constant(offsets, ints.long())
 
 
 def _blocks(count: int, size: int) -> tuple[int]:
@@ -83,12 +69,14 @@ class Encode(torch.autograd.Function):
         ctx: Any, points: Float[Tensor, "3 n"], levels: tuple[Level, ...], total: int, smooth: bool, want_slopes: bool,
         *tables: Float[Tensor, "_ f"],
     ) -> Float[Tensor, "n width"]:  # fmt: skip
+        from bidnerf_hashgrid.kernels import encode_kernel
+
         n, features = points.shape[1], tables[0].shape[1]
         width = total * features
         values = points.new_empty(n, width)
         slopes = points.new_empty((3, n, width) if want_slopes else (0,))
         with torch.cuda.device_of(points):
-            kernels().encode_kernel[_blocks(n, POINTS)](
+            encode_kernel[_blocks(n, POINTS)](
                 points, values, slopes, *_launched(levels, tables), n, width,
                 LEVELS=len(levels), F=features, C=_power_of_two(width), SMOOTH=smooth, SLOPES=want_slopes, BLOCK=POINTS,
             )  # fmt: skip
@@ -99,6 +87,8 @@ class Encode(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Float[Tensor, "n width"]) -> tuple[Tensor | None, ...]:
+        from bidnerf_hashgrid.kernels import scatter_kernel
+
         points, slopes = ctx.saved_tensors
         levels, needed = ctx.levels, ctx.needs_input_grad[5:]
         to_points = (slopes * gradient).sum(-1) if ctx.needs_input_grad[0] else None
@@ -108,17 +98,12 @@ class Encode(torch.autograd.Function):
         parts = flat.split([level.entries for level in levels])
         n, width = gradient.shape
         with torch.cuda.device_of(points):
-            kernels().scatter_kernel[_blocks(n, POINTS)](
+            scatter_kernel[_blocks(n, POINTS)](
                 points, gradient.contiguous(), *_launched(levels, parts), n, width,
                 LEVELS=len(levels), F=ctx.features, C=_power_of_two(width), SMOOTH=ctx.smooth, BLOCK=POINTS,
             )  # fmt: skip
         found = [part if wanted else None for part, wanted in zip(parts, needed, strict=True)]
         return to_points, None, None, None, None, *found
-
-
-def _launched(levels: Sequence[Level], tables: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    meta, offsets = _constants(levels, tables)
-    return meta, tables[0], offsets
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +164,8 @@ def query(
     ``limits`` are the scene's bounds and the largest log density per side of the scene. At points that are not ``wanted``,
     everything is 0.
     """
+    from bidnerf_hashgrid.kernels import field_kernel
+
     n, features = len(positions), tables[0].shape[1]
     bounds, largest = limits
     new = positions.new_empty if wanted is None else positions.new_zeros
@@ -192,14 +179,15 @@ def query(
         place = wanted.long().cumsum(0)
         index, count = place.new_empty(n + 1), place[-1:]
         index.scatter_(0, torch.where(wanted, place - 1, n), torch.arange(n, device=place.device))
-    block = FIELD_POINTS if derivatives else VALUE_POINTS
+    # Derivatives are rounded to TF32 in their products; those of the values are as exact as single precision.
+    block = POINTS if derivatives else 2 * POINTS
     with torch.cuda.device_of(values):
-        kernels().field_kernel[_blocks(n, block)](
+        field_kernel[_blocks(n, block)](
             positions.contiguous(), directions.contiguous(), values, by_both, index, count, *_launched(levels, tables),
             packed.weights(inputs), packed.biases, box, n,
             LEVELS=len(levels), F=features, C=_power_of_two(inputs), WIDTH=packed.width, FEATURES=packed.features,
             HIDDEN=packed.hidden, SMOOTH=smooth, CONTRACTED=bounds.contracted, LIMIT=largest, DERIVATIVES=derivatives,
-            SOME=wanted is not None, BLOCK=block, PRECISION=PRECISION,
+            SOME=wanted is not None, BLOCK=block, PRECISION="tf32",
         )  # fmt: skip
     return values, by_both
 
@@ -213,6 +201,8 @@ def sampled(
     They divide the ray's first ``most`` steps in ``occupied`` cells; with a count of ``most`` they are these steps. The values are
     those of ``OccupancyGrid`` and ``Concentrated``.
     """
+    from bidnerf_hashgrid.march import concentrate_kernel, march_kernel
+
     n, even = len(rays.near), max(2, round(EVEN_SHARE * (count + 1)))
     packed = torch.cat([rays.origins.t(), rays.directions.t(), rays.near[None], rays.far[None]])
     grid = constant((*bounds.centre, bounds.side / 2, step, float(len(occupied))), packed)
@@ -229,11 +219,11 @@ def sampled(
     length = 2 * bounds.side  # a cube's diagonal, and contracted space, are not longer
     steps = _power_of_two(most)
     with torch.cuda.device_of(packed):
-        marches().march_kernel[(n,)](
+        march_kernel[(n,)](
             packed, grid, offset, occupied.view(torch.uint8), middles, counts, n,
-            STEPS=math.ceil(length / step) + 1, MOST=most, CONTRACTED=bounds.contracted, CHUNK=MARCHED,
+            STEPS=math.ceil(length / step) + 1, MOST=most, CONTRACTED=bounds.contracted, CHUNK=2 * POINTS,
         )  # fmt: skip
-        marches().concentrate_kernel[(n,)](
+        concentrate_kernel[(n,)](
             packed, grid, middles, counts, density, shift, starts, ends, valid.view(torch.uint8), n, LARGEST_THICKNESS, TAIL,
             COUNT=count, EVEN=even, MOST=most, S=steps, J=_power_of_two(count + 1), CONTRACTED=bounds.contracted,
             num_warps=max(4, steps // 32),

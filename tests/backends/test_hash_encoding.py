@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from bidnerf_hashgrid import encoding as encoding_module
-from bidnerf_hashgrid import levels as levels_module
 from bidnerf_hashgrid.encoding import HashEncoding, HashEncodingConfig
 from bidnerf_hashgrid.threads import concurrently
 
@@ -112,33 +111,7 @@ def test_agrees_with_the_reference(features: int, interpolation: Interpolation, 
     np.testing.assert_allclose(with_slopes, expected, rtol=1e-10, atol=1e-10)
 
 
-@both_interpolations
-@pytest.mark.parametrize("features", [1, 4])
-@pytest.mark.parametrize("log2_table_size", [4, 7, 16])  # all levels hashed, one dense, all dense
-@pytest.mark.parametrize(
-    "most_entries", [2**23, 2**7]
-)  # in one group or two, or each hashed level in its own
-def test_levels_together_are_levels_one_by_one(
-    features: int, interpolation: Interpolation, log2_table_size: int, most_entries: int, monkeypatch: pytest.MonkeyPatch
-) -> None:  # fmt: skip
-    encoding = make(features, interpolation, log2_table_size)
-    positions = inner_points(encoding, 50)
-
-    def run() -> list[Tensor]:
-        encoding.zero_grad()
-        gradient = position_gradient(encoding, positions)
-        tables = [table.grad for table in encoding.tables if table.grad is not None]
-        return [encoding(positions), encoding(positions, active_levels=2), gradient, *tables]
-
-    expected = run()
-    monkeypatch.setattr(levels_module, "MOST_ENTRIES", most_entries)
-    monkeypatch.setattr(encoding_module, "one_by_one", levels_module.together.__wrapped__)
-    for part, whole in zip(run(), expected, strict=True):
-        torch.testing.assert_close(part, whole)
-
-
-def test_frozen_levels_of_a_group_get_no_gradient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(encoding_module, "one_by_one", levels_module.together)
+def test_frozen_levels_get_no_gradient() -> None:
     encoding = make()
     encoding.tables[1].requires_grad_(False)
     encoding(inner_points(encoding)).sum().backward()
@@ -267,7 +240,7 @@ def test_chunks_do_not_change_the_result(
         return [encoding(positions), gradient, *tables]
 
     whole = run()
-    monkeypatch.setattr(encoding_module, "CPU_CHUNK", 7)
+    monkeypatch.setattr(encoding_module, "CHUNK", 7)
     for part, expected in zip(run(), whole, strict=True):
         torch.testing.assert_close(part, expected)
 
