@@ -23,17 +23,6 @@ NOTHING = 1e10
 """Floating-point values from here on mean "nothing", whatever the unit: Blender's 1e10, the largest float."""
 MILLIMETRE = 0.001
 """Metres."""
-SPIKE, SPIKE_PIXELS = 0.05, 20
-"""Share and number of pixels above which an image's largest value may be the sensor's limit, not a measurement ..."""
-NEAREST_LIMIT, LIMIT_STEP = 4.0, 0.5
-"""... if it is a round number, as ranges in settings and data sheets are: a multiple of 0.5 m, at least 4 m ..."""
-LARGEST_OF_BITS = tuple(2**bits - 1 for bits in range(11, 17))
-"""... or has all bits set, for a sensor with 11 to 16 bits ..."""
-STANDS_OUT = 4
-"""... and is at least this many times as frequent as any other value. A wall facing the camera has a single
-depth as well, but rarely a round one, and several flat surfaces give several values."""
-SATURATED = np.iinfo(np.uint16).max
-"""A 16-bit sensor writes this for "too far" or "nothing"; it becomes 65.535 once converted to metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +72,8 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
 
     Values that no sensor measures become 0: NaN, infinite and negative values, the largest value of an
     integer type, 65535 and 65.535 in a floating-point one, and floats above 1e9 m (1e10, the largest float).
-    So does the largest value of the image if it is the sensor's limit: a round number (``LIMIT_STEP``,
-    ``LARGEST_OF_BITS``) in at least a twentieth of all pixels, far more frequent than any other, but not the
-    only value measured. Raises ``InputError``, whose message begins with ``what``, for arrays of another
+    So does the largest value of the image if it is the sensor's limit: a round number in at least a twentieth of all
+    pixels, far more frequent than any other, but not the only value measured. Raises ``InputError``, whose message begins with ``what``, for arrays of another
     shape or type and a unit that is not positive.
     """
     values = to_numpy(raw)
@@ -119,12 +107,13 @@ def _absent(values: np.ndarray, metres: np.ndarray) -> dict[str, np.ndarray]:
         saturated = values == largest
         far = ~saturated & (metres > FARTHEST)
         return {"negative": values < 0, str(largest): saturated, f"over {FARTHEST:g} m": far}
-    clipped = SATURATED * MILLIMETRE
+    saturated = np.iinfo(np.uint16).max  # 16-bit sensors write it for "too far" or "nothing"
+    clipped = saturated * MILLIMETRE
     absent = {
         "NaN": np.isnan(values),
         "infinite": np.isinf(values),
         "negative": np.isfinite(values) & (values < 0),
-        str(SATURATED): values == SATURATED,
+        str(saturated): values == saturated,
         f"{clipped:g}": np.abs(values - clipped) < 1e-5,
         f"{NOTHING:g} or more": np.isfinite(values) & (values >= NOTHING),
     }
@@ -140,15 +129,17 @@ def _at_limit(values: np.ndarray, metres: np.ndarray, unmeasured: np.ndarray) ->
     largest = float(measured.max())
     mask = ~unmeasured & (metres == largest)
     count = int(mask.sum())
-    steps = round(largest / LIMIT_STEP)
-    is_round = largest >= NEAREST_LIMIT and abs(largest - steps * LIMIT_STEP) < 1e-6 * largest
-    fills_bits = values.dtype.kind != "f" and int(values[mask][0]) in LARGEST_OF_BITS
-    if count < max(SPIKE * values.size, SPIKE_PIXELS) or not (is_round or fills_bits):
+    # Round as ranges in settings and data sheets are, a multiple of 0.5 m from 4 m on, or with all bits of a sensor set.
+    is_round = largest >= 4 and abs(largest - round(2 * largest) / 2) < 1e-6 * largest
+    value = float(values[mask][0])
+    fills_bits = values.dtype.kind != "f" and value in [2**bits - 1 for bits in range(11, 17)]
+    if count < max(0.05 * values.size, 20) or not (is_round or fills_bits):
         return {}
+    # A wall facing the camera has a single depth as well, but rarely a round one, and several flat surfaces give several values.
     _, others = np.unique(measured[measured < largest], return_counts=True)
-    if not others.size or count < STANDS_OUT * others.max():
+    if not others.size or count < 4 * others.max():
         return {}
-    return {f"{float(values[mask][0]):g} (the sensor's limit)": mask}
+    return {f"{value:g} (the sensor's limit)": mask}
 
 
 class DepthReader:

@@ -15,17 +15,10 @@ from bidnerf_core.geometry import MAD_TO_SIGMA
 
 WINDOW_SIDE = 8
 """Side, in pixels, of the square windows to which planes are fitted."""
-PLANAR, QUANTILE_BIAS = 0.25, 1.11
-"""Quantile of the windows' residuals, since this fraction is assumed planar (the others may show edges, curved surfaces and
-relief), and the ratio of the noise to that quantile if all windows are planar and all pixels independent."""
-LEAST_WINDOWS, DEPTH_RANGES = 20, 8
-"""Minimum number of windows in a depth range from which its noise is estimated, and maximum number of ranges."""
-ENOUGH_SPREAD = 1.5
-"""Minimum ratio of the farthest to the nearest range for which the growth of the noise with depth is estimated."""
-LEAST_LINES, MOST_LINES = 8, 0.8
-"""Minimum number of distinct rows (and columns) of a resampled depth image, and their maximum fraction of the total."""
-LEAST_VALUES, REPEATED = 8, 4
-"""Depth has the steps of its distinct values if there are so many of them, in so many pixels each on average."""
+LEAST_WINDOWS = 20
+"""Minimum number of windows in a depth range from which its noise is estimated."""
+LEAST_VALUES = 8
+"""Minimum number of distinct rows and columns of a resampled depth image, and of distinct values of one that is stored in steps."""
 
 
 def estimated_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -> DepthNoise | None:
@@ -53,30 +46,23 @@ def estimated_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -
     off = 1 / z - (1 / z).mean(-1, keepdim=True)
     off = off - (x @ torch.linalg.solve(x.mT @ x, x.mT @ off[..., None]))[..., 0]
     middle, spare = z.median(-1).values, z.shape[-1] / (z.shape[-1] - 3)
-    noise = QUANTILE_BIAS * MAD_TO_SIGMA * spare**0.5 * middle * off.abs().median(-1).values
-    ranges = middle.argsort().tensor_split(min(DEPTH_RANGES, len(z) // LEAST_WINDOWS))
-    at = torch.stack([middle[some].median() for some in ranges])
-    found = torch.stack([noise[some].quantile(PLANAR) for some in ranges])
-    return _fitted(at.numpy(), torch.maximum(found, _rounding(depth) / at).numpy())
-
-
-def _fitted(depth: np.ndarray, noise: np.ndarray) -> DepthNoise:
-    if depth.max() < ENOUGH_SPREAD * depth.min():
-        return DepthNoise(linear=float(np.median(noise)))
-    from scipy.optimize import nnls  # imported here, since it takes as long as the rest of scipy
-
-    (linear, quadratic), _ = nnls(np.stack([np.ones_like(depth), depth], axis=-1), noise)
-    return DepthNoise(linear=float(linear), quadratic=float(quadratic))
-
-
-def _rounding(depth: Float[Tensor, "h w"]) -> float:
-    """Return the standard deviation (metres) of the rounding to the usual step of the values; 0 if they are continuous or
-    few.
-    """
+    # A quarter of the windows is assumed planar (the others may show edges, curved surfaces and relief): the noise is that quantile
+    # of their residuals, times the ratio of the two if all windows are planar and all pixels independent.
+    noise = 1.11 * MAD_TO_SIGMA * spare**0.5 * middle * off.abs().median(-1).values
+    ranges = middle.argsort().tensor_split(min(8, len(z) // LEAST_WINDOWS))
+    at = torch.stack([middle[some].median() for some in ranges]).numpy()
+    found = torch.stack([noise[some].quantile(0.25) for some in ranges]).numpy()
+    # The rounding to the usual step of the values, unless they are continuous or few.
     measured = depth[(depth > 0) & depth.isfinite()]
     values = measured.unique()
-    is_stepped = len(values) >= LEAST_VALUES and len(measured) >= REPEATED * len(values)
-    return float(values.diff().median()) / math.sqrt(12) if is_stepped else 0.0
+    if len(values) >= LEAST_VALUES and len(measured) >= 4 * len(values):
+        found = np.maximum(found, float(values.diff().median()) / math.sqrt(12) / at)
+    if at.max() < 1.5 * at.min():  # too small a range for the growth of the noise with depth
+        return DepthNoise(linear=float(np.median(found)))
+    from scipy.optimize import nnls  # imported here, since it takes as long as the rest of scipy
+
+    (linear, quadratic), _ = nnls(np.stack([np.ones_like(at), at], axis=-1), found)
+    return DepthNoise(linear=float(linear), quadratic=float(quadratic))
 
 
 def _windows(image: Float[Tensor, "h w *c"]) -> Float[Tensor, "n *c p"]:
@@ -94,7 +80,7 @@ def _lines_of_sensor(depth: Float[Tensor, "h w"]) -> tuple[Int[Tensor, "r"], Int
     """
     first = torch.ones(1, dtype=torch.bool)
     rows, columns = (torch.cat([first, (x[1:] != x[:-1]).any(-1)]) for x in (depth, depth.T))
-    if not all(LEAST_LINES <= int(new.sum()) <= MOST_LINES * len(new) for new in (rows, columns)):
+    if not all(LEAST_VALUES <= int(new.sum()) <= 0.8 * len(new) for new in (rows, columns)):
         rows[:], columns[:] = True, True
     return rows.nonzero()[:, 0], columns.nonzero()[:, 0]
 

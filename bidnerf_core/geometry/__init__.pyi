@@ -12,7 +12,6 @@ from .rotations import retracted as retracted
 from .rotations import update_between as update_between
 from .se3 import SE3 as SE3
 from .se3 import pose_from_matrix as pose_from_matrix
-from .se3 import se3_right_jacobian as se3_right_jacobian
 from .se3 import skew as skew
 from .similarity import RIGID_TO as RIGID_TO
 from .similarity import CovarianceConvention as CovarianceConvention

@@ -23,11 +23,6 @@ from torch import Tensor
 from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
 
-SERIES_BELOW = 1e-2
-"""Angle (rad) below which coefficients are computed from their series: sin and cos cancel there, in value and
-derivative."""
-
-
 QuaternionOrder = Literal["wxyz", "xyzw"]
 """The position of a quaternion's scalar part w."""
 
@@ -70,9 +65,14 @@ class SE3:
         return SE3(_polynomial(phi, a, b), rho + b[..., None] * once + c[..., None] * twice)
 
     def log(self) -> Float[Tensor, "*b 6"]:
-        """Return the inverse of ``exp``, with the rotation angle in [0, pi] (eq. 173)."""
+        """Return the inverse of ``exp``, with the rotation angle in [0, pi] (eq. 173): ``[V(phi)^-1 translation, phi]``."""
         phi = rotation_matrix_to_axis_angle(self.rotation)
-        return torch.cat([_matvec(so3_left_jacobian_inverse(phi), self.translation), phi], dim=-1)
+        squared, small, angle = _guarded_angle(phi)
+        half = angle / 2  # eq. 146, where (1 + cos t) / sin t = 1 / tan(t / 2): finite at pi
+        series = 1 / 12 + squared / 720 + squared**2 / 30240
+        c = torch.where(small, series, (1 - half / half.tan()) / angle**2)
+        inverse = _polynomial(phi, torch.full_like(c, -0.5), c)
+        return torch.cat([_matvec(inverse, self.translation), phi], dim=-1)
 
     def update_to(self, other: SE3) -> Float[Tensor, "*b 6"]:
         """Return ``(self.inverse() @ other).log()`` in fewer operations, for rotations that differ by clearly less than half a turn."""
@@ -218,64 +218,12 @@ def skew(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))
 
 
-def so3_left_jacobian(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Return V(phi) (eq. 145): ``I + (1 - cos t)/t^2 [phi]x + (t - sin t)/t^3 [phi]x^2``."""
-    squared, small, angle = _guarded_angle(phi)
-    b = torch.where(small, 0.5 - squared / 24 + squared**2 / 720, (1 - angle.cos()) / angle**2)
-    c = torch.where(small, 1 / 6 - squared / 120 + squared**2 / 5040, (angle - angle.sin()) / angle**3)
-    return _polynomial(phi, b, c)
-
-
-def so3_left_jacobian_inverse(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Return V(phi)^-1 (eq. 146): ``I - 1/2 [phi]x + (1/t^2 - (1 + cos t) / (2 t sin t)) [phi]x^2``."""
-    squared, small, angle = _guarded_angle(phi)
-    half = angle / 2  # (1 + cos t) / sin t = 1 / tan(t / 2): finite at pi
-    series = 1 / 12 + squared / 720 + squared**2 / 30240
-    c = torch.where(small, series, (1 - half / half.tan()) / angle**2)
-    return _polynomial(phi, torch.full_like(c, -0.5), c)
-
-
-def se3_left_jacobian(tangent: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 6 6"]:
-    """Return J, for which ``exp(xi + d) = exp(J d) exp(xi)`` to first order.
-
-    See eqs. 179-180, and Barfoot, "State estimation for robotics", 7.86.
-    """
-    rho, phi = tangent[..., :3], tangent[..., 3:]
-    jacobian = so3_left_jacobian(phi)
-    top = torch.cat([jacobian, _coupling(rho, phi)], dim=-1)
-    return torch.cat([top, torch.cat([torch.zeros_like(jacobian), jacobian], dim=-1)], dim=-2)
-
-
-def se3_right_jacobian(tangent: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 6 6"]:
-    """Return J, for which ``exp(xi + d) = exp(xi) exp(J d)`` to first order: the left Jacobian at ``-xi`` (eq. 76)."""
-    return se3_left_jacobian(-tangent)
-
-
-def _coupling(rho: Float[Tensor, "*b 3"], phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Return Q(rho, phi), eq. 180."""
-    squared, small, angle = _guarded_angle(phi)
-    sin, cos = angle.sin(), angle.cos()
-    a = torch.where(small, 1 / 6 - squared / 120 + squared**2 / 5040, (angle - sin) / angle**3)
-    b = torch.where(small, -1 / 24 + squared / 720 - squared**2 / 40320, (1 - angle**2 / 2 - cos) / angle**4)
-    tail = torch.where(
-        small, -1 / 120 + squared / 5040 - squared**2 / 362880, (angle - sin - angle**3 / 6) / angle**5
-    )
-    r, p = skew(rho), skew(phi)
-    pr, rp, prp = p @ r, r @ p, p @ r @ p
-    return (
-        r / 2
-        + a[..., None, None] * (pr + rp + prp)
-        - b[..., None, None] * (p @ pr + rp @ p - 3 * prp)
-        - 0.5 * (b - 3 * tail)[..., None, None] * (prp @ p + p @ prp)
-    )
-
-
 def _guarded_angle(phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the squared angle, whether it is small, and the angle (1 if small): neither branch of a
-    ``where`` may divide by 0.
+    ``where`` may divide by 0. For small angles, below 0.01 rad, series are used, since sin and cos cancel.
     """
     squared = (phi * phi).sum(-1)
-    small = squared < SERIES_BELOW**2
+    small = squared < 1e-4
     return squared, small, torch.where(small, torch.ones_like(squared), squared).sqrt()
 
 

@@ -19,9 +19,6 @@ from bidnerf_core.depth import (
     find_depth_sensor,
     noise_remark,
 )
-
-# Inside: the constants of the sensors are compared with their publications
-from bidnerf_core.depth.sensors import KINECT, REALSENSE, RENDERED
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization import AutoConfig, settings_of
 from commands import Run
@@ -31,14 +28,18 @@ from problems import FieldMap
 def test_the_kinects_noise_is_that_of_half_a_pixel_of_disparity() -> None:
     disparities_a_pixel, focal, baseline = 8, 580.0, 0.075  # of the infrared camera: pixels, metres
     half_a_step = 0.5 / (disparities_a_pixel * focal * baseline)
-    assert KINECT.noise.deviation(1.0) == pytest.approx(half_a_step, rel=0.02)
-    assert KINECT.noise.deviation(5.0) == pytest.approx(0.04, rel=0.15)  # "about 4 cm at the maximum range"
+    assert DEPTH_SENSORS["kinect"].noise.deviation(1.0) == pytest.approx(half_a_step, rel=0.02)
+    assert DEPTH_SENSORS["kinect"].noise.deviation(5.0) == pytest.approx(
+        0.04, rel=0.15
+    )  # "about 4 cm at the maximum range"
 
 
 def test_the_realsenses_noise_is_about_that_of_intels_formula() -> None:
     focal = 848 / 2 / math.tan(math.radians(90) / 2)
     for z in (1.0, 2.0, 3.0):
-        assert REALSENSE.noise.deviation(z) == pytest.approx(0.08 * z**2 / (focal * 0.050), rel=0.6)
+        assert DEPTH_SENSORS["realsense"].noise.deviation(z) == pytest.approx(
+            0.08 * z**2 / (focal * 0.050), rel=0.6
+        )
 
 
 def test_an_unknown_sensor_has_no_lengths_in_metres() -> None:
@@ -95,7 +96,7 @@ def test_the_localizer_has_the_sensor_of_its_settings() -> None:
     assert Localizer(scene, warm_up=False).depth_sensor == UNKNOWN
     assert Localizer(scene, "bid", warm_up=False).depth_sensor == UNKNOWN
     config = settings_of("auto", {"depth_sensor": "kinect"})
-    assert Localizer(scene, config=config, warm_up=False).depth_sensor == KINECT
+    assert Localizer(scene, config=config, warm_up=False).depth_sensor == DEPTH_SENSORS["kinect"]
 
 
 def test_the_covariance_of_a_pose_by_depth_grows_with_the_scale_of_the_sensor() -> None:
@@ -110,5 +111,5 @@ def test_the_covariance_of_a_pose_by_depth_grows_with_the_scale_of_the_sensor() 
         sizes[name] = float(found.covariance[:3, :3].trace())
     # The pose is the same, so the covariances differ by the squared scales alone.
     ratio = (sizes["kinect"] - sizes["rendered"]) / (sizes["unknown"] - sizes["rendered"])
-    assert ratio == pytest.approx((KINECT.scale / UNKNOWN.scale) ** 2, rel=1e-3)
-    assert RENDERED.scale == 0
+    assert ratio == pytest.approx((DEPTH_SENSORS["kinect"].scale / UNKNOWN.scale) ** 2, rel=1e-3)
+    assert DEPTH_SENSORS["rendered"].scale == 0

@@ -12,10 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from bidnerf_core.geometry import SE3, se3_right_jacobian, skew
+from bidnerf_core.geometry import SE3, skew
 
 # Inside: the Jacobians of the exponential map are compared with its series and differences
-from bidnerf_core.geometry.se3 import se3_left_jacobian, so3_left_jacobian, so3_left_jacobian_inverse
 from refusals import refused
 
 SIZES = [0.0, 1e-12, 1e-8, 1e-5, 1e-3, 0.0099, 0.0101, 0.5, 2.0, math.pi - 1e-3, math.pi - 1e-6]
@@ -73,19 +72,6 @@ def test_adjoint_moves_a_tangent_to_the_other_side(a: torch.Tensor, b: torch.Ten
     )
 
 
-@pytest.mark.parametrize("size", SIZES)
-def test_jacobians_against_finite_differences_and_the_inverse_of_rotations(size: float) -> None:
-    xi, eps = tangent(size, seed=2), 1e-6
-    steps = eps * torch.eye(6, dtype=torch.float64)
-    plus, minus, back = SE3.exp(xi + steps), SE3.exp(xi - steps), SE3.exp(xi).inverse()
-    left = ((plus @ back).log() - (minus @ back).log()).mT / (2 * eps)
-    right = ((back @ plus).log() - (back @ minus).log()).mT / (2 * eps)
-    torch.testing.assert_close(se3_left_jacobian(xi), left, atol=2e-7, rtol=1e-6)
-    torch.testing.assert_close(se3_right_jacobian(xi), right, atol=2e-7, rtol=1e-6)
-    product = so3_left_jacobian(xi[3:]) @ so3_left_jacobian_inverse(xi[3:])
-    torch.testing.assert_close(product, torch.eye(3, dtype=torch.float64), atol=1e-9, rtol=0)
-
-
 @pytest.mark.parametrize("size", [0.0, 1e-9, 1e-4, 0.0099, 0.0101, 1.0, 3.0])
 def test_derivative_of_exp(size: float) -> None:
     point = torch.tensor([0.3, -2.0, 1.0], dtype=torch.float64)
@@ -93,10 +79,10 @@ def test_derivative_of_exp(size: float) -> None:
     assert torch.autograd.gradcheck(lambda x: SE3.exp(x).apply(point), xi, atol=1e-6)
 
 
-def test_derivative_of_log_is_the_inverse_right_jacobian() -> None:
-    xi, zero = tangent(1.3), torch.zeros(6, dtype=torch.float64)
-    found = torch.autograd.functional.jacobian(lambda d: SE3.exp(xi).retract(d).log(), zero)
-    torch.testing.assert_close(found, torch.linalg.inv(se3_right_jacobian(xi)), atol=1e-8, rtol=1e-8)
+@pytest.mark.parametrize("size", [1e-4, 0.0099, 0.0101, 1.3, 3.0])
+def test_derivative_of_log(size: float) -> None:
+    T, zero = SE3.exp(tangent(size)), torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda d: T.retract(d).log(), zero, atol=1e-6)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1e-5, 0.1, 1.0])
