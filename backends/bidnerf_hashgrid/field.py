@@ -163,7 +163,7 @@ class HashGridField(nn.Module):
         """Return the arguments of ``fused.query`` if a kernel computes the field; it gives no gradients of the parameters."""
         encoding = self.encoding
         levels = encoding.levels[:active]
-        if not (levels and fused.fits(encoding.tables)):
+        if not (levels and fused.fits(list(encoding.tables))):
             return None
         if torch.is_grad_enabled() and any(part.requires_grad for part in self.parameters()):
             return None

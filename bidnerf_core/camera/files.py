@@ -101,7 +101,8 @@ def camera_record(record: Record) -> CameraRecord:
         raise record.error(f"camera_model is {model.upper()}", expected=f"one of {', '.join(kinds)}")
     if kind == PERSPECTIVE:  # some programs write 1 for true
         model = FISHEYE if record.value("is_fisheye") else PERSPECTIVE
-    model, focals, lens = model.upper(), (None, None), tuple[float, ...]()
+    model, lens = model.upper(), tuple[float, ...]()
+    focals: tuple[tuple[float, bool] | None, ...] = (None, None)
     if model != PANORAMA:
         focals = (_focal(record, "x"), _focal(record, "y"))
         if focals[0] is None:

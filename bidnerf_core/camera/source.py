@@ -157,12 +157,10 @@ class CameraSource:
             return replace(found, approximate=True)
         if isinstance(camera, Intrinsics | Lens):
             return _fitted(str(where), raster, camera, "camera as given")
+        expected = "Intrinsics or the path of a camera file"
+        if getattr(camera, "shape", None) == (3, 3):
+            expected += "; Intrinsics.from_opencv(K, distortion, (width, height)) makes them from a matrix"
         if not isinstance(camera, str | Path):
-            expected = "Intrinsics or the path of a camera file"
-            if getattr(camera, "shape", None) == (3, 3):
-                expected += (
-                    "; Intrinsics.from_opencv(K, distortion, (width, height)) makes them from a matrix"
-                )
             raise InputError(f"camera is a {type(camera).__name__}", where=where, expected=expected)
         return _fitted(str(where), raster, read_camera(Path(camera), size, str(where)), f"camera of {camera}")
 
