@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import json
+import os
 import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import cv2
 import torch
@@ -16,7 +18,8 @@ from scipy.stats import chi2
 
 from bidnerf_core import Localization, Map, View, load_map
 from bidnerf_core.datasets import Capture, open_dataset
-from bidnerf_core.evaluation import write_record
+from bidnerf_core.evaluation import provenance, script_command
+from bidnerf_core.io import FileInUse, take_lock, to_plain, write_file
 from bidnerf_core.results import normalized_error_squared, pose_error, success_rate
 
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -192,13 +195,79 @@ def times_slower(rows: Sequence[Row], base: Sequence[Row], clock: str = "cpu_sec
     return statistics.median(row[clock] / other[clock] for row, other in zip(rows, base, strict=True))
 
 
+class RowStore:
+    """A file of rows by key, each on a line ``{"key": KEY, "row": ROW}``, which lets an interrupted script resume.
+
+    Use it as a context manager. Each row is computed once, and is on disk before the next one is.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @staticmethod
+    def parse(content: bytes) -> dict[str, Any]:
+        """Return the rows of all complete lines, by the JSON of their keys."""
+        lines = map(json.loads, content.split(b"\n")[:-1])
+        return {line["key"]: line["row"] for line in lines}
+
+    def __enter__(self) -> Self:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = self.path.open("a+b")
+        if not take_lock(self._file.fileno()):
+            self._file.close()
+            raise FileInUse("another process is writing to it", where=self.path)
+        self._file.seek(0)
+        content = self._file.read()
+        self.rows = self.parse(content)
+        self._file.truncate(content.rfind(b"\n") + 1)  # a kill may have cut the last line
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def __contains__(self, key: list[Any]) -> bool:
+        return json.dumps(key) in self.rows
+
+    def get(self, key: list[Any], make: Callable[[], Any]) -> Any:
+        """Return the row of ``key``; if the file does not hold it, compute it with ``make`` and store it."""
+        text = json.dumps(key)
+        if text not in self.rows:
+            row = make()
+            self._file.write(json.dumps({"key": text, "row": row}, allow_nan=False).encode() + b"\n")
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self.rows[text] = row
+        return self.rows[text]
+
+
 def record(name: str, results: dict[str, Any], seed: int = 0, folder: Path = RESULTS) -> Path:
-    """Write a summary with its provenance, in five digits, and say where. Rows of single answers do not belong into it."""
-    path = write_record(folder / f"{name}.json", _rounded(results), seed)
+    """Write a summary with its provenance, in five digits, and say where. Rows of single answers do not belong into it.
+
+    Raises ``ValueError`` if ``results`` contain values that strict JSON cannot represent.
+    """
+    threads, path = torch.get_num_threads(), folder / f"{name}.json"
+    run = provenance(script_command(), f"one process of {threads} thread{'s' if threads > 1 else ''}")
+    kept = {"benchmark": name, **to_plain(run), "seed": seed, "results": _rounded(results)}
+    folder.mkdir(parents=True, exist_ok=True)
+    write_file(path, (_in_lines(kept) + "\n").encode())
     print(path)
     if path.stat().st_size > 60_000:
         print(f"{path}: {path.stat().st_size} bytes, more than a summary should have")
     return path
+
+
+def _in_lines(value: Any, indent: str = "") -> str:
+    """Return a value as JSON, with each object or list on one line if it fits into 120 columns."""
+    line = json.dumps(value, allow_nan=False)
+    if len(indent) + len(line) <= 120 or not value or not isinstance(value, (dict, list, tuple)):
+        return line
+    deeper = indent + " "
+    if isinstance(value, dict):
+        parts = [f"{json.dumps(key)}: {_in_lines(part, deeper)}" for key, part in value.items()]
+    else:
+        parts = [_in_lines(part, deeper) for part in value]
+    first, last = "{}" if isinstance(value, dict) else "[]"
+    return f"{first}\n{deeper}" + f",\n{deeper}".join(parts) + f"\n{indent}{last}"
 
 
 def _rounded(value: Any) -> Any:

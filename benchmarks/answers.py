@@ -45,6 +45,7 @@ from _lab import (
     RESULTS,
     STRICT,
     Row,
+    RowStore,
     Scene,
     cpu_seconds,
     errors_of,
@@ -64,7 +65,7 @@ from torch.nn.functional import interpolate
 from bidnerf_core import Localizer
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import VERSIONS, RowStore, faulty, provenance, random_units, warped
+from bidnerf_core.evaluation import faulty, provenance, random_units, warped
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import write_file
@@ -424,7 +425,7 @@ def about_run(content: Sequence[Any]) -> Row:
     return about | {
         "python": run.python,
         "cpu": run.cpu,
-        "versions": {name: run.versions.get(name) for name in VERSIONS},
+        "versions": run.versions,
     }
 
 
@@ -436,7 +437,7 @@ def read_rows(path: Path) -> dict[tuple[str, ...], Row]:
     content = path.read_bytes()
     if path.suffix == ".xz":
         content = lzma.decompress(content)
-    return {tuple(json.loads(key)): row for key, row in RowStore.parse(path, content)}
+    return {tuple(json.loads(key)): row for key, row in RowStore.parse(content).items()}
 
 
 def answers_of(rows: dict[tuple[str, ...], Row]) -> dict[tuple[str, ...], Row]:

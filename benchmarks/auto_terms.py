@@ -14,6 +14,7 @@ from typing import Any
 
 from _lab import (
     RESULTS,
+    RowStore,
     Scene,
     answer,
     cpu_seconds,
@@ -27,7 +28,6 @@ from _lab import (
 )
 
 from bidnerf_core import Localizer
-from bidnerf_core.evaluation import RowStore
 from bidnerf_core.localization import settings_of
 
 SLOW = "surface alone"

@@ -27,6 +27,7 @@ from _lab import (
     RIGHT,
     STRICT,
     Row,
+    RowStore,
     cpu_seconds,
     in_turn,
     judgement,
@@ -42,7 +43,6 @@ from query_conditions import resized
 from bidnerf_core import SE3, Frame, View
 from bidnerf_core.captures import tried_landmarks
 from bidnerf_core.datasets import Capture, open_dataset
-from bidnerf_core.evaluation import RowStore
 from bidnerf_core.localization import LandmarkMatcher, Loop
 from bidnerf_core.mapping import Features, find_features, tracked_views
 from bidnerf_core.results import normalized_error_squared, pose_error

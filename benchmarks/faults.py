@@ -31,6 +31,7 @@ from _lab import (
     RESULTS,
     STRICT,
     Row,
+    RowStore,
     cpu_seconds,
     held_out,
     judgement,
@@ -49,7 +50,6 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import (
     FAULTS,
     NO_FAULT,
-    RowStore,
     expand_faults,
     faulty,
     find_fault,

@@ -25,6 +25,7 @@ import _lab
 import imageio.v3 as iio
 import numpy as np
 import torch
+from _lab import RowStore
 from kornia.metrics import psnr
 from scipy.stats import binomtest
 
@@ -32,7 +33,6 @@ from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.evaluation import (
     NEVER,
     ResultsFile,
-    RowStore,
     Trial,
     TrialResult,
     run_trial,

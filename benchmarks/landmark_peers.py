@@ -47,6 +47,7 @@ from _lab import (
     RIGHT,
     STRICT,
     Row,
+    RowStore,
     Scene,
     cpu_seconds,
     in_turn,
@@ -79,7 +80,7 @@ from scipy.stats import binomtest
 from sift import FEWEST_INLIERS, SiftMatcher, colmap_pnp, opencv_pnp, sift_points
 
 from bidnerf_core import Localizer, View
-from bidnerf_core.evaluation import RowStore, bid_start, views_digest
+from bidnerf_core.evaluation import bid_start, views_digest
 from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.results import pose_error
 

@@ -22,6 +22,7 @@ import torch
 from _lab import (
     RESULTS,
     Row,
+    RowStore,
     Scene,
     answer,
     cpu_seconds,
@@ -36,7 +37,7 @@ from _lab import (
 )
 
 from bidnerf_core import SE3, Frame, Localization, Localizer, View
-from bidnerf_core.evaluation import RowStore, faulty
+from bidnerf_core.evaluation import faulty
 
 WRONG_FOCAL = 1.1
 """Factor on a focal length that is declared as approximate."""

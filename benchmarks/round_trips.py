@@ -20,6 +20,7 @@ from typing import Any
 from _lab import (
     RESULTS,
     Row,
+    RowStore,
     Scene,
     answer,
     cpu_seconds,
@@ -35,7 +36,6 @@ from _lab import (
 
 from bidnerf_core import ImportOptions, Localizer, Map, export_map, import_map, load_map
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import RowStore
 from bidnerf_core.frames import View
 from bidnerf_core.results import read_pose
 

@@ -22,14 +22,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _lab import RESULTS, Row, cpu_seconds, held_out, judgement, one_thread, parser, rates, record
+from _lab import RESULTS, Row, RowStore, cpu_seconds, held_out, judgement, one_thread, parser, rates, record
 from clouds import Gicp, KissMatcher, Open3d, Points, Ransac, Refine, SmallGicp, measured_points
 from landmark_peers import Answer, Peer, answer, auto, kiss_gicp, open3d
 
 from bidnerf_core import ImportOptions, Localizer, View, import_map, load_map
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import RowStore
 
 CELLS = 256
 """Voxels of the fused depth along the longest side of what was measured."""

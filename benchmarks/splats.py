@@ -24,6 +24,7 @@ import torch
 from _lab import (
     RESULTS,
     Row,
+    RowStore,
     Scene,
     answer,
     cpu_seconds,
@@ -41,7 +42,7 @@ from map_quality import judge
 
 from bidnerf_core import Localizer
 from bidnerf_core.backend import load_backend
-from bidnerf_core.evaluation import RowStore, perturb
+from bidnerf_core.evaluation import perturb
 from bidnerf_core.fields import render
 from bidnerf_core.frames import View
 from bidnerf_core.io import from_plain

@@ -31,12 +31,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _lab import BOUND, RESULTS, Row, answer, cpu_seconds, modes, one_thread, parser, record
+from _lab import BOUND, RESULTS, Row, RowStore, answer, cpu_seconds, modes, one_thread, parser, record
 
 from bidnerf_core import SE3, Intrinsics, Localizer, load_map
 from bidnerf_core.datasets import Capture, Shot, open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import RowStore, views_digest
+from bidnerf_core.evaluation import views_digest
 from bidnerf_core.io import read_header, read_lines
 from bidnerf_core.maps import train
 

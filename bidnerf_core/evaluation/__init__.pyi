@@ -10,7 +10,6 @@ from .faults import parse_faults as parse_faults
 from .faults.camera import rolling_shutter as rolling_shutter
 from .faults.scene import texture as texture
 from .faults.warp import warped as warped
-from .lines import RowStore as RowStore
 from .plan import Plan as Plan
 from .plan import Setup as Setup
 from .plan import Trial as Trial
@@ -28,12 +27,10 @@ from .protocols import find_protocol as find_protocol
 from .protocols import perturb as perturb
 from .protocols import random_units as random_units
 from .protocols import rotation_of_size as rotation_of_size
-from .provenance import VERSIONS as VERSIONS
 from .provenance import note_run as note_run
 from .provenance import provenance as provenance
 from .provenance import read_runs as read_runs
 from .provenance import script_command as script_command
-from .provenance import write_record as write_record
 from .report import chosen_criterion as chosen_criterion
 from .report import write_report as write_report
 from .results import ResultsFile as ResultsFile

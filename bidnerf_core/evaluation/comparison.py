@@ -16,9 +16,8 @@ import torch
 from torch import nn
 
 from bidnerf_core.errors import InputError, amount, printable
-from bidnerf_core.evaluation.lines import as_line
 from bidnerf_core.evaluation.plan import Plan, Trial, parse_settings, planned
-from bidnerf_core.evaluation.results import aligned
+from bidnerf_core.evaluation.results import aligned, as_line
 from bidnerf_core.evaluation.run import (
     Data,
     InThisProcess,

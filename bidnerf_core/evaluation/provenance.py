@@ -1,4 +1,4 @@
-"""The provenance needed to reproduce results (command, code and machine), and records that include it."""
+"""The provenance needed to reproduce results: command, code and machine."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import psutil
 import torch
@@ -22,13 +21,8 @@ import bidnerf_core
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import from_plain, read_record, to_plain, write_file
 
-VERSIONS = ("bidnerf", "torch", "numpy", "scipy", "kornia")
-SOURCES = ("bidnerf_core", "backends", "plugins", "benchmarks", ":!benchmarks/results")
-"""Folders in which uncommitted changes make a run irreproducible from its commit."""
 RUNS = ".meta.json"
 """The ending of the file that lists the runs behind a results file, next to it."""
-LINE = 120
-"""Columns per line of a record: nested values that fit are written on one line."""
 
 
 @dataclass(frozen=True)
@@ -51,18 +45,21 @@ class Provenance:
 
 def provenance(command: str, workers: str) -> Provenance:
     """Return the provenance of a run that begins now; ``workers`` describes what runs it."""
+    # In which uncommitted changes make a run irreproducible from its commit.
+    sources = ("bidnerf_core", "backends", "plugins", "benchmarks", ":!benchmarks/results")
     return Provenance(
         date=datetime.now(UTC).isoformat(timespec="seconds"),
         command=command,
         commit=_git("rev-parse", "--verify", "HEAD") or None,
-        dirty=bool(_git("status", "--porcelain", "--untracked-files=no", "--", *SOURCES)),
+        dirty=bool(_git("status", "--porcelain", "--untracked-files=no", "--", *sources)),
         cpu=_cpu_model(),
         cores=os.cpu_count(),
         gpu=torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         memory_bytes=psutil.virtual_memory().total,
         system=f"{platform.system()} {platform.machine()}",
         python=platform.python_version(),
-        versions={name: version(name) for name in VERSIONS} | {"torch": str(torch.__version__)},
+        versions={name: version(name) for name in ("bidnerf", "torch", "numpy", "scipy", "kornia")}
+        | {"torch": str(torch.__version__)},
         workers=workers,
     )
 
@@ -120,32 +117,3 @@ def script_command() -> str:
     # Words such as ``--out=PATH`` and ``MAP:DATA`` hold paths, too.
     words = ("".join(map(shortened, re.split(r"([=:])", word))) for word in sys.argv)
     return shlex.join(words if Path(sys.argv[0]).name == "bidnerf" else ["python", *words])
-
-
-def write_record(path: Path, results: dict[str, Any], seed: int) -> Path:
-    """Write the results of a benchmark script with its provenance to ``path``, a JSON file, and return the
-    path.
-
-    Raises ``ValueError`` if ``results`` contain values that strict JSON cannot represent.
-    """
-    threads = torch.get_num_threads()
-    run = provenance(script_command(), f"one process of {threads} thread{'s' if threads > 1 else ''}")
-    record = {"benchmark": path.stem, **to_plain(run), "seed": seed, "results": results}
-    content = _in_lines(record) + "\n"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_file(path, content.encode())
-    return path
-
-
-def _in_lines(value: Any, indent: str = "") -> str:
-    """Return a value as JSON, with each object or list on one line if it fits into ``LINE`` columns."""
-    line = json.dumps(value, allow_nan=False)
-    if len(indent) + len(line) <= LINE or not value or not isinstance(value, (dict, list, tuple)):
-        return line
-    deeper = indent + " "
-    if isinstance(value, dict):
-        parts = [f"{json.dumps(key)}: {_in_lines(part, deeper)}" for key, part in value.items()]
-    else:
-        parts = [_in_lines(part, deeper) for part in value]
-    first, last = "{}" if isinstance(value, dict) else "[]"
-    return f"{first}\n{deeper}" + f",\n{deeper}".join(parts) + f"\n{indent}{last}"

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, NamedTuple, Self
 
-from bidnerf_core.errors import printable
-from bidnerf_core.evaluation.lines import LinesFile, as_line
+from bidnerf_core.errors import InputError, printable
 from bidnerf_core.evaluation.plan import Trial
 from bidnerf_core.evaluation.summary import (
     Group,
     Situation,
-    Success,
     Summary,
     grouped,
     situation_titles,
@@ -23,15 +22,26 @@ from bidnerf_core.evaluation.summary import (
 )
 from bidnerf_core.evaluation.trial import TrialResult
 from bidnerf_core.geometry import symbol
-from bidnerf_core.io import from_plain, to_plain, write_file
-from bidnerf_core.results import CRITERIA
+from bidnerf_core.io import (
+    FileInUse,
+    from_plain,
+    open_binary,
+    parse_json,
+    read_file,
+    read_open_file,
+    take_lock,
+    to_plain,
+    write_file,
+)
+from bidnerf_core.results import CRITERIA, Rate
 
-WIDEST_FIRST = 60
-"""Maximum number of characters of a line's first cell for it to share the line with the others."""
+LARGEST_FILE = 512 * 2**20
+"""Bytes. A trial takes a few kilobytes, so this is enough for a hundred thousand trials."""
+BEGINNING = b'{"T_world_camera": '
+"""The beginning of each line."""
 
 
-@dataclass(frozen=True)
-class SummaryRow:
+class SummaryRow(NamedTuple):
     """The statistics of the trials of one condition in one situation, with the words used for these in reports."""
 
     start: str  # title of the situation
@@ -67,7 +77,9 @@ class ResultTable:
                 lines.append([row.start])
                 start = row.start
             known = row.statistics
-            rates = [rate_text(success) for success in known.criteria.values()]
+            rates = [
+                "-" if success is None else _percent(success.rate) for success in known.criteria.values()
+            ]
             error = "-"
             if known.translation is not None and known.rotation_deg is not None:
                 error = f"{known.translation:.3f} {symbol(known.unit)} {known.rotation_deg:6.2f} deg"
@@ -84,11 +96,7 @@ class ResultTable:
         return cls(tuple(read_results(map(Path, paths))))
 
 
-def rate_text(success: Success | None) -> str:
-    """Format the fraction of trials that met a criterion with its interval; a dash if the criterion does not apply."""
-    if success is None:
-        return "-"
-    rate = success.rate
+def _percent(rate: Rate) -> str:
     return f"{100 * rate.rate:.0f} % ({100 * rate.low:.0f}-{100 * rate.high:.0f})"
 
 
@@ -101,7 +109,7 @@ def aligned(lines: Sequence[Sequence[str]]) -> str:
     cells: list[list[str]] = []
     for line in lines:
         first, *others = map(printable, line)
-        cells += [[first], ["", *others]] if others and len(first) > WIDEST_FIRST else [[first, *others]]
+        cells += [[first], ["", *others]] if others and len(first) > 60 else [[first, *others]]
     columns = [[line[i] for line in cells if len(line) > max(i, 1)] for i in range(max(map(len, cells)))]
     widths = [max(map(len, column)) for column in columns]
     return "\n".join(
@@ -125,23 +133,72 @@ def read_results(paths: Iterable[Path]) -> list[TrialResult]:
     """
     found: dict[Any, TrialResult] = {}
     for path in paths:
-        for key, result in ResultsFile.read(path):
-            found.setdefault((key, result.weights, result.inputs), result)
+        for result in ResultsFile.read(path):
+            found.setdefault((key_of(result.trial), result.weights, result.inputs), result)
     return list(found.values())
 
 
-class ResultsFile(LinesFile[TrialResult]):
-    """A file of results by the key of their trials, see ``key_of``."""
+class ResultsFile:
+    """A file of results, one JSON object a line, locked by the process that has it open. Use it as a context manager.
 
-    opening, expected = b'{"T_world_camera": ', "lines as written by 'bidnerf evaluate'"
+    It stays valid if the process is killed at any moment: a line is on disk before its trial counts as done, and an incomplete
+    last line is removed when the file is next opened. Anything else that is not a result raises an error that names the
+    line, and is never deleted. Without a path, results are kept in memory only.
+    """
+
+    expected = "lines as written by 'bidnerf evaluate'"
+
+    def __init__(self, path: Path | None) -> None:
+        self.path = path
+        self.values: dict[str, TrialResult] = {}  # by ``key_of`` their trials
+        self._file: BinaryIO | None = None
 
     @classmethod
-    def parsed(cls, plain: Any, where: str) -> tuple[str, TrialResult]:
-        result = from_plain(TrialResult, plain, where)
-        return key_of(result.trial), result
+    def read(cls, path: Path) -> list[TrialResult]:
+        """Return the result of each complete line. Raises ``InputError`` if the file cannot be read."""
+        return cls._parsed(path, read_file(path, cls.expected, LARGEST_FILE))[0]
 
-    def plain(self, key: str, value: TrialResult) -> Any:
-        return to_plain(value)
+    @classmethod
+    def _parsed(cls, path: Path, content: bytes) -> tuple[list[TrialResult], int]:
+        """Return the result of each line, and the number of bytes in complete lines."""
+        lines, found, length = content.split(b"\n"), [], 0
+        for number, line in enumerate(lines, start=1):
+            where = f"{path}: line {number}"
+            try:
+                plain = parse_json(line, where, cls.expected) if line.strip() else None
+            except InputError:
+                # The last line is dropped only if it begins as a result does: no unrelated file is truncated.
+                if number == len(lines) and (line.startswith(BEGINNING) or BEGINNING.startswith(line)):
+                    break
+                raise
+            if plain is not None:
+                found.append(from_plain(TrialResult, plain, where))
+            length += len(line) + (number < len(lines))
+        return found, length
+
+    def __enter__(self) -> Self:
+        if self.path is None:
+            return self
+        file = self._open(self.path)
+        try:
+            content = read_open_file(file, self.path, self.expected, LARGEST_FILE)
+            results, whole = self._parsed(self.path, content)
+            for result in results:
+                self.values.setdefault(key_of(result.trial), result)
+            if whole < len(content):
+                file.truncate(whole)
+            if whole and content[whole - 1 : whole] != b"\n":
+                file.write(b"\n")
+            file.flush()
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
 
     def __contains__(self, trial: Trial) -> bool:
         return key_of(trial) in self.values
@@ -151,8 +208,58 @@ class ResultsFile(LinesFile[TrialResult]):
 
     def add(self, result: TrialResult) -> None:
         """Append a result, which is on disk when this returns. Raises ``InputError`` if the file was removed."""
-        self.append(key_of(result.trial), result)
+        if self.path is not None:
+            file = self._unmoved(self.path)
+            file.write(as_line(to_plain(result)))
+            file.flush()
+            os.fsync(file.fileno())
+        self.values[key_of(result.trial)] = result
 
     def put_in_order(self, trials: Sequence[Trial]) -> None:
         """Move the results of ``trials`` to the end of the file, in their order, in one atomic step."""
-        self.reorder(map(key_of, trials))
+        last = [key for key in map(key_of, trials) if key in self.values]
+        order = [key for key in self.values if key not in set(last)] + last
+        if self.path is not None:
+            self._unmoved(self.path)
+            if order != list(self.values):
+                ResultTable(tuple(self.values[key] for key in order)).save(self.path)
+                self.__exit__()  # the open file is the one that was replaced
+                self._open(self.path)
+        self.values = {key: self.values[key] for key in order}
+
+    def _unmoved(self, path: Path) -> BinaryIO:
+        """Return the open file. Raises ``InputError`` if the path no longer names it: lines would be lost unnoticed."""
+        assert self._file is not None
+        try:
+            same = os.path.samestat(os.fstat(self._file.fileno()), path.stat())
+        except FileNotFoundError:
+            same = False
+        if not same:
+            raise InputError(
+                "was removed or replaced while it was being written, so its content is lost; start again, or"
+                " move the file back",
+                where=path,
+            )
+        return self._file
+
+    def _open(self, path: Path) -> BinaryIO:
+        """Open, create if needed, and lock the file."""
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if path.exists():
+                open_binary(path, self.expected).close()  # not a pipe, which would wait for a reader
+            self._file = path.open("a+b")
+        except OSError as error:
+            raise InputError(
+                f"cannot be written ({error.strerror})", where=path, expected="a file"
+            ) from error
+        if not take_lock(self._file.fileno()):
+            self.__exit__()
+            raise FileInUse("another process is writing to it; name another --out", where=path)
+        self._file.seek(0)
+        return self._file
+
+
+def as_line(plain: Any) -> bytes:
+    """Return ``plain`` as one line of strict JSON."""
+    return json.dumps(plain, allow_nan=False).encode() + b"\n"

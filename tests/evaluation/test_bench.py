@@ -36,7 +36,7 @@ from bidnerf_core.evaluation import (
 
 # Inside: lines of results, and the middle of a sequence
 from bidnerf_core.evaluation.arcs import arc, mean_up, seen_middle
-from bidnerf_core.evaluation.lines import as_line
+from bidnerf_core.evaluation.results import as_line
 from bidnerf_core.geometry import look_at, turned_about
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import METHODS

@@ -21,7 +21,6 @@ from bidnerf_core.evaluation import (
     Plan,
     ResultsFile,
     ResultTable,
-    RowStore,
     Trial,
     TrialResult,
     faulty,
@@ -239,7 +238,7 @@ def test_an_interrupted_run_goes_on_with_rows_of_the_same_content(
 
     def run(jobs: int, *faults: str) -> dict[str, Any]:
         words = [scene, "--faults", *faults, "--rgbd", "--frames", "3", "--jobs", str(jobs)]
-        with RowStore(tmp_path / "rows.jsonl") as store:
+        with script.RowStore(tmp_path / "rows.jsonl") as store:
             found: dict[str, Any] = script.measured(
                 given(script, monkeypatch, *words), store, InThisProcess()
             )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import itertools
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +22,6 @@ from bidnerf_core.evaluation import (
     note_run,
     provenance,
     read_runs,
-    write_record,
 )
 from bidnerf_core.io import is_temporary, write_file
 
@@ -95,7 +93,6 @@ SAVERS: dict[str, Saver] = {
     "comparison": file("c.json", lambda path, n: Comparison("d", "test", "none", (), "auto", {}, 0, n, ()).save(path)),
     "runs": (lambda folder, n: note_run(folder / "r.jsonl", provenance("bidnerf evaluate", f"{n}")),
              lambda folder: [run.workers for run in read_runs(folder / "r.jsonl")] or None),
-    "record": file("a.json", lambda path, n: write_record(path, {"rate": n}, seed=0), lambda path: json.loads(path.read_text())["results"]),
     "figure": file("a.png", lambda path, n: write_figure(new_figure(n, 1), path)),
     "animation": file("a.gif", lambda path, n: save_gif(path, [np.zeros((4, 4, 3))] * n)),
     "tracker": file("state", lambda path, n: save_state(path, TrackerState(Clock(None, float(n))), "map")),
