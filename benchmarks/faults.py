@@ -52,7 +52,6 @@ from bidnerf_core.evaluation import (
     NO_FAULT,
     expand_faults,
     faulty,
-    find_fault,
     local_processes,
     parse_faults,
     parse_settings,
@@ -153,7 +152,7 @@ def queries(given: argparse.Namespace) -> Iterator[Query]:
         map, data = pair.split(":", 1)
         for depth in given.modes:
             for fault in given.faults:
-                for_depth = any(find_fault(part.name).needs_depth for part in parse_faults(fault))
+                for_depth = any(FAULTS.load(part.name).needs_depth for part in parse_faults(fault))
                 if depth or not for_depth:
                     yield from frames_of(given, map, data, depth, fault, False)
             for other in given.foreign:

@@ -5,7 +5,6 @@ from .faults import NO_FAULT as NO_FAULT
 from .faults import Fault as Fault
 from .faults import expand_faults as expand_faults
 from .faults import faulty as faulty
-from .faults import find_fault as find_fault
 from .faults import parse_faults as parse_faults
 from .faults.camera import rolling_shutter as rolling_shutter
 from .faults.scene import texture as texture

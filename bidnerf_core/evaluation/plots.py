@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.comparison import Comparison, MapRow
-from bidnerf_core.evaluation.faults import NO_FAULT, find_fault
+from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT
 from bidnerf_core.evaluation.summary import (
     NEVER,
     FaultCurve,
@@ -409,7 +409,7 @@ SHARES: dict[str, tuple[Callable[[TrialResult], bool], str]] = {
 
 def _draw_curve(axes: Any, curve: FaultCurve) -> None:
     """Draw one curve. Sizes are evenly spaced, since those of a fault may span orders of magnitude."""
-    fault, places = find_fault(curve.name), np.arange(len(curve.points))
+    fault, places = FAULTS.load(curve.name), np.arange(len(curve.points))
     for turn, (share, colour) in enumerate(SHARES.values()):
         rates = [rate_of(group.results, list(map(share, group.results))) for _, group in curve.points]
         middle = np.array([rate.rate for rate in rates])

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from bidnerf_core.evaluation.faults import NO_FAULT, find_fault, parse_faults
+from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, parse_faults
 from bidnerf_core.evaluation.trial import TrialResult
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.results import CRITERIA, Rate, Reduced, steps_to_success, success_rate_by_frame
@@ -347,7 +347,7 @@ def fault_curves(groups: Sequence[Group]) -> list[FaultCurve]:
             found.setdefault(key, []).append((parts[0].size, group))
     clean = {(group.situation, group.label): group for group in groups}
     for (situation, label, name), points in found.items():
-        neutral, usual = find_fault(name).neutral, clean.get((situation, label))
+        neutral, usual = FAULTS.load(name).neutral, clean.get((situation, label))
         if neutral is not None and usual is not None and neutral not in dict(points):
             points.append((neutral, usual))
     return [

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from bidnerf_core.datasets import READERS, Capture, DatasetOptions, Reader, of_views, write_transforms
-from bidnerf_core.evaluation import FAULTS, find_fault
+from bidnerf_core.evaluation import FAULTS
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import AutoConfig, Localization, Outcome, Problem, find_method, settings_of
@@ -216,5 +216,5 @@ def unseeded(frame: Frame, size: float, generator: Generator) -> Frame:
     [(in_place, "test_given_image_is_left_alone"), (unseeded, "test_same_seed_gives_the_same_image")],
 )
 def test_a_mistake_of_a_fault_is_named(monkeypatch: pytest.MonkeyPatch, change: Any, test: str) -> None:
-    monkeypatch.setitem(registered, ("faults", "mistaken"), replace(find_fault("exposure"), change=change))
+    monkeypatch.setitem(registered, ("faults", "mistaken"), replace(FAULTS.load("exposure"), change=change))
     assert test in failing(FaultContract, name="mistaken")

@@ -10,7 +10,7 @@ from bidnerf_core.evaluation.faults.composition import (
     faulty,
     parse_faults,
 )
-from bidnerf_core.evaluation.faults.fault import FAULTS, Fault, find_fault
+from bidnerf_core.evaluation.faults.fault import FAULTS, Fault
 
 __all__ = [
     "FAULTS",
@@ -20,6 +20,5 @@ __all__ = [
     "check_depth",
     "expand_faults",
     "faulty",
-    "find_fault",
     "parse_faults",
 ]

@@ -7,59 +7,62 @@ import math
 import torch
 
 from bidnerf_core.evaluation.faults import camera, colour, depth, scene
-from bidnerf_core.evaluation.faults.fault import SHARE, SWITCH, Fault
+from bidnerf_core.evaluation.faults.fault import SHARE, SWITCH, Fault, depth_of
 from bidnerf_core.geometry import SE3
 from bidnerf_core.settings import Above, Range, WholeNumbers
 
-FACTOR = Above(0.0, 100.0)
-LARGEST_SHIFT = 10_000.0
-"""Maximum shift of anything, in pixels."""
-LARGER_THAN_IMAGES = 1_000_000
-"""Size, in pixels, of a window that contains any image."""
-HALF_TURN = SE3.exp(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, math.pi], dtype=torch.float64))
-"""A turn by 180 degrees about the optical axis."""
+FACTOR, SHIFT = Above(0.0, 100.0), Range(0.0, 10_000.0)
+PIXELS = WholeNumbers(1, 1_000_000)
+"""Sizes of a window; the largest contains any image."""
 
 # fmt: off
 CATALOGUE: dict[str, Fault] = {
-    "depth-scale": Fault("factor", FACTOR, 1.0, (0.95, 0.98, 1.02, 1.05), depth.scaled, True,
+    "depth-scale": Fault("factor", FACTOR, 1.0, (0.95, 0.98, 1.02, 1.05),
+        lambda frame, factor, _: frame.replace(depth=depth_of(frame) * factor), True,
         summary="depth multiplied by a factor"),
-    "depth-offset": Fault("metres", Range(-1000.0, 1000.0), 0.0, (-0.05, 0.05), depth.offset, True,
+    "depth-offset": Fault("metres", Range(-1000.0, 1000.0), 0.0, (-0.05, 0.05),
+        lambda frame, metres, _: depth.remeasured(frame, depth_of(frame) + metres), True,
         summary="a constant added to the depth"),
-    "depth-noise": Fault("standard deviation over depth", SHARE, 0.0, (0.01, 0.02, 0.05), depth.proportional_noise, True,
+    "depth-noise": Fault("standard deviation over depth", SHARE, 0.0, (0.01, 0.02, 0.05), depth.noisy(1), True,
         summary="Gaussian noise proportional to the depth"),
-    "depth-noise-squared": Fault("standard deviation at 1 m, metres", SHARE, 0.0, (0.0015, 0.005, 0.015), depth.quadratic_noise, True,
+    "depth-noise-squared": Fault("standard deviation at 1 m, metres", SHARE, 0.0, (0.0015, 0.005, 0.015), depth.noisy(2), True,
         summary="Gaussian noise proportional to the depth's square"),
-    "depth-steps": Fault("metres", Range(0.0, 1000.0), 0.0, (0.01, 0.05), depth.quantised, True,
+    "depth-steps": Fault("metres", Range(0.0, 1000.0), 0.0, (0.01, 0.05),
+        lambda frame, step, _: depth.remeasured(frame, (depth_of(frame) / step).round() * step), True,
         summary="depth rounded to multiples of a step"),
     "depth-holes": Fault("share of the pixels", SHARE, 0.0, (0.25, 0.5, 0.75, 0.95), depth.random_holes, True,
         summary="depth missing at random pixels"),
     "depth-hole": Fault("share of the measured pixels", SHARE, 0.0, (0.5, 0.75, 0.9), depth.one_hole, True,
         summary="depth missing on one side, in one piece"),
-    "depth-shift": Fault("pixels", Range(0.0, LARGEST_SHIFT), 0.0, (2.0, 5.0), depth.misregistered, True,
+    "depth-shift": Fault("pixels", SHIFT, 0.0, (2.0, 5.0), depth.misregistered, True,
         summary="depth moved relative to colour, in a random direction"),
-    "depth-window": Fault("pixels a side", WholeNumbers(1, LARGER_THAN_IMAGES), LARGER_THAN_IMAGES, (25.0, 50.0, 100.0), depth.square_window, True,
+    "depth-window": Fault("pixels a side", PIXELS, PIXELS.most, (25.0, 50.0, 100.0), depth.square_window, True,
         summary="depth in a random square only"),
-    "depth-rows": Fault("rows", WholeNumbers(1, LARGER_THAN_IMAGES), LARGER_THAN_IMAGES, (1.0, 10.0), depth.few_rows, True,
+    "depth-rows": Fault("rows", PIXELS, PIXELS.most, (1.0, 10.0), depth.few_rows, True,
         summary="depth in neighbouring rows only"),
     "depth-wall": Fault("1: on, 0: off", SWITCH, 0.0, (1.0,), depth.one_wall, True,
         summary="depth on the largest plane only"),
-    "focal": Fault("factor", FACTOR, 1.0, (0.9, 0.95, 0.98, 1.02, 1.05, 1.1), camera.focal_scaled,
+    "focal": Fault("factor", FACTOR, 1.0, (0.9, 0.95, 0.98, 1.02, 1.05, 1.1),
+        lambda frame, factor, _: camera.restated(frame, fx=frame.intrinsics.fx * factor, fy=frame.intrinsics.fy * factor),
         summary="stated focal lengths multiplied by a factor"),
     "nominal": Fault("1: on, 0: off", SWITCH, 0.0, (1.0,), camera.nominal,
         summary="only the focal length stated, and as approximate, as for an uncalibrated photo"),
-    "stretch": Fault("factor", FACTOR, 1.0, (0.75, 0.9, 1.1, 1.33), camera.stretched,
+    "stretch": Fault("factor", FACTOR, 1.0, (0.75, 0.9, 1.1, 1.33),
+        lambda frame, factor, _: camera.restated(frame, fx=frame.intrinsics.fx * factor),
         summary="stated horizontal focal length multiplied by a factor, as if the image's aspect ratio had changed"),
     "crop": Fault("share of width and height", Range(0.0, 0.9), 0.0, (0.1, 0.25), camera.cropped,
         summary="rows and columns cropped at a corner, not reflected in the stated principal point"),
-    "principal-point": Fault("pixels", Range(0.0, LARGEST_SHIFT), 0.0, (2.0, 5.0, 10.0), camera.principal_point_moved,
+    "principal-point": Fault("pixels", SHIFT, 0.0, (2.0, 5.0, 10.0), camera.principal_point_moved,
         summary="stated principal point moved in a random direction"),
     "distortion": Fault("k1", Range(-1.0, 1.0), 0.0, (-0.1, 0.1, 0.3), camera.distorted,
         summary="radial distortion that the intrinsics do not state"),
     "rolling-shutter": Fault("degrees during the exposure of all rows", Range(0.0, 30.0), 0.0, (0.5, 2.0), camera.rolling_shutter,
         summary="rolling shutter while the camera rotates"),
-    "exposure": Fault("factor", FACTOR, 1.0, (0.5, 0.7, 1.3, 2.0), colour.exposure,
+    "exposure": Fault("factor", FACTOR, 1.0, (0.5, 0.7, 1.3, 2.0),
+        lambda frame, factor, _: colour.recoloured(frame, frame.rgb * factor),
         summary="all values multiplied by a factor"),
-    "white-balance": Fault("factor", FACTOR, 1.0, (0.8, 1.25), colour.white_balance,
+    "white-balance": Fault("factor", FACTOR, 1.0, (0.8, 1.25),
+        lambda frame, factor, _: colour.recoloured(frame, frame.rgb * frame.rgb.new_tensor([factor, 1.0, 1 / factor])),
         summary="red multiplied and blue divided by a factor"),
     "blur": Fault("standard deviation, pixels", Range(0.0, 1000.0), 0.0, (1.0, 3.0, 5.0), colour.blur,
         summary="colours blurred by a Gaussian"),
@@ -79,11 +82,11 @@ CATALOGUE: dict[str, Fault] = {
         summary="an object on the surface that the map lacks"),
     "vanished": Fault("share of the measured surface", SHARE, 0.0, (0.2,), scene.vanished_thing, True,
         summary="a piece of the surface missing"),
-    "mirror": Fault("1: on, 0: off", SWITCH, 0.0, (1.0,), camera.mirrored,
+    "mirror": Fault("1: on, 0: off", SWITCH, 0.0, (1.0,), camera.turned(columns=True),
         summary="left and right swapped"),
-    "flip": Fault("1: on, 0: off", SWITCH, 0.0, (1.0,), camera.flipped,
+    "flip": Fault("1: on, 0: off", SWITCH, 0.0, (1.0,), camera.turned(rows=True),
         summary="top and bottom swapped"),
-    "upside-down": Fault("1: on, 0: off", SWITCH, 0.0, (1.0,), camera.upside_down, T_true_faulty=HALF_TURN,
+    "upside-down": Fault("1: on, 0: off", SWITCH, 0.0, (1.0,), camera.turned(columns=True, rows=True), T_true_faulty=SE3.exp(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, math.pi], dtype=torch.float64)),
         summary="the camera held upside down"),
     "covered": Fault("1: on, 0: off", SWITCH, 0.0, (1.0,), camera.covered_lens,
         summary="one colour everywhere and no depth"),

@@ -16,27 +16,18 @@ from torch import Generator, Tensor
 from bidnerf_core.frames import Frame
 
 
-def exposure(frame: Frame, factor: float, generator: Generator) -> Frame:
-    """Multiply all values by ``factor``; values brighter than white are clipped."""
-    return _recoloured(frame, frame.rgb * factor)
-
-
-def white_balance(frame: Frame, factor: float, generator: Generator) -> Frame:
-    """Multiply red by ``factor`` and divide blue by it: more than 1 is too warm, less is too cold."""
-    return _recoloured(frame, frame.rgb * frame.rgb.new_tensor([factor, 1.0, 1 / factor]))
+def recoloured(frame: Frame, rgb: Float[Tensor, "h w 3"]) -> Frame:
+    """Return the frame with other colours; values brighter than white are clipped."""
+    return replace(frame, rgb=rgb.clamp(0, 1))
 
 
 def blur(frame: Frame, pixels: float, generator: Generator) -> Frame:
     """Blur the colours with a Gaussian whose standard deviation is ``pixels``. Depth stays sharp."""
-    if pixels == 0:
-        return frame
-    size = 2 * max(1, round(3 * pixels)) + 1
     smallest = min(frame.rgb.shape[:2])
-    size = min(
-        size, smallest - 1 + smallest % 2
-    )  # padding by reflection at the border cannot be wider than the image
+    # Padding by reflection at the border cannot be wider than the image.
+    size = min(2 * max(1, round(3 * pixels)) + 1, smallest - 1 + smallest % 2)
     images = frame.rgb.permute(2, 0, 1)[None]
-    return _recoloured(frame, gaussian_blur2d(images, (size, size), (pixels, pixels))[0].permute(1, 2, 0))
+    return recoloured(frame, gaussian_blur2d(images, (size, size), (pixels, pixels))[0].permute(1, 2, 0))
 
 
 def jpeg(frame: Frame, quality: float, generator: Generator) -> Frame:
@@ -45,13 +36,13 @@ def jpeg(frame: Frame, quality: float, generator: Generator) -> Frame:
     Image.fromarray((frame.rgb * 255).round().to(torch.uint8).numpy()).save(
         file, "JPEG", quality=int(quality)
     )
-    return _recoloured(frame, torch.from_numpy(np.array(Image.open(file))).to(frame.rgb) / 255)
+    return recoloured(frame, torch.from_numpy(np.array(Image.open(file))).to(frame.rgb) / 255)
 
 
 def grey(frame: Frame, share: float, generator: Generator) -> Frame:
     """Remove ``share`` of the colours' saturation: 1 leaves only their brightness."""
     brightness = rgb_to_grayscale(frame.rgb.permute(2, 0, 1)).permute(1, 2, 0)
-    return _recoloured(frame, frame.rgb + share * (brightness - frame.rgb))
+    return recoloured(frame, frame.rgb + share * (brightness - frame.rgb))
 
 
 def vignetting(frame: Frame, share: float, generator: Generator) -> Frame:
@@ -59,8 +50,4 @@ def vignetting(frame: Frame, share: float, generator: Generator) -> Frame:
     camera = frame.intrinsics
     middle = frame.rgb.new_tensor([camera.width / 2, camera.height / 2])
     radius = (camera.pixel_centres() - middle).norm(dim=-1, keepdim=True) / middle.norm()
-    return _recoloured(frame, frame.rgb * (1 - share * radius.square()))
-
-
-def _recoloured(frame: Frame, rgb: Float[Tensor, "h w 3"]) -> Frame:
-    return replace(frame, rgb=rgb.clamp(0, 1))
+    return recoloured(frame, frame.rgb * (1 - share * radius.square()))

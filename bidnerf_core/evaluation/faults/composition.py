@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.faults.fault import find_fault
+from bidnerf_core.evaluation.faults.fault import FAULTS
 from bidnerf_core.frames import Frame, View
 
 NO_FAULT = "none"
@@ -25,7 +25,7 @@ class AppliedFault:
     size: float
 
     def __post_init__(self) -> None:
-        allowed = find_fault(self.name).allowed
+        allowed = FAULTS.load(self.name).allowed
         if self.size not in allowed:
             raise InputError(f"size is {self.size:.12g}", where=f"fault {self.name}", expected=allowed)
 
@@ -34,10 +34,15 @@ class AppliedFault:
 
     def __call__(self, view: View, seed: int) -> View:
         """Return the view with this fault. Raises ``InputError`` if it is a fault of depth and none was measured."""
-        fault = find_fault(self.name)
-        generator = torch.Generator().manual_seed(_stream(seed, view.frame.name, self.name))
+        fault = FAULTS.load(self.name)
+        if self.size == fault.neutral:
+            return view
+        # The random choices of one fault on one frame have a seed of their own.
+        text = f"{seed}\n{view.frame.name}\n{self.name}".encode(errors="surrogatepass")
+        stream = int.from_bytes(hashlib.blake2b(text, digest_size=7).digest(), "big")
+        generator = torch.Generator().manual_seed(stream)
         T_ref_camera = view.T_ref_camera
-        if fault.T_true_faulty is not None and self.size != fault.neutral:
+        if fault.T_true_faulty is not None:
             T_ref_camera = T_ref_camera.to(dtype=torch.float64) @ fault.T_true_faulty
         changed = fault.change(view.frame, self.size, generator)
         if not isinstance(changed, Frame):
@@ -91,13 +96,13 @@ def faulty(view: View, faults: str | Sequence[AppliedFault], seed: int) -> View:
 def check_depth(faults: Iterable[str], depth: bool) -> None:
     """Raise ``InputError`` for an unknown fault and, unless ``depth`` is used, for a fault of depth."""
     for part in (part for text in faults for part in parse_faults(text)):
-        if find_fault(part.name).needs_depth and not depth:
+        if FAULTS.load(part.name).needs_depth and not depth:
             raise InputError(f"fault {part} changes the measured depth, which the method does not receive")
 
 
 def _parsed(text: str) -> AppliedFault:
     name, colon, size = text.partition(":")
-    fault = find_fault(name)
+    fault = FAULTS.load(name)
     if not size:
         if fault.is_switch and not colon:
             return AppliedFault(name, 1.0)
@@ -110,9 +115,3 @@ def _parsed(text: str) -> AppliedFault:
     if not math.isfinite(number):
         raise InputError(f"size is {size!r}", where=f"fault {name}", expected=fault.allowed)
     return AppliedFault(name, number)
-
-
-def _stream(seed: int, frame: str, fault: str) -> int:
-    """Return the seed of the random choices of one fault on one frame."""
-    text = f"{seed}\n{frame}\n{fault}".encode(errors="surrogatepass")
-    return int.from_bytes(hashlib.blake2b(text, digest_size=7).digest(), "big")

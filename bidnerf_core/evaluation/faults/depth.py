@@ -6,48 +6,34 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
-from bidnerf_core.evaluation.faults.fault import depth_of, random_direction, random_pixel
+from bidnerf_core.evaluation.faults.fault import Change, depth_of, random_direction, random_pixel
 from bidnerf_core.evaluation.faults.warp import nearest
 from bidnerf_core.frames import Frame
 
-PLANE_TRIALS, PLANE_SAMPLE = 256, 4096
-"""Number of planes to try, and of points used to compare them."""
-PLANE_TOLERANCE = 0.01
-"""Maximum distance of a point from a plane that it belongs to, relative to the point's depth."""
+
+def remeasured(frame: Frame, depth: Float[Tensor, "h w"]) -> Frame:
+    """Return the frame with new depth where there was a measurement; values of 0 and below count as not measured."""
+    valid = (depth_of(frame) > 0) & (depth > 0)
+    return frame.replace(depth=torch.where(valid, depth, torch.zeros_like(depth)))
 
 
-def scaled(frame: Frame, factor: float, generator: Generator) -> Frame:
-    """Multiply the depth by ``factor``."""
-    return frame.replace(depth=depth_of(frame) * factor)
+def noisy(power: int) -> Change:
+    """Return the fault that adds independent Gaussian noise of standard deviation ``size * depth ** power``.
 
+    A power of 2 is typical of triangulating sensors.
+    """
 
-def offset(frame: Frame, metres: float, generator: Generator) -> Frame:
-    """Add a constant to the depth."""
-    return _remeasured(frame, depth_of(frame) + metres)
+    def add(frame: Frame, size: float, generator: Generator) -> Frame:
+        depth = depth_of(frame)
+        noise = torch.randn(depth.shape, generator=generator, dtype=depth.dtype)
+        return remeasured(frame, depth + size * depth**power * noise)
 
-
-def proportional_noise(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Add independent Gaussian noise whose standard deviation is ``share`` of the depth."""
-    depth = depth_of(frame)
-    return _remeasured(frame, depth + share * depth * _normal(depth, generator))
-
-
-def quadratic_noise(frame: Frame, per_metre: float, generator: Generator) -> Frame:
-    """Add independent Gaussian noise of standard deviation ``per_metre * depth ** 2``, typical of triangulating sensors."""
-    depth = depth_of(frame)
-    return _remeasured(frame, depth + per_metre * depth.square() * _normal(depth, generator))
-
-
-def quantised(frame: Frame, step: float, generator: Generator) -> Frame:
-    """Round the depth to multiples of ``step`` (metres)."""
-    depth = depth_of(frame)
-    return frame if step == 0 else _remeasured(frame, (depth / step).round() * step)
+    return add
 
 
 def random_holes(frame: Frame, share: float, generator: Generator) -> Frame:
     """Remove the depth of each pixel with probability ``share``, independently."""
-    depth = depth_of(frame)
-    return _kept(frame, torch.rand(depth.shape, generator=generator) >= share)
+    return _kept(frame, torch.rand(depth_of(frame).shape, generator=generator) >= share)
 
 
 def one_hole(frame: Frame, share: float, generator: Generator) -> Frame:
@@ -70,23 +56,18 @@ def misregistered(frame: Frame, pixels: float, generator: Generator) -> Frame:
 
 def square_window(frame: Frame, pixels: float, generator: Generator) -> Frame:
     """Keep only the depth inside a square of ``pixels`` by ``pixels`` around a random measured pixel."""
-    row, column = random_pixel(depth_of(frame) > 0, generator)
-    height, width = depth_of(frame).shape
-    rows, columns = _interval(row, height, int(pixels)), _interval(column, width, int(pixels))
-    return _kept(frame, rows[:, None] & columns[None, :])
+    rows, columns = _around_a_pixel(frame, int(pixels), generator)
+    return _kept(frame, rows[:, None] & columns)
 
 
 def few_rows(frame: Frame, count: float, generator: Generator) -> Frame:
     """Keep only the depth of ``count`` adjacent rows around a random measured pixel, as from a line scanner."""
-    row, _ = random_pixel(depth_of(frame) > 0, generator)
-    height, width = depth_of(frame).shape
-    return _kept(frame, _interval(row, height, int(count))[:, None].expand(height, width))
+    rows, columns = _around_a_pixel(frame, int(count), generator)
+    return _kept(frame, rows[:, None].expand(-1, len(columns)))
 
 
 def one_wall(frame: Frame, on: float, generator: Generator) -> Frame:
     """Keep only the depth of the plane that contains the most measured points."""
-    if not on:
-        return frame
     depth = depth_of(frame)
     points = frame.intrinsics.unproject(frame.intrinsics.pixel_centres()) * depth[..., None]
     plane = _largest_plane(points[depth > 0], generator)
@@ -94,9 +75,9 @@ def one_wall(frame: Frame, on: float, generator: Generator) -> Frame:
 
 
 def _largest_plane(points: Float[Tensor, "n 3"], generator: Generator) -> Float[Tensor, "4"]:
-    """Return the plane (unit normal, offset) with the most points, among random planes through three points each."""
-    corners = points[torch.randint(len(points), (PLANE_TRIALS, 3), generator=generator)]
-    sample = points[torch.randint(len(points), (PLANE_SAMPLE,), generator=generator)]
+    """Return the plane (unit normal, offset) with the most points of a sample, among 256 planes through three points each."""
+    corners = points[torch.randint(len(points), (256, 3), generator=generator)]
+    sample = points[torch.randint(len(points), (4096,), generator=generator)]
     crossed = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = torch.nn.functional.normalize(crossed, dim=-1)
     planes = torch.cat([normals, -(normals * corners[:, 0]).sum(-1, keepdim=True)], dim=-1)
@@ -108,24 +89,20 @@ def _largest_plane(points: Float[Tensor, "n 3"], generator: Generator) -> Float[
 
 
 def _on_plane(points: Float[Tensor, "*p 3"], plane: Float[Tensor, "4"]) -> Bool[Tensor, "*p"]:
-    return (points @ plane[:3] + plane[3]).abs() <= PLANE_TOLERANCE * points[..., 2]
+    """Return which points are as near to a plane as a hundredth of their depth."""
+    return (points @ plane[:3] + plane[3]).abs() <= 0.01 * points[..., 2]
 
 
-def _interval(middle: int, length: int, size: int) -> Bool[Tensor, "n"]:
-    """Mark ``length`` adjacent places out of ``size``, centred on ``middle`` as far as the ends allow."""
-    first = max(0, min(middle - size // 2, length - size))
-    places = torch.arange(length)
-    return (places >= first) & (places < first + size)
-
-
-def _normal(depth: Float[Tensor, "h w"], generator: Generator) -> Float[Tensor, "h w"]:
-    return torch.randn(depth.shape, generator=generator, dtype=depth.dtype)
-
-
-def _remeasured(frame: Frame, depth: Float[Tensor, "h w"]) -> Frame:
-    """Return the frame with new depth where there was a measurement; values of 0 and below count as not measured."""
-    valid = (depth_of(frame) > 0) & (depth > 0)
-    return frame.replace(depth=torch.where(valid, depth, torch.zeros_like(depth)))
+def _around_a_pixel(frame: Frame, size: int, generator: Generator) -> list[Bool[Tensor, "n"]]:
+    """Mark ``size`` adjacent rows and columns, centred on a random measured pixel as far as the borders allow."""
+    found = []
+    for middle, length in zip(
+        random_pixel(depth_of(frame) > 0, generator), depth_of(frame).shape, strict=True
+    ):
+        first = max(0, min(middle - size // 2, length - size))
+        places = torch.arange(length)
+        found.append((places >= first) & (places < first + size))
+    return found
 
 
 def _kept(frame: Frame, kept: Bool[Tensor, "h w"]) -> Frame:

@@ -31,9 +31,9 @@ class Fault:
 
     unit: str  # of the size, in words
     allowed: Range
-    neutral: float | None  # the size that leaves the frame unchanged; None if there is no such size
+    neutral: float | None  # the size at which there is no fault; None if there is no such size
     sizes: tuple[float, ...]  # sizes worth measuring
-    change: Change
+    change: Change  # not called for the neutral size
     needs_depth: bool = False
     T_true_faulty: SE3 | None = None
     """Pose of the faulty camera in the true camera's frame, at any size but the neutral one; None if they coincide."""
@@ -52,11 +52,6 @@ def _defects(fault: Any) -> Iterator[str]:
 
 FAULTS: Plugins[Fault] = Plugins("faults", _defects)
 """All faults by name."""
-
-
-def find_fault(name: str) -> Fault:
-    """Return a fault by name. Raises ``PluginError``, an ``InputError``, for an unknown name and a broken plugin."""
-    return FAULTS.load(name)
 
 
 def depth_of(frame: Frame) -> Float[Tensor, "h w"]:

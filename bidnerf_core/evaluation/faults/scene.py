@@ -16,22 +16,6 @@ from bidnerf_core.evaluation.faults.fault import depth_of, random_direction, ran
 from bidnerf_core.evaluation.faults.warp import reflected, warped
 from bidnerf_core.frames import Frame
 
-NEAREST_QUANTILE = 0.02
-"""Quantile of the measured depth that counts as the nearest part of the scene."""
-OCCLUDER_DEPTH = (0.4, 0.8)
-"""Limits of an occluder's depth relative to that of the nearest part of the scene."""
-RELIEF = 0.05
-"""Standard deviation of an occluder's depth relative to its mean."""
-TRAVEL, APPROACH = (0.15, 0.3), (0.85, 0.98)
-"""Limits of an object's motion across the image (relative to its shorter side), and of the factor on its depth."""
-ADDED_HEIGHT = (0.02, 0.1)
-"""Limits of the height of an added object above the surface, towards the camera, relative to the depth."""
-WAVES = (2, 3, 4, 5)
-"""Numbers of periods, around a blob's outline, of the waves that compose its radius."""
-BULGE = 0.35
-"""Maximum amplitude of each wave, in the logarithm of the radius."""
-BLOB_OCTAVES = (4, 8, 16, 32, 64, 128)
-"""Numbers of cells along the longer side for the octaves of noise that sum to a texture."""
 RIM = 3
 """Width, in pixels, of the surroundings from which a hole is filled."""
 
@@ -43,9 +27,10 @@ def occluder(frame: Frame, share: float, generator: Generator) -> Frame:
     mask, colours = _textured_blob(frame, share, generator)
     if frame.depth is None or not frame.has_depth:
         return _pasted(frame, mask, colours, frame.depth)
-    near = float(np.quantile(frame.depth[frame.depth > 0].numpy(), NEAREST_QUANTILE))
-    relief = 1 + RELIEF * _bounded_noise(frame, 3, generator)
-    return _pasted(frame, mask, colours, uniform_number(generator, *OCCLUDER_DEPTH) * near * relief)
+    # Nearer than the nearest part of the scene, the second percentile of its depth, with a relief of a twentieth.
+    near = float(np.quantile(frame.depth[frame.depth > 0].numpy(), 0.02))
+    relief = 1 + 0.05 * _bounded_noise(frame, 3, generator)
+    return _pasted(frame, mask, colours, uniform_number(generator, 0.4, 0.8) * near * relief)
 
 
 def unmeasured_occluder(frame: Frame, share: float, generator: Generator) -> Frame:
@@ -63,17 +48,17 @@ def moved_thing(frame: Frame, share: float, generator: Generator) -> Frame:
     """
     height, width = frame.rgb.shape[:2]
     mask = blob(height, width, share, generator)
-    travel = uniform_number(generator, *TRAVEL) * min(height, width)
+    travel = uniform_number(generator, 0.15, 0.3) * min(height, width)
     move = torch.tensor(random_direction(generator)) * travel
     elsewhere = warped(frame, reflected(frame.intrinsics.pixel_centres() - move, width, height))
-    depth = None if elsewhere.depth is None else elsewhere.depth * uniform_number(generator, *APPROACH)
+    depth = None if elsewhere.depth is None else elsewhere.depth * uniform_number(generator, 0.85, 0.98)
     return _pasted(frame, mask, elsewhere.rgb, depth, elsewhere.alpha)
 
 
 def added_thing(frame: Frame, share: float, generator: Generator) -> Frame:
     """Put a textured object on ``share`` of the measured surface, from which it protrudes slightly."""
     mask = _surface_piece(frame, share, generator)
-    rise = uniform_number(generator, *ADDED_HEIGHT) * (1 + 0.4 * _bounded_noise(frame, 6, generator))
+    rise = uniform_number(generator, 0.02, 0.1) * (1 + 0.4 * _bounded_noise(frame, 6, generator))
     colours = texture(frame.intrinsics.height, frame.intrinsics.width, generator)
     return _pasted(frame, mask, colours, depth_of(frame) * (1 - rise))
 
@@ -166,9 +151,9 @@ def _radius(angle: Float[Tensor, "h w"], generator: Generator) -> Float[Tensor, 
     Every point of the outline is visible from the centre, so that the blob is one piece.
     """
     waves = [
-        uniform_number(generator, -BULGE, BULGE)
+        uniform_number(generator, -0.35, 0.35)
         * torch.cos(n * angle + uniform_number(generator, 0, 2 * math.pi))
-        for n in WAVES
+        for n in range(2, 6)  # periods around the outline
     ]
     return torch.stack(waves).sum(0).exp()
 
@@ -176,11 +161,11 @@ def _radius(angle: Float[Tensor, "h w"], generator: Generator) -> Float[Tensor, 
 def texture(height: int, width: int, generator: Generator) -> Float[Tensor, "h w 3"]:
     """Return random colours with detail at several scales and full contrast, with as many features as a photo."""
     longer = max(height, width)
-    layers = [
-        torch.stack([smooth_noise(height, width, *_cells(height, width, n, longer), generator) for _ in range(3)], -1)
-        * (BLOB_OCTAVES[0] / n) ** 0.5
-        for n in BLOB_OCTAVES
-    ]  # fmt: skip
+    layers = []
+    for octave in range(2, 8):  # of noise, whose cells along the longer side double
+        cells = [max(2, round(2**octave * side / longer)) for side in (height, width)]
+        layer = [smooth_noise(height, width, *cells, generator) for _ in range(3)]
+        layers.append(torch.stack(layer, -1) * 2 ** (1 - octave / 2))
     noise = torch.stack(layers).sum(0)
     low, high = noise.flatten(0, 1).quantile(torch.tensor([0.02, 0.98]), dim=0)
     return ((noise - low) / (high - low).clamp_min(1e-6)).clamp(0, 1)
@@ -192,7 +177,3 @@ def smooth_noise(
     """Return normally distributed values on a grid of ``rows`` by ``columns``, interpolated with cubic splines."""
     values = torch.randn((1, 1, rows, columns), generator=generator)
     return torch.nn.functional.interpolate(values, (height, width), mode="bicubic", align_corners=False)[0, 0]
-
-
-def _cells(height: int, width: int, count: int, longer: int) -> tuple[int, int]:
-    return max(2, round(count * height / longer)), max(2, round(count * width / longer))
