@@ -17,15 +17,12 @@ from .plan import parse_settings as parse_settings
 from .plan import planned as planned
 from .plots import comparison_figure as comparison_figure
 from .plots import convergence_plot as convergence_plot
-from .protocols import FARTHEST_START as FARTHEST_START
 from .protocols import PROTOCOLS as PROTOCOLS
 from .protocols import Size as Size
-from .protocols import bid_hard_start as bid_hard_start
 from .protocols import bid_start as bid_start
 from .protocols import find_protocol as find_protocol
 from .protocols import perturb as perturb
 from .protocols import random_units as random_units
-from .protocols import rotation_of_size as rotation_of_size
 from .provenance import note_run as note_run
 from .provenance import provenance as provenance
 from .provenance import read_runs as read_runs

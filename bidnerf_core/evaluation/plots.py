@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.comparison import Comparison, MapRow
+from bidnerf_core.evaluation.comparison import Comparison
 from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT
 from bidnerf_core.evaluation.summary import (
     NEVER,
@@ -55,21 +55,15 @@ from bidnerf_core.results import (
     write_figure,
 )
 
-WIDTH, COLUMNS, HEIGHT = 10.8, 3, 2.7  # inches, panels, inches
+WIDTH, COLUMNS = 10.8, 3  # inches, panels
 PER_INCH = 13
 """Average number of characters per inch of text."""
-LABELS = 5.0
-"""Inches: width of the labels of lines."""
 MOST_LINES, MOST_SITUATIONS = 150, 16
 """Maximum numbers of groups and of situations in a figure; larger figures can be neither drawn nor read."""
 BARS = {"translation": 0.05, "rotation_deg": 5.0}
 """The largest errors of a right answer."""
-LEAST = {"translation": 1e-4, "rotation_deg": 1e-2}
-"""The errors below which all count as equal, since an axis is logarithmic."""
 BOUND: dict[str, Any] = {"color": "#999", "linewidth": 0.8, "linestyle": (0, (4, 3))}
 """The look of a bound, or of where two quantities are equal."""
-BIN, MOST_BINS = 8, 6
-"""Minimum number of trials in a bin of confidences, and maximum number of bins."""
 
 Panel = tuple[str, Callable[[Any], None]]
 """The title of a panel, and the function that draws it."""
@@ -121,7 +115,7 @@ class Figures:
             new = place > 0 and group.situation != shown[place - 1].situation
             heights.append(heights[-1] + (1.6 if new else 1.0) if heights else 0.0)
         named = [
-            _wrapped(f"{self.titles[g.situation]}  ·  {g.label}", LABELS, 2) + f"  (n = {len(g.results)})"
+            _wrapped(f"{self.titles[g.situation]}  ·  {g.label}", 5.0, 2) + f"  (n = {len(g.results)})"
             for g in shown
         ]  # fmt: skip
         criteria = [name for name in CRITERIA if any(applies(name, group.results) for group in shown)]
@@ -148,13 +142,7 @@ class Figures:
 
     def errors(self) -> Figure:
         """Draw, for each situation, the shares of trials within an error, and those answered rightly within a time."""
-        panels: list[Panel] = []
-        for situation, groups in self._by_situation(self.clean):
-            title = self.titles[situation]
-            panels += [
-                (title, partial(self._cumulative, groups=groups, kind=kind)) for kind in BARS
-            ]  # fmt: skip
-            panels.append((title, partial(self._times, groups=groups)))
+        panels = self._by_situation(self.clean, self._cumulative, self._times)
         return Figure(
             self._draw("errors", panels, self.clean),
             "Cumulative errors: the share of all trials whose final error is at most that on the axis; answers that the"
@@ -165,7 +153,8 @@ class Figures:
     def _cumulative(self, axes: Any, groups: Sequence[Group], kind: str) -> None:
         for group in groups:
             errors = [math.inf if r.error is None else getattr(r.error, kind) for r in group.results]
-            self._steps(axes, group, np.maximum(errors, LEAST[kind]))
+            # Errors below a 500th of the bound count as equal, since the axis is logarithmic.
+            self._steps(axes, group, np.maximum(errors, BARS[kind] / 500))
         axes.axvline(BARS[kind], **BOUND)
         what = f"translation error ({unit_of(groups[0].results)})"
         axes.set(xlabel=what if kind == "translation" else "rotation error (degrees)")
@@ -190,26 +179,20 @@ class Figures:
 
     def calibration(self) -> Figure | None:
         """Draw how often answers of a confidence are right, and errors against their standard deviations."""
-        by_label = {
-            label: [
-                r for g in self.groups if g.label == label and g.situation.size is not None for r in g.results
-            ]
-            for label in self.labels
-        }
-        judged = {
-            label: [r for r in results if r.confidence is not None] for label, results in by_label.items()
-        }
-        measured = {
-            label: [r for r in results if r.covariance is not None and r.error is not None]
-            for label, results in by_label.items()
-        }
+        judged: dict[str, list[TrialResult]] = {label: [] for label in self.labels}
+        measured: dict[str, list[TrialResult]] = {label: [] for label in self.labels}
+        for group in self.groups:
+            results = (
+                () if group.situation.size is None else group.results
+            )  # pooled ones are among the others
+            judged[group.label] += [r for r in results if r.confidence is not None]
+            measured[group.label] += [r for r in results if r.covariance is not None and r.error is not None]
         panels: list[Panel] = []
         if any(map(len, judged.values())):
             panels.append(("confidence", partial(self._reliability, judged=judged)))
         if any(map(len, measured.values())):
             panels += [
-                (name, partial(self._deviations, measured=measured, kind=kind))
-                for kind, name in (("translation", "translation"), ("rotation_deg", "rotation"))
+                (kind.partition("_")[0], partial(self._deviations, measured=measured, kind=kind)) for kind in BARS
             ]  # fmt: skip
         if not panels:
             return None
@@ -225,14 +208,12 @@ class Figures:
         axes.plot([0, 100], [0, 100], **BOUND)
         for label, results in judged.items():
             ordered = sorted(results, key=lambda r: r.confidence or 0.0)
-            count = max(1, min(MOST_BINS, len(ordered) // BIN))
-            for part in (
-                list(some) for some in np.array_split(np.array(ordered, dtype=object), count) if len(some)
-            ):
+            colour = line_look(self.labels.index(label))["color"]
+            bins = max(1, min(6, len(ordered) // 8))  # of eight trials or more
+            for part in filter(len, np.array_split(np.array(ordered, dtype=object), bins)):
                 rate = rate_of(part, [succeeded(r) for r in part])
                 middle = 100 * float(np.mean([r.confidence for r in part]))
                 spread = [[100 * (rate.rate - rate.low)], [100 * (rate.high - rate.rate)]]
-                colour = line_look(self.labels.index(label))["color"]
                 axes.errorbar([middle], [100 * rate.rate], yerr=np.maximum(spread, 0), fmt="o", color=colour,
                               markersize=4, elinewidth=1)  # fmt: skip
         axes.set(xlabel="stated confidence (%)", ylabel="right trials (%)", xlim=(-3, 103), ylim=(-3, 103))
@@ -242,18 +223,12 @@ class Figures:
         for label, results in measured.items():
             colour = line_look(self.labels.index(label))["color"]
             for accepted, face in ((True, colour), (False, "none")):
-                points = [
-                    (
-                        standard_deviations(torch.tensor(r.covariance, dtype=torch.float64)),
-                        getattr(r.error, kind),
-                    )
-                    for r in results
-                    if r.converged == accepted
-                ]
-                stated = [math.degrees(s[1]) if kind == "rotation_deg" else s[0] for s, _ in points]
-                shown = [
-                    (x, y) for x, (_, y) in zip(stated, points, strict=True) if 0 < x < math.inf and y > 0
-                ]
+                shown = []
+                for r in (r for r in results if r.converged == accepted):
+                    position, rotation = standard_deviations(torch.tensor(r.covariance, dtype=torch.float64))
+                    stated = math.degrees(rotation) if kind == "rotation_deg" else position
+                    if 0 < stated < math.inf and getattr(r.error, kind) > 0:
+                        shown.append((stated, getattr(r.error, kind)))
                 if shown:
                     axes.plot(*zip(*shown, strict=True), "o", markersize=3.5, color=colour, markerfacecolor=face,
                               alpha=0.7)  # fmt: skip
@@ -270,13 +245,7 @@ class Figures:
         stepwise = [group for group in self.clean if are_stepwise(group.results)]
         if not stepwise:
             return None
-        panels: list[Panel] = []
-        for situation, groups in self._by_situation(stepwise):
-            title = self.titles[situation]
-            panels += [
-                (title, partial(self._traces, groups=groups, kind=kind)) for kind in BARS
-            ]  # fmt: skip
-            panels.append((title, partial(self._share, groups=groups)))
+        panels = self._by_situation(stepwise, self._traces, self._share)
         return Figure(
             self._draw("convergence", panels, stepwise),
             "Errors after each step: median and quartiles of all trials; the dashed lines are 0.05 and 5 degrees. Right: the"
@@ -327,9 +296,16 @@ class Figures:
             f" accepted by the method itself, and accepted but wrong.{self.omitted}",
         )
 
-    def _by_situation(self, groups: Sequence[Group]) -> list[tuple[Situation, list[Group]]]:
-        places = situations(groups)[:MOST_SITUATIONS]
-        return [(place, [group for group in groups if group.situation == place]) for place in places]
+    def _by_situation(
+        self, groups: Sequence[Group], error: Callable[..., None], other: Callable[..., None]
+    ) -> list[Panel]:
+        """Return three panels for each situation: ``error`` draws those of both kinds of error, and ``other`` the third."""
+        panels: list[Panel] = []
+        for situation in situations(groups)[:MOST_SITUATIONS]:
+            title, own = self.titles[situation], [group for group in groups if group.situation == situation]
+            panels += [(title, partial(error, groups=own, kind=kind)) for kind in BARS]
+            panels.append((title, partial(other, groups=own)))
+        return panels
 
     def _look(self, group: Group) -> dict[str, Any]:
         return line_look(self.labels.index(group.label))
@@ -353,7 +329,7 @@ def _draw_panels(
     labels = [_wrapped(label, WIDTH / beside - 0.5) for label in looks]
     legend = 0.35 + 0.2 * sum(label.count("\n") + 1 for label in labels) / beside
     with styled():
-        figure = new_figure(WIDTH, rows * (HEIGHT + 0.15 * max(t.count("\n") for t in titles)) + legend)
+        figure = new_figure(WIDTH, rows * (2.7 + 0.15 * max(t.count("\n") for t in titles)) + legend)
         axes = figure.subplots(rows, columns, squeeze=False).flatten()
         for panel, title, (_, draw) in zip(axes, titles, panels, strict=False):
             draw(panel)
@@ -427,12 +403,6 @@ def _draw_curve(axes: Any, curve: FaultCurve) -> None:
 
 # Several maps.
 
-COSTS: dict[str, Callable[[MapRow], float]] = {
-    "s a trial": lambda row: row.seconds,
-    "peak memory, MiB": lambda row: row.peak_memory_bytes / 2**20,
-    "map, MiB": lambda row: row.map_bytes / 2**20,
-}
-
 
 def comparison_figure(folder: Path, comparison: Comparison) -> Path:
     """Draw errors, times and costs of each map as ``compare.png`` and ``compare.svg``, and return the path of the latter.
@@ -451,16 +421,19 @@ def comparison_figure(folder: Path, comparison: Comparison) -> Path:
         ("", partial(figures._times, groups=groups)),
     ]
 
-    def bars(axes: Any, cost: Callable[[MapRow], float]) -> None:
-        values = [cost(row) for row in comparison.rows]
+    def bars(axes: Any, values: Sequence[float]) -> None:
         drawn = axes.barh(range(len(values)), values, 0.7, color=[figures._look(g)["color"] for g in groups])
         axes.bar_label(drawn, [f"{value:.3g}" for value in values], padding=3)
         axes.set_yticks([])
         axes.invert_yaxis()
         axes.margins(x=0.25)
 
-    costs = {name: cost for name, cost in COSTS.items() if any(map(cost, comparison.rows))}
-    panels += [(name, partial(bars, cost=cost)) for name, cost in costs.items()]
+    costs = {
+        "s a trial": [row.seconds for row in comparison.rows],
+        "peak memory, MiB": [row.peak_memory_bytes / 2**20 for row in comparison.rows],
+        "map, MiB": [row.map_bytes / 2**20 for row in comparison.rows],
+    }
+    panels += [(name, partial(bars, values=values)) for name, values in costs.items() if any(values)]
     return figures._draw("compare", panels, groups)
 
 

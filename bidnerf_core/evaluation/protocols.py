@@ -18,32 +18,26 @@ from torch import Generator, Tensor
 from bidnerf_core.errors import InputError, unknown_name
 from bidnerf_core.geometry import SE3
 
-SMALLEST_E_T, LARGEST_E_T = 0.5, 3.4
-"""The range of e_t in the paper's tables: in units of a scene whose object fills a 2x2x2 cube, in metres in rooms."""
-
 
 def bid_start(T_true: SE3, size: float, seed: int, widest: float = math.pi / 4) -> SE3:
     """Return the start of BID-NeRF, ``T_true exp((e_t u1, e_r u2))`` with random unit u1, u2 and e_t = ``size``.
 
-    The paper does not state which e_r belongs to which e_t, only that errors stay below 45 degrees: here e_r
-    grows linearly from 0.2 rad at e_t = 0.5 to ``widest`` at 3.4.
+    The paper does not state which e_r belongs to which e_t, only that errors stay below 45 degrees: here e_r grows linearly
+    from 0.2 rad at e_t = 0.5 to ``widest`` at 3.4. These are the ends of the range of e_t in the paper's tables: in units of a
+    scene whose object fills a 2x2x2 cube, in metres in rooms.
     """
-    _require_length("size", size)
     u1, u2 = random_units(2, torch.Generator().manual_seed(seed))
-    return T_true.to(dtype=torch.float64).retract(
-        torch.cat([size * u1, max(0.0, rotation_of_size(size, widest)) * u2])
-    )
-
-
-def bid_hard_start(T_true: SE3, size: float, seed: int) -> SE3:
-    """Return a start as ``bid_start`` does, with e_r up to 1.4 rad, the upper end of the range in the paper."""
-    return bid_start(T_true, size, seed, 1.4)
+    e_r = max(0.0, 0.2 + (size - 0.5) / (3.4 - 0.5) * (widest - 0.2))
+    return T_true.to(dtype=torch.float64).retract(torch.cat([size * u1, e_r * u2]))
 
 
 def perturb(T_true: SE3, translation: float, rotation_deg: float, seed: int) -> SE3:
     """Return a start whose error is exactly ``translation`` (metres) and ``rotation_deg``, in random directions."""
     for what, value in (("translation", translation), ("rotation", rotation_deg)):
-        _require_length(what, value)
+        if not (math.isfinite(value) and value >= 0):
+            raise InputError(
+                f"{what} is {value}", where="perturbation", expected="a finite number, 0 or more"
+            )
     u1, u2 = random_units(2, torch.Generator().manual_seed(seed))
     turn = SE3.exp(torch.cat([torch.zeros_like(u2), math.radians(rotation_deg) * u2])).rotation
     return T_true.to(dtype=torch.float64) @ SE3(turn, translation * u1)
@@ -62,20 +56,10 @@ def inerf_start(T_true: SE3, seed: int) -> SE3:
     return T_true.to(dtype=torch.float64) @ SE3(turn, 0.2 * chance[1:])
 
 
-def rotation_of_size(size: float, widest: float = math.pi / 4) -> float:
-    """Return e_r (rad) for e_t = ``size``, on the line from (0.5, 0.2) to (3.4, ``widest``)."""
-    return 0.2 + (size - SMALLEST_E_T) / (LARGEST_E_T - SMALLEST_E_T) * (widest - 0.2)
-
-
 def random_units(count: int, generator: Generator) -> Float[Tensor, "n 3"]:
     """Return unit vectors, uniform on the sphere (float64)."""
     normal = torch.randn((count, 3), generator=generator, dtype=torch.float64)
     return torch.nn.functional.normalize(normal, dim=-1)
-
-
-def _require_length(what: str, value: float) -> None:
-    if not (math.isfinite(value) and value >= 0):
-        raise InputError(f"{what} is {value}", where="perturbation", expected="a finite number, 0 or more")
 
 
 # The 25 starts of Lin et al. 2023, "Parallel Inversion of Neural Radiance Fields for Robust Pose Estimation", from the
@@ -86,9 +70,7 @@ def _require_length(what: str, value: float) -> None:
 # consumes random numbers. Ranges and seed are options of the program that its repository sets for each experiment; 1234, 15
 # and 0.25 are assumed here. The published scenes may be scaled; here lengths are those of the data.
 
-PARALLEL_SEED, CHOSEN_FRAMES, STARTS = 1234, 5, 5
-PARALLEL_TRIALS = CHOSEN_FRAMES * STARTS
-ROTATION_DEG, TRANSLATION = 15.0, 0.25
+PARALLEL_SEED, PARALLEL_TRIALS = 1234, 25
 
 
 def draw_starts(
@@ -96,9 +78,9 @@ def draw_starts(
 ) -> tuple[Int[np.ndarray, "5"], Float[np.ndarray, "5 5 3"], Float[np.ndarray, "5 5 3"]]:
     """Return the published indices of frames, angles (degrees) and translations (units of the data), bit for bit."""
     generator = np.random.RandomState(PARALLEL_SEED)
-    chosen, shape = generator.choice(frames, CHOSEN_FRAMES), (CHOSEN_FRAMES, STARTS, 3)
-    angles = generator.uniform(-ROTATION_DEG, ROTATION_DEG, size=shape)
-    return chosen, angles, generator.uniform(-TRANSLATION, TRANSLATION, size=shape)
+    chosen, shape = generator.choice(frames, 5), (5, 5, 3)
+    angles = generator.uniform(-15.0, 15.0, size=shape)
+    return chosen, angles, generator.uniform(-0.25, 0.25, size=shape)
 
 
 def parallel_cases(frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
@@ -110,7 +92,7 @@ def parallel_cases(frames: int, trials: int, seed: int) -> list[tuple[int, int]]
             expected=f"at most {PARALLEL_TRIALS} from seed {PARALLEL_SEED}, since the list is fixed",
         )
     chosen = draw_starts(frames)[0]
-    return [(int(chosen[i // STARTS]), PARALLEL_SEED + i) for i in range(trials)]
+    return [(int(chosen[i // 5]), PARALLEL_SEED + i) for i in range(trials)]
 
 
 def parallel_start(T_true: SE3, seed: int, frames: int) -> SE3:
@@ -122,25 +104,17 @@ def parallel_start(T_true: SE3, seed: int, frames: int) -> SE3:
             expected=f"{PARALLEL_SEED} to {PARALLEL_SEED + PARALLEL_TRIALS - 1}",
         )
     _, angles, moves = draw_starts(frames)
-    place = divmod(seed - PARALLEL_SEED, STARTS)
-    turn = euler(angles[place])
-    true = T_true.to(dtype=torch.float64)
+    place = divmod(seed - PARALLEL_SEED, 5)
+    true, (phi, theta, psi) = T_true.to(dtype=torch.float64), angles[place] / 180.0 * np.pi
+    (c1, c2, c3), (s1, s2, s3) = np.cos((phi, theta, psi)), np.sin((phi, theta, psi))
+    about_z = np.array([[c1, -s1, 0], [s1, c1, 0], [0, 0, 1]])
+    about_y = np.array([[c2, 0, -s2], [0, 1, 0], [s2, 0, c2]])  # by -theta
+    about_x = np.array([[1, 0, 0], [0, c3, -s3], [0, s3, c3]])
+    turn = torch.from_numpy(about_z @ about_y @ about_x)
     return SE3(turn @ true.rotation, true.translation + torch.from_numpy(moves[place]))
 
 
-def euler(angles_deg: Float[np.ndarray, "3"]) -> Float[Tensor, "3 3"]:
-    """Return the rotation Rz(phi) Ry(-theta) Rx(psi)."""
-    (c1, c2, c3), (s1, s2, s3) = np.cos(angles_deg / 180.0 * np.pi), np.sin(angles_deg / 180.0 * np.pi)
-    about_z = np.array([[c1, -s1, 0], [s1, c1, 0], [0, 0, 1]])
-    about_y = np.array([[c2, 0, -s2], [0, 1, 0], [s2, 0, c2]])
-    about_x = np.array([[1, 0, 0], [0, c3, -s3], [0, s3, c3]])
-    return torch.from_numpy(about_z @ about_y @ about_x)
-
-
 Size = tuple[float, ...]
-FARTHEST_START = 1e6
-"""The largest translation error of a start, metres."""
-
 MOST_TRIALS = 100_000
 """The maximum number of trials per size, since all trials of a plan are in memory."""
 
@@ -182,7 +156,7 @@ class Protocol:
 
     def check_size(self, size: Size) -> None:
         """Raise ``InputError`` for a size with the wrong number of values, or with one that is out of range."""
-        most = [180.0 if "deg" in unit else FARTHEST_START for unit in self.units]
+        most = [180.0 if "deg" in unit else 1e6 for unit in self.units]
         if len(size) != len(self.units) or not all(0 <= x <= m for x, m in zip(size, most, strict=True)):
             expected = " : ".join(self.units) or "none, since it has no sizes"
             limits = f", 0 to {' : '.join(f'{m:g}' for m in most)}" if most else ""
@@ -207,7 +181,7 @@ PROTOCOLS = {
     ),
     "bid-hard": Protocol(
         "like bid, with rotations up to 1.4 rad",
-        lambda T_true, size, seed, frames: bid_hard_start(T_true, size[0], seed),
+        lambda T_true, size, seed, frames: bid_start(T_true, size[0], seed, 1.4),
         ((0.5,), (0.8,), (1.2,)),
         ("e_t (m)",),
     ),

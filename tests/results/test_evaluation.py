@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
-from bidnerf_core.evaluation import bid_hard_start, bid_start, perturb, random_units, rotation_of_size
+from bidnerf_core.evaluation import bid_start, perturb, random_units
 from bidnerf_core.geometry import SE3
 from bidnerf_core.results import (
     CRITERIA,
@@ -204,26 +204,19 @@ def test_perturb_is_wrong_by_exactly_what_was_asked(
     assert float(error.rotation_deg) == pytest.approx(rotation, abs=1e-6)
 
 
-@pytest.mark.parametrize("start", [bid_start, bid_hard_start])
+@pytest.mark.parametrize("widest", [math.pi / 4, 1.4])
 @pytest.mark.parametrize("size", [0.5, 0.8, 1.2, 0.9, 1.7, 3.4])
-def test_bid_has_the_lengths_of_its_tangent(start, size: float) -> None:
+def test_bid_has_the_lengths_of_its_tangent(widest: float, size: float) -> None:
     true = SE3.exp(torch.tensor([0.3, 1.0, -2.0, 0.5, -0.2, 0.9], dtype=torch.float64))
-    widest = math.pi / 4 if start is bid_start else 1.4
-    tangents = (true.inverse() @ SE3.stack([start(true, size, seed) for seed in range(200)])).log()
+    starts = SE3.stack([bid_start(true, size, seed, widest) for seed in range(200)])
+    tangents = (true.inverse() @ starts).log()
     assert tangents[:, :3].norm(dim=-1).tolist() == pytest.approx([size] * 200)
-    assert tangents[:, 3:].norm(dim=-1).tolist() == pytest.approx([rotation_of_size(size, widest)] * 200)
+    assert tangents[:, 3:].norm(dim=-1).tolist() == pytest.approx([np.interp(size, (0.5, 3.4), (0.2, widest))] * 200)
     directions = torch.nn.functional.normalize(tangents.reshape(-1, 2, 3), dim=-1)
     assert (
         directions.mean(0).abs().max() < 0.15
     )  # three standard deviations of a mean of 200 uniform directions
     assert (directions[:, 0] * directions[:, 1]).sum(-1).mean().abs() < 0.15  # the two are independent
-
-
-def test_rotation_grows_linearly_between_the_ends_of_the_paper() -> None:
-    assert rotation_of_size(0.5) == pytest.approx(0.2)
-    assert rotation_of_size(3.4) == pytest.approx(math.pi / 4)
-    assert rotation_of_size(1.95) == pytest.approx((0.2 + math.pi / 4) / 2)
-    assert rotation_of_size(3.4, 1.4) == pytest.approx(1.4)
 
 
 def test_starts_depend_on_the_seed_alone() -> None:
@@ -240,7 +233,6 @@ def test_starts_depend_on_the_seed_alone() -> None:
 def test_impossible_lengths_are_refused(value: float) -> None:
     true = SE3.identity()
     for name, start in (
-        ("size", lambda: bid_start(true, value, 0)),
         ("translation", lambda: perturb(true, value, 1, 0)),
         ("rotation", lambda: perturb(true, 1, value, 0)),
     ):
