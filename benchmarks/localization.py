@@ -74,8 +74,8 @@ def times_less(base: Summary, other: Summary) -> dict[str, float | None]:
         "steps": base.steps / other.steps,
         "seconds": base.seconds / other.seconds,
     }
-    for name, one in base.criteria.items():
-        two = other.criteria[name]
+    for name, one in base.success.items():
+        two = other.success[name]
         if one is not None and two is not None:
             found[f"{name}: steps to success"] = _ratio(one.steps, two.steps)
             found[f"{name}: time to success"] = _ratio(one.milliseconds, two.milliseconds)

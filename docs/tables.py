@@ -107,10 +107,10 @@ def _lines(head: Row, rows: Iterable[Row]) -> str:
 
 MEASURES = {
     "images": ("n", "frames", "trials", "tried", "photos", "images", "test", "requests", "pairs"),
-    "right": ("5deg 0.05", "right", "right.5deg 0.05", "criteria.5deg 0.05", "within 5 degrees, 0.05", "5 cm, 5 deg"),
-    "within 1°, 0.02": ("1deg 0.02", "strict", "right.1deg 0.02", "criteria.1deg 0.02"),
+    "right": ("5deg 0.05", "right", "right.5deg 0.05", "success.5deg 0.05", "criteria.5deg 0.05", "within 5 degrees, 0.05", "5 cm, 5 deg"),
+    "within 1°, 0.02": ("1deg 0.02", "strict", "right.1deg 0.02", "success.1deg 0.02", "criteria.1deg 0.02"),
     "within 2 cm, 2°": ("2 cm, 2 deg",),
-    "to 10 % of the start": ("criteria.10%", "10%"),
+    "to 10 % of the start": ("success.10%", "criteria.10%", "10%"),
     "accepted": ("accepted", "converged", "believed"),
     "of these wrong": ("silent", "accepted_but_wrong", "converged_but_wrong", "wrong_of_accepted", "accepted_wrong", "wrong"),
     "right but refused": ("right_but_rejected", "right_but_not_converged", "right_lost"),
@@ -132,7 +132,7 @@ MEASURES = {
     "slowest, s": ("slowest_cpu_seconds", "slowest_s", "slowest_seconds", "latency_seconds.p95"),
     "time, s": ("seconds", "training.seconds", "train_seconds", "median.first_picture_seconds", "seconds undisturbed"),
     "frames a second": ("median.frames_a_second", "per_second"),
-    "time, ms": ("cpu_ms.median", "graph_ms", "ms", "milliseconds_per_step"),
+    "time, ms": ("cpu_ms.median", "graph_ms", "ms", "ms_per_step", "milliseconds_per_step"),
     "as launched, ms": ("launched_ms",),
     "memory": ("peak_resident_GiB", "training.peak_resident_GiB", "resident_MB", "megabytes"),
 }  # fmt: skip
@@ -144,7 +144,7 @@ INNER = {
 """Names in records that say nothing of what was measured."""
 ASIDE = {
     "settings", "common_settings", "config", "versions", "map", "localization_map", "run", "pairs", "rounds", "paper_percent",
-    "right", "criteria", "errors", "median",
+    "right", "success", "criteria", "errors", "median",
 }  # fmt: skip
 """Parts of records that hold no measurements."""
 NAMES = ("scene", "start", "condition", "clients", "title", "level")
@@ -517,7 +517,7 @@ def _successes(
 ) -> str:
     cells = records[name]["cells"]
     (cell,) = [c for c in cells if c["condition"] == condition and c["start"] == start]
-    return _of(cell["criteria"][within])
+    return _of(cell.get("success", cell.get("criteria"))[within])
 
 
 TABLE_1 = {

@@ -41,8 +41,6 @@ def run(
     if not results:
         raise UsageError("no results file", expected="at least one written by 'bidnerf evaluate'")
     table = ResultTable.load(*results)
-    if not table.rows:
-        raise InputError("no finished trial in it, nothing to report", where=", ".join(map(str, results)))
     with wrong_usage():
         chosen = chosen_criterion(criterion, table.groups)
     if view is not None and not view.is_file():

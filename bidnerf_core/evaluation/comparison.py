@@ -29,11 +29,11 @@ from bidnerf_core.evaluation.run import (
     open_data,
     own_processes,
 )
-from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, Success, summarize
+from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, Success, Summary, summarize
 from bidnerf_core.evaluation.trial import Opened, TrialResult, opened, registered_for, run_trial
 from bidnerf_core.fields import device_of, levels
 from bidnerf_core.frames import View, draw, uniform
-from bidnerf_core.geometry import SE3, LengthUnit, symbol
+from bidnerf_core.geometry import SE3, symbol
 from bidnerf_core.io import to_plain, write_file
 from bidnerf_core.localization import origin_of
 from bidnerf_core.maps import DESCRIPTION, Map, load_info
@@ -51,36 +51,24 @@ from bidnerf_core.settings import to_flat
 
 log = logging.getLogger("bidnerf")
 
-COUNTED_RAYS = 2048
-"""The number of rays on which samples are counted."""
 
-
-@dataclass(frozen=True)
-class MapRow:
-    """The statistics of one map in a comparison. Medians and means are over its trials."""
+@dataclass(frozen=True, kw_only=True)
+class MapRow(Summary):
+    """The statistics of one map in a comparison."""
 
     map: str  # the shortest name that is unique among the maps
     backend: str
     weights: str  # identifies the training run, see ``Map.training``
-    success: dict[str, Success | None]  # by criterion; None if it does not apply
-    unit: LengthUnit  # of the map
-    translation: float | None  # median of the final errors; None if most are not finite
-    rotation_deg: float | None
-    steps: float  # median
-    seconds: float  # median time of a trial
-    ms_per_step: float  # median
-    peak_memory_bytes: int  # of the process of this map
     samples_per_ray: float  # mean
     map_bytes: int  # size of the map's description and weights
 
     @classmethod
     def of(cls, label: str, size: int, results: Sequence[TrialResult], samples: Sequence[float]) -> MapRow:
         """Return the statistics of the trials on one map of ``size`` bytes; ``samples`` has the samples per ray of each."""
-        found = summarize(results)
+        first = results[0]
         return cls(
-            label, results[0].backend, results[0].weights, found.criteria, found.unit, found.translation,
-            found.rotation_deg, found.steps, found.seconds, found.milliseconds_per_step, found.peak_memory_bytes,
-            statistics.fmean(samples), size,
+            map=label, backend=first.backend, weights=first.weights, samples_per_ray=statistics.fmean(samples),
+            map_bytes=size, **vars(summarize(results)),
         )  # fmt: skip
 
 
@@ -222,12 +210,12 @@ def measured(
     (view,) = dataset.views(trial.split, trial.frames[-1:])
     number = to_flat(parse_settings(trial.method, trial.config)).get("level")
     level = stored.field if number is None else levels(stored.field)[number]
-    own = (View(view.frame, SE3.identity()),)
+    own, count = (View(view.frame, SE3.identity()),), 2048
     device = device_of(stored.field)
-    pixels = draw(own, COUNTED_RAYS, uniform, torch.Generator().manual_seed(trial.seed), device=device)
+    pixels = draw(own, count, uniform, torch.Generator().manual_seed(trial.seed), device=device)
     with torch.no_grad():
         samples = level.sampler(pixels.rays(view.T_ref_camera.translated(-origin_of(stored)), stored.bounds))
-    return result, float(samples.valid.sum()) / COUNTED_RAYS
+    return result, float(samples.valid.sum()) / count
 
 
 def map_bytes(stored: Scene) -> int:

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from bidnerf_core.datasets import Capture, DatasetOptions, in_other_split
 from bidnerf_core.errors import InputError, InputWarning, amount, refuse_text
@@ -22,22 +22,13 @@ from bidnerf_core.io import parse_record
 from bidnerf_core.localization import find_method, settings_of
 from bidnerf_core.maps import Map
 from bidnerf_core.scenes import ClosedFormData, closed_form_data, is_closed_form
-from bidnerf_core.settings import Range, WholeNumbers, to_flat
+from bidnerf_core.settings import LARGEST_SEED, Range, Settings, WholeNumbers, to_flat
 
 log = logging.getLogger("bidnerf")
 
-LIMITS: dict[str, Range] = {
-    "trials": WholeNumbers(1, MOST_TRIALS),
-    "seed": WholeNumbers(0, 2**31 - 1),
-    "images": WholeNumbers(1, 1000),
-    "angle": Range(0.01, 360.0),
-    "shards": WholeNumbers(1, MOST_TRIALS),
-}
 FOLDERS = ("map", "data", "depth_points", "masks", "camera", "register_depth")
 READING = ("split", "device", "masks", "mask_hides", "camera", "register_depth", "depth_unit")
 """The options that decide how a map and a dataset are read."""
-LISTED = 4
-"""Number of frames that a message names."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +110,7 @@ class Trial(Setup):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan(Setup):
+class Plan(Setup, Settings):
     """A set of trials. None selects the protocol's own sizes, number of trials and seed.
 
     Raises ``InputError`` for an unknown protocol, method or fault, and for settings and numbers that are invalid for any
@@ -130,23 +121,20 @@ class Plan(Setup):
     config: Any = (
         "{}"  # settings of the method, a dictionary of those that differ from the defaults, or its JSON
     )
-    trials: int | None = None  # of each size
-    seed: int | None = None
+    trials: Annotated[int, WholeNumbers(1, MOST_TRIALS)] | None = None  # of each size
+    seed: Annotated[int, WholeNumbers(0, LARGEST_SEED)] | None = None
     frames: Sequence[str] | None = None  # use only these
-    images: int = 1  # length of the sequence around the object that is localized jointly
-    angle: float = 15.0  # degrees between neighbours of a sequence
+    images: Annotated[int, WholeNumbers(1, 1000)] = 1  # length of the sequence that is localized jointly
+    angle: Annotated[float, Range(0.01, 360.0)] = 15.0  # degrees between neighbours of a sequence
     faults: Sequence[str] = (NO_FAULT,)  # each is applied to the same frames from the same starts
     shard: int = 0  # the part to run, of ``shards``: every ``shards``-th trial
-    shards: int = 1
+    shards: Annotated[int, WholeNumbers(1, MOST_TRIALS)] = 1
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        Setup.__post_init__(self)
+        Settings.__post_init__(self)
         for name in ("faults", "frames", "sizes"):
             refuse_text(name, getattr(self, name))
-        for name, allowed in LIMITS.items():
-            value = getattr(self, name)
-            if value is not None and (value not in allowed or (name != "angle" and type(value) is not int)):
-                raise InputError(f"{name} is {value}", expected=allowed)
         if not 0 <= self.shard < self.shards:
             raise InputError(f"shard is {self.shard}", expected=f"0 to {self.shards - 1}")
         twice = [name for name, count in Counter(self.frames or ()).items() if count > 1]
@@ -235,7 +223,7 @@ def parse_settings(method: str, config: str) -> Any:
 
 def listed(frames: Sequence[str]) -> str:
     """Return the first few names of frames, for a message."""
-    return ", ".join(frames[:LISTED]) + (", ..." if len(frames) > LISTED else "")
+    return ", ".join(frames[:4]) + (", ..." if len(frames) > 4 else "")
 
 
 def _rigs(plan: Plan, dataset: Capture, names: list[str], data: str) -> list[tuple[str, ...]]:

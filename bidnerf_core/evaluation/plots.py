@@ -210,7 +210,9 @@ class Figures:
             ordered = sorted(results, key=lambda r: r.confidence or 0.0)
             colour = line_look(self.labels.index(label))["color"]
             bins = max(1, min(6, len(ordered) // 8))  # of eight trials or more
-            for part in filter(len, np.array_split(np.array(ordered, dtype=object), bins)):
+            for part in (
+                list(some) for some in np.array_split(np.array(ordered, dtype=object), bins) if len(some)
+            ):
                 rate = rate_of(part, [succeeded(r) for r in part])
                 middle = 100 * float(np.mean([r.confidence for r in part]))
                 spread = [[100 * (rate.rate - rate.low)], [100 * (rate.high - rate.rate)]]

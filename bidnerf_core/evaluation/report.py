@@ -45,9 +45,6 @@ UNFINISHED = (
 )
 LISTED_FRAMES = 24
 """Number of trials that a report lists."""
-THUMBNAIL = 240
-"""Pixels of the longer side of the picture of a trial."""
-LENGTH_OF_HEAD = 4096  # bytes at the beginning of a page that contain the mark of a report
 
 
 def write_report(
@@ -74,7 +71,7 @@ def write_report(
     require_matplotlib()
     try:
         with open_binary(folder / "index.html", "the page of a report") as file:
-            is_ours = MARK.encode() in file.read(LENGTH_OF_HEAD)
+            is_ours = MARK.encode() in file.read(4096)
     except InputError:
         is_ours = False
     if folder.is_dir() and not is_ours and not all(is_temporary(file.name) for file in folder.iterdir()):
@@ -181,7 +178,7 @@ def thumbnails(rows: Sequence[TrialResult], data: Sequence[str | Path]) -> list[
             opened[name, trial.split] = setup.open(name)
         view, content = trial_views(trial, opened[name, trial.split])[-1], io.BytesIO()
         image = Image.fromarray(as_picture(view.frame.rgb))
-        image.thumbnail((THUMBNAIL, THUMBNAIL))
+        image.thumbnail((240, 240))
         image.save(content, "JPEG", quality=80)
         pictures.append(base64.b64encode(content.getvalue()).decode())
     return pictures

@@ -77,9 +77,7 @@ class ResultTable:
                 lines.append([row.start])
                 start = row.start
             known = row.statistics
-            rates = [
-                "-" if success is None else _percent(success.rate) for success in known.criteria.values()
-            ]
+            rates = ["-" if success is None else _percent(success.rate) for success in known.success.values()]
             error = "-"
             if known.translation is not None and known.rotation_deg is not None:
                 error = f"{known.translation:.3f} {symbol(known.unit)} {known.rotation_deg:6.2f} deg"

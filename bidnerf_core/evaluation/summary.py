@@ -157,19 +157,19 @@ class Success:
     milliseconds: float | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Summary:
     """Statistics of a group of trials. A median is None if the middle value is unknown."""
 
     trials: int
     frames: int  # number of distinct ones; this, not the number of trials, limits the precision of the rates
     unit: LengthUnit  # of the errors
-    criteria: dict[str, Success | None]  # by name; None if a criterion does not apply
+    success: dict[str, Success | None]  # by criterion; None if it does not apply
     translation: float | None  # median of the final errors
     rotation_deg: float | None  # median of the final errors
     steps: float  # median
     seconds: float  # median
-    milliseconds_per_step: float  # median
+    ms_per_step: float  # median
     peak_memory_bytes: int  # largest
     converged: int
     converged_but_wrong: int  # converged, and not within 5 degrees and 0.05
@@ -184,12 +184,12 @@ def summarize(results: Sequence[TrialResult]) -> Summary:
         trials=len(results),
         frames=len({frame_of(result) for result in results}),
         unit=unit_of(results),
-        criteria={name: success_of(results, name) for name in CRITERIA},
+        success={name: success_of(results, name) for name in CRITERIA},
         translation=median(e.translation if e else None for e in errors),
         rotation_deg=median(e.rotation_deg if e else None for e in errors),
         steps=statistics.median(r.steps for r in results),
         seconds=statistics.median(r.seconds for r in results),
-        milliseconds_per_step=statistics.median(1000 * r.seconds / max(1, r.steps) for r in results),
+        ms_per_step=statistics.median(1000 * r.seconds / max(1, r.steps) for r in results),
         peak_memory_bytes=max(r.peak_memory_bytes for r in results),
         converged=sum(accepted for accepted, _ in pairs),
         converged_but_wrong=sum(accepted and not right for accepted, right in pairs),

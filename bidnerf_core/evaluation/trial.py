@@ -42,9 +42,6 @@ Rows: TypeAlias = tuple[tuple[float, ...], ...]
 Opened: TypeAlias = tuple[Map, Capture]
 """A map, and a dataset of the same scene."""
 DIGEST_BYTES = 16  # enough that no two inputs coincide by chance
-LARGEST_COUNT = 2**63 - 1
-"""The largest count. JSON can hold integers that no tensor or float can."""
-STATUS, RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 @dataclass(frozen=True)
@@ -122,7 +119,7 @@ class TrialResult:
 
     def __post_init__(self) -> None:
         for name in ("steps", "seed", "peak_memory_bytes"):
-            if abs(getattr(self, name)) > LARGEST_COUNT:
+            if abs(getattr(self, name)) >= 2**63:  # JSON can hold integers that no tensor or float can
                 raise ValueError(f"{name} is larger than any measurement")
 
 
@@ -269,7 +266,9 @@ def forget_peak_memory() -> None:
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         torch.cuda.reset_peak_memory_stats()
     with contextlib.suppress(OSError):
-        RESET.write_text("5")  # proc(5): resets the peak resident set to the present one
+        Path("/proc/self/clear_refs").write_text(
+            "5"
+        )  # proc(5): resets the peak resident set to the present one
 
 
 def peak_memory_bytes() -> int:
@@ -277,7 +276,7 @@ def peak_memory_bytes() -> int:
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         return int(torch.cuda.max_memory_allocated())
     with contextlib.suppress(OSError):
-        for line in STATUS.read_text().splitlines():
+        for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024
     try:

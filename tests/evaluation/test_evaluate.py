@@ -109,7 +109,7 @@ def test_a_table_has_what_the_command_writes(
 def test_a_table_is_summed_up_saved_and_loaded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = bn.evaluate(BLOBS, BLOBS, quick(trials=4))
     (row,) = table.summary
-    found = row.statistics.criteria["5deg 0.05"]
+    found = row.statistics.success["5deg 0.05"]
     assert found is not None
     assert (row.start, row.label, found.rate.trials) == ("bid 0.3", "bid", 4)
     assert 0 <= found.rate.low <= found.rate.rate <= found.rate.high <= 1

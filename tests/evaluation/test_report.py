@@ -99,12 +99,12 @@ def test_groups_are_named_by_what_differs(results: list[TrialResult]) -> None:
 def test_a_summary_counts(results: list[TrialResult]) -> None:
     by_name = {(g.situation.start, g.label): summarize(g.results) for g in grouped(results)}
     slow = by_name["bid, all sizes", "bid, level none"]
-    judged = slow.criteria["10%"]
+    judged = slow.success["10%"]
     assert judged is not None
     assert (judged.rate.successes, judged.rate.trials) == (6, 12)
     assert judged.rate == success_rate_by_frame([True] * 6 + [False] * 6, [0] * 12)
     assert judged.steps == 7
-    assert (slow.milliseconds_per_step, slow.seconds, slow.trials) == (200, 2, 12)
+    assert (slow.ms_per_step, slow.seconds, slow.trials) == (200, 2, 12)
     assert slow.translation == pytest.approx((0.001 + 1.2) / 2)
     assert (slow.converged_but_wrong, slow.right_but_not_converged) == (0, 0)
     lied = dataclasses.replace(result(0, None), converged=True)
@@ -113,8 +113,8 @@ def test_a_summary_counts(results: list[TrialResult]) -> None:
 
 def test_without_a_start_there_is_no_share_of_its_error() -> None:
     summary = summarize([result(s, 2, protocol="none") for s in range(3)])
-    assert summary.criteria["10%"] is None
-    assert summary.criteria["5deg 0.05"] is not None
+    assert summary.success["10%"] is None
+    assert summary.success["5deg 0.05"] is not None
 
 
 def test_comparisons_agree_with_scipy(results: list[TrialResult]) -> None:

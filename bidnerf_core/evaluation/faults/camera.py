@@ -18,7 +18,7 @@ from bidnerf_core.evaluation.protocols import random_units
 from bidnerf_core.frames import Frame
 
 
-def restated(frame: Frame, **changes: float) -> Frame:
+def restated(frame: Frame, **changes: Any) -> Frame:
     """Change the stated camera; the image is unchanged."""
     return frame.replace(intrinsics=replace(frame.intrinsics, **changes))
 
@@ -114,5 +114,7 @@ def _rays(camera: Intrinsics) -> Float[Tensor, "h w 3"]:
 
 def _of_images(frame: Frame, change: Callable[[Tensor], Tensor], **more: Any) -> Frame:
     """Return the frame with its colours, depth, alpha and hidden pixels changed in the same way, and other attributes ``more``."""
-    images = {name: getattr(frame, name) for name in ("rgb", "depth", "alpha", "hidden")}
-    return replace(frame, **{n: None if x is None else change(x) for n, x in images.items()}, **more)
+    for name in ("rgb", "depth", "alpha", "hidden"):
+        image = getattr(frame, name)
+        more[name] = None if image is None else change(image)
+    return replace(frame, **more)

@@ -163,8 +163,8 @@ def texture(height: int, width: int, generator: Generator) -> Float[Tensor, "h w
     longer = max(height, width)
     layers = []
     for octave in range(2, 8):  # of noise, whose cells along the longer side double
-        cells = [max(2, round(2**octave * side / longer)) for side in (height, width)]
-        layer = [smooth_noise(height, width, *cells, generator) for _ in range(3)]
+        rows, columns = (max(2, round(2**octave * side / longer)) for side in (height, width))
+        layer = [smooth_noise(height, width, rows, columns, generator) for _ in range(3)]
         layers.append(torch.stack(layer, -1) * 2 ** (1 - octave / 2))
     noise = torch.stack(layers).sum(0)
     low, high = noise.flatten(0, 1).quantile(torch.tensor([0.02, 0.98]), dim=0)
