@@ -17,11 +17,10 @@ from .settings import LEAST_TOKEN as LEAST_TOKEN
 from .settings import ServiceLimits as ServiceLimits
 from .upload import public_message as public_message
 from .upload import read_upload as read_upload
-from .web import CLIENT_GONE as CLIENT_GONE
+from .web import Application as Application
+from .web import answered as answered
 from .web import body_of as body_of
 from .web import errors as errors
 from .web import json_body as json_body
-from .web import left as left
-from .web import new_app as new_app
 from .web import photo_body as photo_body
 from .web import photo_of as photo_of

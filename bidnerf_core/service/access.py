@@ -5,10 +5,9 @@ from __future__ import annotations
 import contextlib
 import hmac
 import ipaddress
-from http.cookies import SimpleCookie
 from urllib.parse import urlsplit
 
-from starlette.datastructures import Headers
+from starlette.requests import HTTPConnection
 from starlette.types import Scope
 
 OPEN = "/health"
@@ -22,41 +21,27 @@ def refusal(scope: Scope, token: str | None, cookie: str | None = None) -> tuple
     address that they ask, or, if another site's name resolves to this machine, by their ``Host``. ``cookie`` is the name
     of a cookie that may hold the token.
     """
-    headers = Headers(scope=scope)
-    host, origin = headers.get("host", ""), headers.get("origin")
-    is_own_page = origin is None or urlsplit_or_none(origin, "netloc") == host
+    request = HTTPConnection(scope)
+    host, origin = request.headers.get("host", ""), request.headers.get("origin")
+    try:
+        is_local = is_loopback(urlsplit(f"//{host}").hostname)
+        is_own_page = origin is None or urlsplit(origin).netloc == host
+    except ValueError:  # they are no addresses
+        is_local = is_own_page = False
     if token is not None:
-        given = headers.get("authorization", "")
-        if scope["path"] == OPEN or hmac.compare_digest(f"Bearer {token}".encode(), given.encode()):
-            return None
-        if cookie is not None and is_own_page and _has_cookie(headers, cookie, token):
+        given = [(f"Bearer {token}", request.headers.get("authorization", ""))]
+        if cookie is not None and is_own_page:
+            given.append((token, request.cookies.get(cookie, "")))
+        if scope["path"] == OPEN or any(hmac.compare_digest(a.encode(), b.encode()) for a, b in given):
             return None
         return 401, "expected the header 'Authorization: Bearer TOKEN' with the token of this service"
-    if not is_loopback(urlsplit_or_none(f"//{host}", "hostname")):
+    if not is_local:
         return 403, "without a token the service answers requests to localhost only"
-    if not is_own_page:
-        return 403, "requests from pages of other sites are rejected"
-    return None
-
-
-def _has_cookie(headers: Headers, name: str, token: str) -> bool:
-    with contextlib.suppress(Exception):  # a malformed cookie is none
-        found = SimpleCookie("; ".join(headers.getlist("cookie"))).get(name)
-        return found is not None and hmac.compare_digest(found.value.encode(), token.encode())
-    return False
-
-
-def urlsplit_or_none(address: str, part: str) -> str | None:
-    """Return a part of an address; None if it is not an address."""
-    try:
-        return getattr(urlsplit(address), part)
-    except ValueError:
-        return None
+    return None if is_own_page else (403, "requests from pages of other sites are rejected")
 
 
 def is_loopback(host: str | None) -> bool:
     """Return whether a name or address is a loopback one."""
-    try:
-        return host is not None and ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost" or str(host).endswith(".localhost")
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(host or "").is_loopback
+    return host == "localhost" or str(host).endswith(".localhost")

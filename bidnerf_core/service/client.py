@@ -11,23 +11,10 @@ import urllib.request
 import uuid
 import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict
-
-if TYPE_CHECKING:
-    from typing import Unpack
+from typing import Any, TypeAlias
 
 File: TypeAlias = str | Path | bytes
 """A file, or its content as bytes."""
-
-
-class PhotoFacts(TypedDict, total=False):
-    """What may be known about a photo, beside its files."""
-
-    name: str | None  # of the frame, in the answer
-    focal: float | None  # pixels of the stored image
-    hfov: float | None  # degrees
-    depth_unit: float | None  # metres per step of the depth image
-    seed: int | None
 
 
 class ServiceError(Exception):
@@ -56,15 +43,15 @@ class ServiceClient:
         depth: File | Any = None,
         camera: File | None = None,
         start: Any = None,
-        **known: Unpack[PhotoFacts],
+        **known: str | float | None,
     ) -> dict[str, Any]:
         """Return the JSON of ``bidnerf localize`` for a photo: a file, its bytes, or an array of bytes (h, w) or (h, w, 3).
 
         ``map`` is by default the one that the photo shows. ``depth`` is a file, its bytes, or an array (h, w) of planar z,
         ``camera`` a file with the camera, or its content, and ``start`` the 4x4 rows of T_world_camera. What else is ``known`` is
-        given by name, see ``PhotoFacts``.
+        given by name: ``name`` (of the frame, in the answer), ``focal`` (pixels of the stored image), ``hfov`` (degrees),
+        ``depth_unit`` (metres per step of the depth image) and ``seed``.
         """
-        fields: dict[str, Any] = {**known, "map": map}
         edge = uuid.uuid4().hex
         rows = getattr(start, "tolist", lambda: start)()
         files = {
@@ -74,35 +61,35 @@ class ServiceClient:
             "start": None if start is None else json.dumps(rows).encode(),
         }
         parts = [
-            _part(edge, name, str(value).encode()) for name, value in fields.items() if value is not None
+            _part(edge, name, str(value).encode())
+            for name, value in {**known, "map": map}.items()
+            if value is not None
         ]
         for name, file in files.items():
             if file is not None:
                 content = file if isinstance(file, bytes) else Path(file).read_bytes()
                 parts.append(_part(edge, name, content, name if isinstance(file, bytes) else Path(file).name))
         body = b"".join(parts) + f"--{edge}--\r\n".encode()
-        found: dict[str, Any] = self.ask("/localize", body, f"multipart/form-data; boundary={edge}")
-        return found
+        return self.ask("/localize", body, f"multipart/form-data; boundary={edge}")
 
     def maps(self) -> dict[str, Any]:
         """Return the facts about each map by its name."""
-        found: dict[str, Any] = self.ask("/maps")
-        return found
+        return self.ask("/maps")
 
     def health(self) -> dict[str, Any]:
         """Return whether the service can answer, and how many requests wait."""
-        found: dict[str, Any] = self.ask("/health")
-        return found
+        return self.ask("/health")
 
-    def ask(self, path: str, body: bytes | None = None, kind: str = "application/json") -> Any:
-        """Return the JSON at a path such as /maps, or the response to ``body``."""
+    def ask(self, path: str, body: bytes | None = None, kind: str = "application/json") -> dict[str, Any]:
+        """Return the JSON object at a path such as /maps, or the response to ``body``."""
         headers = {"Content-Type": kind} | ({"Authorization": f"Bearer {self.token}"} if self.token else {})
         request = urllib.request.Request(self.url + path, body, headers)
         until = time.monotonic() + self.timeout
         while True:
             try:
                 with urllib.request.urlopen(request, timeout=self.timeout) as answer:
-                    return json.load(answer)
+                    found: dict[str, Any] = json.load(answer)
+                    return found
             except urllib.error.HTTPError as error:
                 wait = float(error.headers.get("Retry-After") or 0)
                 if error.code not in (429, 503) or time.monotonic() + wait > until:
@@ -126,8 +113,7 @@ def _part(edge: str, name: str, content: bytes, file: str | None = None) -> byte
 def _npy(array: Any) -> bytes:
     import numpy as np
 
-    file = io.BytesIO()
-    np.save(file, np.asarray(array))
+    np.save(file := io.BytesIO(), np.asarray(array))
     return file.getvalue()
 
 

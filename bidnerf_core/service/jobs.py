@@ -84,8 +84,8 @@ class Queue:
         job = self.enter(name)
         try:
             yield job
-        except BaseException:
-            job.stop("refused")
+        except BaseException as error:
+            job.stop("timeout" if isinstance(error, Refused) and error.status == 504 else "cancelled")
             raise
 
     def put(self, job: Job, task: Any) -> None:

@@ -8,7 +8,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from bidnerf_core.errors import InputError, spelling_hint
@@ -40,9 +48,7 @@ class Refused(Exception):
 class Upload:
     """A photo and what is known about it, as sent with a request: no value is ever used as a file name."""
 
-    parameters: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # those of ``PhotoParameters`` that were given
+    parameters: Mapping[str, Any] = field(default_factory=dict)  # those of ``PhotoForm`` that were given
     files: Mapping[str, bytes] = field(default_factory=dict)  # "photo" and perhaps "depth"
 
     @property
@@ -79,8 +85,8 @@ def _only_given_defaults(schema: dict[str, Any]) -> None:
             del each["default"]
 
 
-class PhotoParameters(BaseModel):
-    """What may be known about a photo, in the query of a request or as fields of a form."""
+class PhotoForm(BaseModel):
+    """A photo and what may be known about it: a form, of which the query of a request may hold all but the files."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra=_only_given_defaults)
 
@@ -94,26 +100,22 @@ class PhotoParameters(BaseModel):
     seed: Annotated[int, BeforeValidator(_decimal)] = Field(
         ABSENT, ge=0, le=LARGEST_SEED, description="seed of every random choice"
     )
-    camera: Annotated[str, BeforeValidator(_without_aliases)] = Field(
+    camera: Annotated[str, AfterValidator(_without_aliases)] = Field(
         ABSENT, description="the content of a camera file: transforms.json, cameras.json or cameras.txt"
     )
     start: str = Field(ABSENT, description="JSON with a 4x4 T_world_camera to start from")
 
+    photo: bytes = Field(description="an image file")
+    depth: bytes = Field(ABSENT, description="a depth image, or the .npy of an array: planar z")
+
     @model_validator(mode="after")
-    def _has_one_camera(self) -> PhotoParameters:
+    def _has_one_camera(self) -> PhotoForm:
         given = [name for name in CAMERAS if name in self.model_fields_set]
         if len(given) > 1:
             raise PydanticCustomError(
                 "cameras", f"{' and '.join(given)} are given, expected one of {', '.join(CAMERAS)}"
             )
         return self
-
-
-class PhotoForm(PhotoParameters):
-    """The form in which a photo is sent with what is known about it."""
-
-    photo: bytes = Field(description="an image file")
-    depth: bytes = Field(ABSENT, description="a depth image, or the .npy of an array: planar z")
 
 
 EXPECTED = {
@@ -163,14 +165,6 @@ class Problem(BaseModel):
     status: int
     detail: str
     localization: Localization = Field(ABSENT)
-
-
-class Service(BaseModel):
-    """The version, the maps, and where the description of the service is."""
-
-    bidnerf: str
-    maps: list[str]
-    description: str
 
 
 class Health(BaseModel):

@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -35,8 +34,8 @@ FORK_SECONDS = 60.0
 """Time for a new worker to report; on an accelerator it copies the maps first."""
 PAUSE = 1.0
 """Seconds between two looks at an idle worker, and between two attempts to reload the maps."""
-LARGEST_ANSWER = 2**24
-"""Bytes of a worker's answer."""
+LOST = (OSError, EOFError, ValueError, psutil.Error)
+"""What a connection to a process that has died, or sends nonsense, raises."""
 
 
 class Lost(Exception):
@@ -46,27 +45,15 @@ class Lost(Exception):
 class WorkerProcess:
     """A running worker, as seen by the service."""
 
-    def __init__(self, connection: Connection, timeout: float) -> None:
-        """Wait for a new worker's first message. Raises ``InputError`` if it cannot serve, ``OSError`` or ``EOFError`` if it is lost."""
+    def __init__(self, connection: Connection) -> None:
+        """Wait for a new worker's first message. Raises ``InputError`` if it cannot serve, and ``LOST`` if it is lost."""
         self._connection = connection
-        try:
-            if not connection.poll(timeout):
-                raise TimeoutError
-            first = json.loads(connection.recv_bytes(LARGEST_ANSWER))
-        except BaseException:
-            connection.close()
-            raise
-        if "error" in first:
-            connection.close()
-            raise InputError(first["error"])
-        self.pid: int = first["pid"]
-        try:
-            self._process = psutil.Process(
-                self.pid
-            )  # remembers when it began: its number may be another's, later
-        except psutil.NoSuchProcess as error:
-            connection.close()
-            raise EOFError from error
+        if not connection.poll(FORK_SECONDS):
+            raise TimeoutError
+        self.pid: int = _reply(connection)["pid"]
+        self._process = psutil.Process(
+            self.pid
+        )  # remembers when it began: its number may be another's, later
 
     @property
     def ended(self) -> bool:
@@ -77,19 +64,22 @@ class WorkerProcess:
             return True
 
     def ask(self, task: Any) -> dict[str, Any]:
-        """Return the worker's answer. Raises ``EOFError`` or ``OSError`` if it exits before answering."""
+        """Return the worker's answer. Raises ``LOST`` if it exits before answering."""
         self._connection.send(task)
-        answer: dict[str, Any] = json.loads(self._connection.recv_bytes(LARGEST_ANSWER))
-        return answer | {"worker": self.pid}
+        return _reply(self._connection) | {"worker": self.pid}
 
     def kill(self) -> None:
         """Kill the process; ``ask`` then raises in the thread that waits there."""
         with contextlib.suppress(psutil.NoSuchProcess):
             self._process.kill()
 
-    def close(self) -> None:
-        """Close the connection to a process that has ended or was killed."""
-        self._connection.close()
+
+def _reply(connection: Connection) -> dict[str, Any]:
+    """Return the JSON that a process sends. Raises ``InputError`` if it states an error, and ``LOST`` if the process is lost."""
+    reply: dict[str, Any] = json.loads(connection.recv_bytes(2**24))
+    if "error" in reply:
+        raise InputError(reply["error"])
+    return reply
 
 
 class Pool:
@@ -102,8 +92,7 @@ class Pool:
         self._order, self._limits = order, limits
         self._workers: dict[int, WorkerProcess] = {}
         self._busy: set[int] = set()
-        self._maps: subprocess.Popen[bytes] | None = None
-        self._control: socket.socket | None = None
+        self._maps: tuple[subprocess.Popen[bytes], socket.socket] | None = None
         self._loading = threading.Lock()
         self._threads: list[threading.Thread] = []
         self.metrics = Metrics(
@@ -114,7 +103,7 @@ class Pool:
             },
             {
                 "service": lambda: [os.getpid()],
-                "maps": lambda: [process.pid for process in [self._maps] if process is not None],
+                "maps": lambda: [] if self._maps is None else [self._maps[0].pid],
                 "workers": lambda: self.alive,
             },
         )  # fmt: skip
@@ -136,14 +125,12 @@ class Pool:
             self._workers[0] = self._fork()
         except BaseException as error:
             self.close()
-            if isinstance(error, OSError | EOFError):
+            if isinstance(error, LOST) and not isinstance(error, InputError):
                 raise InputError("the process that loads the maps died; was memory short?") from error
             raise
-        self._threads = [
-            threading.Thread(target=self._work, args=[number], name=f"worker {number}", daemon=True)
-            for number in range(self._limits.processes)
-        ]
-        for thread in self._threads:
+        for number in range(self._limits.processes):
+            thread = threading.Thread(target=self._work, args=[number], name=f"worker {number}", daemon=True)
+            self._threads.append(thread)
             thread.start()
 
     def close(self) -> None:
@@ -161,10 +148,7 @@ class Pool:
         while not self.queue.closed:
             worker = self._workers.get(number)
             if worker is None or worker.ended:
-                if worker is not None:
-                    self._replace(number, worker, "ended")
-                else:
-                    self._renew(number)
+                self._replace(number, "ended")
                 continue
             job = self.queue.next(PAUSE)
             if job is not None:
@@ -182,93 +166,75 @@ class Pool:
         os.makedirs(tempfile.gettempdir(), exist_ok=True)  # something may have removed it
         while job.attempts < ATTEMPTS and (worker := self._workers.get(number)) is not None:
             if worker.ended:  # since it was last looked at, and not by this job
-                self._replace(number, worker, "ended")
+                self._replace(number, "ended")
                 continue
             job.attempts += 1
-            folder = tempfile.mkdtemp(prefix="bidnerf-serve-")
-            try:
-                with job.killed_by(worker.kill):
-                    return worker.ask((job.task, folder))
-            except (OSError, EOFError, ValueError):  # it died, or what came is no answer
-                self._replace(number, worker, job.stopped or "died")
-            finally:
-                shutil.rmtree(
-                    folder, ignore_errors=True
-                )  # of a worker that is idle or dead, so nothing is written there
+            with tempfile.TemporaryDirectory(prefix="bidnerf-serve-", ignore_cleanup_errors=True) as folder:
+                try:
+                    with job.killed_by(worker.kill):
+                        return worker.ask((job.task, folder))
+                except LOST:
+                    self._replace(number, job.stopped or "died")
             if job.stopped:
                 return None
         raise Lost
 
-    def _replace(self, number: int, worker: WorkerProcess, reason: str) -> None:
-        worker.kill()
-        worker.close()
-        self.metrics.restarts.labels(reason=reason).inc()
-        del self._workers[number]
-        self._renew(number)
+    def _replace(self, number: int, reason: str) -> None:
+        """Fork a worker in the place of one that has ended or is killed here.
 
-    def _renew(self, number: int) -> None:
-        """Fork a worker. If the process that holds the maps has ended or does not answer, they are reloaded first."""
-        while True:
+        If the process that holds the maps has ended or does not answer, they are reloaded first.
+        """
+        worker = self._workers.pop(number, None)
+        if worker is not None:
+            worker.kill()
+            self.metrics.restarts.labels(reason=reason).inc()
+        while number not in self._workers and not self.queue.closed:
             with self._loading:
-                if self.queue.closed:
-                    return
                 try:
-                    if self._control is None:
+                    if self._maps is None:
                         self._load()
                     self._workers[number] = self._fork()
                     return
-                except InputError:
-                    pass
-                except (OSError, EOFError):
+                except LOST:  # InputError is one of them
                     self._end_maps()
                     self.metrics.restarts.labels(reason="maps").inc()
             time.sleep(PAUSE)
 
     def _fork(self) -> WorkerProcess:
         """Return a new worker. Raises as ``WorkerProcess`` does."""
-        if self._control is None:
-            raise EOFError
         ours, theirs = socket.socketpair()
-        with ours, theirs:
-            socket.send_fds(self._control, [b"w"], [theirs.fileno()])
-            connection = Connection(ours.detach())
-        return WorkerProcess(connection, FORK_SECONDS)
+        connection = Connection(ours.detach())
+        with theirs:
+            if self._maps is None:  # the pool is being closed
+                raise EOFError
+            socket.send_fds(self._maps[1], [b"w"], [theirs.fileno()])
+        return WorkerProcess(connection)
 
     def _load(self) -> None:
-        """Start the process that loads the maps. Raises ``InputError`` if it cannot serve them."""
+        """Start the process that loads the maps. Raises ``InputError`` if it cannot serve them, and ``LOST`` if it dies."""
         ours, theirs = socket.socketpair()
         with theirs:
-            self._maps = subprocess.Popen(
+            process = subprocess.Popen(
                 [sys.executable, "-m", "bidnerf_core.service.worker", str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,  # Ctrl-C reaches only this process, which then ends the others
                 env={**os.environ, "OMP_NUM_THREADS": "1"},
             )
-        self._control = ours
-        connection = Connection(os.dup(ours.fileno()))
-        try:
+        self._maps = process, ours
+        with Connection(os.dup(ours.fileno())) as connection:
             connection.send(self._order)
-            reply = json.loads(connection.recv_bytes(LARGEST_ANSWER))
-        except (OSError, EOFError) as error:
-            self._end_maps()
-            raise InputError("the process that loads the maps died; was memory short?") from error
-        finally:
-            connection.close()
-        if "error" in reply:
-            self._end_maps()
-            raise InputError(reply["error"])
-        self.described = reply["maps"]
+            self.described = _reply(connection)["maps"]
 
     def _end_maps(self, group: bool = False) -> None:
         """Kill the process that holds the maps and, with ``group``, the workers that it forked."""
-        if self._maps is not None:
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                if group:
-                    os.killpg(self._maps.pid, signal.SIGKILL)
-                self._maps.kill()
-            self._maps.wait()
-            self._maps = None
-        if self._control is not None:
-            self._control.close()
-            self._control = None
+        if self._maps is None:
+            return
+        process, control = self._maps
+        self._maps = None
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            if group:
+                os.killpg(process.pid, signal.SIGKILL)
+            process.kill()
+        process.wait()
+        control.close()

@@ -10,10 +10,11 @@ import secrets
 import signal
 import socket
 import threading
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import is_dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.service.settings import ServiceLimits, checked_token
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
 
 PORT = 8000
-LOOPBACK = "127.0.0.1"
 HEAD_SECONDS = 10.0
 """Time for the head of a request to arrive, counted from the connection or from the end of its idle time."""
 IDLE_SECONDS = 15
@@ -32,18 +32,7 @@ CONNECTIONS = 256
 """Open connections; a further one ends that which has been without a request for the longest."""
 GRACE = 10
 """Seconds for running requests when the service shuts down."""
-ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-NAME = re.compile(r"[\w.-]{1,100}")
 NEEDS = "the service needs the extra 'serve' (pip install 'bidnerf[serve]')"
-
-
-class AppOptions(TypedDict, total=False):
-    """How ``service_app`` finds poses, and its limits."""
-
-    method: str
-    config: Any
-    device: str
-    limits: ServiceLimits | None
 
 
 Scenes: TypeAlias = str | Path | Sequence[str | Path] | Mapping[str, str | Path]
@@ -92,7 +81,7 @@ def serve(
     token: str | None = None,
     ready: Callable[[str, str | None], None] | None = None,
     stop: threading.Event | None = None,
-    **options: Unpack[AppOptions],
+    **options: Any,
 ) -> None:
     """Serve maps over HTTP until the process is interrupted, or ``stop`` is set.
 
@@ -140,7 +129,7 @@ def run_app(
     """
     import uvicorn
 
-    with _bound(host or LOOPBACK, port) as bound:
+    with _bound(host or "127.0.0.1", port) as bound:
         options = uvicorn.Config(
             app, http=_impatient(), ws="none", loop="asyncio", lifespan="off", log_config=None, access_log=False,
             server_header=False, proxy_headers=False, timeout_keep_alive=IDLE_SECONDS, timeout_graceful_shutdown=grace, backlog=CONNECTIONS,
@@ -157,17 +146,13 @@ def named(scenes: Scenes) -> dict[str, Path]:
     )
     if not pairs:
         raise InputError("no map to serve", expected="folders of maps")
+    names = [name for name, _ in pairs]
     for name, folder in pairs:
-        if not NAME.fullmatch(name) or name in (".", ".."):
+        if not re.fullmatch(r"[\w.-]{1,100}", name) or name in (".", "..") or names.count(name) > 1:
             raise InputError(
-                f"its name is {name!r}",
-                where=folder,
-                expected="letters, digits, '.', '-' and '_'; give it a name: NAME=MAP",
-            )
-        if [other for other, _ in pairs].count(name) > 1:
-            raise InputError(
-                f"another map is also named {name!r}; give it a different name: NAME=MAP", where=folder
-            )
+                f"its name is {name!r}", where=folder,
+                expected="another one for each map, of letters, digits, '.', '-' and '_'; give it a name: NAME=MAP",
+            )  # fmt: skip
     return {name: Path(folder) for name, folder in pairs}
 
 
@@ -183,14 +168,10 @@ def _bound(host: str, port: int) -> socket.socket:
 
 
 async def _run(
-    app: FastAPI,
-    server: Any,
-    bound: socket.socket,
-    ready: Callable[[str], Any],
-    stop: threading.Event | None,
-) -> None:
-    server.capture_signals = contextlib.nullcontext  # it would raise them again at the end
-    async with app.router.lifespan_context(app), _signals_end(server):
+    app: FastAPI, server: Any, bound: socket.socket, ready: Callable[[str], Any], stop: threading.Event | None
+) -> None:  # fmt: skip
+    server.capture_signals = partial(_signals_end, server)  # its own would raise them again at the end
+    async with app.router.lifespan_context(app):
         serving = asyncio.ensure_future(server.serve(sockets=[bound]))
         while not server.started and not serving.done():
             await asyncio.sleep(0.02)
@@ -198,34 +179,32 @@ async def _run(
         if server.started:
             ready(f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}")
         while not serving.done():
-            if stop is not None and stop.is_set():
-                server.should_exit = True
+            server.should_exit |= stop is not None and stop.is_set()
             await asyncio.wait({serving}, timeout=None if stop is None else 0.1)
         await serving
 
 
-@contextlib.asynccontextmanager
-async def _signals_end(server: Any) -> AsyncIterator[None]:
-    """Let the signals that ask a program to stop end the service, which is its normal end; a second one ends
-    it immediately.
-    """
+@contextlib.contextmanager
+def _signals_end(server: Any) -> Iterator[None]:
+    """Let the signals that ask a program to stop end the service, which is its normal end; a second one ends it immediately."""
 
-    def end() -> None:
+    def end(*_: Any) -> None:
         server.force_exit = server.should_exit
         server.should_exit = True
 
-    loop, before = asyncio.get_running_loop(), dict[int, Any]()
-    if threading.current_thread() is threading.main_thread():
-        before = {number: signal.getsignal(number) for number in ENDING}
-    ours = [number for number, handler in before.items() if handler is not signal.SIG_IGN]
-    for number in ours:
-        loop.add_signal_handler(number, end)
+    is_main = threading.current_thread() is threading.main_thread()
+    names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if is_main and hasattr(signal, name)]
+    before: dict[int, Any] = {
+        getattr(signal, name): signal.getsignal(getattr(signal, name)) for name in names
+    }
+    before = {number: handler for number, handler in before.items() if handler is not signal.SIG_IGN}
+    for number in before:
+        signal.signal(number, end)
     try:
         yield
     finally:
-        for number in ours:
-            loop.remove_signal_handler(number)
-            signal.signal(number, before[number])
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _impatient() -> type[Any]:

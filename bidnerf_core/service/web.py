@@ -14,7 +14,6 @@ from typing import Any
 
 import jinja2
 from fastapi import FastAPI, Request
-from fastapi.openapi.utils import get_openapi
 from starlette.datastructures import MutableHeaders, UploadFile
 from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException, MultiPartParser
@@ -22,12 +21,11 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import HTMLResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from bidnerf_core.errors import InputError, spelling_hint
+from bidnerf_core.errors import InputError
 from bidnerf_core.service.access import OPEN, refusal
 from bidnerf_core.service.models import (
     LONGEST_NAME,
     PhotoForm,
-    PhotoParameters,
     Problem,
     Refused,
     Upload,
@@ -62,49 +60,65 @@ ERRORS = {
     504: ("took too long", "The answer took too long."),
 }  # fmt: skip
 """Titles and descriptions of errors."""
-UPLOAD_ERRORS = (400, 408, 413, 429)
-"""The errors of every request with a body."""
-HEADERS = {
-    "Cache-Control": "Answers are not cached unless they say so.",
-    "Content-Security-Policy": "Nothing in an answer is ever run or framed.",
-    "X-Content-Type-Options": "The type of an answer is not to be guessed: nosniff.",
-    "Retry-After": "Whole seconds after which to try again.",
-    "WWW-Authenticate": "How to authenticate: Bearer.",
-}
-FILES = ("photo", "depth", "camera", "start")
-"""The parts of a form that may be files. ``camera`` and ``start`` may be query parameters as well."""
-
-REFERENCE = "#/components/schemas/{model}"
-
 Report = Callable[[Scope, int, float], None]
 """Receives the scope, status and duration (seconds) of each request."""
 
 
-def new_app(
-    title: str, description: str, token: str | None, cookie: str | None = None, report: Report | None = None, **more: Any
-) -> FastAPI:  # fmt: skip
-    """Return an application that answers errors in the format of RFC 9457 and describes itself, see ``refusal`` for its access."""
-    app = FastAPI(
-        title=title, description=description, version=version("bidnerf"), openapi_url=None, docs_url=None, redoc_url=None,
-        redirect_slashes=False, generate_unique_id_function=lambda route: f"{min(route.methods or ()).lower()} {route.path}", **more,
-    )  # fmt: skip
-    app.add_middleware(Gate, token=token, cookie=cookie, report=report)
-    for kind in (Refused, InputError, HTTPException):
-        app.add_exception_handler(kind, _failure)
-    app.openapi = lambda: described(app, 401 if token is not None else 403)  # type: ignore[method-assign]
+class Application(FastAPI):
+    """An application that answers errors in the format of RFC 9457 and describes itself, see ``refusal`` for its access."""
 
-    @app.get("/openapi.json", summary="This description, in the format of OpenAPI 3.1.")
-    async def openapi() -> dict[str, Any]:
-        return app.openapi()
+    def __init__(
+        self,
+        title: str,
+        token: str | None,
+        cookie: str | None = None,
+        report: Report | None = None,
+        **more: Any,
+    ) -> None:
+        self.refused = 401 if token is not None else 403
+        super().__init__(
+            title=title, version=version("bidnerf"), openapi_url=None, docs_url=None, redoc_url=None, redirect_slashes=False,
+            generate_unique_id_function=lambda route: f"{min(route.methods or ()).lower()} {route.path}",
+            separate_input_output_schemas=False, responses=errors(self.refused, 500), **more,
+        )  # fmt: skip
+        self.add_middleware(Gate, token=token, cookie=cookie, report=report)
+        for kind in (Refused, InputError, HTTPException):
+            self.add_exception_handler(kind, _failure)
 
-    @app.get("/docs", summary="This description, as a page.", response_class=HTMLResponse)
-    async def docs() -> HTMLResponse:
-        template = files(__package__).joinpath("docs.html").read_text(encoding="utf-8")
-        page = jinja2.Environment(autoescape=True).from_string(template).render(api=app.openapi())
-        policy = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
-        return HTMLResponse(page, headers={"Content-Security-Policy": policy})
+        @self.get("/openapi.json", summary="This description, in the format of OpenAPI 3.1.")
+        async def openapi() -> dict[str, Any]:
+            return self.openapi()
 
-    return app
+        @self.get("/docs", summary="This description, as a page.", response_class=HTMLResponse)
+        async def docs() -> HTMLResponse:
+            template = files(__package__).joinpath("docs.html").read_text(encoding="utf-8")
+            page = jinja2.Environment(autoescape=True).from_string(template).render(api=self.openapi())
+            policy = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
+            return HTMLResponse(page, headers={"Content-Security-Policy": policy})
+
+    def openapi(self) -> dict[str, Any]:
+        """Return the description; what FastAPI says of checks that it does not make here is left out."""
+        if self.openapi_schema is not None:
+            return self.openapi_schema
+        api = super().openapi()
+        schemas = api.setdefault("components", {}).setdefault("schemas", {})
+        for unused in ("HTTPValidationError", "ValidationError"):
+            schemas.pop(unused, None)
+        schemas["Problem"] = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+        schemas |= schemas["Problem"].pop("$defs", {})
+        for operation in (each for operations in api["paths"].values() for each in operations.values()):
+            for body in operation.get("requestBody", {"content": {}})["content"].values():
+                schemas |= body["schema"].pop("$defs", {})
+            if "HTTPValidationError" in json.dumps(operation["responses"].get("422")):
+                del operation["responses"]["422"]
+        api["security"] = []
+        if self.refused == 401:
+            api["components"]["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
+            api["security"] = [{"token": []}]
+            health = api["paths"][OPEN]["get"]
+            health["security"] = []
+            del health["responses"]["401"]
+        return api
 
 
 class Gate:
@@ -176,12 +190,14 @@ async def _failure(request: Request, error: Exception) -> Response:
 async def body_of(request: Request, limits: ServiceLimits) -> bytes:
     """Read the body of a request. Raises ``Refused`` for one that is too large or does not arrive in time."""
     close = {"Connection": "close"}  # the rest of the body is not read
-    announced = request.headers.get("content-length", "0")
     most = f"expected at most {limits.max_megabytes:g} MiB"
-    if not (announced.isascii() and announced.isdigit() and len(announced) <= 20):
-        raise Refused(400, f"Content-Length is {short(announced)}, expected a number", close)
-    if int(announced) > limits.max_bytes:
-        raise Refused(413, f"the request has {int(announced) / MEBIBYTE:,.0f} MiB, {most}", close)
+    text = request.headers.get("content-length", "0")
+    try:
+        announced = int(text)
+    except ValueError as error:
+        raise Refused(400, f"Content-Length is {short(text)}, expected a number", close) from error
+    if announced > limits.max_bytes:
+        raise Refused(413, f"the request has {announced / MEBIBYTE:,.0f} MiB, {most}", close)
     content = bytearray()
     try:
         async with asyncio.timeout(limits.upload_timeout):
@@ -199,34 +215,22 @@ async def body_of(request: Request, limits: ServiceLimits) -> bytes:
 async def photo_of(request: Request, limits: ServiceLimits) -> Upload:
     """Read a photo and what is known about it: a form, or the bytes of the photo with query parameters. Raises ``Refused``."""
     content = await body_of(request, limits)
-    values, sent = dict[str, Any](), dict[str, bytes]()
-
-    def add(name: str, value: str | bytes) -> None:
-        if name in values or name in sent:
-            raise InputError(f"{name} is given twice", expected="once")
-        if name in ("photo", "depth") and isinstance(value, bytes):
-            sent[name] = value
-        else:
-            values[name] = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
-
-    for name, text in request.query_params.multi_items():
-        add(name, text)
     kind, stem = request.headers.get("content-type", "").partition(";")[0].strip().lower(), ""
-    if kind != "multipart/form-data":
-        add("photo", content)
-    else:
-        for name, part in await _parts(request, content):
-            if isinstance(part, UploadFile) and name not in FILES:
-                hint = spelling_hint(name, FILES, f", expected any of {', '.join(FILES)}")
-                raise InputError(f"unknown file {short(name)}{hint}")
-            if name == "photo" and isinstance(part, UploadFile):
-                stem = PurePosixPath((part.filename or "").replace("\\", "/")).stem[:LONGEST_NAME]
-            add(name, await part.read() if isinstance(part, UploadFile) else part)
-    parameters = checked(PhotoParameters, values).model_dump(exclude_unset=True)
-    if not sent.get("photo"):
+    items: list[tuple[str, Any]] = request.query_params.multi_items()
+    items += await _parts(request, content) if kind == "multipart/form-data" else [("photo", content)]
+    values = dict[str, Any]()
+    for name, value in items:
+        if name in values:
+            raise InputError(f"{name} is given twice", expected="once")
+        if name == "photo" and isinstance(value, UploadFile):
+            stem = PurePosixPath((value.filename or "").replace("\\", "/")).stem[:LONGEST_NAME]
+        values[name] = await value.read() if isinstance(value, UploadFile) else value
+    if not values.get("photo"):
         raise InputError("no photo", expected="its bytes as the body, or a form with a file 'photo'")
-    if "depth_unit" in parameters and "depth" not in sent:
+    if "depth_unit" in values and "depth" not in values:
         raise InputError("depth_unit was given without depth", expected="the depth image that it belongs to")
+    parameters = checked(PhotoForm, values).model_dump(exclude_unset=True)
+    sent = {name: parameters.pop(name) for name in ("photo", "depth") if name in parameters}
     # The stem of a file's name is text in the answer, never a file name; a given name takes precedence.
     return Upload(({"name": stem} if stem else {}) | parameters, sent)
 
@@ -250,10 +254,23 @@ async def _parts(request: Request, content: bytes) -> list[tuple[str, str | Uplo
         raise InputError(f"not a readable form: {reason}") from error
 
 
-async def left(request: Request) -> None:
-    """Return once the client has closed the connection."""
-    while (await request.receive())["type"] != "http.disconnect":
-        pass
+async def answered(request: Request, work: asyncio.Future[Any], seconds: float | None = None) -> Any:
+    """Return the result of work. Raises ``Refused`` if its client disconnects first, or it takes too long."""
+
+    async def left() -> None:
+        while (await request.receive())["type"] != "http.disconnect":
+            pass
+
+    leaving: asyncio.Future[Any] = asyncio.ensure_future(left())
+    try:
+        await asyncio.wait({work, leaving}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+        if work.done():
+            return work.result()
+        if leaving.done():
+            raise Refused(CLIENT_GONE, "the client has left")
+        raise Refused(504, f"no answer within {seconds:g} s")
+    finally:
+        leaving.cancel()
 
 
 # The description.
@@ -261,75 +278,43 @@ async def left(request: Request) -> None:
 
 def photo_body(*without: str) -> dict[str, Any]:
     """Return what OpenAPI says of a request with a photo: its parameters and its body, leaving some out."""
-    file = {"type": "string", "format": "binary"}
-    form, known = (model.model_json_schema() for model in (PhotoForm, PhotoParameters))
-    for schema in (form, known):
-        schema["properties"] = {
-            name: each for name, each in schema["properties"].items() if name not in without
-        }
-    parameters = [{"name": name, "in": "query", "schema": each} for name, each in known["properties"].items()]
-    kinds = {kind: {"schema": file} for kind in ("image/*", "application/octet-stream")}
+    form = PhotoForm.model_json_schema()
+    for name in without:
+        del form["properties"][name]
+    file = {"schema": form["properties"]["photo"]}
     return {
-        "parameters": parameters,
-        "requestBody": {"required": True, "content": {"multipart/form-data": {"schema": form}, **kinds}},
+        "parameters": [
+            {"name": name, "in": "query", "schema": each}
+            for name, each in form["properties"].items()
+            if name not in ("photo", "depth")
+        ],
+        "requestBody": {
+            "required": True,
+            "content": {
+                "multipart/form-data": {"schema": form},
+                "image/*": file,
+                "application/octet-stream": file,
+            },
+        },
     }
 
 
 def json_body(model: Any) -> dict[str, Any]:
     """Return what OpenAPI says of a request with JSON."""
-    schema = model.model_json_schema(ref_template=REFERENCE)
+    schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
     return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}}}}
 
 
 def errors(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Return error responses, as ``responses`` of a path; ``described`` fills them."""
-    return {status: {} for status in statuses}
-
-
-def described(app: FastAPI, refused: int) -> dict[str, Any]:
-    """Return the description of an application, whose every path may refuse a request with the status ``refused``."""
-    if app.openapi_schema is not None:
-        return app.openapi_schema
-    api = get_openapi(
-        title=app.title, version=app.version, description=app.description, routes=app.routes,
-        separate_input_output_schemas=False,
-    )  # fmt: skip
-    schemas = api.setdefault("components", {}).setdefault("schemas", {})
-    for unused in ("HTTPValidationError", "ValidationError"):
-        schemas.pop(unused, None)
-    schemas["Problem"] = Problem.model_json_schema(ref_template=REFERENCE)
-    schemas |= schemas["Problem"].pop("$defs", {})
-    content = {PROBLEM: {"schema": {"$ref": "#/components/schemas/Problem"}}}
-    names = getattr(app.state, "names", ())
-    for path, operations in api["paths"].items():
-        for operation in operations.values():
-            responses = operation["responses"]
-            for body in operation.get("requestBody", {"content": {}})["content"].values():
-                schemas |= body["schema"].pop("$defs", {})
-            for each in operation.get("parameters", ()):
-                each["schema"] |= {"enum": [*names]} if each["name"] == "map" else {}
-            is_open = path == OPEN and refused == 401
-            if "HTTPValidationError" in json.dumps(responses.get("422", {})):
-                del responses["422"]  # paths that FastAPI believes to check their parameters by itself
-            for status in (500,) if is_open else (refused, 500):
-                responses[str(status)] = {}
-            for status, response in responses.items():
-                if int(status) >= 400:
-                    response |= {"description": ERRORS[int(status)][1], "content": content}
-                also = {"401": "WWW-Authenticate", "429": "Retry-After", "503": "Retry-After"}.get(status)
-                response["headers"] = {
-                    name: {"$ref": f"#/components/headers/{name}"} for name in (*SAFE, also) if name
-                }
-            operation["responses"] = dict(sorted(responses.items()))
-            if is_open:
-                operation["security"] = []
-    number = {"type": "integer", "minimum": 1}
-    api["components"]["headers"] = {
-        name: {"description": text, "required": True, "schema": number if name == "Retry-After" else {"type": "string"}}
-        for name, text in HEADERS.items()
-    }  # fmt: skip
-    if refused == 401:
-        api["components"]["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
-    api["security"] = [{"token": []}] if refused == 401 else []
-    app.openapi_schema = api
-    return api
+    """Return error responses, as ``responses`` of a path."""
+    headers = {401: "WWW-Authenticate", 429: "Retry-After", 503: "Retry-After"}
+    return {
+        status: {
+            "description": ERRORS[status][1],
+            "content": {PROBLEM: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+            "headers": {headers[status]: {"schema": {"type": "string"}, "required": True}}
+            if status in headers
+            else {},
+        }
+        for status in statuses
+    }

@@ -14,7 +14,6 @@ import signal
 import socket
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -25,40 +24,29 @@ from bidnerf_core.io import to_plain
 from bidnerf_core.localization import Localizer, settings_of
 from bidnerf_core.maps import Map, MapCollection, load_map
 from bidnerf_core.results import Answer, localize_each
-from bidnerf_core.service.models import Refused, Upload
+from bidnerf_core.service.models import MapFacts, Refused, Upload
 from bidnerf_core.service.protocols import PROTOCOLS
 from bidnerf_core.service.upload import public_message, read_upload
 
-FACTS = ("backend", "cameras", "landmarks", "surfels", "unit", "distances", "bounds", "complete", "bidnerf")
-"""The facts about a map that clients may see. The others name photos and folders."""
 
-
-@dataclass(frozen=True)
 class Worker:
     """Everything needed to answer requests, loaded before workers are forked."""
 
-    maps: Mapping[str, Localizer]
-    together: MapCollection | None  # several maps, for photos whose map is not known
-    max_pixels: float
-
-    @staticmethod
-    def of(maps: Mapping[str, Localizer], max_pixels: float) -> Worker:
-        """Return a worker for maps by name; several form a collection that uses their localizers."""
-        together, first = None, next(iter(maps.values()))
+    def __init__(self, maps: Mapping[str, Localizer], max_pixels: float) -> None:
+        """``maps`` are the localizers by the names of their maps; several form a collection, for photos whose map is not known."""
+        self.maps, self.max_pixels, first = maps, max_pixels, next(iter(maps.values()))
+        self.together: MapCollection | None = None
         if len(maps) > 1:
             scenes = {name: _scene(localizer) for name, localizer in maps.items()}
-            together = MapCollection(scenes, first.method, first.config, localizers=dict(maps))
-        return Worker(maps, together, max_pixels)
+            self.together = MapCollection(scenes, first.method, first.config, localizers=dict(maps))
 
-    @property
-    def described(self) -> dict[str, Any]:
-        """The facts about each map that clients may see, by its name."""
+    def describe(self) -> dict[str, Any]:
+        """Return the facts about each map that clients may see, by its name; the others name photos and folders."""
         found = {}
         for name, localizer in self.maps.items():
             scene = _scene(localizer)
-            facts, anchor = scene.describe().plain(), scene.anchor
-            found[name] = {key: facts[key] for key in FACTS}
-            found[name]["anchor"] = to_plain(anchor)
+            facts = scene.describe().plain() | {"anchor": to_plain(scene.anchor)}
+            found[name] = {key: facts[key] for key in MapFacts.model_fields}
         return found
 
     def answer(self, task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -84,9 +72,7 @@ class Worker:
             found = {"status": error.status, "detail": error.detail, "more": error.more}
         except InputError as error:
             found = {"status": 422, "detail": public_message(error, folder)}
-        except (
-            Exception
-        ) as error:  # an internal error: the worker continues, and the log states what happened
+        except Exception as error:  # the worker continues, and the log states what happened
             found = {"status": 500, "detail": "internal error", "fault": f"{type(error).__name__}: {error}"}
         return found | {
             "outcome": outcomes[-1] if outcomes else "bad input" if found["status"] < 500 else "fault"
@@ -133,7 +119,7 @@ def main() -> None:
         return
     gc.collect()
     gc.freeze()  # otherwise a collection in a worker would write to, and so copy, every page with an object
-    _send(connection, {"maps": worker.described})
+    _send(connection, {"maps": worker.describe()})
     connection.close()
     while True:
         asked, descriptors, _, _ = socket.recv_fds(control, 1, 1)
@@ -170,7 +156,7 @@ def _loaded(order: Mapping[str, Any]) -> Worker:
         name: Localizer(load_map(folder), order["method"], config, warm_up=warm_up)
         for name, folder in order["maps"].items()
     }
-    return Worker.of(maps, order["max_pixels"])
+    return Worker(maps, order["max_pixels"])
 
 
 def _serve(worker: Worker, device: str, connection: Connection) -> None:
@@ -181,7 +167,7 @@ def _serve(worker: Worker, device: str, connection: Connection) -> None:
                 name: Localizer(_scene(each), each.method, each.config, device)
                 for name, each in worker.maps.items()
             }
-            worker = Worker.of(moved, worker.max_pixels)
+            worker = Worker(moved, worker.max_pixels)
     except (InputError, RuntimeError) as error:
         _send(connection, {"error": str(error)})
         return

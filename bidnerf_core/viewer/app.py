@@ -13,7 +13,7 @@ from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 from urllib.parse import parse_qs
 
 import torch
@@ -32,16 +32,15 @@ from bidnerf_core.localization import Localizer
 from bidnerf_core.maps import Map
 from bidnerf_core.progress import job_context
 from bidnerf_core.service import (
-    CLIENT_GONE,
+    Application,
     Job,
     Refused,
     ServiceLimits,
+    answered,
     body_of,
     checked,
     errors,
     json_body,
-    left,
-    new_app,
     photo_body,
     photo_of,
     public_message,
@@ -153,7 +152,9 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
             jobs.close()
             painter.shutdown(wait=False, cancel_futures=True)
 
-    app = new_app("bidnerf view", "A map, and localizations in it.", token, COOKIE, lifespan=lifespan)
+    app = Application(
+        "bidnerf view", token, COOKIE, lifespan=lifespan, description="A map, and localizations in it."
+    )
     if token is not None:
         app.add_middleware(Login, token=token)
 
@@ -233,17 +234,10 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
                     return jpeg((quick_image if camera.quick else field_image)(scene, intrinsics, T))
             return None
 
-        drawing = asyncio.ensure_future(asyncio.get_running_loop().run_in_executor(painter, render))
-        leaving = asyncio.ensure_future(left(request))
-        waited: set[asyncio.Future[Any]] = {drawing, leaving}
         try:
-            await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
+            content = await answered(request, asyncio.get_running_loop().run_in_executor(painter, render))
         finally:
             cancelled.set()
-            leaving.cancel()
-        content = await drawing
-        if content is None:
-            raise Refused(CLIENT_GONE, "the viewer has left")
         return Response(content, media_type="image/jpeg")
 
     return app

@@ -91,10 +91,10 @@ def test_transparent_pixels_show_the_background_of_the_map(grounds: list[Map], t
 def test_the_service_finds_the_map_of_a_photo(grounds: list[Map], tmp_path: Path) -> None:
     """Under the names by which the maps are served, and with the localizers that serve them."""
     localizers = {name: bn.Localizer(scene) for name, scene in zip("ab", grounds, strict=False)}
-    worker = Worker.of(localizers, 1e6)
+    worker = Worker(localizers, 1e6)
     assert worker.together is not None
     assert worker.together.localizer("b") is localizers["b"]
-    assert Worker.of({"a": localizers["a"]}, 1e6).together is None
+    assert Worker({"a": localizers["a"]}, 1e6).together is None
     png = iio.imwrite("<bytes>", (255 * photo(SEEDS[1]).frame.rgb).byte().numpy(), extension=".png")
     task = {"map": None, "upload": Upload({"name": "<i>", "focal": CAMERA.fx}, {"photo": png})}
     reply = worker.answer(task, tmp_path)
