@@ -14,12 +14,13 @@ import dataclasses
 import functools
 import inspect
 import re
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, distributions, entry_points
 from typing import Any, Generic, TypeAlias, TypeVar
 
-from bidnerf_core.errors import InputError, spelling_hint, unknown_name
+from bidnerf_core.errors import InputError, InputWarning, spelling_hint, unknown_name
 
 GROUPS: Mapping[str, str] = {
     "backends": "backend",
@@ -145,17 +146,13 @@ def list_plugins(group: str) -> list[PluginInfo]:
 @functools.cache
 def _declared(group: str) -> tuple[PluginInfo, ...]:
     """Return what installed distributions declare in a group. Of several versions of one, the first on ``sys.path`` counts."""
-    try:
-        points = entry_points(group=f"bidnerf.{group}")
-        infos = [
-            PluginInfo(group, name, p.value, *_name_version_summary(p.dist))
-            for p in points
-            for name in (p.load() if p.name == TABLE else [p.name])
-        ]
-    except Exception as error:  # one malformed file stops all look-ups, also those of other programs
-        raise PluginError(
-            f"the metadata of an installed package cannot be read ({_described(error)}); reinstall or remove it"
-        ) from error
+    infos = list[PluginInfo]()
+    for p in _points(f"bidnerf.{group}"):
+        try:
+            names = p.load() if p.name == TABLE else [p.name]
+        except Exception as error:
+            raise PluginError(f"{p.value}: the table cannot be imported ({_described(error)})") from error
+        infos += [PluginInfo(group, name, p.value, *_name_version_summary(p.dist)) for name in names]
     found = []
     for info in infos:
         rivals = [x for x in infos if x.name == info.name and x is not info]
@@ -165,6 +162,24 @@ def _declared(group: str) -> tuple[PluginInfo, ...]:
             fault = "expected a value of the form 'module:object'"
         found.append(replace(info, fault=fault))
     return tuple(found)
+
+
+def _points(group: str) -> Sequence[EntryPoint]:
+    """Return the entry points of a group. A package whose metadata is malformed is left out with a warning."""
+    with contextlib.suppress(Exception):  # one such package stops this look-up of all
+        return list(entry_points(group=group))
+    found = dict[str, Sequence[EntryPoint]]()
+    for dist in distributions():
+        try:
+            found.setdefault(dist.name, list(dist.entry_points.select(group=group)))
+        except Exception as error:
+            warnings.warn(
+                f"the plugins of {dist.name} are left out, since its metadata cannot be read ({_described(error)});"
+                " reinstall or remove it",
+                InputWarning,
+                stacklevel=2,
+            )
+    return [point for points in found.values() for point in points]
 
 
 @functools.cache  # a look-up parses the metadata anew

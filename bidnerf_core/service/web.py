@@ -230,7 +230,7 @@ async def photo_of(request: Request, limits: ServiceLimits) -> Upload:
     if "depth_unit" in values and "depth" not in values:
         raise InputError("depth_unit was given without depth", expected="the depth image that it belongs to")
     parameters = checked(PhotoForm, values).model_dump(exclude_unset=True)
-    sent = {name: parameters.pop(name) for name in ("photo", "depth") if name in parameters}
+    sent: dict[str, bytes] = {name: parameters.pop(name) for name in ("photo", "depth") if name in parameters}
     # The stem of a file's name is text in the answer, never a file name; a given name takes precedence.
     return Upload(({"name": stem} if stem else {}) | parameters, sent)
 

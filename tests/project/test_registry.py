@@ -330,9 +330,12 @@ def test_of_two_versions_the_first_on_the_path_wins_as_for_import(
     assert listed("mist") == []  # which only the hidden version has
 
 
-def test_malformed_metadata_is_reported_in_one_line(site: Site) -> None:
+def test_a_package_with_malformed_metadata_is_left_out_with_a_warning(site: Site) -> None:
     site.metadata("unrelated", "1.0", "[console_scripts]\nnonsense\n")
-    assert "metadata of an installed package cannot be read" in refusal("hashgrid")
+    site.backend()
+    with pytest.warns(InputWarning, match="plugins of unrelated are left out"):
+        assert isinstance(load_backend("fog"), Backend)
+    assert listed("hashgrid")[0].is_bundled
 
 
 def test_metadata_without_the_bundled_plugins_is_to_be_renewed(monkeypatch: pytest.MonkeyPatch) -> None:

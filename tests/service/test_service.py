@@ -15,6 +15,7 @@ import socket
 import tempfile
 import threading
 import time
+from base64 import b64encode
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -32,6 +33,7 @@ pytest.importorskip("uvicorn", reason="the extra 'serve' is not installed")
 from bidnerf_core import InputError, ServiceClient, open_dataset, serve
 from bidnerf_core.camera import WAYS, WAYS_OF_PHOTO
 from bidnerf_core.localization import settings_of
+from bidnerf_core.registry import _declared
 from bidnerf_core.service import ServiceError, ServiceLimits, public_message, service_app
 
 # Inside: workers are killed, and the description is compared with the parameters that are read
@@ -47,6 +49,31 @@ LIMITS = ServiceLimits(
     workers=1, queue=3, timeout=120.0, upload_timeout=0.5, max_megabytes=1.0, max_megapixels=1.0
 )
 FORM = "multipart/form-data; boundary=xyz"
+ECHO = '''"""A protocol that answers the JSON of a photo with its name."""
+import base64
+from pydantic import BaseModel
+
+class Question(BaseModel):
+    photo: str
+    start: str
+
+class Answer(BaseModel):
+    frame: str
+    cameras: int
+
+class Echo:
+    summary, request, response = "Return the name of a photo.", Question, Answer
+    media_type = "application/vnd.echo+json;version=1"
+
+    def answer(self, body, scene, localize):
+        from bidnerf_core.service import Upload
+
+        photo = Upload({"name": "echo", "focal": 32.0, "start": body["start"]}, {"photo": base64.b64decode(body["photo"])})
+        answer, plain = localize(photo)
+        return {"frame": plain["frame"], "cameras": len(scene.info.cameras)}
+
+echo = Echo()
+'''
 
 
 @dataclass
@@ -164,7 +191,12 @@ class Served:
 def served(place: Place) -> Iterator[Served]:
     """One service for all tests, on a port of its own: its start takes seconds."""
     ready, stop, told, made = threading.Event(), threading.Event(), [], []
-    maps = [place.folder / "map", place.folder / "hall"]
+    maps, site = [place.folder / "map", place.folder / "hall"], place.folder / "site"
+    (site / "echo-1.0.dist-info").mkdir(parents=True)
+    (site / "echo-1.0.dist-info/METADATA").write_text("Metadata-Version: 2.1\nName: echo\nVersion: 1.0\n")
+    points = "[bidnerf.services]\necho = strange_echo:echo\n"
+    (site / "echo-1.0.dist-info/entry_points.txt").write_text(points)
+    (site / "strange_echo.py").write_text(ECHO)
 
     def tell(url: str, token: str | None) -> None:
         told.extend([url, token, asyncio.get_running_loop()])
@@ -178,6 +210,9 @@ def served(place: Place) -> Iterator[Served]:
     options |= {"ready": tell, "stop": stop}
     running = threading.Thread(target=serve, args=[maps], kwargs=options)
     with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(site))
+        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")])))
+        _declared.cache_clear()
         patch.setattr(tempfile, "tempdir", str(place.folder / "uploads"))
         patch.setattr("bidnerf_core.service.server.service_app", kept)
         running.start()
@@ -190,6 +225,7 @@ def served(place: Place) -> Iterator[Served]:
     finally:
         stop.set()
         running.join(30)
+        _declared.cache_clear()
     with pytest.raises(ServiceError, match="refused"):
         ServiceClient(told[0]).ask("/maps")
 
@@ -238,6 +274,17 @@ def test_a_photo_may_be_the_body(service: Service, place: Place) -> None:
     assert reply.json["frame"] == "<script>"
     assert reply.headers["content-type"] == "application/json"
     assert reply.headers["x-content-type-options"] == "nosniff"
+
+
+def test_a_registered_protocol_is_answered(service: Service, place: Place) -> None:
+    """Both processes load the plugin: that which listens, and the worker."""
+    asked = {"photo": b64encode(place.photo).decode(), "start": place.start}
+    for path in ("/echo?map=map", "/maps/hall/echo"):
+        reply = service.post(path, json.dumps(asked).encode(), "application/json")
+        assert reply.json == {"frame": "echo", "cameras": service.get("/maps/hall").json["cameras"]}
+    assert service.post("/echo", json.dumps(asked).encode()).json["detail"].startswith("several maps")
+    assert "no 'photo'" in service.post("/maps/map/echo", b"{}").json["detail"]
+    assert service.get("/maps/map/echo").json == {"status": "running"}
 
 
 def test_names_are_text_and_never_files(service: Service, place: Place) -> None:
