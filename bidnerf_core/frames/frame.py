@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -47,13 +47,12 @@ from bidnerf_core.io import (
 SPARSE = 0.05
 """Fraction of pixels with depth below which depth counts as sparse: the pixels in between then remain unknown."""
 BLACK = (0.0, 0.0, 0.0)
-FULL_BYTE = 255
 IMAGES = ("rgb", "depth", "alpha", "hidden")
 
 
 def as_floats(colours: Shaped[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Convert bytes to floats in [0, 1]; floats are returned unchanged."""
-    return colours.float().div_(FULL_BYTE) if colours.dtype == torch.uint8 else colours
+    return colours.float().div_(255) if colours.dtype == torch.uint8 else colours
 
 
 class _Colours:
@@ -135,7 +134,7 @@ class Frame:
             if image is not None or what == "rgb":
                 _check_image(where, what, image, camera, is_new=what in new)
         if "rgb" in new and self.rgb_bytes.dtype != torch.uint8:
-            rounded = (self.rgb_bytes * FULL_BYTE).round_().clamp_(0, FULL_BYTE).to(torch.uint8)
+            rounded = (self.rgb_bytes * 255).round_().clamp_(0, 255).to(torch.uint8)
             self.__dict__["rgb"] = rounded
         if self.depth is not None and "depth" in new and not _is_finite(self.depth):
             self.__dict__["depth"] = self.depth.nan_to_num(0.0, 0.0, 0.0)
@@ -393,8 +392,7 @@ class Frame:
     @property
     def rgb_bytes(self) -> Shaped[Tensor, "h w 3"]:
         """The colours as they are stored, from 0 to 255."""
-        stored: Tensor = self.__dict__["rgb"]
-        return stored
+        return cast(Tensor, self.__dict__["rgb"])
 
     def colours_at(self, rows: Int[Tensor, "*p"], columns: Int[Tensor, "*p"]) -> Float[Tensor, "*p 3"]:
         """Return the colours in [0, 1] of some pixels."""

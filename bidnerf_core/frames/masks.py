@@ -25,10 +25,6 @@ from bidnerf_core.io import IMAGE_SUFFIXES, decode, resampled
 HiddenColour = Literal["black", "white"]
 """The colour in masks of the pixels that are ignored."""
 INVERTED = "if it marks what should be used, the masks are inverted (--mask-hides, mask_hides in Python)"
-HALF = 0.5
-"""Pixels of half the largest value of the file's type are white; masks that hide half of most images may be inverted."""
-AFFIXES = re.compile("^(dynamic_)?mask_|[_.-]mask$")
-"""What turns the name of a photo into the name of its mask."""
 
 
 class WhollyHidden(InputError):
@@ -48,7 +44,16 @@ def read_mask(
     channel is the mask. Raises ``InputError`` if the file is not an image, or has another aspect ratio, and
     ``WhollyHidden`` if it hides everything.
     """
-    white = _upright(torch.from_numpy(_white(decode(path))), path, raster)
+    stored = torch.from_numpy(_white(decode(path)))
+    given, own = (stored.shape[1], stored.shape[0]), read_exif(path).orientation
+    if own != UPRIGHT and same_aspect(own.upright_size(*given), raster.upright_size):
+        white = own.upright(stored)
+    else:
+        fits = all(same_aspect(given, x) for x in (raster.size, raster.upright_size))
+        if raster.orientation != UPRIGHT and fits:
+            text = "the mask fits the image both as stored and as turned by EXIF; it is turned like the image"
+            warnings.warn(f"{path}: {text}", InputWarning, stacklevel=2)
+        white = raster.turned(stored, "mask", path)
     if tuple(white.shape) != size[::-1]:
         white = resampled(white, *size)
     hidden = white if hides == "white" else ~white
@@ -62,19 +67,6 @@ def hides_everything(path: Path, hides: HiddenColour = "black") -> bool:
     return bool((_white(decode(path)) == (hides == "white")).all())
 
 
-def _upright(stored: Bool[Tensor, "mh mw"], path: Path, raster: Raster) -> Bool[Tensor, "h w"]:
-    """Turn the mask upright like the image of ``raster``. Raises ``InputError`` for another aspect ratio."""
-    given, own = (stored.shape[1], stored.shape[0]), read_exif(path).orientation
-    if own != UPRIGHT and same_aspect(own.upright_size(*given), raster.upright_size):
-        return own.upright(stored)
-    if raster.orientation != UPRIGHT and all(
-        same_aspect(given, x) for x in (raster.size, raster.upright_size)
-    ):
-        text = "the mask fits the image both as stored and as turned by EXIF; it is turned like the image"
-        warnings.warn(f"{path}: {text}", InputWarning, stacklevel=3)
-    return raster.turned(stored, "mask", path)
-
-
 def _white(raw: np.ndarray) -> Bool[np.ndarray, "h w"]:
     values = raw if raw.ndim == 3 else raw[..., None]
     colours, alpha = (values[..., :-1], values[..., -1:]) if values.shape[-1] in (2, 4) else (values, None)
@@ -82,8 +74,8 @@ def _white(raw: np.ndarray) -> Bool[np.ndarray, "h w"]:
         colours = alpha
     brightness: np.ndarray = colours.max(-1)
     full = float(np.iinfo(brightness.dtype).max) if brightness.dtype.kind in "ui" else 1.0
-    is_dark = float(brightness.max(initial=0)) < HALF * full
-    found: np.ndarray = brightness > 0 if is_dark else brightness >= HALF * full
+    is_dark = float(brightness.max(initial=0)) < full / 2
+    found: np.ndarray = brightness > 0 if is_dark else brightness >= full / 2
     return found
 
 
@@ -114,7 +106,7 @@ class MaskFolder:
             raise InputError("contains no images", where=self.path, expected="masks")
         self._by_name = defaultdict[str, list[Path]](list)
         for file in files:
-            photo = PurePath(AFFIXES.sub("", file.stem))
+            photo = PurePath(re.sub("^(dynamic_)?mask_|[_.-]mask$", "", file.stem))
             stem = photo.stem if photo.suffix.lower() in IMAGE_SUFFIXES else photo.name
             parts = (*file.relative_to(self.path).parts[:-1], stem)
             for depth in range(1, len(parts) + 1):
@@ -150,6 +142,6 @@ def masks_sentence(hidden: Sequence[Bool[Tensor, "h w"] | None]) -> str | None:
     mean, without = 100 * sum(shares) / len(shares), len(hidden) - len(shares)
     line = f"masks hide {mean:.3g} % of the pixels of {amount(len(shares), 'image')}"
     line += f"; {amount(without, 'image')} without hidden pixels" if without else ""
-    if float(np.median(shares)) > HALF:
+    if float(np.median(shares)) > 0.5:
         line += f"; {INVERTED}"
     return line

@@ -91,10 +91,6 @@ def draw(
     return Observations.stacked(parts)
 
 
-MOST_FOR_MIDDLE = 200_000
-"""Number of a view's measured points above which only some of them are used for the median."""
-
-
 def measured_middle(views: Sequence[View]) -> Float[Tensor, "3"] | None:
     """Return the component-wise median of the measured points, in the views' reference frame; None if there are none.
 
@@ -105,7 +101,7 @@ def measured_middle(views: Sequence[View]) -> Float[Tensor, "3"] | None:
         if view.frame.depth is None:
             continue
         number = (view.frame.depth.flatten()[::4] > 0).nonzero()[:, 0]
-        number = 4 * number[:: max(1, len(number) // MOST_FOR_MIDDLE)]
+        number = 4 * number[:: max(1, len(number) // 200_000)]
         width = view.frame.intrinsics.width
         places = torch.stack([number % width, number // width], dim=-1)
         pixels = observe(view, places, torch.float64, "cpu")
@@ -115,32 +111,25 @@ def measured_middle(views: Sequence[View]) -> Float[Tensor, "3"] | None:
 
 
 DrawerName = Literal["uniform", "interest-points", "interest-regions"]
-QUALITY = 0.01
-"""Minimum corner response of an interest point, relative to the strongest response in the image."""
-FAINTEST = 1e-5
-"""Minimum corner response of an interest point in any image. A blank wall with noise of 1/255 stays below it."""
-BORDER = 3
-"""Width, in pixels, of the margin that the corner detector needs; smaller images have no corners."""
-REACH = 6
-"""Interest regions are the squares that reach this many pixels from an interest point to each side."""
 
 
 def interest_points(frame: Frame) -> Int[Tensor, "n 2"]:
     """Return corners (column, row) by Shi and Tomasi 1994, "Good features to track"; possibly none."""
-    if min(frame.rgb_bytes.shape[:2]) <= BORDER:
+    if min(frame.rgb_bytes.shape[:2]) <= 3:  # the margin that the detector needs
         return torch.zeros((0, 2), dtype=torch.long)
     grey = rgb_to_grayscale(frame.rgb.detach().float().cpu().permute(2, 0, 1)[None])
     response = nms2d(gftt_response(grey), (5, 5))[0, 0]
-    strong = response > max(QUALITY * float(response.max()), FAINTEST)
+    # Relative to the strongest in the image; and the noise of 1/255 of a blank wall stays below 1e-5.
+    strong = response > max(0.01 * float(response.max()), 1e-5)
     return strong.nonzero().flip(-1)
 
 
 def interest_regions(frame: Frame) -> Int[Tensor, "n 2"]:
-    """Return the interest points of a frame and the pixels around them, row by row."""
+    """Return the interest points of a frame and the pixels up to six away from them along both axes, row by row."""
     columns, rows = interest_points(frame).unbind(-1)
     mask = torch.zeros((1, *frame.rgb_bytes.shape[:2]))
     mask[0, rows, columns] = 1
-    return max_pool2d(mask, 2 * REACH + 1, stride=1, padding=REACH)[0].nonzero().flip(-1)
+    return max_pool2d(mask, 13, stride=1, padding=6)[0].nonzero().flip(-1)
 
 
 def visible_at(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:

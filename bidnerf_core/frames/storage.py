@@ -19,9 +19,8 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame, as_floats
 
 BLOCK = 2**28
-"""Bytes per block, unless an image is larger. With few blocks it is cheap to draw pixels from all images at once."""
-IN_MEMORY = 2**28
-"""Bytes of images held in memory; more are held in a file, whose pages the system may drop when it needs memory."""
+"""Bytes per block, unless an image is larger. With few blocks it is cheap to draw pixels from all images at once. Images that fill more than
+one are held in a file, whose pages the system may drop when it needs memory."""
 ALIGNMENT = 16
 MOST_BLOCKS = 64
 """Number of separate blocks of memory above which images are copied into one."""
@@ -30,12 +29,12 @@ MOST_BLOCKS = 64
 class PixelStore:
     """Holds the images of frames one after another.
 
-    ``expected`` is the number of bytes that will be stored. If it exceeds ``IN_MEMORY``, they go to nameless
+    ``expected`` is the number of bytes that will be stored. If it exceeds ``BLOCK``, they go to nameless
     files in ``folder`` (by default, the system's folder for temporary files) that vanish with the process.
     """
 
     def __init__(self, expected: int, folder: Path | None = None) -> None:
-        self._mapped, self._folder, self._expected = expected > IN_MEMORY, folder, expected
+        self._mapped, self._folder, self._expected = expected > BLOCK, folder, expected
         self._block, self._used = torch.empty(0, dtype=torch.uint8), 0
 
     def stored(self, frame: Frame) -> Frame:

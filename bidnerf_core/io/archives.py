@@ -12,7 +12,6 @@ from bidnerf_core.io.files import PackedFile, open_binary
 
 LARGEST_MEMBER = 256 * 2**20
 """Bytes that an unpacked member has at most, unless stated otherwise. A small archive can hold members that unpack to any size."""
-MOST_MEMBERS = 1_000_000
 
 
 class Archive:
@@ -32,9 +31,10 @@ class Archive:
             cut = begins == b"PK"
             why = "ends too early, probably an incomplete copy" if cut else f"is not a zip archive ({error})"
             raise InputError(why, where=path, expected=expected) from error
-        if len(members) > MOST_MEMBERS:
+        most = 1_000_000
+        if len(members) > most:
             raise InputError(
-                f"holds {len(members)} files", where=path, expected=f"{expected} of at most {MOST_MEMBERS}"
+                f"holds {len(members)} files", where=path, expected=f"{expected} of at most {most}"
             )
         self._members = {member.filename: member for member in members}
 

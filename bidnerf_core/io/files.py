@@ -19,14 +19,6 @@ from bidnerf_core.errors import InputError
 
 LARGEST_TEXT = 128 * 2**20
 """Bytes. Parsed text takes ten times as much memory as its file, so the size is checked before reading."""
-TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}")
-FILE_KINDS = {
-    stat.S_IFDIR: "a folder",
-    stat.S_IFIFO: "a named pipe",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-}
 
 
 @dataclass(frozen=True)
@@ -48,10 +40,6 @@ class PackedFile:
         return self.where
 
 
-LFS_POINTER = b"version https://git-lfs.github.com/spec/"
-"""How a file begins that stands for another one in a repository cloned without Git LFS."""
-
-
 def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
     """Open a regular file for reading. ``expected`` briefly describes what it should be ("an image file").
 
@@ -62,9 +50,11 @@ def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
         return io.BytesIO(path.read())
     try:
         mode = path.stat().st_mode
-        if stat.S_ISREG(mode):
-            file = path.open("rb")
-            is_pointer = file.peek(len(LFS_POINTER)).startswith(LFS_POINTER)
+        file = path.open("rb") if stat.S_ISREG(mode) else None
+        pointer = (
+            b"version https://git-lfs.github.com/spec/"  # what a clone without Git LFS has in place of a file
+        )
+        is_pointer = file is not None and file.peek(len(pointer)).startswith(pointer)
     except FileNotFoundError as error:
         raise InputError("no such file", where=path, expected=expected) from error
     except PermissionError as error:
@@ -72,13 +62,15 @@ def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
     except (OSError, ValueError) as error:  # a NUL in the name raises ValueError
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"cannot be opened ({reason})", where=path, expected=expected) from error
-    if stat.S_ISREG(mode):
-        if is_pointer:
-            file.close()
-            raise InputError("is a pointer of Git LFS, not the file", where=path, expected="git lfs pull")
-        return file
-    kind = FILE_KINDS.get(stat.S_IFMT(mode), "no regular file")
-    raise InputError(f"is {kind}", where=path, expected=expected)
+    if file is None:
+        kinds = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket"}
+        kinds |= {stat.S_IFCHR: "a device", stat.S_IFBLK: "a device"}
+        kind = kinds.get(stat.S_IFMT(mode), "no regular file")
+        raise InputError(f"is {kind}", where=path, expected=expected)
+    if is_pointer:
+        file.close()
+        raise InputError("is a pointer of Git LFS, not the file", where=path, expected="git lfs pull")
+    return file
 
 
 def read_file(path: Path, expected: str, most: int = LARGEST_TEXT) -> bytes:
@@ -113,7 +105,7 @@ def temporary(path: Path) -> Path:
 
 def is_temporary(name: str) -> bool:
     """Return whether a name belongs to a temporary file, left behind if its process was killed while writing."""
-    return TEMPORARY.fullmatch(name) is not None
+    return re.fullmatch(r"\..+\.[0-9a-f]{8}", name) is not None
 
 
 def write_file(path: Path, content: bytes) -> None:
@@ -134,7 +126,12 @@ def write_file(path: Path, content: bytes) -> None:
         if isinstance(error, OSError):
             raise OSError(error.errno, error.strerror or str(error), str(path)) from error
         raise
-    _sync_folder(path.parent)
+    with contextlib.suppress(OSError):  # not all systems can flush a folder's entries to disk
+        number = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
 
 
 class FileInUse(InputError):
@@ -176,13 +173,3 @@ def take_lock(number: int) -> bool:
         return lock_descriptor(number, blocking=False)
     except OSError:
         return True
-
-
-def _sync_folder(folder: Path) -> None:
-    """Flush a folder's directory entries to disk, on systems that support it."""
-    with contextlib.suppress(OSError):
-        number = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(number)
-        finally:
-            os.close(number)

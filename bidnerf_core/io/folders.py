@@ -46,23 +46,16 @@ def output_folder(
 
     check()
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    with removed_on_failure():
-        _make_writable(out)
+    try:
+        with removed_on_failure():
+            out.mkdir(parents=True, exist_ok=True)
+            probe = temporary(out / "writable")
+            probe.write_bytes(b"")
+            probe.unlink()
+    except OSError as error:
+        found, expected = f"cannot be written ({error.strerror})", "a folder that can be created and written"
+        raise InputError(found, where=out, expected=expected) from error
     # While the lock is held: afterwards, the folder may be another process's.
     with locked(out), removed_on_failure():
         check()  # another process may have finished meanwhile
         yield
-
-
-def _make_writable(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        probe = temporary(out / "writable")
-        probe.write_bytes(b"")
-        probe.unlink()
-    except OSError as error:
-        raise InputError(
-            f"cannot be written ({error.strerror})",
-            where=out,
-            expected="a folder that can be created and written",
-        ) from error

@@ -36,16 +36,7 @@ FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "AVIF", "HEIF")
 """The formats that are decoded, whatever a file's name. Pillow supports more, and reads EPS by starting
 another program."""
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
-RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 HEIF_SUFFIXES = (".heic", ".heif", ".hif")
-HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs", b"mif1", b"msf1")
-"""Brands in the first bytes of HEIF files (ISO/IEC 23008-12)."""
-MAGIC = (b"\x89PNG\r\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"GIF8")
-"""First bytes of PNG, JPEG, TIFF (both byte orders) and GIF; BMP, WebP, AVIF and HEIF are identified by later bytes."""
-DEPTHS = (10, 12, 14)
-"""Bit depths of sensors whose values are stored in 16 bits: the smallest that fits an image's largest value
-is assumed."""
-NAMED_BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 CONVERTED = ("CMYK", "YCbCr", "HSV")
 """Colour spaces that Pillow converts to RGB."""
 
@@ -53,11 +44,6 @@ CONVERTED = ("CMYK", "YCbCr", "HSV")
 # filter is set once and with the lowest precedence: filters belong to the whole process, so threads that
 # changed and restored them while reading images would leave each other's filters behind.
 warnings.filterwarnings("ignore", module=r"PIL\.", append=True)
-SEGMENT = re.compile(rb"\xff([\xc0-\xcf\xd8-\xfe])")
-"""The beginning of a segment of a JPEG file; within a scan, 0xff is followed by 0 or a restart marker."""
-MOST_SCANS, MOST_SEGMENTS = 100, 1000
-"""Scans and segments in a JPEG file. Each scan goes through the whole image, and libjpeg's usual script has ten of them;
-of segments, the depth map that a phone stores with a photo takes a few hundred."""
 FULL_SCALE = {"bool": 1, "uint8": 255, "uint16": 65535}
 COLOUR_ROUNDING = 1e-3
 """Tolerance by which a floating-point channel may exceed [0, 1], as happens in resampling and colour conversion."""
@@ -98,7 +84,7 @@ def read_image(
             for rows, part in ((rgb, over(colour, cover, background)), (alpha, cover)):
                 if part is not None:
                     rows.add(part if width == image.width else reduced(part, width, len(strip)), height)
-    found, mask = rgb.whole(), None if cover is None else alpha.whole()
+    found, mask = rgb.image, None if cover is None else alpha.image
     if size is None or size[1] == height:
         return found, mask
     return reduced(found, *size), None if mask is None else reduced(mask, *size)
@@ -116,11 +102,20 @@ def read_compact_image(
     pixels = _Rows()
     with open_image(path) as image:
         if image.mode in ("L", "RGB", *CONVERTED) and not _is_deep(image):
-            if size is not None:
-                _decode_smaller(image, size)
+            if size is not None and image.format == "JPEG":
+                # It decodes to a half, a quarter or an eighth along each side. Sizes that are not multiples are kept, since their last
+                # column or row would be weighted too heavily.
+                sides = [
+                    (image.width // f, image.height // f)
+                    for f in (8, 4, 2)
+                    if image.width % f == image.height % f == 0
+                ]
+                fitting = [(w, h) for w, h in sides if w >= size[0] and h >= size[1]]
+                if fitting:
+                    image.draft(image.mode, fitting[0])
             for strip, _ in _strips(path, image):
                 pixels.add(torch.from_numpy(strip), image.height)
-            found = pixels.whole() if size is None else reduced(pixels.whole(), *size)
+            found = pixels.image if size is None else reduced(pixels.image, *size)
             return (found if found.ndim == 3 else found[..., None].repeat(1, 1, 3)), None
     rgb, alpha = read_image(path, background, size)
     return rgb if size is None else (rgb * FULL_SCALE["uint8"]).round_().to(torch.uint8), alpha
@@ -130,28 +125,13 @@ class _Rows:
     """An image that is put together from strips, from top to bottom; its memory is allocated for the first one."""
 
     def __init__(self) -> None:
-        self._image, self._count = torch.empty(0), 0
+        self.image, self._count = torch.empty(0), 0
 
     def add(self, strip: Shaped[Tensor, "n w *c"], height: int) -> None:
         if self._count == 0:
-            self._image = strip.new_empty((height, *strip.shape[1:]))
-        self._image[self._count : self._count + len(strip)] = strip
+            self.image = strip.new_empty((height, *strip.shape[1:]))
+        self.image[self._count : self._count + len(strip)] = strip
         self._count += len(strip)
-
-    def whole(self) -> Shaped[Tensor, "h w *c"]:
-        return self._image
-
-
-def _decode_smaller(image: Image.Image, size: tuple[int, int]) -> None:
-    """Let a JPEG file decode to a half, a quarter or an eighth of its size along each side, if that is no
-    less than ``size``.
-
-    Sizes that are not multiples are kept, since their last column or row would be weighted too heavily.
-    """
-    factors = [f for f in (8, 4, 2) if image.width // f >= size[0] and image.height // f >= size[1]]
-    fitting = [f for f in factors if image.width % f == 0 and image.height % f == 0]
-    if image.format == "JPEG" and fitting:
-        image.draft(image.mode, (image.width // fitting[0], image.height // fitting[0]))
 
 
 def channels(
@@ -199,7 +179,15 @@ def pixel_array(pixels: np.ndarray | Tensor, what: str) -> Float[Tensor, "h w c"
             f"{what} has dtype {raw.dtype.name}", expected="uint8 in [0, 255], uint16 or floats in [0, 1]"
         )
     if raw.dtype.kind == "f":
-        _check_unit_range(raw, what)
+        low, high = (float(x) for x in (raw.min(), raw.max()))
+        if not np.isfinite(raw).all():
+            count = int((~np.isfinite(raw)).sum())
+            raise InputError(
+                f"{what} has {count} values that are NaN or infinite", expected="floats in [0, 1]"
+            )
+        if low < -COLOUR_ROUNDING or high > 1 + COLOUR_ROUNDING:
+            hint = "; divide by 255, or give uint8" if 1 < high <= 255 and low >= 0 else ""
+            raise InputError(f"{what} has floats from {low:g} to {high:g}", expected=f"[0, 1]{hint}")
     scaled = raw.reshape(*raw.shape[:2], -1).astype(np.float32) / FULL_SCALE.get(raw.dtype.name, 1)
     return torch.from_numpy(scaled).clamp(0, 1)
 
@@ -217,16 +205,6 @@ def to_numpy(array: np.ndarray | Tensor) -> np.ndarray:
     return (values.float() if values.dtype == torch.bfloat16 else values).numpy()
 
 
-def _check_unit_range(raw: np.ndarray, what: str) -> None:
-    if not np.isfinite(raw).all():
-        count = int((~np.isfinite(raw)).sum())
-        raise InputError(f"{what} has {count} values that are NaN or infinite", expected="floats in [0, 1]")
-    low, high = float(raw.min()), float(raw.max())
-    if low < -COLOUR_ROUNDING or high > 1 + COLOUR_ROUNDING:
-        hint = "; divide by 255, or give uint8" if 1 < high <= 255 and low >= 0 else ""
-        raise InputError(f"{what} has floats from {low:g} to {high:g}", expected=f"[0, 1]{hint}")
-
-
 def over(
     colour: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"] | None, background: Sequence[float]
 ) -> Float[Tensor, "h w 3"]:
@@ -239,11 +217,11 @@ def over(
 
 def background_colour(background: Background) -> tuple[float, float, float]:
     """Return the rgb triple for ``background``. Raises ``InputError`` if it is not a colour."""
-    expected = '"white", "black" or three numbers in [0, 1]'
+    expected, named = '"white", "black" or three numbers in [0, 1]', {"black": 0.0, "white": 1.0}
     if isinstance(background, str):
-        if background not in NAMED_BACKGROUNDS:
+        if background not in named:
             raise InputError(f"background is {background!r}", expected=expected)
-        return NAMED_BACKGROUNDS[background]
+        background = (named[background],) * 3
     values = tuple(float(value) for value in background)
     if len(values) != 3 or not all(math.isfinite(value) and 0 <= value <= 1 for value in values):
         raise InputError(f"background is {values}", expected=expected)
@@ -277,7 +255,11 @@ def decode(path: ImageSource) -> np.ndarray:
 def _strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[np.ndarray, int | None]]:
     """Yield the pixels of strips of an open image, from top to bottom, and the value of white if it is not that of the type."""
     whole = _pixels(path, image) if _is_deep(image) else None
-    full = None if whole is None else _used_range(whole)
+    full = None
+    if whole is not None and (whole.ndim == 2 or whole.shape[2] not in (2, 4)):
+        # Sensors of 10, 12 or 14 bits are stored in 16: the smallest that fits the largest value is assumed.
+        bits = next((bits for bits in (10, 12, 14) if whole.max(initial=0) < 2**bits), 16)
+        full = 2**bits - 1
     rows = max(1, STRIP // image.width)
     for top in range(0, image.height, rows):
         last = min(top + rows, image.height)
@@ -285,14 +267,6 @@ def _strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[np.ndarray,
             yield _pixels(path, image.crop((0, top, image.width, last))), full
         else:
             yield whole[top:last], full
-
-
-def _used_range(pixels: np.ndarray) -> int:
-    """Return the full scale of the sensor whose values are stored in 16 bits."""
-    colours = pixels[..., :-1] if pixels.ndim == 3 and pixels.shape[2] in (2, 4) else pixels
-    largest = int(colours.max(initial=0))
-    fits = [2**bits - 1 for bits in DEPTHS if largest < 2**bits]
-    return fits[0] if fits and colours is pixels else FULL_SCALE["uint16"]
 
 
 def _is_deep(image: Image.Image) -> bool:
@@ -338,16 +312,25 @@ def open_image(path: ImageSource) -> Iterator[Image.Image]:
     Raises ``InputError`` if there is no such regular file, if it is not readable as an image, and if the
     image has more than ``LARGEST_IMAGE`` pixels according to its header, before memory is allocated.
     """
-    if isinstance(path, Path) and path.suffix.lower() in RAW_SUFFIXES:
+    raw = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
+    if isinstance(path, Path) and path.suffix.lower() in raw:
         found = "is a raw photo, of which only a thumbnail would be read"
         raise InputError(found, where=path, expected="a JPEG, PNG or TIFF file developed from it")
     with open_binary(path, "an image file") as file:
         if is_heif(file.read(12)):
-            _register_heif(path)
+            try:
+                import pillow_heif
+            except ImportError as error:
+                found = "is HEIC, which needs the package pillow-heif (pip install pillow-heif); or convert the photo to JPEG"
+                raise InputError(found, where=path) from error
+            pillow_heif.register_heif_opener()
         file.seek(0)
         _check_segments(path, file)
+        Image.preinit()
+        with contextlib.suppress(ImportError):  # Pillow from 11.3 on
+            from PIL import AvifImagePlugin  # noqa: F401
         try:
-            with Image.open(file, formats=_formats()) as image:
+            with Image.open(file, formats=[name for name in FORMATS if name in Image.OPEN]) as image:
                 if image.width * image.height > LARGEST_IMAGE:
                     megapixels = image.width * image.height / 1e6
                     raise _too_large(path, f"{image.width}x{image.height}, {megapixels:.0f} megapixels")
@@ -357,41 +340,33 @@ def open_image(path: ImageSource) -> Iterator[Image.Image]:
         except Image.DecompressionBombError as error:
             raise _too_large(path, f"more than {LARGEST_IMAGE // 10**6} megapixels") from error
         except Exception as error:  # decoders may raise anything, even SyntaxError
+            why = reason(error)
+            if isinstance(error, UnidentifiedImageError):  # its text has the repr of the open file
+                why = f"its content is in none of the formats {', '.join(FORMATS)}"
+            if file.seek(0, os.SEEK_END) == 0:
+                why = "the file is empty"
             raise InputError(
-                f"not readable as an image ({_why_unreadable(file, error)})",
-                where=path,
-                expected="a complete image file",
+                f"not readable as an image ({why})", where=path, expected="a complete image file"
             ) from error
-
-
-def _formats() -> list[str]:
-    """Return the ``FORMATS`` that this installation of Pillow supports; each is registered by a module of its own."""
-    Image.preinit()
-    with contextlib.suppress(ImportError):  # Pillow from 11.3 on
-        from PIL import AvifImagePlugin  # noqa: F401
-    return [name for name in FORMATS if name in Image.OPEN]
-
-
-def _why_unreadable(file: BinaryIO, error: Exception) -> str:
-    if file.seek(0, os.SEEK_END) == 0:
-        return "the file is empty"
-    if isinstance(error, UnidentifiedImageError):  # its text has the repr of the open file
-        return f"its content is in none of the formats {', '.join(FORMATS)}"
-    return reason(error)
 
 
 def _check_segments(path: ImageSource, file: BinaryIO) -> None:
     """Raise ``InputError`` for a JPEG file whose decoding takes far longer than its size suggests; rewind others."""
     content = file.read() if file.read(2) == b"\xff\xd8" else b""
     file.seek(0)
-    at, scans, segments = 0, 0, 0
-    while marker := SEGMENT.search(content, at):
+    # Each scan goes through the whole image, and libjpeg's usual script has ten of them; of segments, the depth map that a phone stores
+    # with a photo takes a few hundred.
+    at, scans, segments, most_scans, most_segments = 0, 0, 0, 100, 1000
+    begins = re.compile(
+        rb"\xff([\xc0-\xcf\xd8-\xfe])"
+    )  # within a scan, 0xff is followed by 0 or a restart marker
+    while marker := begins.search(content, at):
         code, segments = marker[1], segments + 1
         scans += code == b"\xda"
         if code == b"\xd9":  # the end of the image, after which phones store videos
             return
-        if scans > MOST_SCANS or segments > MOST_SEGMENTS:
-            found = f"has more than {MOST_SCANS} scans or {MOST_SEGMENTS} segments"
+        if scans > most_scans or segments > most_segments:
+            found = f"has more than {most_scans} scans or {most_segments} segments"
             raise InputError(found, where=path, expected="a JPEG file of fewer")
         length = content[marker.end() : marker.end() + 2]
         at = marker.end() + (0 if code == b"\xd8" else max(2, int.from_bytes(length, "big")))
@@ -403,7 +378,8 @@ def _too_large(path: ImageSource, size: str) -> InputError:
 
 def is_heif(head: bytes) -> bool:
     """Return whether the first 12 bytes of a file, or more, identify it as HEIF, such as an iPhone's HEIC, whatever its name."""
-    return head[4:8] == b"ftyp" and head[8:12] in HEIF_BRANDS
+    brands = b"heic heix heim heis hevc hevx hevm hevs mif1 msf1".split()  # ISO/IEC 23008-12
+    return head[4:8] == b"ftyp" and head[8:12] in brands
 
 
 def looks_like_image(path: Path) -> bool:
@@ -413,22 +389,17 @@ def looks_like_image(path: Path) -> bool:
             head = file.read(12)
     except InputError:
         return False
+    first = (
+        b"\x89PNG\r\n",
+        b"\xff\xd8\xff",
+        b"II*\0",
+        b"MM\0*",
+        b"GIF8",
+    )  # PNG, JPEG, TIFF of both byte orders, GIF
     webp = head[:4] == b"RIFF" and head[8:12] == b"WEBP"
     bitmap = head[:2] == b"BM" and head[6:10] == bytes(4)
     avif = head[4:12] in (b"ftypavif", b"ftypavis")
-    return head.startswith(MAGIC) or webp or bitmap or avif or is_heif(head)
-
-
-def _register_heif(path: ImageSource) -> None:
-    try:
-        import pillow_heif
-    except ImportError as error:
-        raise InputError(
-            "is HEIC, which needs the package pillow-heif (pip install pillow-heif); or convert the photo to"
-            " JPEG",
-            where=path,
-        ) from error
-    pillow_heif.register_heif_opener()
+    return head.startswith(first) or webp or bitmap or avif or is_heif(head)
 
 
 def reason(error: Exception) -> str:

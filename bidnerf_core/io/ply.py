@@ -15,10 +15,6 @@ import numpy as np
 from bidnerf_core.errors import InputError
 from bidnerf_core.io.files import open_binary
 
-LARGEST_HEADER = 64 * 1024
-"""Bytes."""
-SHORTEST_NUMBER = 2
-"""Bytes per number in a text file, including the separator."""
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -85,7 +81,7 @@ def check_ply_size(path: Path, header: PlyHeader) -> None:
     left = path.stat().st_size - header.length
     for element in header.elements:
         binary = sum(np.dtype(of).itemsize for _, of in element.properties)
-        size = SHORTEST_NUMBER * len(element.properties) if header.order == "=" else binary
+        size = 2 * len(element.properties) if header.order == "=" else binary  # a digit and a separator
         if element.count * (size + element.has_lists) > left + 1:  # the last line of a text may lack its end
             raise InputError(
                 f"declares {element.count:,} elements {element.name!r}, but its {left:,} bytes of data"
@@ -96,7 +92,7 @@ def check_ply_size(path: Path, header: PlyHeader) -> None:
 
 
 def _header(file: BinaryIO, path: Path, expected: str) -> PlyHeader:
-    start = file.read(LARGEST_HEADER)
+    start = file.read(64 * 1024)
     end = start.find(b"end_header")
     stop = start.find(b"\n", end)
     if not start.startswith(b"ply") or end < 0 or stop < 0:
@@ -110,12 +106,17 @@ def _header(file: BinaryIO, path: Path, expected: str) -> PlyHeader:
             if words[0] == "format":
                 order = ORDERS[words[1]]
             elif words[0] == "element":
-                count = int(words[2])
-                if count < 0:
+                elements.append(PlyElement(words[1], int(words[2]), ()))
+                if elements[-1].count < 0:
                     raise ValueError
-                elements.append(PlyElement(words[1], count, ()))
             elif words[0] == "property":
-                elements[-1] = _with_property(elements[-1], words)
+                last = elements[-1]
+                if words[1] == "list":
+                    elements[-1] = replace(last, has_lists=True)
+                elif words[2] in last.names:
+                    raise ValueError
+                else:
+                    elements[-1] = replace(last, properties=(*last.properties, (words[2], TYPES[words[1]])))
             else:
                 raise ValueError
         except (ValueError, KeyError, IndexError) as error:
@@ -124,21 +125,12 @@ def _header(file: BinaryIO, path: Path, expected: str) -> PlyHeader:
             ) from error
     if not order:
         raise InputError("its header names no format", where=path, expected=expected)
-    for element in elements:  # otherwise any number of them would fit into no bytes
-        if element.count and not element.properties and not element.has_lists:
-            raise InputError(
-                f"the elements {element.name!r} have no properties", where=path, expected=expected
-            )
+    # Any number of elements without properties would fit into no bytes.
+    empty = [x.name for x in elements if x.count and not x.properties and not x.has_lists]
+    if empty:
+        raise InputError(f"the elements {empty[0]!r} have no properties", where=path, expected=expected)
     file.seek(stop + 1)
     return PlyHeader(order, tuple(elements), stop + 1)
-
-
-def _with_property(element: PlyElement, words: list[str]) -> PlyElement:
-    if words[1] == "list":
-        return replace(element, has_lists=True)
-    if words[2] in element.names:
-        raise ValueError
-    return replace(element, properties=(*element.properties, (words[2], TYPES[words[1]])))
 
 
 def _text_rows(file: BinaryIO, count: int, kind: np.dtype, path: Path) -> np.ndarray:

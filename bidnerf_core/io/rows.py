@@ -12,8 +12,6 @@ from bidnerf_core.io.files import read_file
 
 LARGEST_ROWS = 256 * 2**20
 """Bytes. A trajectory over a whole day at 100 Hz is about this large."""
-SHOWN = 60
-"""Number of characters of a row shown in a message."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ class Row:
             raise self.error(f" has {len(words)} entries")
         found = self.plain_numbers(words)
         if not all(map(math.isfinite, found)):
-            raise self.error(f": {self.text[:SHOWN]!r} is not finite")
+            raise self.error(f": {self.text[:60]!r} is not finite")
         return found
 
     def plain_numbers(self, words: Sequence[str]) -> list[float]:
@@ -66,7 +64,7 @@ class Row:
         except ValueError as error:
             raise self.error(f": {error}") from error
         if not abs(found) < 2**63:
-            raise self.error(f": {word[:SHOWN]} has more than 64 bits")
+            raise self.error(f": {word[:60]} has more than 64 bits")
         return found
 
 

@@ -25,11 +25,6 @@ _Part = TypeVar("_Part")
 LARGEST_ARRAY = 800_000_000
 """Bytes: an image of 100 megapixels in double precision."""
 TENSOR_FILE = "a safetensors file"
-LARGEST_HEADER = 16 * 2**20
-"""Bytes of the header of a safetensors file, which takes about a hundred per tensor."""
-MOST_AXES = 64
-"""Axes of a tensor, as in NumPy."""
-HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def read_array(path: Path, expected: str) -> np.ndarray:
@@ -57,9 +52,10 @@ def read_archive(path: Path, names: Sequence[str], expected: str) -> dict[str, n
 def _array(file: BinaryIO | io.BytesIO, size: int) -> np.ndarray:
     """Read an array from a file of ``size`` bytes. Raises ``ValueError``, and NumPy's ``OSError``."""
     version = np.lib.format.read_magic(file)
-    if version not in HEADERS:
+    if version not in ((1, 0), (2, 0)):
         raise ValueError(f"version {version} of the format")
-    shape, _, kind = HEADERS[version](file)
+    old, new = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
+    shape, _, kind = (old if version == (1, 0) else new)(file)
     if kind.hasobject:
         raise ValueError("objects of Python")
     needed, left = math.prod(shape) * kind.itemsize, size - file.tell()
@@ -100,13 +96,13 @@ def _checked_header(path: Path, file: BinaryIO, expected: str) -> dict[str, Any]
     """Return the header of a safetensors file, checked against the file's length before memory is allocated."""
     size = os.fstat(file.fileno()).st_size
     length = struct.unpack("<Q", file.read(8).ljust(8, b"\xff"))[0]
-    if not length <= min(size - 8, LARGEST_HEADER):
+    if not length <= min(size - 8, 16 * 2**20):  # a header takes about a hundred bytes per tensor
         raise InputError("not readable (its header is truncated)", where=path, expected=expected)
     try:
         header: dict[str, Any] = parse_json(file.read(length), str(path), expected)
         parts = [part for name, part in header.items() if name != "__metadata__"]
         ends = [part["data_offsets"][1] for part in parts]
-        if max((len(part["shape"]) for part in parts), default=0) > MOST_AXES:
+        if max((len(part["shape"]) for part in parts), default=0) > 64:  # axes, as in NumPy
             raise ValueError
         described = 8 + length + max(ends, default=0)
     except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:

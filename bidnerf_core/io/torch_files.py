@@ -15,9 +15,6 @@ from torch import Tensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.io.archives import Archive
 
-CODE = re.compile(r"GLOBAL ([\w.]+)")
-"""How torch names the object that a file tried to call."""
-
 
 class _Ignored:
     """Placeholder for a NumPy number, which programs store among optimizer settings; its value is discarded."""
@@ -27,13 +24,6 @@ class _Ignored:
 
     def __setstate__(self, state: object) -> None:
         pass
-
-
-STAND_INS = (
-    "numpy._core.multiarray.scalar", "numpy.core.multiarray.scalar", "numpy.dtype", "numpy.dtypes.Float64DType",
-    "numpy.dtypes.Float32DType", "_codecs.encode",
-)  # fmt: skip
-"""Names in pickles that are replaced by ``_Ignored``."""
 
 
 def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
@@ -56,12 +46,15 @@ def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
             found, where=path, expected=f"{expected} that is not compressed, as torch.save writes it"
         )
     try:
-        with torch.serialization.safe_globals([(_Ignored, name) for name in STAND_INS]):
+        arrays = [f"numpy.{core}.multiarray.scalar" for core in ("_core", "core")]
+        kinds = [f"numpy.dtypes.Float{bits}DType" for bits in (64, 32)]
+        names = [*arrays, *kinds, "numpy.dtype", "_codecs.encode"]
+        with torch.serialization.safe_globals([(_Ignored, name) for name in names]):
             content = torch.load(
                 path, map_location="cpu", weights_only=True, mmap=mapped and archive is not None
             )
     except Exception as error:  # each kind of damage raises a different exception
-        code = CODE.search(str(error))
+        code = re.search(r"GLOBAL ([\w.]+)", str(error))  # how torch names what a file tried to call
         if isinstance(error, pickle.UnpicklingError) and code:
             found = f"would run code ({code[1]}) and was not read"
         else:

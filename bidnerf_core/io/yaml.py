@@ -9,10 +9,6 @@ import yaml
 
 from bidnerf_core.errors import InputError
 
-LARGEST_YAML = 2**20
-"""Bytes; a calibration with the points of all its images takes some 100,000."""
-DEEPEST = 50
-"""Lists and mappings within each other."""
 TAG = "tag:yaml.org,2002:"
 
 
@@ -52,9 +48,13 @@ def parse_yaml(content: bytes, where: str, expected: str) -> Any:
     """Return the first document of a YAML text. Raises ``InputError``, whose message begins with ``where``, if it is malformed, too
     large or too deep, or has aliases or merge keys.
     """
-    if len(content) > LARGEST_YAML:
+    most, deepest = (
+        2**20,
+        50,
+    )  # bytes (the points of all images of a calibration take some 100,000), and levels
+    if len(content) > most:
         found = f"has {len(content):,} bytes of YAML"
-        raise InputError(found, where=where, expected=f"{expected} of at most {LARGEST_YAML:,}")
+        raise InputError(found, where=where, expected=f"{expected} of at most {most:,}")
     try:
         text = re.sub(r"\A\s*%YAML.*\n", "", content.decode("utf-8-sig"))  # OpenCV's is malformed
         depth = 0
@@ -62,8 +62,8 @@ def parse_yaml(content: bytes, where: str, expected: str) -> Any:
             if isinstance(event, yaml.AliasEvent):
                 raise yaml.YAMLError(f"aliases (*{event.anchor}) are not read")
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > DEEPEST:
-                raise yaml.YAMLError(f"more than {DEEPEST} lists and mappings within each other")
+            if depth > deepest:
+                raise yaml.YAMLError(f"more than {deepest} lists and mappings within each other")
         return next(iter(yaml.load_all(text, Loader=_Loader)), None)
     except (UnicodeDecodeError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__

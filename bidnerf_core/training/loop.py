@@ -18,14 +18,8 @@ from bidnerf_core.devices import captured, graph_memory, without_waiting
 from bidnerf_core.errors import InputError
 from bidnerf_core.training.report import Report, TrainingState, TrainingStep, TrainingStopped
 
-BESIDE = "beside."
-"""Prefix of the names under which a state holds parameters learned jointly with the field."""
-
-
 READ_EVERY = 16
 """Steps after which the host reads the figures of a training on a GPU; in between, it never waits."""
-WARM_UP = 2
-"""Steps before a capture, which load kernels and create Adam's moments, as a capture does not allow this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +116,8 @@ def fit(
         else:
             with without_waiting():
                 seen[key] += 1
-                if seen[key] > WARM_UP and key not in graphs:
+                # Two steps before load kernels and create Adam's moments, as a capture does not allow this.
+                if seen[key] > 2 and key not in graphs:
                     graphs[key] = captured(partial(take, step), device, generator, memory)
                 graphs.get(key, partial(take, step))()
         if (step + 1) % every and step + 1 < steps:
@@ -161,7 +156,7 @@ def _state(
 ) -> TrainingState:
     moments = {"generator": generator.get_state()}
     if beside is not None:
-        moments |= {BESIDE + name: value for name, value in beside.state_dict().items()}
+        moments |= {f"beside.{name}": value for name, value in beside.state_dict().items()}
     for number, parameter in enumerate(_parameters(optimizer)):
         for name, value in optimizer.state.get(parameter, {}).items():
             moments[f"{number}.{name}"] = value
@@ -180,15 +175,12 @@ def _restore(
     else:  # that of another kind of device
         generator.manual_seed(generator.initial_seed() + state.step)
     if beside is not None:
-        found = {k.removeprefix(BESIDE): v for k, v in state.optimizer.items() if k.startswith(BESIDE)}
-        beside.load_state_dict(found)
+        beside.load_state_dict(_below("beside.", state.optimizer))
     for number, parameter in enumerate(_parameters(optimizer)):
-        prefix = f"{number}."
-        found = {
-            name.removeprefix(prefix): value.to(parameter.device, copy=True)
-            for name, value in state.optimizer.items()
-            if name.startswith(prefix)
-        }
-        if found:
-            optimizer.state[parameter] = found
+        if found := _below(f"{number}.", state.optimizer):
+            optimizer.state[parameter] = {k: v.to(parameter.device, copy=True) for k, v in found.items()}
     return state.step
+
+
+def _below(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

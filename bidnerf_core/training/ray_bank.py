@@ -76,15 +76,19 @@ class RayBank:
         self._cameras = _PixelRays([frame.intrinsics for frame in frames], home)
         rotation = torch.stack([view.T_ref_camera.rotation for view in views]).float()
         origin = torch.stack([view.T_ref_camera.translation for view in views]).float()
+        motion = None
+        if any(view.motion is not None for view in views):
+            rows = [AT_REST if view.motion is None else view.motion for view in views]
+            motion = torch.stack(rows).float()
         self.offsets, self._visible, self._rotation, self._origin, self._motion = moved(
-            (offsets, visible, rotation, origin, _motion_of(views)), home
+            (offsets, visible, rotation, origin, motion), home
         )
         self._drawn = self.count if visible is None else int(visible[-1])
 
     @property
     def has_distances(self) -> bool:
         """Whether any ray has a measured distance."""
-        return self.has_depth or len(self._landmarks) > 0
+        return self.has_depth or len(self._landmarks[0]) > 0
 
     def draw(self, count: int, generator: Generator) -> TrainingBatch:
         """Return the rays of ``count`` pixels, drawn uniformly from all visible pixels of the views.
@@ -97,20 +101,25 @@ class RayBank:
             some = round(MEASURED_SHARE * count)
             index[:some] = self._few[self._random(len(self._few), some, generator)]
         deviation, seen = torch.zeros(count, device=self.home), torch.zeros(0, device=self.home)
-        if len(self._landmarks):
+        if landmarks := len(self._landmarks[0]):
             some = round(LANDMARK_SHARE * count)
-            chosen = self._random(len(self._landmarks), some, generator)
-            index[:some] = self._landmarks.pixel[chosen]
-            seen, deviation[:some] = self._landmarks.distance[chosen], self._landmarks.deviation[chosen]
+            chosen = self._random(landmarks, some, generator)
+            index[:some], seen, deviation[:some] = (part[chosen] for part in self._landmarks)
         view = torch.searchsorted(self.offsets, index, right=True) - 1
         pixel = index - self.offsets[view]
         ray = self._cameras.rays(view, pixel)
         length = torch.linalg.vector_norm(ray, dim=-1)
-        T = self._poses(view, pixel)
+        T = SE3(self._rotation[view], self._origin[view])
+        if self._motion is not None:
+            T = T @ poses_of_rows(self._cameras.exposure_times(view, pixel), self._motion[view])
         directions = T.rotate(ray / length[:, None])
         distance = self._depth.at(view, pixel)[:, 0] * length if self.has_depth else torch.zeros_like(length)
         distance[: len(seen)] = seen
-        rgb, background = self._coloured(view, pixel, generator)
+        rgb = self._rgb.at(view, pixel)
+        usual = background = constant(self.bounds.background, rgb).expand(count, 3)
+        if self.has_alpha:
+            background = torch.rand(rgb.shape, generator=generator, device=generator.device).to(rgb)
+            rgb = rgb + (1 - self._alpha.at(view, pixel)) * (background - usual)
         origins, coloured = T.translation, torch.ones_like(index, dtype=torch.bool)
         observed = Observations(origins, directions, rgb, distance, coloured)
         rays = self.bounds.rays(origins, directions)
@@ -132,13 +141,6 @@ class RayBank:
         passed = (~hidden).cumsum(1) <= (rank - self._visible[block])[:, None]
         return block * HIDDEN_BLOCK + passed.sum(1)
 
-    def _poses(self, view: Int[Tensor, "r"], pixel: Int[Tensor, "r"]) -> SE3:
-        """Return the camera poses at the times at which pixels of the views were exposed."""
-        T = SE3(self._rotation[view], self._origin[view])
-        if self._motion is None:
-            return T
-        return T @ poses_of_rows(self._cameras.exposure_times(view, pixel), self._motion[view])
-
     def _few_measured(self, frames: Sequence[Frame], offsets: Int[Tensor, "v"]) -> Int[Tensor, "m"]:
         """Return the indices of the pixels with depth if it is sparse (structure from motion); otherwise none."""
         none = torch.zeros(0, dtype=torch.long)
@@ -151,17 +153,6 @@ class RayBank:
             if frame.depth is not None
         ]
         return torch.cat([none, *parts])
-
-    def _coloured(
-        self, view: Int[Tensor, "r"], pixel: Int[Tensor, "r"], generator: Generator
-    ) -> tuple[Tensor, Tensor]:
-        """Return the pixels' colours and the background colours over which they are composited."""
-        rgb = self._rgb.at(view, pixel)
-        usual = constant(self.bounds.background, rgb).expand(len(view), 3)
-        if not self.has_alpha:
-            return rgb, usual
-        background = torch.rand(rgb.shape, generator=generator, device=generator.device).to(rgb)
-        return rgb + (1 - self._alpha.at(view, pixel)) * (background - usual), background
 
 
 MOST_RAYS = 2**24
@@ -230,27 +221,13 @@ def _home_of(frames: Sequence[Frame], device: torch.device) -> torch.device:
     return torch.device("cpu")
 
 
-def _motion_of(views: Sequence[View]) -> Float[Tensor, "v 6"] | None:
-    """Return the motions of the cameras during the readout of their images; None if none moved."""
-    if all(view.motion is None for view in views):
-        return None
-    return torch.stack([AT_REST if view.motion is None else view.motion for view in views]).float()
+def _landmark_pixels(
+    views: Sequence[View], offsets: Int[Tensor, "v"]
+) -> tuple[Int[Tensor, "m"], Float[Tensor, "m"], Float[Tensor, "m"]]:
+    """Return the pixels (among those of all views) that show a landmark, its distance, and the deviation of that (metres).
 
-
-@dataclass(frozen=True, eq=False)
-class _LandmarkPixels:
-    """The pixels, in all views, that show a landmark."""
-
-    pixel: Int[Tensor, "m"]  # index among the pixels of all views
-    distance: Float[Tensor, "m"]  # metres
-    deviation: Float[Tensor, "m"]  # metres
-
-    def __len__(self) -> int:
-        return len(self.pixel)
-
-
-def _landmark_pixels(views: Sequence[View], offsets: Int[Tensor, "v"]) -> _LandmarkPixels:
-    """Return the landmarks of the views without dense depth, whose measurements are better."""
+    Views with dense depth have none, since their own measurements are better.
+    """
     parts: list[tuple[Tensor, Tensor, Tensor]] = [
         (torch.zeros(0, dtype=torch.long), torch.zeros(0), torch.zeros(0))
     ]
@@ -261,4 +238,5 @@ def _landmark_pixels(views: Sequence[View], offsets: Int[Tensor, "v"]) -> _Landm
         columns = seen.pixels[:, 0].long().clamp(0, camera.width - 1)
         rows = seen.pixels[:, 1].long().clamp(0, camera.height - 1)
         parts.append((first + rows * camera.width + columns, seen.distance.float(), seen.deviation.float()))
-    return _LandmarkPixels(*(torch.cat(part) for part in zip(*parts, strict=True)))
+    pixel, distance, deviation = map(torch.cat, zip(*parts, strict=True))
+    return pixel, distance, deviation

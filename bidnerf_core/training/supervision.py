@@ -20,9 +20,6 @@ from bidnerf_core.training.loss import distortion, supervised_loss
 from bidnerf_core.training.ray_bank import RayBank, TrainingBatch
 from bidnerf_core.training.report import Report
 
-COLOUR_RATE = 2e-3  # learning rate of the colour transforms
-COLOUR_PENALTY = 1e-3  # weight of their penalty relative to the colour error
-
 
 @dataclass(frozen=True)
 class SupervisionConfig(Settings):
@@ -71,7 +68,7 @@ class Supervision:
         """Call ``training.fit`` so that it also learns the per-image parameters, and resumes them with the field."""
         learned: list[dict[str, Any]] = []
         if self.colours is not None:
-            learned = [{"params": list(self.colours.parameters()), "lr": COLOUR_RATE}]
+            learned = [{"params": list(self.colours.parameters()), "lr": 2e-3}]
         if isinstance(outcome, Replayable) and self.bank.home != self.bank.device:
             outcome = outcome.__call__  # batches are copied, which cannot be replayed
         fit(field, [*groups, *learned], outcome, steps, report, schedule, seed, beside=self.colours)
@@ -95,7 +92,7 @@ class Supervision:
         depth_weight = self.config.depth_weight if self.bank.has_distances else 0.0
         loss, mse = supervised_loss(rendering, batch, self.side, depth_weight, weight)
         if self.colours is not None:
-            loss = loss + COLOUR_PENALTY * self.colours.penalty()
+            loss = loss + 1e-3 * self.colours.penalty()
         if self.config.distortion_weight:
             loss = loss + self.config.distortion_weight * distortion(rendering, self.side)
         return loss, mse
