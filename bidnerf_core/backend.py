@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from threading import Lock
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, Protocol, TypeVar, cast, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -90,15 +90,6 @@ def load_backend(name: str, wanted_by: str = "") -> Backend:
 
 
 @runtime_checkable
-class QuickConfig(Protocol):
-    """Optional part of a backend: settings for small and simple scenes, which ``bidnerf demo`` trains with."""
-
-    def quick_config(self) -> Any:
-        """Return a config of the backend's ``config_type`` that trains such a scene in about a minute."""
-        ...
-
-
-@runtime_checkable
 class UpgradingField(Protocol):
     """Optional part of a field that accepts states stored by earlier versions of its backend."""
 
@@ -108,19 +99,14 @@ class UpgradingField(Protocol):
 
 
 def quick_config(backend: Backend) -> Any:
-    """Return the backend's config for small scenes, or its default config if it has none."""
-    return backend.quick_config() if isinstance(backend, QuickConfig) else backend.config_type()
+    """Return the config by which a backend trains small and simple scenes in about a minute, as ``bidnerf demo`` does.
+
+    It is what the backend's optional method ``quick_config`` returns, or else its default config.
+    """
+    return getattr(backend, "quick_config", backend.config_type)()
 
 
-@runtime_checkable
-class Seeded(Protocol):
-    """A config with a seed for the initial weights."""
-
-    @property
-    def seed(self) -> int: ...
-
-
-Config = TypeVar("Config", bound=Seeded)
+Config = TypeVar("Config")
 Field = TypeVar("Field", bound=nn.Module)
 
 _seeding = Lock()
@@ -129,8 +115,9 @@ _seeding = Lock()
 
 @dataclass(frozen=True)
 class RecipeBackend(Generic[Config, Field]):
-    """A ``Backend`` composed of a config, a field and a training recipe. The seed makes the initial weights
-    reproducible.
+    """A ``Backend`` composed of a config, a field and a training recipe.
+
+    The config's ``seed``, an int, makes the initial weights reproducible.
     """
 
     summary: str
@@ -144,7 +131,7 @@ class RecipeBackend(Generic[Config, Field]):
 
     def build(self, config: Config, bounds: SceneBounds) -> Field:
         with _seeding, torch.random.fork_rng(devices=[]):
-            torch.manual_seed(config.seed)
+            torch.manual_seed(cast(Any, config).seed)
             return self.field_type(config, bounds)
 
     def train(self, field: Field, views: Sequence[View], config: Config, report: Report) -> None:

@@ -38,17 +38,6 @@ def constant(values: tuple[float, ...], like: Tensor) -> Shaped[Tensor, "n"]:
     return found
 
 
-@contextmanager
-def noted() -> Iterator[list[Tensor]]:
-    """Collect all constants that are requested within the context, in any thread; the list keeps them alive."""
-    notes: list[Tensor] = []
-    _notes.append(notes)
-    try:
-        yield notes
-    finally:
-        _notes.remove(notes)
-
-
 @lru_cache(maxsize=256)
 def _constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     with torch.inference_mode(False):
@@ -121,6 +110,7 @@ def captured(
     """
     if device.type != "cuda":
         return step
+    constants: list[Tensor] = []  # those requested during the capture, in any thread
     graph, before = torch.cuda.CUDAGraph(), None if generator is None else generator.clone_state()
     if generator is not None:
         graph.register_generator_state(generator)
@@ -129,10 +119,8 @@ def captured(
         try:
             # Other threads may continue to launch.
             pool, stream = memory or graph_memory(device)
-            with (
-                noted() as constants,
-                torch.cuda.graph(graph, pool, stream, capture_error_mode="thread_local"),
-            ):
+            _notes.append(constants)
+            with torch.cuda.graph(graph, pool, stream, capture_error_mode="thread_local"):
                 step()
         except RuntimeError as error:  # it waits for the device somewhere, as a third party's field may
             if generator is not None and before is not None:
@@ -142,6 +130,8 @@ def captured(
                 f"operations are launched one by one, since a step cannot be captured: {why}", stacklevel=2
             )
             return step
+        finally:  # equal lists are told apart: two may be empty
+            _notes[:] = [notes for notes in _notes if notes is not constants]
 
     def replay(read: list[Tensor] = constants) -> None:  # keeps alive what the graph reads
         graph.replay()

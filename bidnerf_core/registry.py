@@ -36,9 +36,6 @@ GROUPS: Mapping[str, str] = {
 """The kinds of object that can be registered, and the noun for each. The entry-point group has the prefix
 ``bidnerf.``."""
 
-BUNDLED = "bidnerf"
-"""The distribution whose plugins are bundled."""
-NAME = re.compile(r"[\w.-]+")
 TABLE = "*"
 """The name of an entry point whose object is a mapping of plugins by name. Listing its group imports it."""
 
@@ -71,7 +68,7 @@ class PluginInfo:
 
     @property
     def is_bundled(self) -> bool:
-        return self.distribution == BUNDLED
+        return self.distribution == "bidnerf"
 
     @property
     def summary(self) -> str:
@@ -99,7 +96,7 @@ def register(group: str, name: str, value: Any, replace: bool = False) -> None:
     that name, whether registered before, installed or bundled. Raises ``InputError`` for an unknown group, an
     invalid name, and a name that is taken.
     """
-    if not (isinstance(name, str) and NAME.fullmatch(name)):
+    if not (isinstance(name, str) and re.fullmatch(r"[\w.-]+", name)):
         raise InputError(f"name is {name!r}", where="register", expected="letters, digits, '.', '-' and '_'")
     taken = [info for info in list_plugins(group) if info.name == name]
     if taken and not replace and registered.get((group, name)) is not value:
@@ -207,7 +204,12 @@ def load_plugin(group: str, name: str, defects: Defects | None = None, wanted_by
     infos = list_plugins(group)
     info = next((info for info in infos if info.name == name), None)
     if info is None:
-        raise PluginError(_unknown(group, name, infos), where=wanted_by)
+        noun, names = GROUPS[group], sorted({info.name for info in infos})
+        hint = spelling_hint(str(name).lower(), names)
+        why = f"no {noun} {name!r}{hint}; installed: {', '.join(names) or 'none'}"
+        if not any(info.is_bundled for of in GROUPS for info in _declared(of)):
+            why = f"no {noun} {name!r}: the metadata of bidnerf lists no plugins at all; reinstall bidnerf"
+        raise PluginError(why, where=wanted_by)
     where = f"{wanted_by}: {info}" if wanted_by else info
     if info.fault is not None:
         raise PluginError(info.fault, where=where)
@@ -229,13 +231,6 @@ def load_plugin(group: str, name: str, defects: Defects | None = None, wanted_by
     if wrong is not None:
         raise PluginError(f"not {kind}: {wrong}", where=where)
     return plugin
-
-
-def _unknown(group: str, name: str, infos: Sequence[PluginInfo]) -> str:
-    noun, names = GROUPS[group], sorted({info.name for info in infos})
-    if not any(info.is_bundled for of in GROUPS for info in _declared(of)):
-        return f"no {noun} {name!r}: the metadata of bidnerf lists no plugins at all; reinstall bidnerf"
-    return f"no {noun} {name!r}{spelling_hint(str(name).lower(), names)}; installed: {', '.join(names) or 'none'}"
 
 
 def _described(error: BaseException) -> str:

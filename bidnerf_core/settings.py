@@ -136,12 +136,6 @@ def _allowed(kind: Any) -> dict[str, tuple[Range | OneOf, bool]]:
     return found
 
 
-def is_expert(kind: type, name: str) -> bool:
-    """Return whether a field of ``kind`` is marked as one for experts."""
-    hint = typing.get_type_hints(kind, include_extras=True)[name]
-    return any(isinstance(note, Expert) for note in getattr(hint, "__metadata__", ()))
-
-
 def to_flat(settings: Any) -> dict[str, Any]:
     """Return all settings by their flat names, as JSON-serializable values."""
     flat: dict[str, Any] = {}

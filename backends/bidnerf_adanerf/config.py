@@ -53,14 +53,3 @@ class AdaNerfConfig(SupervisionConfig):
         if not self.dense_part + self.soft_part <= 1:
             parts = self.dense_part + self.soft_part
             raise InputError(f"dense_part and soft_part sum to {parts:g}", expected="at most 1")
-
-    @classmethod
-    def paper(cls) -> AdaNerfConfig:
-        """Return the configuration of the AdaNeRF paper (Kurz et al. 2022), training settings included.
-
-        Both networks have 8 layers of width 256, and rays are divided into 128 bins.
-        """
-        return cls(
-            width=256, layers=8, position_frequencies=10, direction_frequencies=4, oracle_width=256, oracle_layers=8,
-            bins=128, steps=300_000, samples_per_step=2048 * 128, rays_at_most=2048, learning_rate=5e-4, carve=False,
-        )  # fmt: skip

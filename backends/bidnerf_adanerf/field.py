@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -40,26 +37,5 @@ class AdaNerfField(nn.Module):
     def sampler(self) -> Sparse:
         return Sparse(self.oracle, self.bins, self.config.threshold, self.config.max_samples)
 
-    @property
-    def dense(self) -> DenseField:
-        return DenseField(self)
-
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         return query_network(self.shading, self.bounds, positions, directions)
-
-
-@dataclass(frozen=True)
-class DenseField:
-    """The field with all bins shaded, without the oracle: the sparse field is trained to reproduce its rendering."""
-
-    sparse: AdaNerfField
-
-    def parameters(self) -> Iterator[nn.Parameter]:
-        return self.sparse.parameters()
-
-    @property
-    def sampler(self) -> Bins:
-        return self.sparse.bins
-
-    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        return self.sparse.query(positions, directions)

@@ -45,14 +45,6 @@ class VanillaConfig(FieldConfig, SupervisionConfig):
         if not (self.include_input or self.position_frequencies):
             raise InputError("position_frequencies is 0 without include_input", expected="one of them")
 
-    @classmethod
-    def paper(cls) -> VanillaConfig:
-        """Return the sizes and the training of the paper (section 5.3, appendix A)."""
-        return cls(
-            layers=8, width=256, skip=5, position_frequencies=10, direction_frequencies=4, coarse_samples=64,
-            fine_samples=128, steps=200_000, samples_per_step=4096 * 192, learning_rate=5e-4, carve=False,
-        )  # fmt: skip
-
 
 def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, report: Report) -> None:
     """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""

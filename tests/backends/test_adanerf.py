@@ -136,12 +136,11 @@ def test_the_pose_is_felt_through_positions_and_not_through_the_choice(
     assert float(found.abs().max()) > 0
 
 
-def test_the_dense_field_is_shaded_in_all_bins(field: AdaNerfField, rays: Rays) -> None:
+def test_without_a_threshold_all_bins_are_shaded(field: AdaNerfField, rays: Rays) -> None:
     everything = replace(field.sampler, threshold=-1.0, most=SMALL.bins)
-    all_bins = render(field.dense, rays)
-    found = everything(rays)
-    assert torch.equal(found.valid, all_bins.samples.valid)
-    torch.testing.assert_close(found.starts, all_bins.samples.starts)
+    found, all_bins = everything(rays), field.bins(rays)
+    assert torch.equal(found.valid, all_bins.valid)
+    torch.testing.assert_close(found.starts, all_bins.starts)
 
 
 # Dense training.
@@ -369,8 +368,3 @@ def test_settings_are_judged() -> None:
         AdaNerfConfig(dense_part=0.7, soft_part=0.5)
     with pytest.raises(InputError, match="learning_rate is 0, expected more than 0"):
         AdaNerfConfig(learning_rate=0)
-
-
-def test_presets() -> None:
-    paper = AdaNerfConfig.paper()
-    assert (paper.width, paper.layers, paper.bins) == (256, 8, 128)

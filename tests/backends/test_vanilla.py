@@ -112,7 +112,7 @@ def test_density_does_not_depend_on_the_direction_and_colour_does() -> None:
 
 
 def test_the_paper_has_the_papers_network() -> None:
-    net = NerfNetwork(VanillaConfig.paper())
+    net = NerfNetwork(NetworkConfig(8, 256, skip=5, position_frequencies=10, direction_frequencies=4))
     assert [layer.in_features for layer in net.trunk] == [63, 256, 256, 256, 256, 319, 256, 256]
     assert (net.view.in_features, net.view.out_features) == (256 + 27, 128)
 

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bidnerf_core.localization import METHODS, AutoConfig, BidConfig, BidLmConfig, find_method, settings_of
-from bidnerf_core.settings import EXPERT, Above, Count, OneOf, Range, Settings, from_flat, is_expert, to_flat
+from bidnerf_core.settings import EXPERT, Above, Count, OneOf, Range, Settings, from_flat, to_flat
 from refusals import refused
 
 TABLE: dict[str, int] = {"first": 1}
@@ -134,11 +134,6 @@ def test_messages_name_settings_as_users_do_and_not_the_groups_that_hold_them() 
         settings_of("auto", {"fine_rays": 1}, "here")
     with refused(where="here: fine_rays", found="found 'x'", expected="int"):
         settings_of("auto", {"fine_rays": "x"}, "here")
-
-
-def test_settings_for_experts_are_marked() -> None:
-    assert is_expert(Inner, "scale")
-    assert not is_expert(Inner, "share")
 
 
 def leaves(config: Any) -> Iterator[tuple[Any, str]]:
