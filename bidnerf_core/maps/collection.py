@@ -37,8 +37,6 @@ from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, cou
 
 log = logging.getLogger("bidnerf")
 
-ASKED = 5
-"""Largest number of maps in which an image is localized, the most similar ones first."""
 KEPT = 6
 """Number of maps from folders that stay in memory after use."""
 
@@ -97,7 +95,7 @@ class MapCollection:
         scenes: str | Path | Sequence[Map | str | Path] | Mapping[str, Map],
         method: str = USUAL_METHOD,
         config: Any = None,
-        asked: int = ASKED,
+        asked: int = 5,
         progress: ProgressCallback | None = None,
         cancel: Cancel | None = None,
         localizers: Mapping[str, Localizer] | None = None,
@@ -105,7 +103,7 @@ class MapCollection:
         """Read the landmarks of all maps: those in the subfolders of one folder, a list of maps and of folders
         of maps, or maps by name.
 
-        ``asked`` is the largest number of maps that are tried, and ``localizers`` are existing ones by the
+        ``asked`` is the largest number of maps that are tried, the most similar ones first, and ``localizers`` are existing ones by the
         names of their maps. Raises ``InputError`` if there is no map, or
         two have the same name, and ``Cancelled`` once ``cancel`` returns True.
         """

@@ -40,15 +40,13 @@ from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
     BakeConfig,
     LandmarkMap,
-    SurfaceMap,
-    TrackedViews,
     bake,
     concatenated,
     tracked_views,
 )
 from bidnerf_core.maps.baking import bake_landmarks, with_tracks_in
 from bidnerf_core.maps.checkpoints import Checkpoints
-from bidnerf_core.maps.description import MapInfo, load_info, longest_side
+from bidnerf_core.maps.description import load_info, longest_side
 from bidnerf_core.maps.map import USUAL_BAKE, Map, load_map
 from bidnerf_core.maps.views import Images, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context
@@ -62,16 +60,6 @@ or a folder of photos."""
 
 LeftOut: TypeAlias = tuple[str, str]
 """The name of a photo that is not added, and the reason."""
-LEAST_LOCATED = 0.25
-"""Smallest fraction of new photos that must be localized for them to show the scene of the map."""
-SAME_PLACE = 0.02
-"""Distance, relative to the scene, within which a photo with the same name as one of the map's counts as that photo."""
-STAND_IN_SIDE = 320
-"""Longer side, in pixels, of the renderings that replace the photos the map was built from."""
-STAND_IN_DEPTHS = 400
-"""Number of pixels of such a rendering whose distances are used in training."""
-SAME_DESCRIPTOR = 0.42
-"""Largest distance between descriptors of one landmark, relative to that between descriptors of different landmarks."""
 
 
 def extend(
@@ -131,7 +119,8 @@ def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> li
             "has no landmarks for localizing photos; 'bidnerf bake MAP --data DATA' builds them", where=where
         )
     localizer, cameras = Localizer(scene), {camera.name: camera.pose for camera in scene.info.cameras}
-    near, count = SAME_PLACE * scene.bounds.side, counter("locating", "photos")
+    # within which a photo with the same name as one of the map's counts as that photo
+    near, count = 0.02 * scene.bounds.side, counter("locating", "photos")
     views, left_out, known = list[View](), list(unread), 0
     for number, frame in enumerate(frames, start=1):
         check_cancelled("extending")
@@ -153,7 +142,7 @@ def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> li
         count(number, len(frames))
     for name, why in left_out:
         log.info(f"{name}: left out: {why}")
-    if len(views) + known < max(1.0, LEAST_LOCATED * len(frames)):
+    if len(views) + known < max(1.0, 0.25 * len(frames)):
         raise InputError(
             f"localizes {len(views) + known} of {amount(len(frames), 'photo')}",
             where=where,
@@ -168,22 +157,24 @@ def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> li
 
 def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], list[LeftOut]]:
     """Read photos, downscaled to the size of the map's largest image; also return those that cannot be read."""
-    side, frames, unread = longest_side(scene.info), list[Frame](), list[LeftOut]()
-    source: Sequence[Frame] | Sequence[View] | Capture | Photos
-    if isinstance(photos, str | Path):
-        path, background = Path(photos), scene.bounds.background
-        if path.is_dir() and find_reader(path) is not None:
-            source = open_dataset(path, background)
-        else:
-            camera = CameraSource(assumed=landmark_cameras(scene))
-            source = Photos(photo_files([path]), DatasetOptions(camera, background=background))
+    side, frames, unread, background = (
+        longest_side(scene.info),
+        list[Frame](),
+        list[LeftOut](),
+        scene.bounds.background,
+    )
+    source: Sequence[Frame] | Sequence[View] | Capture
+    if not isinstance(photos, str | Path):
+        source = photos.split(split) if isinstance(photos, Capture) else photos
+    elif (path := Path(photos)).is_dir() and find_reader(path) is not None:
+        source = open_dataset(path, background).split(split)
     else:
-        source = photos
-    if isinstance(source, Capture | Photos):
-        capture = source.capture if isinstance(source, Photos) else source.split(split)
-        for place, name in enumerate(capture.names):
+        camera = CameraSource(assumed=landmark_cameras(scene))
+        source = Photos(photo_files([path]), DatasetOptions(camera, background=background)).capture
+    if isinstance(source, Capture):
+        for place, name in enumerate(source.names):
             try:
-                frames.append(capture.at_most(side)[place].frame)
+                frames.append(source.at_most(side)[place].frame)
             except InputError as error:
                 unread.append((name, str(error)))
     else:
@@ -195,7 +186,7 @@ def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], lis
         raise InputError(f"none of {amount(len(unread), 'photo')} can be read: {unread[0][1]}")
     if not frames:
         raise InputError("no photos to add", expected="at least one")
-    frames = [frame.over(scene.bounds.background) for frame in frames]
+    frames = [frame.over(background) for frame in frames]
     return [frame if side is None else frame.at_most(side) for frame in frames], unread
 
 
@@ -213,26 +204,19 @@ def _old_views(scene: Map, data: Images | None, split: str) -> list[View]:
         return views
     count, views = counter("rendering", "images"), []
     for number, camera in enumerate(scene.info.cameras, start=1):
-        small, pose = camera.intrinsics.at_most(STAND_IN_SIDE), camera.pose
+        small, pose = camera.intrinsics.at_most(320), camera.pose
         image = render_image(scene.field, small, pose, scene.bounds)
         frame = Frame(camera.name, image.rgb.cpu().clamp(0, 1), small)
-        seen = _distances(frame, image.depth.cpu(), image.opacity.cpu(), number)
+        # Some of the distances that the field renders, so that training preserves them without treating them as measurements.
+        depth, generator = image.depth.cpu(), torch.Generator().manual_seed(number)
+        solid = ((image.opacity.cpu() > 0.95) & (depth > 0)).nonzero()
+        rows = solid[torch.randperm(len(solid), generator=generator)[:400]]
+        pixels = rows.flip(-1).double() + 0.5
+        distance = depth[rows[:, 0], rows[:, 1]].double() * small.unproject(pixels).norm(dim=-1)
+        seen = SeenLandmarks(pixels.float(), distance.float(), (0.01 * distance).float())
         views.append(View(frame, pose, landmarks=seen))
         count(number, len(scene.info.cameras))
     return views
-
-
-def _distances(frame: Frame, depth: Tensor, opacity: Tensor, seed: int) -> SeenLandmarks:
-    """Return some of the distances that a field renders, so that training preserves them without treating
-    them as measurements.
-    """
-    solid = ((opacity > 0.95) & (depth > 0)).nonzero()
-    generator = torch.Generator().manual_seed(seed)
-    rows = solid[torch.randperm(len(solid), generator=generator)[:STAND_IN_DEPTHS]]
-    pixels = rows.flip(-1).double() + 0.5
-    along = frame.intrinsics.unproject(pixels).norm(dim=-1)
-    distance = depth[rows[:, 0], rows[:, 1]].double() * along
-    return SeenLandmarks(pixels.float(), distance.float(), (0.01 * distance).float())
 
 
 def _extended(
@@ -245,13 +229,20 @@ def _extended(
 ) -> Map:
     """Return the map with new photos; ``complete`` states whether ``old`` are its own photos, not renderings."""
     began, where, everything = time.monotonic(), scene.name, [*old, *new]
-    tracked = tracked_views(
-        everything if complete else new,
-        scene.info.landmark_features,
-    )
-    seeing = _with_distances(everything if complete else new, tracked)
-    new = seeing[len(old) :] if complete else seeing
-    weighted = seeing if complete else [*old] * _repeated(old, new) + seeing
+    given = everything if complete else new
+    tracked = tracked_views(given, scene.info.landmark_features)
+    seeing = list(given)
+    with contextlib.suppress(InputError):  # one photo, or photos without overlap
+        # Those without dense depth get the landmarks they show, from which training takes distances.
+        parts = zip(given, tracked.seen(DEFAULT_LANDMARKS), strict=True)
+        seeing = [v if v.frame.has_dense_depth else replace(v, landmarks=part) for v, part in parts]
+    new, weighted = (seeing[len(old) :], seeing) if complete else (seeing, [*old, *seeing])
+    if old and not complete:  # renderings, with fewer pixels than photos, which are to count as much
+        pixels = [
+            sum(v.frame.intrinsics.width * v.frame.intrinsics.height for v in part) / len(part)
+            for part in (old, new)
+        ]
+        weighted = [*old] * min(3, max(1, round(pixels[1] / pixels[0]))) + seeing
     field, done = _trained_on(scene, weighted, steps, len(new) / max(1, len(everything)))
     info = replace(
         scene.info,
@@ -261,15 +252,33 @@ def _extended(
         seconds=scene.info.seconds + time.monotonic() - began,
     )
     grown = replace(scene, info=info, field=info.in_map_unit(field), folder=None, record=scene.capture)
-    if (surface := _surface(grown, seeing, config)) is not None:
-        grown = replace(grown, surface=surface)
+    # From measured depth and, unlike ``bake_surface``, also from depth rendered from the other cameras: the photos of these are
+    # not at hand, and what they measured must not be lost.
+    measured = [view for view in seeing if view.frame.has_dense_depth]
+    names = {view.frame.name for view in measured}
+    others = [(c.intrinsics, c.pose) for c in info.cameras if c.name not in names]
+    try:
+        grown = replace(grown, surface=bake(grown.field, grown.bounds, others, measured, config))
+    except InputError as error:
+        log.info(f"the surface is unchanged: {error}")
     check_cancelled("extending")
     if complete:
         info, landmarks, tracked = bake_landmarks(info, grown.field, seeing, where, tracked)
         grown = replace(grown, info=info, landmarks=landmarks).with_survey(seeing, tracked)
         info = grown.info
     else:
-        landmarks = _more_landmarks(info, scene.landmarks, tracked, [view.frame.name for view in new])
+        landmarks = scene.landmarks
+        try:
+            more = with_tracks_in(
+                info, tracked.landmarks(DEFAULT_LANDMARKS), [view.frame.name for view in new]
+            )
+        except InputError as error:  # one photo, or photos without overlap
+            log.info(f"no new landmarks: {error}")
+        else:
+            if landmarks is None or not len(more):
+                landmarks = landmarks or more
+            else:
+                landmarks = concatenated([landmarks, more[~_present(landmarks, more)]])
     grown = grown.with_parts(None, landmarks or scene.landmarks)
     before, after = (0 if m.landmarks is None else len(m.landmarks) for m in (scene, grown))
     log.info(f"{where}: {before} landmarks before, {after} now; {amount(len(info.cameras), 'image')}")
@@ -280,31 +289,6 @@ def _extended(
         raise InputError("was retrained meanwhile; extend it again", where=where)
     check_cancelled("extending")
     return replace(grown, info=replace(info, anchor=stored.anchor)).stored_in(scene.folder)
-
-
-def _with_distances(views: Sequence[View], tracked: TrackedViews) -> list[View]:
-    """Return the views; those without dense depth get the landmarks they show, from which training takes distances."""
-    try:
-        seen = tracked.seen(DEFAULT_LANDMARKS)
-    except InputError:  # one photo, or photos without overlap
-        return list(views)
-    return [
-        view if view.frame.has_dense_depth else replace(view, landmarks=part)
-        for view, part in zip(views, seen, strict=True)
-    ]
-
-
-def _repeated(old: Sequence[View], new: Sequence[View]) -> int:
-    """Return how often renderings are repeated so that, with fewer pixels than photos, they count as much;
-    three times at most.
-    """
-    if not old:
-        return 1
-    pixels = [
-        sum(v.frame.intrinsics.width * v.frame.intrinsics.height for v in part) / len(part)
-        for part in (old, new)
-    ]
-    return min(3, max(1, round(pixels[1] / pixels[0])))
 
 
 def _trained_on(
@@ -346,34 +330,6 @@ def _in_field_unit(view: View, factor: float) -> View:
     return replace(view, frame=frame, T_ref_camera=pose, landmarks=seen)
 
 
-def _surface(scene: Map, views: Sequence[View], config: BakeConfig) -> SurfaceMap | None:
-    """Bake the surface from the measured depth of views and, unlike ``bake_surface``, also from depth rendered from the
-    other cameras: the photos of these are not at hand, and what they measured must not be lost.
-    """
-    measured = [view for view in views if view.frame.has_dense_depth]
-    names = {view.frame.name for view in measured}
-    others = [(c.intrinsics, c.pose) for c in scene.info.cameras if c.name not in names]
-    try:
-        return bake(scene.field, scene.bounds, others, measured, config)
-    except InputError as error:
-        log.info(f"the surface is unchanged: {error}")
-        return None
-
-
-def _more_landmarks(
-    info: MapInfo, landmarks: LandmarkMap | None, tracked: TrackedViews, names: Sequence[str]
-) -> LandmarkMap | None:
-    """Return the landmarks of a map plus those of new photos, called ``names``, that it lacks."""
-    try:
-        more = with_tracks_in(info, tracked.landmarks(DEFAULT_LANDMARKS), names)
-    except InputError as error:  # one photo, or photos without overlap
-        log.info(f"no new landmarks: {error}")
-        return landmarks
-    if landmarks is None or not len(more):
-        return landmarks or more
-    return concatenated([landmarks, more[~_present(landmarks, more)]])
-
-
 def _present(landmarks: LandmarkMap, more: LandmarkMap) -> Bool[Tensor, "n"]:
     """Return which landmarks of ``more`` match one of ``landmarks``: near in space, given its accuracy, with
     a similar descriptor.
@@ -384,7 +340,8 @@ def _present(landmarks: LandmarkMap, more: LandmarkMap) -> Bool[Tensor, "n"]:
     index = torch.from_numpy(np.asarray(near).reshape(len(more), -1))
     deviation = more.deviations.amax(-1)[:, None] + landmarks.deviations.amax(-1)[index]
     descriptors = landmarks.descriptors[index].float() - more.descriptors[:, None].float()
-    alike = descriptors.norm(dim=-1) <= SAME_DESCRIPTOR * landmarks.unrelated_distance
+    # Relative to the distance between descriptors of different landmarks; those of one are nearer to each other.
+    alike = descriptors.norm(dim=-1) <= 0.42 * landmarks.unrelated_distance
     return ((distance <= 3 * deviation) & alike).any(-1)
 
 

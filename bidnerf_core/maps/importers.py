@@ -46,7 +46,7 @@ class ImportedField:
     bounds: SceneBounds
     _: KW_ONLY
     found: tuple[str, ...] = ()  # sentences on the content of the file, such as counts, and what was left out
-    steps: int = 1  # of its training, if known
+    steps: int = 1  # of its training, 1 if unknown
     points: Float[Tensor, "n 3"] | None = (
         None  # metres, world: points on the matter, from which its extent is reported
     )
@@ -158,7 +158,7 @@ def bounds_about(
     """
     inner, outer = robust_box(points, 0.15, 0.25), robust_box(points)
     sides = [float((upper - lower).max()) for lower, upper in (inner, outer)]
-    contracted = sides[1] > UNBOUNDED * sides[0]
+    contracted = sides[1] > 3 * sides[0]
     lower, upper = inner if contracted else outer
     farthest = points[:: max(1, len(points) // 200_000)].double() - (lower + upper) / 2
     reach = float(torch.linalg.vector_norm(farthest, dim=-1).quantile(0.999))
@@ -166,7 +166,3 @@ def bounds_about(
     far = 1.5 * (reach + diagonal) if contracted else 3 * diagonal
     low, high = ((float(c[0]), float(c[1]), float(c[2])) for c in (lower, upper))
     return SceneBounds(low, high, 1e-3 * diagonal, far, background, contracted, footprint)
-
-
-UNBOUNDED = 3.0
-"""Ratio of the sides of the boxes around nearly all matter and around most of it above which a scene is unbounded."""

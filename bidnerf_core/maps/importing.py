@@ -15,8 +15,8 @@ from typing import Any
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.captures import StoredCamera, stored_cameras
-from bidnerf_core.datasets import Capture, open_dataset
+from bidnerf_core.captures import stored_cameras
+from bidnerf_core.datasets import open_dataset
 from bidnerf_core.devices import working_device
 from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.fields import NoField, RadianceField, SceneBounds, device_of, render
@@ -35,7 +35,7 @@ from bidnerf_core.mapping import (
     surface_of_points,
     tracked_views,
 )
-from bidnerf_core.maps.baking import bake_surface, check_alike
+from bidnerf_core.maps.baking import check_alike
 from bidnerf_core.maps.description import MapInfo, cameras_of
 from bidnerf_core.maps.importers import ImportedField, Structure, bounds_about, importer_of, robust_box
 from bidnerf_core.maps.map import Map, frozen_field
@@ -49,16 +49,6 @@ from bidnerf_core.training import TrainingState
 
 log = logging.getLogger("bidnerf")
 
-SMALLEST, LARGEST = 0.05, 500.0
-"""Range of plausible longest sides of a scene (metres); outside it, lengths are probably in another unit."""
-RAYS_WITH_DEPTH = 4096
-SAME_LENGTH = 0.03
-"""Relative difference between rendered and measured depth that is not worth reporting."""
-FEWEST_COMPARED = 200
-USUAL_COUNT = 2000
-"""Keypoints of an image that are used, beyond which only those that observe a point are: as many as SIFT finds in a query."""
-OPAQUE = 0.5
-"""Opacity of a ray above which its rendered depth is meaningful."""
 AS_IN_THE_FILE = ImportOptions()
 
 
@@ -110,7 +100,13 @@ def import_map(
             if photos is not None:
                 raise InputError("is a model with photos of its own; leave out the photos", where=where)
             return _of_structure(found, found.structure, options, place, baking is not None)
-        images = _own_photos(found, where) if photos is None else photos
+        images = photos
+        if images is None and found.photos is not None:
+            try:
+                images = open_dataset(found.photos)
+                log.info(f"{where}: training photos found in {found.photos}")
+            except InputError as error:
+                log.info(f"{where}: its training images cannot be read: {error}")
         read = None if images is None else read_views(images, options.images).about(origin)
         views: list[View] = [] if read is None else read.views
         unit: LengthUnit = "metres" if scale != 1 else "units" if read is None else read.unit
@@ -118,24 +114,33 @@ def import_map(
         bounds = found.bounds
         if read is not None and read.source and any(view.frame.alpha is not None for view in views):
             bounds = replace(bounds, background=read.background)  # over which its images were composited
+        step = max(1, found.steps)  # 0 would be that of a map without a field
         info = MapInfo(
-            found.backend,
-            to_plain(found.config, "config"),
-            bounds,
-            found.steps,
-            True,
-            path.name,
-            landmark_features=options.features,
-            unit=unit,
-            origin=origin,
+            found.backend, to_plain(found.config, "config"), bounds, step, True, path.name,
+            landmark_features=options.features, unit=unit, origin=origin,
             gravity_up=None if read is None else read.gravity_up,
-        )
+        )  # fmt: skip
         scene = Map(info, frozen_field(info, found.tensors, None)).to(device)
-        scene = replace(scene, info=replace(info, cameras=_cameras(scene.field, found, read, where)))
+        if read is not None:
+            cameras = read.with_files(stored_cameras(views))
+        elif found.cameras:
+            cameras = found.cameras
+            count = amount(len(cameras), "camera")
+            log.info(f"{where}: {count} of its training images found next to it")
+        else:
+            cameras = viewpoints(scene.field, bounds, found.up, found.is_solid)
+            place_of = "around it" if found.is_solid else "found in free space"
+            log.info(f"{where}: no photos; viewed from {amount(len(cameras), 'viewpoint')} {place_of}")
+        scene = replace(scene, info=replace(info, cameras=cameras))
         if views:
-            _check_photos(scene, views, where)
+            check_alike(scene.info, scene.field, views, where)
+            ratio = ratio_to_measured_depth(scene.field, scene.bounds, views)
+            if ratio is not None and abs(ratio - 1) > 0.03:
+                text = f"the photos' measured depth is {ratio:.3g} times the field's; is its scale different?"
+                text = f"{where}: {text} The poses of the photos would have to be scaled as well"
+                warnings.warn(text, InputWarning, stacklevel=2)
         if place is not None:
-            state = TrainingState(found.steps, found.tensors, {})
+            state = TrainingState(step, found.tensors, {})
             scene = replace(scene, info=write_parts(place, scene.info, state), folder=place)
         if baking is None:
             return scene
@@ -193,12 +198,8 @@ def _described(structure: Structure, features: str, origin: Origin) -> tuple[Rea
             f"its descriptors have {channels} channels, those of {features!r} {probe.descriptors.shape[1]}",
             where=capture.path, expected="the detector that made them (--landmark-features)",
         )  # fmt: skip
-    views, images, labels, free = (
-        list[View](),
-        list[ImageKeypoints](),
-        list[torch.Tensor](),
-        len(structure.positions),
-    )
+    views, images, labels = list[View](), list[ImageKeypoints](), list[torch.Tensor]()
+    free = len(structure.positions)
     for shot, keypoints, observed in zip(capture.shots, structure.keypoints, structure.observed, strict=True):
         stored, T = shot.camera, shot.T_world_camera
         assert isinstance(stored, Intrinsics)  # as the importer promises
@@ -207,7 +208,8 @@ def _described(structure: Structure, features: str, origin: Origin) -> tuple[Rea
         size = camera.height, camera.width
         blank.setdefault(size, torch.zeros((*size, 3), dtype=torch.uint8))
         order = (observed < 0).long().argsort(stable=True)
-        order = order[: max(int((observed >= 0).sum()), USUAL_COUNT)]
+        # As many as SIFT finds in a query; beyond, only those that observe a point.
+        order = order[: max(int((observed >= 0).sum()), 2000)]
         scale = torch.tensor([camera.width / stored.width, camera.height / stored.height])
         chosen = Keypoints(
             (keypoints.pixels[order] * scale).clamp(
@@ -239,35 +241,6 @@ def _described(structure: Structure, features: str, origin: Origin) -> tuple[Rea
     return read, TrackedViews(TrackedKeypoints(images, label, torch.arange(len(label))), features, points)
 
 
-def _own_photos(found: ImportedField, where: str) -> Capture | None:
-    """Return the dataset of the training images that the file names, or None if it names none or they cannot be read."""
-    if found.photos is None:
-        return None
-    try:
-        dataset = open_dataset(found.photos)
-    except InputError as error:
-        log.info(f"{where}: its training images cannot be read: {error}")
-        return None
-    log.info(f"{where}: training photos found in {found.photos}")
-    return dataset
-
-
-def _cameras(
-    field: RadianceField, found: ImportedField, read: ReadViews | None, where: str
-) -> tuple[StoredCamera, ...]:
-    if read is not None:
-        return read.with_files(stored_cameras(read.views))
-    if found.cameras:
-        log.info(f"{where}: {amount(len(found.cameras), 'camera')} of its training images found next to it")
-        return found.cameras
-    chosen = viewpoints(field, found.bounds, found.up, found.is_solid)
-    log.info(
-        f"{where}: no photos; viewed from {amount(len(chosen), 'viewpoint')}"
-        + (" around it" if found.is_solid else " found in free space")
-    )
-    return chosen
-
-
 def _report_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
     """Log how large the scene is, and warn if its lengths are hardly in metres."""
     if found.points is None or not len(found.points):
@@ -281,27 +254,14 @@ def _report_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
         f"{where}: extent {extent}"
         + (" metres" if unit == "metres" else "; its unit is not stored (--scale gives its length in metres)")
     )
-    if not SMALLEST <= max(size) <= LARGEST:
-        other = "millimetres" if max(size) > LARGEST else "kilometres or an arbitrary unit"
-        warnings.warn(
-            f"{where}: {extent} would be {'very large' if max(size) > LARGEST else 'tiny'} in metres; are its lengths {other}?"
-            " --scale changes them",
-            InputWarning,
-            stacklevel=3,
-        )
-
-
-def _check_photos(scene: Map, views: Sequence[View], where: str) -> None:
-    """Raise ``InputError`` for photos that do not show the field, and warn if their depth has another unit."""
-    check_alike(scene.info, scene.field, views, where)
-    ratio = ratio_to_measured_depth(scene.field, scene.bounds, views)
-    if ratio is not None and abs(ratio - 1) > SAME_LENGTH:
-        warnings.warn(
-            f"{where}: the photos' measured depth is {ratio:.3g} times the field's; is its scale different?"
-            " The poses of the photos would have to be scaled as well",
-            InputWarning,
-            stacklevel=3,
-        )
+    doubt = ""
+    if max(size) > 500:
+        doubt = "very large in metres; are its lengths millimetres?"
+    elif not max(size) >= 0.05:
+        doubt = "tiny in metres; are its lengths kilometres or an arbitrary unit?"
+    if doubt:
+        text = f"{where}: {extent} would be {doubt} --scale changes them"
+        warnings.warn(text, InputWarning, stacklevel=3)
 
 
 @torch.no_grad()
@@ -311,29 +271,28 @@ def ratio_to_measured_depth(field: RadianceField, bounds: SceneBounds, views: Se
     if not measured:
         return None
     generator = torch.Generator().manual_seed(0)
-    count = max(RAYS_WITH_DEPTH, len(measured))
+    count = max(4096, len(measured))
     pixels = draw(measured, count, uniform, generator, device=device_of(field)).flattened()
     seen = render(field, bounds.rays(pixels.origins, pixels.directions), bounds.background)
-    both = (pixels.distance > 0) & (seen.opacity > OPAQUE)
-    if int(both.sum()) < FEWEST_COMPARED:
+    both = (pixels.distance > 0) & (seen.opacity > 0.5)
+    if int(both.sum()) < 200:
         return None
     return float((pixels.distance[both] * seen.opacity[both] / seen.distance[both]).median())
 
 
 def _baked(scene: Map, found: ImportedField, views: Sequence[View], config: BakeConfig) -> Map:
-    has_landmarks = bool(views) or found.is_coloured
-    if not views and found.is_coloured:
-        log.info(
-            f"{scene.info.data}: landmarks are from rendered images, which match photos less well; --photos"
-            " builds them from photos, as in training"
-        )
-    surface = None
+    name, surface = scene.info.data, None
     if found.surface is not None:
         surface = surface_of_points(*found.surface, scene.bounds, cameras_of(scene.info), config)
         log.info(
-            f"{scene.info.data}: surface of {len(surface.surfels)} surfels from its own points, in cells with a side of"
+            f"{name}: surface of {len(surface.surfels)} surfels from its own points, in cells with a side of"
             f" {surface.cell:.3g}, {surface.mebibytes:.1f} MiB"
         )
-    if has_landmarks:
-        return scene.with_baked_parts(views, config, not views, surface=surface)
-    return scene.with_parts(surface or bake_surface(scene.info, scene.field, [], config, scene.name))
+    if not views and not found.is_coloured:
+        return scene.with_surface(views, config, surface)
+    if not views:
+        log.info(
+            f"{name}: landmarks are from rendered images, which match photos less well; --photos builds them from photos,"
+            " as in training"
+        )
+    return scene.with_baked_parts(views, config, not views, surface=surface)

@@ -28,12 +28,8 @@ Position = Sequence[float] | Float[Tensor, "3"]
 Place = str | Position
 """A point of a map: its three coordinates, the name of one of its cameras, or ``NAME@U,V``, what that camera
 shows at a pixel."""
-DIGITS = re.compile(r"\d+|\.\w+$")
-"""The parts in which the names of photos of one capture differ: numbers and file extensions."""
 LEAST_CAMERAS = 3
 """Smallest number of cameras with known positions that gives a scale that can be checked."""
-WORST_FIT = 0.2
-"""Largest distance (root mean square) of scaled cameras from their known positions, relative to the spread of these."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +79,7 @@ def factor_of_poses(scene: Map, known: Mapping[str, SE3 | Position]) -> ScaleFit
     target = torch.stack([_position(known[name]) for name in found])
     fit = fit_similarity(source, target)
     off = float((fit.apply(source) - target).square().sum(-1).mean().sqrt())
-    if off > WORST_FIT * spread(target):
+    if off > 0.2 * spread(target):
         raise InputError(
             f"the cameras are {off:.3g} m (root mean square) from their known positions after the best"
             " scaling",
@@ -99,7 +95,10 @@ def place_of(scene: Map, place: Place) -> Float[Tensor, "3"]:
     if (camera := _camera_of(scene, place)) is not None:
         return camera.pose.translation + origin_of(scene)
     name, at, pixel = place.rpartition("@")
-    numbers = _numbers(pixel)
+    try:
+        numbers = [number for word in pixel.split(",") if math.isfinite(number := float(word))]
+    except ValueError:
+        numbers = []
     if at and len(numbers) == 2 and (camera := _camera_of(scene, name)) is not None:
         return _seen_at(scene, camera, numbers[0], numbers[1]) + origin_of(scene)
     if not at and len(numbers) == 3:
@@ -133,7 +132,10 @@ def _no_camera(scene: Map, name: str) -> str:
     others = "NAME@U,V for what a camera shows at a pixel, or coordinates X,Y,Z"
     if not names:
         return "it has no cameras; expected coordinates X,Y,Z"
-    alike = [each for each in names if DIGITS.sub("", each) == DIGITS.sub("", name)]
+    digits = re.compile(
+        r"\d+|\.\w+$"
+    )  # the parts in which the names of photos of one capture differ, and file extensions
+    alike = [each for each in names if digits.sub("", each) == digits.sub("", name)]
     if not alike:
         hint = spelling_hint(name, names, f", expected a name such as {names[0]!r}")
         return f"none of its {len(names)} cameras is called {name!r}{hint}; or give {others}"
@@ -160,11 +162,3 @@ def _seen_at(scene: Map, camera: StoredCamera, u: float, v: float) -> Float[Tens
             f"{camera.name}@{u:g},{v:g} shows the background", expected="a pixel that shows the scene"
         )
     return origin[0] + float(shown.distance[0] / shown.opacity[0]) * direction[0]
-
-
-def _numbers(text: str) -> list[float]:
-    try:
-        found = [float(word) for word in text.split(",")]
-    except ValueError:
-        return []
-    return found if all(map(math.isfinite, found)) else []

@@ -14,7 +14,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from bidnerf_core.backend import Backend, load_backend
+from bidnerf_core.backend import load_backend
 from bidnerf_core.captures import (
     CaptureReport,
     UpDirection,
@@ -333,14 +333,6 @@ class Map:
         check_cancelled("surface")
         return self.with_parts(surface or bake_surface(self.info, self.field, views, config, self.name))
 
-    def completed(self) -> Map:
-        """Return the map with its training ended as it stands, and its folder without what resuming it would need."""
-        info, field = replace(self.info, complete=True), trained_field(self.field)
-        if self.folder is not None:
-            state = TrainingState(info.step, cast(nn.Module, field).state_dict(), {})
-            info = write_parts(self.folder, info, state, keep=True)
-        return replace(self, info=info)
-
     def with_survey(self, views: Sequence[View], tracked: TrackedViews | None) -> Map:
         """Return the map with the capture record of photos, whose keypoints were ``tracked``, and the field's error on them.
 
@@ -436,30 +428,29 @@ def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None 
 
     Errors name the files of ``folder``. Raises ``InputError`` if the backend or the weights do not fit.
     """
-    where = str(DESCRIPTION if folder is None else folder / DESCRIPTION)
-    path = Path(info.weights) if folder is None else folder / info.weights
     if not info.step:
         return info.in_map_unit(NoField())
-    backend, outline = load_backend(info.backend, "" if folder is None else str(folder)), None
+    where, path, checked = str((folder or Path()) / DESCRIPTION), (folder or Path()) / info.weights, False
     try:  # only the shapes, before memory is allocated for a field of whatever size map.json describes
         with torch.device("meta"):
-            outline = build_field(backend, info, where)[0]
+            outline = build_field(info, where)
     except InputError:
         raise
     except Exception:  # a backend may raise anything for missing values
         log.debug("%s: backend %r needs real tensors to build its field", where, info.backend)
-    if outline is not None:
-        tensors = checked_weights(outline, tensors, path)
-    field, _ = build_field(backend, info, where)
-    if outline is None:
+    else:
+        tensors, checked = checked_weights(outline, tensors, path), True
+    field = build_field(info, where)
+    if not checked:
         tensors = checked_weights(field, tensors, path)
     cast(nn.Module, field).load_state_dict(tensors)
     cast(nn.Module, field).requires_grad_(False).eval()
     return info.in_map_unit(field)
 
 
-def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceField, Any]:
-    """Build the untrained field (an ``nn.Module``) that ``info`` describes, and its config."""
+def build_field(info: MapInfo, where: str) -> RadianceField:
+    """Build the untrained field (an ``nn.Module``) that ``info`` describes. Raises ``InputError`` as ``frozen_field`` does."""
+    backend = load_backend(info.backend, where)
     config: Any = from_plain(backend.config_type, info.config, f"{where}: config")
     try:
         field = backend.build(config, info.bounds if info.field_frame is None else info.field_frame.bounds)
@@ -471,4 +462,4 @@ def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceFi
             where=where,
             expected="an nn.Module with query and sampler",
         )
-    return field, config
+    return field

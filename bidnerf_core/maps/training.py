@@ -16,14 +16,14 @@ from typing import Any, cast
 import torch
 from torch import nn
 
-from bidnerf_core.backend import Backend, load_backend, quick_config
+from bidnerf_core.backend import load_backend, quick_config
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import as_given, at_stored_poses, located, prepared, stored_cameras
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.datasets import HOLD_OUT_EVERY, DatasetOptions
 from bidnerf_core.devices import moved, working_device
 from bidnerf_core.errors import Cancelled, InputError, amount, enumeration
-from bidnerf_core.fields import NoField, RadianceField, device_of
+from bidnerf_core.fields import NoField, device_of, trained_field
 from bidnerf_core.frames import View
 from bidnerf_core.io import from_plain, packed, to_plain
 from bidnerf_core.mapping import BakeConfig, TrackedViews
@@ -41,8 +41,6 @@ from bidnerf_core.training import TrainingState, TrainingStopped
 log = logging.getLogger("bidnerf")
 
 USUAL = TrainOptions()
-QUICK = "quick"
-"""Stands for the settings of a backend's short training."""
 
 
 class OtherSettings(InputError):
@@ -83,19 +81,23 @@ def train(
     unless ``options.trust_poses`` is set; the folder must be empty unless ``options.overwrite`` is set.
     """
     chosen, settings = load_backend(backend), config
-    if config == QUICK:
+    if config == "quick":
         settings = quick_config(chosen)
     elif config is None or isinstance(config, dict):
         settings = from_plain(chosen.config_type, config or {}, f"settings of backend {backend!r}")
     elif not isinstance(config, chosen.config_type):
         found, expected = type(config).__name__, chosen.config_type.__name__
         raise InputError(
-            f"config is a {found}", expected=f"a {expected} or a dict of its settings, or {QUICK!r}"
+            f"config is a {found}", expected=f"a {expected} or a dict of its settings, or 'quick'"
         )
     baking = bake_settings(bake)
     working_device(options.device)  # rejected before anything is read
-    place = None if out is None else Path(out)
-    known = None if options.overwrite or place is None else landmarks_alone(place)
+    place, known = None if out is None else Path(out), None
+    if place is not None and not options.overwrite:
+        with contextlib.suppress(InputError):
+            info = load_info(place)
+            # complete without a field, as an imported map may be
+            known = load_map(place) if info.complete and not info.step else None
     with (
         job_context(progress, cancel),
         finished_parts(place),
@@ -105,15 +107,8 @@ def train(
         posed_images(data, options.images, place, options.overwrite) as (posed, images),
     ):
         if known is not None:
-            return _with_field(
-                known,
-                posed,
-                images,
-                chosen,
-                replace(known.info, backend=backend, config=to_plain(settings, "config")),
-                options,
-                baking,
-            )
+            info = replace(known.info, backend=backend, config=to_plain(settings, "config"))
+            return _with_field(replace(known, info=info), posed, images, options, baking)
         read = read_views(posed, images, options.depth_points, options.point_choice, place)
         origin = chosen_origin(torch.stack([view.T_ref_camera.translation.cpu() for view in read.views]))
         if any(origin):
@@ -136,23 +131,12 @@ def train(
             )
         counter("finding the bounds of the scene", "stage")(0, 1)
         info = MapInfo(
-            backend,
-            to_plain(settings, "config"),
-            estimate_bounds(taken.views, read.background),
-            0,
-            False,
-            read.source,
-            cameras=read.with_files(taken.cameras),
-            pose_refinement=taken.refinement,
-            distances=taken.distances,
-            sparse_depth=read.sparse_depth,
-            hidden=read.hidden,
-            landmark_features=options.features,
-            unit=read.unit,
-            origin=origin,
-            gravity_up=read.gravity_up,
-        )
-        built = build_field(chosen, info, str(place or read.place))
+            backend, to_plain(settings, "config"), estimate_bounds(taken.views, read.background), 0, False, read.source,
+            cameras=read.with_files(taken.cameras), pose_refinement=taken.refinement, distances=taken.distances,
+            sparse_depth=read.sparse_depth, hidden=read.hidden, landmark_features=options.features, unit=read.unit,
+            origin=origin, gravity_up=read.gravity_up,
+        )  # fmt: skip
+        build_field(info, str(place or read.place))  # raises before anything is written
         scene, tracked = Map(info, NoField()), taken.tracked
         if baking is not None:
             # A map that is already there stays until the first checkpoint.
@@ -160,42 +144,27 @@ def train(
                 scene = replace(scene, info=write_parts(place, info, TrainingState(0, {}, {})), folder=place)
             scene, tracked = scene.with_landmarks(taken.views, tracked=tracked)
         scene = replace(scene, folder=place)
-        return _baked(_trained(chosen, built, taken.views, scene, options), taken.views, tracked, baking)
-
-
-def landmarks_alone(folder: Path) -> Map | None:
-    """Return the map in a folder if it is complete without a field, as an imported one may be; None for anything else there."""
-    try:
-        info = load_info(folder)
-    except InputError:
-        return None
-    return load_map(folder) if info.complete and not info.step else None
+        return _baked(_trained(taken.views, scene, options), taken.views, tracked, baking)
 
 
 def _with_field(
-    scene: Map, data: Images, images: DatasetOptions, backend: Backend, info: MapInfo, options: TrainOptions, config: BakeConfig | None
-) -> Map:  # fmt: skip
-    """Train a field, as ``info`` describes it, for a map of landmarks, which it keeps with its cameras and their poses."""
-    images = replace(images, largest=longest_side(info))
+    scene: Map, data: Images, images: DatasetOptions, options: TrainOptions, config: BakeConfig | None
+) -> Map:
+    """Train the field that a map of landmarks describes, and keep these with the map's cameras and their poses."""
+    info, images = scene.info, replace(images, largest=longest_side(scene.info))
     read = read_views(data, images, options.depth_points, options.point_choice, scene.folder).about(
         info.origin
     )
-    own = {camera.name: camera for camera in info.cameras}
-    unknown = [view.frame.name for view in read.views if view.frame.name not in own]
-    if unknown:
-        raise InputError(
-            f"image {unknown[0]!r} is none of those of {scene.name}",
-            where=read.place,
-            expected="images of that map",
-        )
+    own = {camera.name for camera in info.cameras}
+    if unknown := [view.frame.name for view in read.views if view.frame.name not in own]:
+        found, expected = f"image {unknown[0]!r} is none of those of {scene.name}", "images of that map"
+        raise InputError(found, where=read.place, expected=expected)
     tracked, views = located(
         at_stored_poses(read.views, info.cameras), info.landmark_features, True, read.depth_unit
     )
     bounds = estimate_bounds(views, read.background)
     info = replace(info, bounds=bounds, complete=False, hidden=read.hidden, sparse_depth=read.sparse_depth)
-    scene = replace(scene, info=info)
-    built = build_field(backend, info, str(scene.folder))
-    return _baked(_trained(backend, built, views, scene, options), views, tracked, config)
+    return _baked(_trained(views, replace(scene, info=info), options), views, tracked, config)
 
 
 @contextlib.contextmanager
@@ -253,24 +222,26 @@ def resume(
             tracked, views = located(
                 views, features=info.landmark_features, trust_poses=True, depth_unit=read.depth_unit
             )  # the same as when training began
+        state = None
         if info.complete or finish:
             scene = load_map(out, device)
-            if not info.complete:
-                log.info(f"{out}: ends with the {amount(info.step, 'step')} done so far")
-                scene = scene.completed()
-            if scene.landmarks is None and baking is not None:
-                scene, tracked = scene.with_landmarks(views, tracked=tracked)
-            return _baked(scene, views, tracked, baking) if scene.has_field else scene
-        backend = load_backend(info.backend, str(out))
-        built = build_field(backend, info, str(out))
-        state = None
-        if info.step:
-            state = load_state(out, info, built[0])
-            log.info(f"{out}: resuming from step {info.step}")
-        scene = Map(info, NoField(), None, load_landmarks(out, info), out)
+        else:
+            scene = Map(info, NoField(), None, load_landmarks(out, info), out)
+            if info.step:
+                state = load_state(out, info, build_field(info, str(out)))
+                log.info(f"{out}: resuming from step {info.step}")
+        if finish and not info.complete:
+            log.info(f"{out}: ends with the {amount(info.step, 'step')} done so far")
+            field = cast(nn.Module, trained_field(scene.field)).state_dict()
+            done = replace(info, complete=True)  # without what resuming would need
+            scene = replace(
+                scene, info=write_parts(out, done, TrainingState(info.step, field, {}), keep=True)
+            )
         if scene.landmarks is None and baking is not None:
             scene, tracked = scene.with_landmarks(views, tracked=tracked)
-        return _baked(_trained(backend, built, views, scene, options, state), views, tracked, baking)
+        if not (info.complete or finish):
+            scene = _trained(views, scene, options, state)
+        return _baked(scene, views, tracked, baking) if scene.has_field else scene
 
 
 def interrupted(folder: Path, baking: bool = True) -> MapInfo:
@@ -283,7 +254,7 @@ def interrupted(folder: Path, baking: bool = True) -> MapInfo:
         info = load_info(folder)
     except InputError as error:
         raise InputError(f"{error}; nothing to resume, train without --resume") from error
-    if info.complete and not (baking and info.surface is None):
+    if info.complete and not (baking and (info.surface is None or info.capture is None)):
         baked = " and baked" if info.surface is not None else ""
         raise InputError(
             f"training is complete ({amount(info.step, 'step')}){baked}, nothing to resume", where=folder
@@ -339,10 +310,6 @@ def poses_folder(out: Path) -> Path:
 
 def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> None:
     """Raise ``InputError`` for views (or their depth or background) that differ from those the training began with."""
-    if read.source and read.background != info.bounds.background:
-        raise OtherSettings(
-            f"was started with background {info.bounds.background}, got {read.background}", where=out
-        )
     if stored_cameras(read.views) != as_given(info.cameras):
         part = f"split {split!r} has" if read.source else "these have"
         raise InputError(
@@ -350,37 +317,39 @@ def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> 
             where=read.place,
             expected=f"those of {info.data!r} unchanged",
         )
-    if read.hidden != info.hidden:
-        raise OtherSettings(
-            f"was started with {info.hidden} pixels hidden by masks, got {read.hidden}; resuming keeps the"
-            " masks (--masks)",
-            where=out,
-        )
-    if read.sparse_depth != info.sparse_depth:
-        raise OtherSettings(
-            f"was started with the depth of {info.sparse_depth} pixels from points, got {read.sparse_depth};"
-            " resuming keeps the points (--depth-points) and their selection",
-            where=out,
-        )
+    background, kept = info.bounds.background, "resuming keeps"
+    for before, now, what in (
+        (background, read.background if read.source else background, "background {}, got {}"),
+        (info.hidden, read.hidden, f"{{}} pixels hidden by masks, got {{}}; {kept} the masks (--masks)"),
+        (
+            info.sparse_depth,
+            read.sparse_depth,
+            f"the depth of {{}} pixels from points, got {{}}; {kept} the points (--depth-points) and their selection",
+        ),
+    ):
+        if before != now:
+            raise OtherSettings(f"was started with {what.format(before, now)}", where=out)
 
 
 def _trained(
-    backend: Backend, built: tuple[RadianceField, Any], views: Sequence[View], scene: Map, options: TrainOptions,
-    state: TrainingState | None = None,
-) -> Map:  # fmt: skip
-    """Train the field of a map, ``built`` with its config, from a ``state``, or from the beginning, to the end."""
+    views: Sequence[View], scene: Map, options: TrainOptions, state: TrainingState | None = None
+) -> Map:
+    """Train the field that a map describes, from a ``state``, or from the beginning, to the end."""
     out, device = scene.folder, working_device(options.device)
+    backend, where = load_backend(scene.info.backend, str(out or "")), scene.name
     unsaved = scene.landmarks if scene.info.landmarks is None else None
     report = Checkpoints(scene.info, out, state, options.checkpoint_seconds, unsaved)
     del state  # the report frees it once training resumes from it
-    config, where = built[1], str(out or scene.info.data or "map in memory")
-    field = moved(built[0], device)
+    field = moved(build_field(scene.info, where), device)
+    config: Any = from_plain(backend.config_type, scene.info.config, f"{where}: config")
     try:
         backend.train(field, views, config, report)
     except TrainingStopped as stopped:
-        kept, advice = "cancelled", ", nothing is stored"
-        if out is not None:
-            kept, advice = "saved", "; --resume continues from there"
+        kept, advice = (
+            ("cancelled", ", nothing is stored")
+            if out is None
+            else ("saved", "; --resume continues from there")
+        )
         raise Cancelled(f"{where}: {kept} after step {stopped.step}{advice}") from stopped
     report.finish(field)
     log.info(
@@ -392,8 +361,10 @@ def _trained(
 
 
 def _baked(scene: Map, views: Sequence[View], tracked: TrackedViews | None, config: BakeConfig | None) -> Map:
+    """Bake what a map with a field lacks: its surface, and the capture record of photos whose keypoints were ``tracked``."""
     if config is not None:
-        scene = baked_if_possible(scene, lambda whole: whole.with_surface(views, config))
+        if scene.surface is None:
+            scene = baked_if_possible(scene, lambda whole: whole.with_surface(views, config))
         scene = scene.with_survey(views, tracked)
     if scene.folder is not None:
         size = sum(file.stat().st_size for file in scene.folder.iterdir()) / 2**20

@@ -13,24 +13,11 @@ from bidnerf_core.captures import MatrixRows, StoredCamera, horizontal_axes
 from bidnerf_core.fields import RadianceField, Rays, SceneBounds, device_of, render
 from bidnerf_core.geometry import SE3, look_at
 
-SIZE = 192
-"""Width and height of an image in pixels."""
-FIELD_OF_VIEW = 70.0  # degrees
+CAMERA = Intrinsics.from_hfov(70.0, 192, 192)
 VIEWS = 48
 """Number of viewpoints."""
-PLACES = 400
-"""Number of random places in the box that are tried."""
 DIRECTIONS = 48
 """Number of rays from each place, evenly over the sphere."""
-SOLID = 0.8
-"""Opacity above which a ray hits something."""
-CLEARANCE = 0.04
-"""Smallest distance from matter, relative to the box's longest side; closer up, little is visible."""
-ENCLOSED = 0.6
-"""Fraction of the rays from a place that hit matter above which it is inside a room or the like."""
-ROOMY = 0.2
-"""Fraction of the places in the box that must be free and enclosed for the scene to be viewed from inside. An
-object with hollows (Lego: 0.09) has some such places, and a room (0.5) has many."""
 
 
 def viewpoints(
@@ -47,21 +34,21 @@ def viewpoints(
     """
     generator = torch.Generator().manual_seed(0)
     lower, size = torch.tensor(bounds.lower), torch.tensor(bounds.size)
-    places = lower + size * torch.rand((PLACES, 3), generator=generator)
+    places = lower + size * torch.rand((400, 3), generator=generator)
     distance = _distances(field, bounds, places)
     hit = distance > 0
     nearest = torch.where(hit, distance, torch.inf).quantile(0.1, dim=1)  # exceeded by nine out of ten rays
-    free = (nearest > CLEARANCE * bounds.side) & (hit.float().mean(1) > ENCLOSED)
-    if not is_solid and float(free.float().mean()) > ROOMY:
+    # Closer up than this, little is visible; a place is inside a room or the like if most rays from it hit matter.
+    free = (nearest > 0.04 * bounds.side) & (hit.float().mean(1) > 0.6)
+    # An object with hollows (Lego: 0.09) has some such places, and a room (0.5) has many.
+    if not is_solid and float(free.float().mean()) > 0.2:
         poses = _within(places[free], distance[free], up)
     else:  # from all around the box, at a distance from which it fills the images
         centre = torch.tensor(bounds.centre, dtype=torch.float64)
-        radius = math.dist(bounds.lower, bounds.upper) / 2 / math.sin(math.radians(FIELD_OF_VIEW / 2)) * 0.8
+        radius = 0.8 * math.dist(bounds.lower, bounds.upper) * math.hypot(CAMERA.fx, CAMERA.cx) / CAMERA.width
         poses = [look_at(centre + radius * direction, centre, up) for direction in sphere(VIEWS)]
-    focal = SIZE / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
-    camera = Intrinsics(focal, focal, SIZE / 2, SIZE / 2, SIZE, SIZE)
     rows: list[MatrixRows] = [(*((a, b, c, d) for a, b, c, d in pose.matrix().tolist()),) for pose in poses]
-    return tuple(StoredCamera(f"viewpoint-{n:03d}", camera, row) for n, row in enumerate(rows))
+    return tuple(StoredCamera(f"viewpoint-{n:03d}", CAMERA, row) for n, row in enumerate(rows))
 
 
 @torch.no_grad()
@@ -74,7 +61,9 @@ def _distances(
     towards = sphere(DIRECTIONS).float().expand(len(places), -1, -1).reshape(-1, 3).to(device)
     near = torch.full_like(origins[:, 0], bounds.near)
     seen = render(field, Rays(origins, towards, near, torch.full_like(near, bounds.far)), bounds.background)
-    found = torch.where(seen.opacity > SOLID, seen.distance / seen.opacity.clamp(min=SOLID), 0)
+    found = torch.where(
+        seen.opacity > 0.8, seen.distance / seen.opacity.clamp(min=0.8), 0
+    )  # of something solid
     return found.cpu().reshape(len(places), -1)
 
 

@@ -49,10 +49,6 @@ AS_STORED = DatasetOptions()
 
 Origin: TypeAlias = tuple[float, float, float]
 """The origin of a map's own coordinates, see ``Map.origin``."""
-LARGEST_COORDINATE = 1000.0
-"""Smallest coordinates that may be recentred. Single precision resolves 0.06 mm there, in metres."""
-FAR = 10.0
-"""Smallest ratio of the distance from 0 to the size of a scene at which it is recentred: it gains one digit."""
 
 
 def chosen_origin(points: Float[Tensor, "n 3"]) -> Origin:
@@ -61,7 +57,8 @@ def chosen_origin(points: Float[Tensor, "n 3"]) -> Origin:
     """
     low, high = points.double().amin(0), points.double().amax(0)
     middle, size = (low + high) / 2, float((high - low).max())
-    if not float(middle.abs().max()) > max(LARGEST_COORDINATE, FAR * size):
+    # Single precision resolves 0.06 mm at 1000 m; at ten times a scene's size, recentring gains one digit.
+    if not float(middle.abs().max()) > max(1000.0, 10 * size):
         return 0.0, 0.0, 0.0
     step = 10.0 ** math.ceil(math.log10(max(size, 1.0)))
     x, y, z = (step * (middle / step).round()).tolist()
