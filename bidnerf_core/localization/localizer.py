@@ -243,9 +243,8 @@ def checked_map(given: object, where: str) -> SceneMap:
     """Return ``given`` if it is a map, or the map in the folder ``given``. Raises ``InputError``, prefixed with ``where``, for
     anything else, and as ``load_map`` does.
     """
-    if isinstance(given, str | Path):
-        for load in LOADERS:
-            return load(Path(given))
+    if LOADERS and isinstance(given, str | Path):
+        return LOADERS[0](Path(given))
     if isinstance(given, SceneMap):
         return given
     raise InputError(f"got a {type(given).__name__}", where=where, expected="a Map, or the folder of one")

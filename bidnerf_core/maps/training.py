@@ -26,7 +26,7 @@ from bidnerf_core.errors import Cancelled, InputError, amount, enumeration
 from bidnerf_core.fields import NoField, device_of, trained_field
 from bidnerf_core.frames import View
 from bidnerf_core.io import from_plain, packed, to_plain
-from bidnerf_core.mapping import BakeConfig, TrackedViews
+from bidnerf_core.mapping import BakeConfig, TrackedViews, tracked_views
 from bidnerf_core.maps.checkpoints import Checkpoints
 from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info, longest_side
 from bidnerf_core.maps.map import USUAL_BAKE, Map, build_field, frozen_field, load_map
@@ -239,6 +239,8 @@ def resume(
             )
         if scene.landmarks is None and baking is not None:
             scene, tracked = scene.with_landmarks(views, tracked=tracked)
+        elif tracked is None and baking is not None and info.capture is None:
+            tracked = tracked_views(views, info.landmark_features)
         if not (info.complete or finish):
             scene = _trained(views, scene, options, state)
         return _baked(scene, views, tracked, baking) if scene.has_field else scene

@@ -46,17 +46,8 @@ from bidnerf_core.results.trajectory import TrajectoryErrors, spans, world_of_tr
 
 log = logging.getLogger("bidnerf")
 
-RECOGNISED = {
-    Outcome.CONVERGED, Outcome.IMPRECISE, Outcome.MIRRORED, Outcome.MISCALIBRATED, Outcome.UNCERTAIN
-}  # fmt: skip
-"""Outcomes of images that show the scene."""
-SEVERAL = 3
-"""Minimum number of images, all of them rejected, at which the user is asked whether the map is the right one."""
-
 BAD_INPUT = "bad input"
 """Outcome of an image that could not be read."""
-SAME_POSE = 1e-4
-"""Difference between the matrices of two poses (metres) that rounding in files may cause."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,10 +212,20 @@ class Answers:
         """A question to append to a summary: empty unless there are several images and none shows the scene
         of the map.
         """
+        recognised = {
+            Outcome.CONVERGED, Outcome.IMPRECISE, Outcome.MIRRORED, Outcome.MISCALIBRATED, Outcome.UNCERTAIN
+        }  # fmt: skip
         found = [answer.found for answer in self.answers]
-        if len(found) < SEVERAL or any(map(_shows_scene, found)):
-            return ""
-        return "; do they show the scene of this map?"
+        for each in found:
+            evidence = each.diagnostics
+            shows_scene = each.outcome in recognised
+            if each.outcome is Outcome.AMBIGUOUS and isinstance(evidence, Evidence):
+                # It counts if far more landmarks fit its pose than by chance.
+                bounds = [bound for bound in LANDMARK_BOUNDS if bound.measure == "above_chance"]
+                shows_scene = all(evidence.above_chance >= bound.limit for bound in bounds)
+            if shows_scene:
+                return ""
+        return "; do they show the scene of this map?" if len(found) >= 3 else ""
 
     @property
     def remark(self) -> str | None:
@@ -272,24 +273,25 @@ class Answers:
             import pandas
         except ImportError as error:
             raise InputError("a table needs pandas (pip install pandas)") from error
-        return pandas.DataFrame([self._row(each) for each in self.given])
-
-    def _row(self, answer: Answer | Failure) -> dict[str, Any]:
-        """Return a row of the table."""
-        row = {key: value for key, value in self.plain(answer).items() if not isinstance(value, list | dict)}
-        if isinstance(answer, Answer):
+        rows = [
+            {k: v for k, v in self.plain(each).items() if not isinstance(v, list | dict)}
+            for each in self.given
+        ]
+        for row, answer in (
+            (row, each) for row, each in zip(rows, self.given, strict=True) if isinstance(each, Answer)
+        ):
             T, found = answer.found.T_world_camera.to("cpu", torch.float64), answer.found
             row |= zip(("x", "y", "z"), T.translation.tolist(), strict=True)
             row |= zip(("qx", "qy", "qz", "qw"), T.quaternion("xyzw").tolist(), strict=True)
             if found.covariance is not None:
                 position, rotation = standard_deviations(found.covariance)
                 row |= {"sigma_translation": position, "sigma_rotation_deg": math.degrees(rotation)}
-            if (error := answer.error) is not None:
+            if (off := answer.error) is not None:
                 row |= {
-                    "error_translation": float(error.translation),
-                    "error_rotation_deg": float(error.rotation_deg),
+                    "error_translation": float(off.translation),
+                    "error_rotation_deg": float(off.rotation_deg),
                 }
-        return row
+        return pandas.DataFrame(rows)
 
     @property
     def lost(self) -> list[tuple[int, int]]:
@@ -328,7 +330,9 @@ class Answers:
         return sum(
             answer.truth is not None
             and answer.name in given
-            and torch.allclose(given[answer.name], answer.truth.matrix(), rtol=0, atol=SAME_POSE)
+            and torch.allclose(
+                given[answer.name], answer.truth.matrix(), rtol=0, atol=1e-4
+            )  # rounding in files
             for answer in self.answers
         )
 
@@ -391,18 +395,6 @@ def plain_localization(found: Localization, backend: str, error: PoseError | Non
     return found.plain() | {"backend": backend, "error": None if error is None else error.plain()}
 
 
-def _shows_scene(found: Localization) -> bool:
-    """Return whether an image was recognized. An ambiguous one counts if far more landmarks fit its pose than
-    by chance.
-    """
-    evidence = found.diagnostics
-    if found.outcome is Outcome.AMBIGUOUS and isinstance(evidence, Evidence):
-        return all(
-            evidence.above_chance >= each.limit for each in LANDMARK_BOUNDS if each.measure == "above_chance"
-        )
-    return found.outcome in RECOGNISED
-
-
 def localize_each(
     localizer: Localizer | MapCollection,
     queries: QuerySource,
@@ -434,15 +426,24 @@ def localize_each(
             try:
                 query = queries.read(number)
                 if isinstance(localizer, MapCollection):
-                    placement = _placement(localizer, query, seed)
+                    if len(query.views) != 1 or query.depth_rays is not None:
+                        found_rig, expected = (
+                            "is a rig or has points from a sensor",
+                            "single images for several maps",
+                        )
+                        raise InputError(found_rig, where=query.name, expected=expected)
+                    placement = localizer(query.views[0].frame, seed)
                     found = placement.found
                 else:
                     bare = [view.frame.name for view in query.views if not view.frame.has_depth]
                     if bare and query.truth is not None and query.depth_rays is None and not bare_before:
                         bare_before = True
                         log.info("%s: no measured depth; colour only", ", ".join(bare))
-                    if number == 0:
-                        _log_depth_noise(query, localizer)
+                    sensor, shown = localizer.shared.depth_sensor, query.frame
+                    if number == 0 and sensor != "unknown" and shown.depth is not None and shown.has_depth:
+                        remark = noise_remark(shown.depth, shown.intrinsics, sensor)
+                        if remark is not None:
+                            log.info("%s: %s", query.name, remark)
                     begin = None if start is None else start(query)
                     found = localizer(query.views, begin, query.depth_rays, seed)
                 frame = query.frame.replace(name=query.name)
@@ -463,22 +464,3 @@ def localize_each(
                 each(query, answer)
             count(number + 1, total)
     return answers
-
-
-def _placement(maps: MapCollection, query: Query, seed: int) -> Placement:
-    if len(query.views) != 1 or query.depth_rays is not None:
-        raise InputError(
-            "is a rig or has points from a sensor",
-            where=query.name,
-            expected="single images for several maps",
-        )
-    return maps(query.views[0].frame, seed)
-
-
-def _log_depth_noise(query: Query, localizer: Localizer) -> None:
-    """Compare the noise of a query's depth with that of the sensor named in the settings."""
-    frame, sensor = query.frame, localizer.shared.depth_sensor
-    if sensor != "unknown" and frame.depth is not None and frame.has_depth:
-        remark = noise_remark(frame.depth, frame.intrinsics, sensor)
-        if remark is not None:
-            log.info("%s: %s", query.name, remark)

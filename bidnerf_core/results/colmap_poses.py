@@ -25,7 +25,10 @@ def write_colmap_poses(path: Path, images: Sequence[PosedImage]) -> None:
     Image names are file paths relative to the folder that contains all of them. Raises ``InputError`` for a
     lens that COLMAP cannot describe, and if another program's cameras.txt exists there.
     """
-    _check_beside(path)
+    beside = path.with_name("cameras.txt")
+    if beside.exists() and HEAD not in beside.read_text(errors="replace")[:100]:
+        expected = f"{path.name} in a folder without another model"
+        raise InputError("would be replaced, since a COLMAP model has one;", where=beside, expected=expected)
     files = [image.file for image in images if image.file is not None]
     folder = os.path.commonpath([file.resolve().parent for file in files]) if files else ""
     stored = list[PosedImage]()
@@ -41,24 +44,27 @@ def write_colmap_model(
     path: Path,
     images: Sequence[PosedImage],
     points: Sequence[str] = (),
-    keypoints: Sequence[Sequence[str]] | None = None,
+    keypoints: Sequence[Sequence[str]] = (),
 ) -> None:
     """Write a COLMAP text model of images called as in COLMAP, whose poses and cameras are those of the stored files.
 
     ``points`` are the rows of points3D.txt, and ``keypoints`` holds, for each image, those of POINTS2D[]: x, y, and the number
     of the point. Characters of names that would break a row are escaped.
     """
-    cameras: dict[Intrinsics, int] = {}
+    cameras, listed = dict[Intrinsics, int](), ""
     rows = list[str]()
     for number, image in enumerate(images, start=1):
         T = image.pose.inverse()
         numbers = (*T.quaternion("wxyz").tolist(), *T.translation.tolist())
-        camera = cameras.setdefault(image.intrinsics, len(cameras) + 1)
+        own = cameras.setdefault(image.intrinsics, len(cameras) + 1)
         pose = " ".join(f"{x:.15g}" for x in numbers)
-        seen = "" if keypoints is None else " ".join(keypoints[number - 1])
-        rows.append(f"{number} {pose} {camera} {printable(image.name)}\n{seen}\n")
+        seen = " ".join(keypoints[number - 1]) if keypoints else ""
+        rows.append(f"{number} {pose} {own} {printable(image.name)}\n{seen}\n")
     head = f"{HEAD}; {frame_of(images, 'world to camera')}\n"
-    listed = "".join(camera_row(number, camera) for camera, number in cameras.items())
+    for camera, number in cameras.items():
+        model, parameters = colmap_model(camera)
+        lens = " ".join(f"{x:.15g}" for x in parameters)
+        listed += f"{number} {model} {camera.width} {camera.height} {lens}\n"
     columns = {
         "cameras.txt": "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n" + listed,
         "points3D.txt": "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
@@ -68,21 +74,3 @@ def write_colmap_model(
     }
     for name, content in columns.items():
         write_file(path.with_name(name), f"{head}{content}".encode())
-
-
-def camera_row(number: int, camera: Intrinsics) -> str:
-    """Return the row of a camera. Raises ``InputError`` for a lens without a COLMAP model."""
-    model, parameters = colmap_model(camera)
-    numbers = " ".join(f"{x:.15g}" for x in parameters)
-    return f"{number} {model} {camera.width} {camera.height} {numbers}\n"
-
-
-def _check_beside(path: Path) -> None:
-    """Raise ``InputError`` if a camera file that this module did not write would be replaced."""
-    beside = path.with_name("cameras.txt")
-    if beside.exists() and HEAD not in beside.read_text(errors="replace")[:100]:
-        raise InputError(
-            "would be replaced, since a COLMAP model has one;",
-            where=beside,
-            expected=f"{path.name} in a folder without another model",
-        )

@@ -20,18 +20,12 @@ from bidnerf_core.captures import write_inria_cameras
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.io import output_folder, write_file
 from bidnerf_core.localization import origin_of
-from bidnerf_core.mapping import LandmarkMap, Tracks
 from bidnerf_core.maps import Map
 from bidnerf_core.registry import Plugins, interface_defects
 from bidnerf_core.results.colmap_poses import write_colmap_model
 from bidnerf_core.results.pose_files import PosedImage, frame_of, write_pose_transforms
 
 log = logging.getLogger("bidnerf")
-
-GREY = 0.5
-"""Colour of landmarks in a map without a surface."""
-FRUSTUM = 0.03
-"""Length of the drawn frustum of a camera, relative to the scene."""
 
 Exporter: TypeAlias = Callable[[Map, Path], Sequence[Path]]
 """A function that writes a map, whose surface and landmarks are on the CPU, into an existing folder and returns the files.
@@ -78,10 +72,9 @@ def export_map(scene: Map, out: str | Path, to: str, overwrite: bool = False) ->
 
 def export_clouds(scene: Map, out: Path) -> list[Path]:
     """The surface, the landmarks and the cameras as point clouds and meshes."""
-    images = _images(scene)
+    images, files = _images(scene), list[Path]()
     if not images and scene.surface is None and scene.landmarks is None:
         raise InputError("has no surface, landmarks or cameras to export", where=scene.name)
-    files = []
     if scene.surface is not None:
         parts = scene.surface.surfels
         columns = {
@@ -94,10 +87,17 @@ def export_clouds(scene: Map, out: Path) -> list[Path]:
     if scene.landmarks is not None:
         files.append(_write_landmarks(scene, images, out))
     if images:
-        vertices, faces = _pyramids(images, FRUSTUM * scene.bounds.side)
+        corners, length = list[Tensor](), 0.03 * scene.bounds.side
+        for image in images:  # a pyramid for each
+            camera = image.intrinsics
+            x, y = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
+            local = [[0.0, 0, 0], [-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1]]
+            corners.append(image.T_world_camera.apply(length * torch.tensor(local, dtype=torch.float64)))
+        one = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1], [1, 3, 2], [1, 4, 3]])
+        faces = (one[None] + 5 * np.arange(len(images))[:, None, None]).reshape(-1, 3)
         what = f"{amount(len(images), 'camera')}, five points each, the first of which is its centre"
+        vertices = torch.cat(corners).to(torch.float64 if any(scene.origin) else torch.float32)
         files.append(out / "cameras.ply")
-        vertices = vertices if any(scene.origin) else vertices.float()
         write_file(files[-1], ply({"x y z": vertices}, head(scene, images, what), faces))
         cameras = [camera.translated(origin_of(scene)) for camera in scene.info.cameras]
         files += write_inria_cameras(out, cameras)
@@ -107,53 +107,41 @@ def export_clouds(scene: Map, out: Path) -> list[Path]:
 def export_colmap(scene: Map, out: Path) -> list[Path]:
     """A text model of COLMAP: the cameras, with the landmarks as its points, and the keypoints that they were built from."""
     images, landmarks = _needed_images(scene, "colmap"), scene.landmarks
-    files = [image.name for image in images]
-    folder = os.path.commonpath([os.path.dirname(name) for name in files])
+    folder = os.path.commonpath([os.path.dirname(image.name) for image in images])
     upright = [replace(image, name=os.path.relpath(image.name, folder or ".")) for image in images]
     images = [image.as_stored for image in upright]
-    points, keypoints = list[str](), list[list[str]]()
+    points, keypoints = list[str](), [list[str]() for _ in images]
     if landmarks is not None:
-        tracks = [list[str]() for _ in range(len(landmarks))]
-        keypoints = [list[str]() for _ in images]
-        errors, seen = np.full(len(landmarks), landmarks.noise), landmarks.tracks
-        if seen is not None:
-            errors = _reprojection_errors(scene, landmarks, seen)
-            pixels = seen.pixel.double()
-            for number, (before, after) in enumerate(zip(upright, images, strict=True)):
-                if after is not before:
-                    own = seen.image == number
-                    rays = (after.pose.inverse() @ before.pose).rotate(
-                        before.intrinsics.unproject(pixels[own])
-                    )
-                    pixels[own] = after.intrinsics.project(rays)
-            rows = zip(seen.landmark.tolist(), seen.image.tolist(), pixels.tolist(), strict=True)
-            for landmark, image, (u, v) in rows:
-                tracks[landmark].append(f" {image + 1} {len(keypoints[image])}")
-                keypoints[image].append(f"{u:.6g} {v:.6g} {landmark + 1}")
-        else:
+        places, tracks = (
+            landmarks.positions.double() + origin_of(scene),
+            [list[str]() for _ in range(len(landmarks))],
+        )
+        total, count = torch.zeros(2, len(landmarks), dtype=torch.float64)
+        if landmarks.tracks is None:
             log.info(f"{scene.name}: its landmarks have no tracks; 'bidnerf bake MAP --data DATA' finds them")
+        else:
+            for number, (before, after) in enumerate(zip(upright, images, strict=True)):
+                own = landmarks.tracks.image == number
+                seen, pixels = landmarks.tracks.landmark[own].long(), landmarks.tracks.pixel[own].double()
+                projected = before.intrinsics.project(before.pose.inverse().apply(places[seen]))
+                total.index_add_(0, seen, (projected - pixels).norm(dim=-1))
+                count.index_add_(0, seen, torch.ones(len(seen), dtype=torch.float64))
+                if after is not before:
+                    rays = (after.pose.inverse() @ before.pose).rotate(before.intrinsics.unproject(pixels))
+                    pixels = after.intrinsics.project(rays)
+                for landmark, (u, v) in zip(seen.tolist(), pixels.tolist(), strict=True):
+                    tracks[landmark].append(f" {number + 1} {len(keypoints[number])}")
+                    keypoints[number].append(f"{u:.6g} {v:.6g} {landmark + 1}")
+        # The mean distance from the projections; that of a single one says nothing, and -1 is COLMAP's for unknown.
+        errors = torch.where(count > 1, total / count.clamp(min=1), -1).tolist()
         colours = (_colours(scene).clamp(0, 1) * 255).round().long().tolist()
-        places = _in_world(scene, landmarks.positions).tolist()
         digits = 16 if any(scene.origin) else 9
         points = [
             f"{number + 1} {x:.{digits}g} {y:.{digits}g} {z:.{digits}g} {r} {g} {b} {errors[number]:.3f}{''.join(tracks[number])}"
-            for number, ((x, y, z), (r, g, b)) in enumerate(zip(places, colours, strict=True))
+            for number, ((x, y, z), (r, g, b)) in enumerate(zip(places.tolist(), colours, strict=True))
         ]
-    write_colmap_model(out / "images.txt", images, points, keypoints or None)
+    write_colmap_model(out / "images.txt", images, points, keypoints)
     return [out / "cameras.txt", out / "images.txt", out / "points3D.txt"]
-
-
-def _reprojection_errors(scene: Map, landmarks: LandmarkMap, tracks: Tracks) -> np.ndarray:
-    """Return the mean distance (pixels) of the keypoints of each landmark from its projections."""
-    total, count = np.zeros(len(landmarks)), np.zeros(len(landmarks))
-    for number, camera in enumerate(scene.info.cameras):
-        own = tracks.image == number
-        seen = tracks.landmark[own].long()
-        local = camera.pose.inverse().apply(landmarks.positions[seen].double())
-        error = (camera.intrinsics.project(local) - tracks.pixel[own].double()).norm(dim=-1)
-        np.add.at(total, seen.numpy(), error.numpy())
-        np.add.at(count, seen.numpy(), 1)
-    return np.where(count > 0, total / np.maximum(count, 1), landmarks.noise)
 
 
 def export_transforms(scene: Map, out: Path) -> list[Path]:
@@ -210,24 +198,18 @@ def ply(columns: dict[str, Tensor], comments: list[str], faces: np.ndarray | Non
 
     Colours in [0, 1] are written as bytes, integers with 32 bits, and others in their own precision.
     """
-    kinds, values = [], []
+    kinds, values = list[tuple[str, str]](), list[np.ndarray]()
+    stored = {"uchar": "u1", "float": "<f4", "double": "<f8", "int": "<i4"}
     for names, column in columns.items():
-        table = column.detach().cpu().reshape(len(column), -1)
+        table, kind = column.detach().cpu().reshape(len(column), -1), "int"
         if names == "red green blue":
-            array, kind = (table.clamp(0, 1) * 255).round().to(torch.uint8).numpy(), "uchar"
-        elif table.dtype == torch.float64:
-            array, kind = table.numpy(), "double"
+            table, kind = (table.clamp(0, 1) * 255).round(), "uchar"
         elif table.dtype.is_floating_point:
-            array, kind = table.float().numpy(), "float"
-        else:
-            array, kind = table.to(torch.int32).numpy(), "int"
-        for number, name in enumerate(names.split()):
+            kind = "double" if table.dtype == torch.float64 else "float"
+        for name, value in zip(names.split(), table.numpy().T, strict=True):
             kinds.append((name, kind))
-            values.append(array[:, number])
-    row = np.dtype(
-        [(name, {"uchar": "u1", "float": "<f4", "double": "<f8", "int": "<i4"}[kind]) for name, kind in kinds]
-    )
-    rows = np.empty(len(values[0]), row)
+            values.append(value)
+    rows = np.empty(len(values[0]), np.dtype([(name, stored[kind]) for name, kind in kinds]))
     for (name, _), value in zip(kinds, values, strict=True):
         rows[name] = value
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
@@ -255,21 +237,5 @@ def _colours(scene: Map) -> Float[Tensor, "n 3"]:
     landmarks = scene.landmarks
     assert landmarks is not None
     if scene.surface is None:
-        return torch.full((len(landmarks), 3), GREY)
+        return torch.full((len(landmarks), 3), 0.5)
     return scene.surface.surfels.rgb[scene.surface.nearest(landmarks.positions)]
-
-
-def _pyramids(images: list[PosedImage], length: float) -> tuple[Float[Tensor, "v 3"], np.ndarray]:
-    """Return the corners of a pyramid for each camera, and the triangles between them."""
-    corners = []
-    for image in images:
-        camera = image.intrinsics
-        right, down = 0.5 * camera.width / camera.fx * length, 0.5 * camera.height / camera.fy * length
-        local = [
-            [0.0, 0, 0],
-            *([x, y, length] for x, y in ((-right, -down), (right, -down), (right, down), (-right, down))),
-        ]
-        corners.append(image.T_world_camera.apply(torch.tensor(local, dtype=torch.float64)))
-    one = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1], [1, 3, 2], [1, 4, 3]])
-    faces = (one[None] + 5 * np.arange(len(images))[:, None, None]).reshape(-1, 3)
-    return torch.cat(corners), faces

@@ -20,12 +20,9 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import reduced, write_file
 from bidnerf_core.localization import Localization, SceneMap, Start, checked_map, origin_of, start_pose
 
-PICTURE_SIDE = 240
-"""Maximum pixels on the longer side; larger photos are downscaled, since each rendered pixel takes time."""
-TILE = 240  # pixels: smaller images are enlarged to about this, so that captions fit
-CAPTION, GAP = 22, 6  # pixels
-INK, FRAME, PAPER = (30, 34, 42), (214, 216, 220), (255, 255, 255)
-OBSERVED_EDGES, RENDERED_EDGES = (0, 190, 110), (235, 0, 140)
+SIDE = 240
+"""Pixels on the longer side of a picture: larger photos are downscaled, since each rendered pixel takes time, and smaller images
+are enlarged to about this, so that captions fit."""
 NO_DEPTH = (38, 38, 42)  # colour where no depth was measured
 
 
@@ -55,7 +52,7 @@ class Painter:
     """Draws overlays of one photo with renderings of a map."""
 
     def __init__(self, map: SceneMap, frame: Frame) -> None:
-        scale = PICTURE_SIDE / max(frame.intrinsics.width, frame.intrinsics.height)
+        scale = SIDE / max(frame.intrinsics.width, frame.intrinsics.height)
         self._map = map
         self._camera = frame.intrinsics if scale >= 1 else frame.intrinsics.scaled(scale)
         size = (self._camera.width, self._camera.height)
@@ -157,7 +154,7 @@ def blend(observed: ArrayLike | Tensor, rendered: ArrayLike | Tensor) -> UInt8[n
     a, b = as_picture(observed, "observed"), as_picture(rendered, "rendered")
     require_same_size([a, b], ("observed", "rendered"))
     mixed = 0.55 * (a / 2 + b / 2) + 0.45 * 255
-    for image, colour in ((b, RENDERED_EDGES), (a, OBSERVED_EDGES)):
+    for image, colour in ((b, (235, 0, 140)), (a, (0, 190, 110))):
         strength = 0.9 * edges(image)[..., None]
         mixed = mixed * (1 - strength) + strength * np.array(colour)
     return mixed.clip(0, 255).astype(np.uint8)
@@ -186,16 +183,14 @@ def edges(image: ArrayLike | Tensor) -> Float[np.ndarray, "h w"]:
 
 def tile(image: ArrayLike | Tensor, caption: str) -> UInt8[np.ndarray, "H W 3"]:
     """Return the image on white, enlarged if it is small, with its caption above it."""
-    picture = Image.fromarray(as_picture(image))
-    scale = max(1, round(TILE / picture.width))
+    picture, top, gap = Image.fromarray(as_picture(image)), 22, 6
+    scale = max(1, round(SIDE / picture.width))
     picture = picture.resize((picture.width * scale, picture.height * scale), Image.Resampling.NEAREST)
-    canvas = Image.new("RGB", (picture.width + GAP, picture.height + CAPTION + GAP), PAPER)
-    draw = ImageDraw.Draw(canvas)
-    draw.text((GAP, 4), caption, fill=INK, font=ImageFont.load_default(13))
-    canvas.paste(picture, (GAP // 2, CAPTION))
-    draw.rectangle(
-        (GAP // 2 - 1, CAPTION - 1, GAP // 2 + picture.width, CAPTION + picture.height), outline=FRAME
-    )
+    canvas = Image.new("RGB", (picture.width + gap, picture.height + top + gap), (255, 255, 255))
+    draw, corner = ImageDraw.Draw(canvas), (gap // 2 + picture.width, top + picture.height)
+    draw.text((gap, 4), caption, fill=(30, 34, 42), font=ImageFont.load_default(13))
+    canvas.paste(picture, (gap // 2, top))
+    draw.rectangle((gap // 2 - 1, top - 1, *corner), outline=(214, 216, 220))
     return np.asarray(canvas)
 
 

@@ -30,18 +30,6 @@ from bidnerf_core.mapping import SurfaceMap
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
 """The colour-blind-safe palette of Okabe and Ito (2008), with brown instead of yellow, which is hard to see on white."""
 
-DASHES = ("-", "--", ":", "-.")  # for more lines than there are colours
-STYLE: dict[str, Any] = {
-    "font.family": "DejaVu Sans", "font.size": 9, "axes.titlesize": 9, "axes.titlelocation": "left",
-    "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.7, "axes.edgecolor": "#555",
-    "xtick.color": "#333", "ytick.color": "#333", "xtick.major.width": 0.7, "ytick.major.width": 0.7,
-    "grid.color": "#ddd", "grid.linewidth": 0.6, "legend.frameon": False, "legend.fontsize": 8.5,
-    "svg.hashsalt": "bidnerf", "text.parse_math": False,  # names may contain dollar signs
-}  # fmt: skip
-
-LONGEST_LINE = 200
-"""Maximum number of characters of a line of text in a figure."""
-
 CRITERION_NAMES = {
     "10%": "translation error at most 10 % of the start's",
     "5deg 0.05": "under 5° and 0.05 units",
@@ -52,22 +40,6 @@ SHORT_CRITERION_NAMES = {
     "5deg 0.05": "5° and 0.05 units",
     "1deg 0.02": "1° and 0.02 units",
 }
-LOOKS: dict[PhotoProblem, tuple[str, str]] = {
-    "mirrored": (COLOURS[3], "P"), "turned": (COLOURS[3], "v"), "badly posed": (COLOURS[1], "X"),
-    "apart": (COLOURS[7], "s"), "isolated": (COLOURS[6], "D"), "blurred": (COLOURS[4], "h"),
-    "badly exposed": (COLOURS[5], "*"),
-}  # fmt: skip
-"""Colour and marker of each problem."""
-MOST_POINTS = 20_000
-"""Maximum number of landmarks drawn."""
-CAPTURE_MARGIN = 0.5
-"""Margin of the plot around the cameras, relative to their extent; landmarks farther away are left out."""
-MOST_LABELS = 16
-"""Maximum number of photos with problems that are named in the plot."""
-SURFELS = 12_000
-"""Maximum number of surfels drawn."""
-PATH_MARGIN = 1.5
-"""Extent of the drawn surface around the path, in multiples of the path's size; at least half of the scene's extent."""
 
 
 def require_matplotlib() -> Any:
@@ -81,7 +53,14 @@ def require_matplotlib() -> Any:
 
 def styled() -> Any:
     """Return a context in which figures are drawn and saved in the common style."""
-    return require_matplotlib().rc_context(STYLE)
+    style = {
+        "font.family": "DejaVu Sans", "font.size": 9, "axes.titlesize": 9, "axes.titlelocation": "left",
+        "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.7, "axes.edgecolor": "#555",
+        "xtick.color": "#333", "ytick.color": "#333", "xtick.major.width": 0.7, "ytick.major.width": 0.7,
+        "grid.color": "#ddd", "grid.linewidth": 0.6, "legend.frameon": False, "legend.fontsize": 8.5,
+        "svg.hashsalt": "bidnerf", "text.parse_math": False,  # names may contain dollar signs
+    }  # fmt: skip
+    return require_matplotlib().rc_context(style)
 
 
 def new_figure(width: float, height: float) -> Any:
@@ -111,37 +90,32 @@ def write_figure(figure: Any, path: Path, **options: Any) -> None:
     """
     require_matplotlib()
     from matplotlib.text import Text
+    from matplotlib.ticker import FuncFormatter
 
     for text in figure.findobj(Text):
         text.set_text(_drawable(text.get_text()))
-    for axes in figure.axes:
-        for axis in (axes.xaxis, axes.yaxis):
-            _make_labels_drawable(axis.get_major_formatter())
+    for formatter in (
+        axis.get_major_formatter() for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)
+    ):
+        if isinstance(
+            formatter, FuncFormatter
+        ):  # given labels, which are set again whenever a figure is drawn
+            formatter.func = lambda *place, labels=formatter.func: _drawable(str(labels(*place)))
     file = io.BytesIO()
     figure.savefig(file, format=path.suffix.lstrip(".") or "png", **options)
     write_file(path, file.getvalue())
 
 
-def _make_labels_drawable(formatter: Any) -> None:
-    """Modify a formatter of given labels, which are set again whenever a figure is drawn."""
-    from matplotlib.ticker import FuncFormatter
-
-    if isinstance(formatter, FuncFormatter):
-        labels = formatter.func
-        formatter.func = lambda *place: _drawable(str(labels(*place)))
-
-
 def _drawable(text: str) -> str:
+    """Return a text that is printable, in lines of at most 200 characters."""
     lines = (printable(line) for line in text.split("\n"))
-    return "\n".join(
-        line if len(line) <= LONGEST_LINE else line[: LONGEST_LINE - 3] + "..." for line in lines
-    )
+    return "\n".join(line if len(line) <= 200 else line[:197] + "..." for line in lines)
 
 
 def line_look(place: int) -> dict[str, Any]:
     """Return the colour and the dashes of line number ``place``."""
     turn, colour = divmod(place, len(COLOURS))
-    return {"color": COLOURS[colour], "linestyle": DASHES[turn % len(DASHES)], "linewidth": 1.6}
+    return {"color": COLOURS[colour], "linestyle": ("-", "--", ":", "-.")[turn % 4], "linewidth": 1.6}
 
 
 def draw_capture(
@@ -158,12 +132,28 @@ def draw_capture(
         figure = new_figure(7.6, 7.0)
         panel = figure.add_subplot()
         cameras = _from_above([photo.position for photo in report.photos], report)
-        _frame(panel, cameras, report, unit)
-        if points is not None and seen_by is not None and len(points):
-            _draw_landmarks(figure, panel, _from_above(points.double().tolist(), report), seen_by)
-        for gap in (*report.coverage.gaps, *filter(None, [report.coverage.open_side])):
+        looks_inwards = report.coverage.arrangement in ("around", "one side")
+        shown = np.concatenate([cameras, np.zeros((1, 2))]) if looks_inwards else cameras  # and the centre
+        low, high = shown.min(0), shown.max(0)
+        middle, reach = (
+            (low + high) / 2,
+            max(float((high - low).max()), 1e-6),
+        )  # with a margin of half of that
+        panel.set(xlim=(middle[0] - reach, middle[0] + reach), ylim=(middle[1] - reach, middle[1] + reach))
+        panel.set(aspect="equal", xlabel=f"{unit}, from the centre of the capture")
+        if points is not None and seen_by is not None and len(points):  # darker if more photos show them
+            step = max(1, math.ceil(len(points) / 20_000))
+            views, places = seen_by.numpy()[::step], _from_above(points[::step].double().tolist(), report)
+            order = np.argsort(views, kind="stable")
+            drawn = panel.scatter(
+                *places[order].T, c=views[order], s=2, cmap="Blues", vmin=0,
+                vmax=max(3.0, float(np.quantile(views, 0.98))), linewidths=0, zorder=1,
+            )  # fmt: skip
+            figure.colorbar(drawn, ax=panel, label="photos that show a landmark", shrink=0.7, pad=0.02)
+        gaps = [*report.coverage.gaps, *filter(None, [report.coverage.open_side])]
+        for gap in gaps if looks_inwards else ():
             _draw_gap(panel, gap, cameras, report)
-        _draw_cameras(panel, cameras, report)
+        _draw_cameras(panel, cameras, report, {name for gap in gaps for name in (gap.after, gap.before)})
         panel.set_title("The capture from above")
         figure.legend(loc="outside lower center", ncols=4)
         try:
@@ -181,42 +171,21 @@ def _from_above(points: Any, report: CaptureReport) -> Float[np.ndarray, "n 2"]:
     return torch.stack([away @ first, away @ second], dim=-1).numpy()
 
 
-def _frame(panel: Any, cameras: Float[np.ndarray, "v 2"], report: CaptureReport, unit: LengthUnit) -> None:
-    """Set the visible part of the plane: the cameras, the centre if they look at it, and a margin."""
-    shown = cameras
-    if report.coverage.arrangement in ("around", "one side"):
-        shown = np.concatenate([cameras, np.zeros((1, 2))])
-    low, high = shown.min(0), shown.max(0)
-    reach = max(float((high - low).max()), 1e-6) * (0.5 + CAPTURE_MARGIN)
-    middle = (low + high) / 2
-    panel.set_xlim(middle[0] - reach, middle[0] + reach)
-    panel.set_ylim(middle[1] - reach, middle[1] + reach)
-    panel.set_aspect("equal")
-    panel.set_xlabel(f"{unit}, from the centre of the capture")
-
-
-def _draw_landmarks(
-    figure: Any, panel: Any, points: Float[np.ndarray, "n 2"], seen_by: Int[Tensor, "n"]
+def _draw_cameras(
+    panel: Any, cameras: Float[np.ndarray, "v 2"], report: CaptureReport, ends: set[str]
 ) -> None:
-    """Draw landmarks, darker if more photos show them."""
-    step = max(1, math.ceil(len(points) / MOST_POINTS))
-    views = seen_by.numpy()[::step]
-    order = np.argsort(views, kind="stable")
-    drawn = panel.scatter(
-        *points[::step][order].T, c=views[order], s=2, cmap="Blues", vmin=0,
-        vmax=max(3.0, float(np.quantile(views, 0.98))), linewidths=0, zorder=1,
-    )  # fmt: skip
-    figure.colorbar(drawn, ax=panel, label="photos that show a landmark", shrink=0.7, pad=0.02)
-
-
-def _draw_cameras(panel: Any, cameras: Float[np.ndarray, "v 2"], report: CaptureReport) -> None:
-    """Draw the cameras with their directions and problems; name those with problems, and those at the ends of gaps."""
+    """Draw the cameras with their directions and problems; name the first with problems, and those at the ``ends`` of gaps."""
+    looks: dict[PhotoProblem | None, tuple[str, str]] = {
+        None: (COLOURS[2], "o"), "mirrored": (COLOURS[3], "P"), "turned": (COLOURS[3], "v"), "badly posed": (COLOURS[1], "X"),
+        "apart": (COLOURS[7], "s"), "isolated": (COLOURS[6], "D"), "blurred": (COLOURS[4], "h"),
+        "badly exposed": (COLOURS[5], "*"),
+    }  # fmt: skip
     ahead = [[p + d for p, d in zip(photo.position, photo.direction, strict=True)] for photo in report.photos]
     length = 0.04 * (panel.get_xlim()[1] - panel.get_xlim()[0])
     for start, step in zip(cameras, _from_above(ahead, report) - cameras, strict=True):
         panel.plot(*np.stack([start, start + length * step]).T, color="#555", linewidth=0.7, zorder=2)
     worst = [photo.problems[0] if photo.problems else None for photo in report.photos]
-    for problem, (colour, marker) in ((None, (COLOURS[2], "o")), *LOOKS.items()):
+    for problem, (colour, marker) in looks.items():
         if not len(places := cameras[[each == problem for each in worst]]):
             continue
         panel.scatter(
@@ -229,10 +198,8 @@ def _draw_cameras(panel: Any, cameras: Float[np.ndarray, "v 2"], report: Capture
             edgecolors="white",
             linewidths=0.5,
         )
-    gaps = (*report.coverage.gaps, *filter(None, [report.coverage.open_side]))
-    ends = {name for gap in gaps for name in (gap.after, gap.before)}
     named = [i for i, photo in enumerate(report.photos) if photo.problems or photo.name in ends]
-    for i in named[:MOST_LABELS]:
+    for i in named[:16]:
         panel.annotate(
             report.photos[i].name, cameras[i], (4, 4), textcoords="offset points", fontsize=6, zorder=4
         )
@@ -240,8 +207,6 @@ def _draw_cameras(panel: Any, cameras: Float[np.ndarray, "v 2"], report: Capture
 
 def _draw_gap(panel: Any, gap: Gap, cameras: Float[np.ndarray, "v 2"], report: CaptureReport) -> None:
     """Shade the directions from the centre without any camera."""
-    if report.coverage.arrangement not in ("around", "one side"):
-        return
     from matplotlib.patches import Wedge
 
     (after,) = _from_above([photo.position for photo in report.photos if photo.name == gap.after], report)
@@ -283,8 +248,14 @@ def draw_path(
         for panel, upward, title in zip(panels, (1, 2), ("from above", "from the side"), strict=True):
             projection = np.stack([axes[0], axes[upward]], axis=-1)
             places = poses.translation.double().numpy() @ projection
-            if surface is not None:
-                _draw_surface(panel, surface, projection, places)
+            if surface is not None:  # a sample around the path, at least half of the scene's extent wide
+                surfels = moved(surface.surfels, "cpu")
+                points, middle = surfels.positions.double().numpy() @ projection, places.mean(0)
+                size = max(0.5 * surface.extent, 1.5 * float(np.abs(places - middle).max()))
+                near = np.flatnonzero((np.abs(points - middle) <= size).all(-1))
+                some = near[:: max(1, -(-len(near) // 12_000))]
+                paint = 0.3 + 0.7 * surfels.rgb[torch.from_numpy(some)].clamp(0, 1).numpy()
+                panel.scatter(*points[some].T, s=2, c=paint, linewidths=0, rasterized=True)
             if known:
                 panel.plot(
                     *(np.array(known) @ projection).T, color="#000", linewidth=0.8, label="ground truth"
@@ -316,17 +287,3 @@ def _axes(poses: SE3, up: Float[Tensor, "3"]) -> Float[np.ndarray, "3 3"]:
         right = torch.linalg.cross(up, torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())])
     right = right / right.norm()
     return torch.stack([right, torch.linalg.cross(up, right), up]).numpy()
-
-
-def _draw_surface(
-    panel: Any, surface: SurfaceMap, projection: Float[np.ndarray, "3 2"], places: Float[np.ndarray, "n 2"]
-) -> None:
-    """Draw a sample of the surfels around the path in their colours."""
-    surfels = moved(surface.surfels, "cpu")
-    points = surfels.positions.double().numpy() @ projection
-    middle = places.mean(0)
-    size = max(0.5 * surface.extent, PATH_MARGIN * float(np.abs(places - middle).max()))
-    near = np.flatnonzero((np.abs(points - middle) <= size).all(-1))
-    some = near[:: max(1, -(-len(near) // SURFELS))]
-    colours = surfels.rgb[torch.from_numpy(some)].clamp(0, 1).numpy()
-    panel.scatter(*points[some].T, s=2, c=0.3 + 0.7 * colours, linewidths=0, rasterized=True)

@@ -24,11 +24,9 @@ from bidnerf_core.geometry import SE3, LengthUnit, pose_from_matrix
 from bidnerf_core.io import parse_json, read_file, write_file
 from bidnerf_core.registry import Plugins, interface_defects
 
-TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 OPENCV_AXES = "camera axes x right, y down, z forward (OpenCV)"
 EXPECTED_POSE = '{"T_world_camera": 4x4 rows}'
 EXPECTED_POSITIONS = '{"NAME": [x, y, z], ...} or [{"frame": "NAME", "T_world_camera": 4x4 rows}, ...]'
-NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +99,8 @@ def write_tum(path: Path, images: Sequence[PosedImage]) -> None:
     In the last case, a comment before the row names the image, since other programs skip comments.
     """
     timed = all(image.time is not None for image in images)
-    named = not timed and all(NUMBER.fullmatch(image.name) for image in images)
-    rows = [f"# {TUM_COLUMNS} ({frame_of(images)})"]
+    named = not timed and all(re.fullmatch(r"\d+(\.\d+)?", image.name) for image in images)
+    rows = [f"# timestamp tx ty tz qx qy qz qw ({frame_of(images)})"]
     for image in images:
         if not (timed or named):
             rows.append(f"# {printable(image.name if image.file is None else image.file.name)}")

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bidnerf_core.datasets import BreaksOff, Capture, TimedFrame, open_sequence
+from bidnerf_core.datasets import BreaksOff, Capture, open_sequence
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.frames import Frame
 from bidnerf_core.localization import Localizer, SceneMap, Tracker, landmark_cameras
 from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context
 from bidnerf_core.results.answers import Answer, Answers
-
-TRIED = 3
-"""Number of unreadable frames at the beginning of a sequence after which tracking is given up: probably none
-can be read."""
 
 
 def track(
@@ -53,21 +49,27 @@ def track(
     total = -(-len(sequence) // every)
     with job_context(progress, cancel):
         count = counter("tracking", "frames")
-        for number, timed in enumerate(_every(sequence, every)):
-            if isinstance(timed, TimedFrame):
+        for number, place in enumerate(range(0, len(sequence), every)):
+            try:
+                timed = sequence[place]
+            except BreaksOff:
+                raise
+            except InputError as error:
+                if not answers.answers and number + 1 >= min(3, total):  # probably none can be read
+                    many = (
+                        "the first frame cannot"
+                        if number == 0
+                        else f"none of the first {number + 1} frames can"
+                    )
+                    raise InputError(f"{many} be read: {error}") from error
+                warnings.warn(f"{error}; left out", InputWarning, stacklevel=2)
+                answers.unread += 1
+            else:
                 frame = timed.frame if depth else timed.frame.replace(depth=None)
                 found = tracker(frame, timed.time)
                 answer = answers.add(frame, found, timed.time, timed.truth, every * number)
                 if each is not None:
                     each(timed.frame, answer)
-            elif not answers.answers and number + 1 >= min(TRIED, total):
-                first = (
-                    "the first frame cannot" if number == 0 else f"none of the first {number + 1} frames can"
-                )
-                raise InputError(f"{first} be read: {timed}")
-            else:
-                warnings.warn(f"{timed}; left out", InputWarning, stacklevel=2)
-                answers.unread += 1
             count(number + 1, total)
     return answers
 
@@ -75,14 +77,3 @@ def track(
 def opened_for(scene: SceneMap, path: str | Path, **options: Any) -> Capture:
     """Open a sequence as ``open_sequence`` does, with the map's background and its cameras for images that have none."""
     return open_sequence(path, assumed=landmark_cameras(scene), background=scene.bounds.background, **options)
-
-
-def _every(frames: Capture, every: int) -> Iterator[TimedFrame | InputError]:
-    """Yield every n-th frame; one that cannot be read is yielded as an error, unless no later one can be."""
-    for place in range(0, len(frames), every):
-        try:
-            yield frames[place]
-        except BreaksOff:
-            raise
-        except InputError as error:
-            yield error

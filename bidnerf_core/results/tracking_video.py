@@ -9,25 +9,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from PIL import Image
-from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame
-from bidnerf_core.localization import Localization, SceneMap
+from bidnerf_core.localization import SceneMap
 from bidnerf_core.results.answers import Answer
 from bidnerf_core.results.overlays import Painter, tile
 
 WRITTEN_SUFFIXES = (".mp4", ".mkv", ".webm")
-RATES = 1.0, 60.0
-"""Minimum and maximum number of frames per second."""
 USUAL_RATE = 30.0
 """Frames per second of sequences without time stamps."""
-QUALITY = "20"
-"""Constant rate factor of the encoder, almost without visible loss."""
-WHITE_DEPTH = 5.0
-"""Depth (metres) drawn in white if only depth was recorded."""
 
 
 def check_video(file: Path) -> None:
@@ -68,15 +61,28 @@ class TrackingVideo:
             self._partial.replace(self._file)
 
     def add(self, frame: Frame, answer: Answer) -> None:
-        """Draw a frame."""
-        picture, time = self._drawn(frame, answer.found), answer.time
+        """Draw a frame: its colours, or its depth as grey values up to 5 m if no colours were recorded, beside the map."""
+        found, time = answer.found, answer.time
+        painter = Painter(self._scene, found.frame_as_taken(frame))
+        observed = painter.observed
+        if frame.depth is not None and not frame.has_colour:
+            grey = (frame.depth.cpu() / 5.0).clamp(0, 1)
+            rows, columns = (
+                torch.linspace(0, old - 1, new).round().long()
+                for old, new in zip(grey.shape, observed.shape[:2], strict=True)
+            )
+            observed = grey[rows][:, columns][..., None].expand(-1, -1, 3)
+        caption = "rendered at the pose found" if found.converged else f"not accepted: {found.outcome}"
+        rendered = tile(painter.rendered(found.T_world_camera), caption)
+        picture = np.concatenate([tile(observed, f"observed: {frame.name}"), rendered], axis=1)
+        picture = np.ascontiguousarray(picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2])
         if self._first is None:
             self._first = picture, time
             return
         first, began = self._first
         if self._stream is None:
             apart = 0.0 if time is None or began is None else abs(time - began)
-            rate = min(RATES[1], max(RATES[0], 1 / apart)) if apart else USUAL_RATE
+            rate = min(60.0, max(1.0, 1 / apart)) if apart else USUAL_RATE
             self._open(first, rate)
         if picture.shape != first.shape:
             size = (first.shape[1], first.shape[0])
@@ -90,7 +96,7 @@ class TrackingVideo:
         codec = "libvpx-vp9" if self._file.suffix.lower() == ".webm" else "libx264"
         self._file_out = av.open(str(self._partial), "w")
         self._stream = self._file_out.add_stream(
-            codec, rate=Fraction(rate).limit_denominator(1000), options={"crf": QUALITY}
+            codec, rate=Fraction(rate).limit_denominator(1000), options={"crf": "20"}
         )
         self._stream.height, self._stream.width = first.shape[:2]
         self._stream.pix_fmt = "yuv420p"
@@ -100,25 +106,3 @@ class TrackingVideo:
         from av import VideoFrame
 
         self._file_out.mux(self._stream.encode(VideoFrame.from_ndarray(picture, format="rgb24")))
-
-    def _drawn(self, frame: Frame, found: Localization) -> UInt8[np.ndarray, "h w 3"]:
-        painter = Painter(self._scene, found.frame_as_taken(frame))
-        caption = "rendered at the pose found" if found.converged else f"not accepted: {found.outcome}"
-        tiles = (
-            tile(_observed(frame, painter.observed), f"observed: {frame.name}"),
-            tile(painter.rendered(found.T_world_camera), caption),
-        )
-        picture = np.concatenate(tiles, axis=1)
-        return np.ascontiguousarray(picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2])
-
-
-def _observed(frame: Frame, reduced: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """Return a frame's colours, or its depth as grey values if no colours were recorded."""
-    if frame.has_colour or frame.depth is None:
-        return reduced
-    grey = (frame.depth.cpu() / WHITE_DEPTH).clamp(0, 1)
-    rows, columns = (
-        torch.linspace(0, old - 1, new).round().long()
-        for old, new in zip(grey.shape, reduced.shape[:2], strict=True)
-    )
-    return grey[rows][:, columns][..., None].expand(-1, -1, 3)

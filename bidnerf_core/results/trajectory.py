@@ -17,13 +17,6 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3, LengthUnit, Similarity, fit_similarity, symbol
 from bidnerf_core.results.errors import PoseError, pose_error
 
-LEAST_POSES = 3
-"""Minimum number of poses that determine an alignment."""
-LEAST_FOR_WORLDS = 3
-"""Smallest number of poses for which a common transformation means anything: it has seven degrees of freedom."""
-UNEXPLAINED = 0.1
-"""Largest error, relative to the median error, that may remain in any pose after the transformation."""
-
 
 @dataclass(frozen=True)
 class ErrorSummary:
@@ -65,7 +58,7 @@ class TrajectoryErrors:
     def of(found: SE3, true: SE3, unit: LengthUnit = "units") -> TrajectoryErrors:
         """Compare poses ``T_world_camera`` (n, in ``unit``), in chronological order. Raises ``InputError`` if there are none."""
         count = len(found.translation)
-        distances = alignment_errors(found, true) if count >= LEAST_POSES else None
+        distances = alignment_errors(found, true) if count >= 3 else None  # fewer determine no alignment
         return TrajectoryErrors(
             count,
             ErrorSummary.of(pose_error(found, true, unit)),
@@ -74,40 +67,26 @@ class TrajectoryErrors:
         )
 
 
-def rigid_alignment(found: SE3, true: SE3) -> SE3:
-    """Return the T_true_found that brings the camera centres of ``found`` (n) nearest to those of ``true``,
-    without scaling.
-
-    Raises ``InputError`` if all centres coincide.
-    """
-    source, target = found.translation.double(), true.translation.double()
-    rotation = fit_similarity(source, target).T_target_source.rotation
-    return SE3(rotation, target.mean(0) - rotation @ source.mean(0))
-
-
 def alignment_errors(found: SE3, true: SE3) -> Float[Tensor, "n"] | None:
     """Return the absolute trajectory error of each pose: its distance (metres) from the truth after a rigid alignment.
 
-    Returns None if the camera did not move, since the rotation is then undetermined.
+    The alignment brings the camera centres nearest to the true ones, without scaling. Returns None if the camera did not move,
+    since the rotation is then undetermined.
     """
+    source, target = found.translation.double(), true.translation.double()
     try:
-        T_true_found = rigid_alignment(found, true)
+        rotation = fit_similarity(source, target).T_target_source.rotation
     except InputError:
         return None
-    aligned = T_true_found.apply(found.translation.double())
-    return torch.linalg.vector_norm(aligned - true.translation.double(), dim=-1)
+    return torch.linalg.vector_norm(
+        (source - source.mean(0)) @ rotation.mT - (target - target.mean(0)), dim=-1
+    )
 
 
-def relative_errors(found: SE3, true: SE3, apart: int = 1) -> PoseError:
-    """Return the relative pose errors (n - apart) of the motion from each pose to the one ``apart`` poses
-    later.
-
-    Sturm et al. 2012, eq. 2. Raises ``InputError`` if the trajectory is too short.
-    """
-    if not 1 <= apart < len(found.translation):
-        raise InputError(f"relative errors of {len(found.translation)} poses that are {apart} apart")
+def relative_errors(found: SE3, true: SE3) -> PoseError:
+    """Return the relative pose errors (n - 1) of the motion from each pose to the next: Sturm et al. 2012, eq. 2."""
     found, true = found.to(torch.float64), true.to(torch.float64)
-    moved = [T[:-apart].inverse() @ T[apart:] for T in (found, true)]
+    moved = [T[:-1].inverse() @ T[1:] for T in (found, true)]
     return pose_error(moved[0], moved[1])
 
 
@@ -117,7 +96,9 @@ def world_of_truth(found: SE3, true: SE3) -> Similarity | None:
     None unless it explains all errors. Its rotation is the mean of those between the orientations, so that the
     positions confirm it.
     """
-    if len(found.translation) < LEAST_FOR_WORLDS:
+    if (
+        len(found.translation) < 3
+    ):  # a transformation of seven degrees of freedom would explain nearly anything
         return None
     found, true = found.to(torch.float64), true.to(torch.float64)
     u, _, vh = torch.linalg.svd((found.rotation @ true.rotation.mT).sum(0))
@@ -134,7 +115,7 @@ def world_of_truth(found: SE3, true: SE3) -> Similarity | None:
         torch.linalg.vector_norm(source - target, dim=-1)
         for source in (worlds.apply(true.translation), true.translation)
     )
-    return worlds if bool(left.max() < UNEXPLAINED * error.median()) else None
+    return worlds if bool(left.max() < 0.1 * error.median()) else None
 
 
 def spans(flags: Sequence[bool]) -> list[tuple[int, int]]:
@@ -150,8 +131,4 @@ def spans(flags: Sequence[bool]) -> list[tuple[int, int]]:
 
 def _three(values: Float[Tensor, "n"]) -> tuple[float, float, float]:
     values = values.double()
-    return (
-        float(values.quantile(0.5)),
-        float(values.quantile(0.95)),
-        float(values.square().mean().sqrt()),
-    )
+    return float(values.quantile(0.5)), float(values.quantile(0.95)), float(values.square().mean().sqrt())

@@ -11,11 +11,6 @@ from bidnerf_core.geometry import symbol
 from bidnerf_core.io import write_file
 from bidnerf_core.results.pose_files import PosedImage, common_unit
 
-EUROC_HEAD = (
-    "#timestamp [ns],p_RS_R_x [{0}],p_RS_R_y [{0}],p_RS_R_z [{0}],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"
-)
-NANOSECONDS = 10**9
-
 
 def write_kitti_poses(path: Path, images: Sequence[PosedImage]) -> None:
     """Write KITTI poses: per image, a row with the twelve numbers of a 3x4 camera-to-world matrix, without times."""
@@ -39,11 +34,10 @@ def write_euroc_poses(path: Path, images: Sequence[PosedImage]) -> None:
     The time of an image without one is its number, in seconds. The head names the unit of the positions, which is ``[m]`` only
     for metric maps.
     """
-    rows = [EUROC_HEAD.format(symbol(common_unit(images)))]
+    positions = ",".join(f"p_RS_R_{axis} [{symbol(common_unit(images))}]" for axis in "xyz")
+    rows = [f"#timestamp [ns],{positions},q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"]
     for image in images:
         time = image.number if image.time is None else image.time
         numbers = [*image.pose.translation.tolist(), *image.pose.quaternion("wxyz").tolist()]
-        rows.append(
-            ",".join([str(round(time * NANOSECONDS)), *(f"{number:.12g}" for number in numbers)]) + "\n"
-        )
+        rows.append(",".join([str(round(time * 10**9)), *(f"{number:.12g}" for number in numbers)]) + "\n")
     write_file(path, "".join(rows).encode())

@@ -13,6 +13,7 @@ from torch import Tensor
 
 import tiny
 from bidnerf_core import import_map, load_map
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import write_transforms
 from bidnerf_core.errors import InputError, InputWarning
@@ -68,7 +69,7 @@ class TinyImporter:
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A file that exactly one importer reads; where it has no photos, the field is seen from few places."""
     monkeypatch.setitem(registered, ("importers", "tiny"), TinyImporter())
-    for name, value in (("VIEWS", FEW), ("SIZE", 32), ("PLACES", 60)):
+    for name, value in (("VIEWS", FEW), ("CAMERA", Intrinsics.from_hfov(70, 32, 32))):
         monkeypatch.setattr(f"bidnerf_core.maps.viewpoints.{name}", value)
     path = tmp_path / "field.tiny"
     path.touch()

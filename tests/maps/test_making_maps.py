@@ -124,7 +124,19 @@ def test_cancelled_and_resumed_equals_uninterrupted(whole: bn.Map, tmp_path: Pat
     assert_same_field(resumed, whole)
     with refused(where=tmp_path / "half", found="complete (12 steps), nothing to resume"):
         bn.resume(tmp_path / "half", tiny.views(), bake=False)
-    assert bn.resume(tmp_path / "half", tiny.views(), bake=BAKE).surface is not None
+    with pytest.raises(
+        bn.Cancelled, match=r"has its landmarks, field and surface so far; --resume continues"
+    ):
+        bn.resume(
+            tmp_path / "half",
+            tiny.views(),
+            bake=BAKE,
+            cancel=lambda: load_info(tmp_path / "half").surface is not None,
+        )  # during the survey, which is what is left to do
+    surface = load_info(tmp_path / "half").surface
+    surveyed = bn.resume(tmp_path / "half", tiny.views(), bake=BAKE)
+    assert surveyed.capture is not None
+    assert surveyed.info.surface == surface
     with refused(where=tmp_path / "half", found="complete (12 steps) and baked, nothing to resume"):
         bn.resume(tmp_path / "half", tiny.views())
 

@@ -14,7 +14,7 @@ from bidnerf_core.results import TrajectoryErrors, spans
 from bidnerf_core.results.plots import draw_path
 
 # Inside: errors after each alignment, compared with evo's, and the paths that are drawn
-from bidnerf_core.results.trajectory import ErrorSummary, alignment_errors, relative_errors, rigid_alignment
+from bidnerf_core.results.trajectory import ErrorSummary, alignment_errors, relative_errors
 from refusals import refused
 
 
@@ -48,16 +48,15 @@ def test_ate_is_evos() -> None:
     assert ate == pytest.approx(ape.get_statistic(metrics.StatisticsType.rmse), abs=1e-9)
 
 
-@pytest.mark.parametrize("apart", [1, 7])
-def test_rpe_is_evos(apart: int) -> None:
+def test_rpe_is_evos() -> None:
     metrics = pytest.importorskip("evo.core.metrics")
     found, true = walk(noise=0.02), walk()
-    ours = relative_errors(found, true, apart)
+    ours = relative_errors(found, true)
     for relation, values in (
         (metrics.PoseRelation.translation_part, ours.translation),
         (metrics.PoseRelation.rotation_angle_deg, ours.rotation_deg),
     ):
-        rpe = metrics.RPE(relation, apart, metrics.Unit.frames, all_pairs=True)
+        rpe = metrics.RPE(relation, 1, metrics.Unit.frames, all_pairs=True)
         rpe.process_data((evo_path(true), evo_path(found)))
         assert np.allclose(values.numpy(), rpe.error, atol=1e-7)
 
@@ -71,7 +70,6 @@ def test_the_raw_error_sees_an_offset_that_alignment_removes() -> None:
     assert errors.ate == pytest.approx(0.0, abs=1e-9)
     assert errors.rpe is not None
     assert errors.rpe.translation_rmse == pytest.approx(0.0, abs=1e-9)
-    assert torch.allclose(rigid_alignment(moved, true).matrix(), T.inverse().matrix(), atol=1e-9)
 
 
 def test_scale_is_not_aligned() -> None:
@@ -91,8 +89,6 @@ def test_a_camera_at_rest_has_no_alignment() -> None:
 def test_short_trajectories() -> None:
     one = walk(1)
     assert TrajectoryErrors.of(one, one).rpe is None
-    with refused(found="1 poses that are 1 apart"):
-        relative_errors(one, one)
     with refused(found="no errors", expected="at least one pose"):
         TrajectoryErrors.of(one[:0], one[:0])
 
