@@ -21,7 +21,6 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping.surface.cell_size import chosen_grid, comparison_noise, finest_cell, spacing
 from bidnerf_core.mapping.surface.posed_depth import (
     WITNESSES,
-    PosedDepthImage,
     agreed,
     measured_image,
     rendered_image,
@@ -34,23 +33,14 @@ from bidnerf_core.settings import Above, Range, Settings
 Camera = tuple[Intrinsics, SE3]
 """Intrinsics and T_world_camera."""
 
-KEYFRAME_SIDE = 400
-"""Maximum number of pixels along the longer side of a rendered keyframe."""
-MOST = 100
-"""Maximum number of rendered keyframes, from cameras at regular intervals."""
-SPACING_POINTS = 5000
-"""Number of points of a scan from whose nearest neighbours the point spacing is estimated."""
-NOISE_RAYS = 4096
-"""Number of rays on which the colour noise is measured."""
-
 
 def rendered_views(field: RadianceField, bounds: SceneBounds, cameras: Sequence[Camera]) -> list[View]:
-    """Render images with depth of ``field`` from ``cameras``, for a map without photos."""
-    chosen = cameras[:: max(1, math.ceil(len(cameras) / MOST))]
+    """Render images with depth of ``field`` from up to 100 of ``cameras``, at regular intervals, for a map without photos."""
+    chosen = cameras[:: max(1, math.ceil(len(cameras) / 100))]
     views, count = list[View](), counter("rendering", "views")
     for number, (intrinsics, T) in enumerate(chosen):
         count(number, len(chosen))
-        small = intrinsics.at_most(KEYFRAME_SIDE)
+        small = intrinsics.at_most(400)
         image = render_image(field, small, T, bounds)
         views.append(View(Frame(f"{number:04d}", image.rgb, small, image.depth), T))
     return views
@@ -59,7 +49,7 @@ def rendered_views(field: RadianceField, bounds: SceneBounds, cameras: Sequence[
 @torch.no_grad()
 def colour_noise(field: RadianceField, bounds: SceneBounds, views: Sequence[View]) -> float:
     """Return the root mean square difference between rendered and photographed colours over pixels of all views."""
-    count, generator = max(NOISE_RAYS, len(views)), torch.Generator().manual_seed(0)
+    count, generator = max(4096, len(views)), torch.Generator().manual_seed(0)
     pixels = draw(views, count, uniform, generator, device=device_of(field)).flattened()
     seen = render(field, bounds.rays(pixels.origins, pixels.directions), bounds.background)
     return float((seen.rgb - pixels.rgb).square().mean().sqrt())
@@ -104,23 +94,21 @@ def bake(
     for number, (intrinsics, T) in enumerate(cameras, start=1):
         images.append(rendered_image(field, bounds, intrinsics, T, config.rays / total))
         count(len(views) + number, total)
-    return surface_of(images, bounds, config)
-
-
-def surface_of(images: Sequence[PosedDepthImage], bounds: SceneBounds, config: BakeConfig) -> SurfaceMap:
-    """Bake the surface from images with depth, see ``bake``."""
     cell = max(finest_cell(images, config.opacity), VoxelGrid.filling(bounds, config.cells).cell)
     tolerance = 2 * max(cell, comparison_noise(images, config.opacity))
-    points, rgb = _agreed_points(images, tolerance, config)
+    parts, colours = [], []
+    for number, posed in enumerate(images):
+        solid = posed.solid(config.opacity)
+        seen = posed.points(solid)
+        kept = agreed(seen, number, images, tolerance, config.agreement)
+        parts.append(seen[kept])
+        colours.append(posed.image.rgb[solid][kept])
+    points, rgb = torch.cat(parts), torch.cat(colours)
     inside = VoxelGrid.covering(bounds, cell).contains(points)
-    points, rgb = points[inside], rgb[inside]
-    if not len(points):
+    if not bool(inside.any()):
         raise InputError("no surface to bake: no point that several views agree on")
-    grid = chosen_grid(points, bounds, cell, spacing(images, config.opacity), config.megabytes)
-    _, (positions, colours) = merged(grid.numbers(points), points, rgb)
-    surfels = fused_surfels(positions, colours)
-    keyframes = torch.stack([image.T_world_camera.matrix() for image in images])
-    return SurfaceMap(surfels, SurfelIndex.of(surfels.positions, grid), keyframes)
+    coarsest, keyframes = spacing(images, config.opacity), [image.T_world_camera for image in images]
+    return _fused(points[inside], rgb[inside], bounds, (cell, coarsest), keyframes, config)
 
 
 def surface_of_points(
@@ -136,25 +124,19 @@ def surface_of_points(
     if len(points) < 2:
         raise InputError(f"no surface to bake: {len(points)} points within the bounds of the scene")
     places = points.numpy()
-    away, _ = cKDTree(places).query(places[:: max(1, len(points) // SPACING_POINTS)], k=2)
-    apart = float(np.median(np.asarray(away)[:, 1]))
-    finest = max(apart, VoxelGrid.filling(bounds, config.cells).cell)
-    grid = chosen_grid(points, bounds, finest, 4 * finest, config.megabytes)
+    away, _ = cKDTree(places).query(places[:: max(1, len(points) // 5000)], k=2)
+    spread = float(np.median(np.asarray(away)[:, 1]))
+    finest = max(spread, VoxelGrid.filling(bounds, config.cells).cell)
+    return _fused(points, rgb, bounds, (finest, 4 * finest), [T for _, T in cameras], config)
+
+
+def _fused(
+    points: Float[Tensor, "p 3"], rgb: Float[Tensor, "p 3"], bounds: SceneBounds,
+    cells: tuple[float, float], keyframes: Sequence[SE3], config: BakeConfig,
+) -> SurfaceMap:  # fmt: skip
+    """Return the surface of points whose cells are between the finest and the coarsest (metres)."""
+    grid = chosen_grid(points, bounds, *cells, config.megabytes)
     _, (positions, colours) = merged(grid.numbers(points), points, rgb)
     surfels = fused_surfels(positions, colours)
-    keyframes = torch.stack([T.matrix() for _, T in cameras]) if cameras else torch.zeros(0, 4, 4)
-    return SurfaceMap(surfels, SurfelIndex.of(surfels.positions, grid), keyframes)
-
-
-def _agreed_points(
-    images: Sequence[PosedDepthImage], tolerance: float, config: BakeConfig
-) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]]:
-    """Return the points (metres, world) that other images confirm to within ``tolerance`` (metres), and their colours."""
-    points, colours = [], []
-    for number, posed in enumerate(images):
-        solid = posed.solid(config.opacity)
-        seen = posed.points(solid)
-        kept = agreed(seen, number, images, tolerance, config.agreement)
-        points.append(seen[kept])
-        colours.append(posed.image.rgb[solid][kept])
-    return torch.cat(points), torch.cat(colours)
+    poses = torch.stack([T.matrix() for T in keyframes]) if keyframes else torch.zeros(0, 4, 4)
+    return SurfaceMap(surfels, SurfelIndex.of(surfels.positions, grid), poses)

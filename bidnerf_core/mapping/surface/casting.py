@@ -11,9 +11,6 @@ from torch import Tensor
 from bidnerf_core.devices import constant, may_wait
 from bidnerf_core.mapping.surface.surface_map import SurfaceMap
 
-ROUND = 6
-"""Number of steps after which rays that have hit the surface or left the grid are dropped."""
-
 
 @dataclass(frozen=True, eq=False)
 class Cast:
@@ -45,7 +42,8 @@ def cast(
     left, on = torch.arange(len(best), device=best.device), rays.near < rays.far
     here, o, d, far = rays.near, origins, directions, rays.far
     for step in range(steps):
-        if step % ROUND == 0 and may_wait(best.device):
+        # Every sixth step, rays that have hit the surface or left the grid are dropped.
+        if step % 6 == 0 and may_wait(best.device):
             left, here, o, d, far = left[on], here[on], o[on], d[on], far[on]
             on = torch.ones_like(left, dtype=torch.bool)
             if not len(left):
@@ -60,7 +58,7 @@ def cast(
             values[left] = torch.where(closer, new, values[left])
         met[left] |= on & hit
         here = torch.where(hit, here, here + clearance.clamp(min=cell))
-        if step % ROUND == ROUND - 1:
+        if step % 6 == 5:
             on = on & (here < far) & ~hit
     return Cast(met, best, index)
 

@@ -19,20 +19,6 @@ from bidnerf_core.mapping.surface.posed_depth import PosedDepthImage, witnesses
 from bidnerf_core.mapping.surface.surface_map import surfel_bytes
 from bidnerf_core.mapping.surface.surfel_index import BLOCK_SIDE, MOST_CELLS, block_levels, index_bytes
 
-PIXEL = 0.7
-"""Cell as a fraction of a pixel's footprint; several images together resolve more than one."""
-LAYER = 2.0
-"""Minimum cell in standard deviations of depth; with finer ones, a plane would become several layers of surfels."""
-PER_CELL = 1.32
-"""Minimum mean number of points per occupied cell. Randomly scattered points then leave 5/9 of the cells empty; with fewer, the
-mean distance between surfels exceeds the radius of their discs, which is 1.5 cells.
-"""
-COMPARED_IMAGES, CELL_POINTS = 40, 400
-"""Number of images, and of points in each, from which the noise is estimated."""
-GROSS = 5.0
-"""Multiple of the median above which differences are occlusions or gross errors instead of noise."""
-MOST_NOISE = 2.0
-"""Upper limit of the noise, in standard deviations of an unknown sensor; images that differ by more are inconsistent."""
 COARSER = 2**0.25
 """Factor by which cells grow until they contain enough points and fit into memory."""
 
@@ -40,10 +26,12 @@ COARSER = 2**0.25
 def finest_cell(images: Sequence[PosedDepthImage], opacity: float) -> float:
     """Return the finest cell (metres) that the images' resolution and the noise of measured depth justify.
 
-    Rendered images are too sparsely sampled to distinguish noise from scene structure.
+    It is a fraction of a pixel's footprint, since several images together resolve more than one, and at least two standard
+    deviations of depth; with finer ones, a plane would become several layers of surfels. Rendered images are too sparsely
+    sampled to distinguish noise from scene structure.
     """
     measured = [posed for posed in images if posed.measured]
-    return max(PIXEL * footprint(images, opacity), LAYER * depth_noise(measured, opacity))
+    return max(0.7 * footprint(images, opacity), 2 * depth_noise(measured, opacity))
 
 
 def footprint(images: Sequence[PosedDepthImage], opacity: float) -> float:
@@ -78,18 +66,23 @@ def _spread(
     opacity: float,
     beyond: Callable[[PosedDepthImage, Float[Tensor, "p 3"]], Float[Tensor, "p"]],
 ) -> float:
-    found = []
-    for number in range(0, len(images), max(1, math.ceil(len(images) / COMPARED_IMAGES))):
+    """Return the robust deviation of the differences at up to 400 points of each of 40 images.
+
+    Those of more than five times the median are occlusions or gross errors. Images that differ by more than two standard
+    deviations of an unknown sensor are inconsistent.
+    """
+    found = [torch.zeros(0)]
+    for number in range(0, len(images), max(1, math.ceil(len(images) / 40))):
         points = images[number].points(images[number].solid(opacity))
-        points = points[:: max(1, len(points) // CELL_POINTS)]
-        found += [beyond(images[other], points) for other in witnesses(number, images)]
-    differences = torch.cat(found).abs() if found else torch.zeros(0)
+        points = points[:: max(1, len(points) // 400)]
+        found += [beyond(images[other], points).abs() for other in witnesses(number, images)]
+    differences = torch.cat(found)
     differences = differences[differences.isfinite()]
     if not len(differences):
         return 0.0
-    near = differences[differences <= GROSS * differences.median()]
+    near = differences[differences <= 5 * differences.median()]
     distance = _median([float(depths.median()) for _, depths in _depths(images, opacity)])
-    return min(mad_deviation(near) / math.sqrt(2), MOST_NOISE * UNKNOWN.noise.deviation(distance))
+    return min(mad_deviation(near) / math.sqrt(2), 2 * UNKNOWN.noise.deviation(distance))
 
 
 def chosen_grid(
@@ -97,11 +90,12 @@ def chosen_grid(
 ) -> VoxelGrid:
     """Return a grid with cells of ``finest`` metres, or coarser if points (metres, world) or memory are scarce.
 
-    If points are scarce, cells grow up to ``coarsest`` at most, at which each contains a pixel. If the limit of ``megabytes``
+    Randomly scattered points leave 5/9 of the cells empty if there are 1.32 per occupied cell; with fewer, the mean distance between
+    surfels exceeds the radius of their discs, which is 1.5 cells. If points are scarce, cells grow up to ``coarsest`` at most, at which each contains a pixel. If the limit of ``megabytes``
     makes them larger, an ``InputWarning`` states by how much. Raises ``InputError`` if no cell size satisfies that limit.
     """
     grid = VoxelGrid.covering(bounds, finest)
-    while grid.cell < coarsest and len(points) < PER_CELL * len(grid.numbers(points).unique()):
+    while grid.cell < coarsest and len(points) < 1.32 * len(grid.numbers(points).unique()):
         grid = VoxelGrid.covering(bounds, min(COARSER * grid.cell, coarsest))
     wished, needed = grid, surface_bytes(points, grid)
     while surface_bytes(points, grid) > 1e6 * megabytes:

@@ -77,9 +77,9 @@ def rendered_image(
     field: RadianceField, bounds: SceneBounds, intrinsics: Intrinsics, T_world_camera: SE3, pixels: float
 ) -> PosedDepthImage:
     """Render the field from a pose at a resolution of about ``pixels`` pixels."""
-    small, T = _shrunk(intrinsics, pixels), T_world_camera
-    image = render_image(field, small, T, bounds)
-    return PosedDepthImage(small, T.to("cpu", torch.float64), image, mean_focal(intrinsics))
+    small = _shrunk(intrinsics, pixels)
+    image = render_image(field, small, T_world_camera, bounds)
+    return PosedDepthImage(small, T_world_camera.to("cpu", torch.float64), image, mean_focal(intrinsics))
 
 
 def measured_image(view: View, pixels: float) -> PosedDepthImage:

@@ -14,12 +14,7 @@ from torch import Tensor
 from bidnerf_core.devices import Resident, moved, working_device
 from bidnerf_core.fields import VoxelGrid
 from bidnerf_core.geometry import multiplied
-from bidnerf_core.mapping.surface.surfel_index import SurfelIndex
-
-SURFEL_NEIGHBOURS = 12
-"""Number of neighbours to which each surfel's plane and colour gradient are fitted."""
-RADIUS = 0.7
-"""Radius of a surfel, as a fraction of its distance from its fourth neighbour."""
+from bidnerf_core.mapping.surface.surfel_index import SurfelIndex, index_bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,38 +47,25 @@ def merged(cells: Int[Tensor, "p"], *values: Float[Tensor, "p _"]) -> tuple[Int[
 
 def fused_surfels(positions: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"]) -> Surfels:
     """Make surfels of merged points: fit a plane to the neighbours of each point and project it onto that plane."""
-    near = _neighbours(positions, SURFEL_NEIGHBOURS)
+    points = positions.numpy()
+    _, index = cKDTree(points).query(points, k=min(12, len(points)), workers=-1)  # with itself
+    near = torch.from_numpy(np.asarray(index, dtype=np.int64).reshape(len(points), -1))
     offsets = positions[near] - positions[:, None]
     mean = offsets.mean(1)
     centred = offsets - mean[:, None]
     _, axes = torch.linalg.eigh(centred.mT @ centred)
     normals = axes[..., 0]
     positions = positions + normals * (normals * mean).sum(-1, keepdim=True)
-    return Surfels(positions, normals, rgb[near].mean(1), _gradient(centred, normals, rgb[near]))
-
-
-def _neighbours(positions: Float[Tensor, "n 3"], count: int) -> Int[Tensor, "n k"]:
-    """Return the indices of each point's nearest neighbours, including itself."""
-    points = positions.numpy()
-    _, index = cKDTree(points).query(points, k=min(count, len(points)), workers=-1)
-    return torch.from_numpy(np.asarray(index, dtype=np.int64).reshape(len(points), -1))
-
-
-def _gradient(
-    offsets: Float[Tensor, "n k 3"], normals: Float[Tensor, "n 3"], rgb: Float[Tensor, "n k 3"]
-) -> Float[Tensor, "n 3 3"]:
-    """Return the least-squares gradient of colour within the plane.
-
-    See Park et al. 2017, "Colored point cloud registration", eq. 10.
-    """
-    flat = offsets - (offsets * normals[:, None]).sum(-1, keepdim=True) * normals[:, None]
+    # The gradient of colour within the plane by least squares (Park et al. 2017, "Colored point cloud registration", eq. 10)
+    flat = centred - (centred * normals[:, None]).sum(-1, keepdim=True) * normals[:, None]
     spread = flat.mT @ flat
     size = spread.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=torch.finfo(flat.dtype).tiny)
     # Any weight along the normal makes the gradient 0 there; a little weight everywhere regularizes thin strips.
     held = normals[:, :, None] * normals[:, None] + 0.02 * torch.eye(3)
-    system = spread / size[:, None, None] + held
-    seen = flat.mT @ (rgb - rgb.mean(1, keepdim=True)) / size[:, None, None]
-    return torch.linalg.solve(system, seen).mT
+    colours, colour = rgb[near], rgb[near].mean(1)
+    seen = flat.mT @ (colours - colour[:, None]) / size[:, None, None]
+    gradient = torch.linalg.solve(spread / size[:, None, None] + held, seen).mT
+    return Surfels(positions, normals, colour, gradient)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,14 +99,9 @@ class SurfaceMap(Resident):
         return self.index.grid
 
     @property
-    def bytes(self) -> int:
-        """Memory of the surfels and their index, in bytes."""
-        return surfel_bytes(len(self.surfels)) + self.index.bytes
-
-    @property
     def mebibytes(self) -> float:
         """Memory of the surfels and their index, in MiB."""
-        return self.bytes / 2**20
+        return (surfel_bytes(len(self.surfels)) + index_bytes(self.index.level)) / 2**20
 
     @property
     def stored_cells(self) -> int:
@@ -150,11 +127,10 @@ class SurfaceMap(Resident):
         few holes between them, small enough to preserve edges.
         """
         points = self.surfels.positions.cpu().numpy()  # scipy's tree is the host's
-        away, _ = cKDTree(points).query(points[:: max(1, len(points) // 5000)], k=min(5, len(points)))
-        return (
-            RADIUS * float(np.quantile(np.asarray(away).reshape(-1, min(5, len(points)))[:, -1], 0.9))
-            or self.cell
-        )
+        neighbour = min(5, len(points))  # with itself
+        away, _ = cKDTree(points).query(points[:: max(1, len(points) // 5000)], k=neighbour)
+        fourth = np.asarray(away).reshape(-1, neighbour)[:, -1]
+        return 0.7 * float(np.quantile(fourth, 0.9)) or self.cell
 
     @cached_property
     def box(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:

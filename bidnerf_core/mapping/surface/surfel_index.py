@@ -30,11 +30,6 @@ MOST_CELLS = 2**31 - 1
 COARSER_FROM = (2.0, 3.5, 6.0)
 """Minimum distances of a block's octants from octants with surfels (centre to centre, in octants of 4 cells) for 2, 4 and 8
 cells along each side to share an entry. All surfels are then at least twice that side away."""
-ENTRIES_AT_ONCE = 1 << 20
-"""Number of entries computed at once."""
-
-LEAF = 32
-"""Surfels in a leaf of the k-d tree: the fastest in measurements with points some cells away from a plane of surfels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,14 +50,11 @@ class SurfelIndex:
         if not len(positions):
             raise InputError("no surface to bake: no point that several views agree on")
         level = block_levels(positions, grid)
-        first = _firsts(level)
-        tree = cKDTree(positions.numpy(), leafsize=LEAF)
+        counts = CELLS_OF_BLOCK >> 3 * level.view(-1).long()
+        first = (counts.cumsum(0) - counts).int().view(level.shape)
+        # Leaves of 32 are the fastest in measurements with points some cells away from a plane of surfels.
+        tree = cKDTree(positions.numpy(), leafsize=32)
         return SurfelIndex(grid, first, level, _nearest_to_middles(tree, grid, level))
-
-    @property
-    def bytes(self) -> int:
-        """Memory of the index in use, in bytes."""
-        return index_bytes(self.level)
 
     def __call__(self, points: Float[Tensor, "*p 3"]) -> Int[Tensor, "*p"]:
         """Return the index (int64) of the surfel nearest to each point (metres, world).
@@ -95,7 +87,8 @@ class SurfelIndex:
         border.
         """
         longest = max(self.grid.shape) + 2
-        parts, strides = [], _strides(block_shape(self.grid))
+        _, y, z = block_shape(self.grid)
+        parts, strides = [], (y * z, z, 1)
         for axis, count in enumerate(self.grid.shape):
             cell = (torch.arange(longest) - 1).clamp(0, count - 1)
             place = torch.zeros((longest, 3), dtype=torch.int64)
@@ -140,21 +133,7 @@ def block_levels(positions: Float[Tensor, "n 3"], grid: VoxelGrid) -> UInt8[Tens
 
 def index_bytes(level: UInt8[Tensor, "x y z"]) -> int:
     """Return the memory (bytes) of an index with blocks of these levels: 4 per entry, and 13 per block."""
-    return 4 * int(_counts(level).sum()) + 13 * level.numel()
-
-
-def _counts(level: UInt8[Tensor, "x y z"]) -> Int[Tensor, "b"]:
-    """Return the number of entries of each block."""
-    return CELLS_OF_BLOCK >> 3 * level.view(-1).long()
-
-
-def _firsts(level: UInt8[Tensor, "x y z"]) -> Int[Tensor, "x y z"]:
-    counts = _counts(level)
-    return (counts.cumsum(0) - counts).int().view(level.shape)
-
-
-def _strides(shape: tuple[int, int, int]) -> tuple[int, int, int]:
-    return shape[1] * shape[2], shape[2], 1
+    return 4 * int((CELLS_OF_BLOCK >> 3 * level.long()).sum()) + 13 * level.numel()
 
 
 def _morton(place: Int[Tensor, "*c 3"]) -> Int[Tensor, "*c"]:
@@ -168,7 +147,7 @@ def _nearest_to_middles(tree: cKDTree, grid: VoxelGrid, level: UInt8[Tensor, "x 
     corners = torch.cartesian_prod(*3 * [torch.arange(BLOCK_SIDE)])
     corners = corners[_morton(corners).argsort()]
     levels, found = level.view(-1).long(), []
-    step = ENTRIES_AT_ONCE // CELLS_OF_BLOCK
+    step = 2**20 // CELLS_OF_BLOCK  # a million entries at once at most
     for at in range(0, len(levels), step):
         number = torch.arange(at, min(at + step, len(levels)))
         block = torch.stack(torch.unravel_index(number, level.shape), dim=-1)
