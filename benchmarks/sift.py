@@ -159,7 +159,7 @@ def _posed(views: Sequence[View], pycolmap: Any) -> Any:
 
 def _match(views: Sequence[View], model: Any, folder: Path, pycolmap: Any) -> None:
     """Match the descriptors of neighbouring images, and keep the matches that the known poses allow."""
-    pairs = (likely_pairs(views, NEIGHBOURS) + 1).tolist()
+    pairs = (likely_pairs([view.T_ref_camera for view in views], NEIGHBOURS) + 1).tolist()
     (folder / "pairs.txt").write_text("".join(f"{i} {j}\n" for i, j in pairs))
     pycolmap.match_image_pairs(
         folder / "database.db",

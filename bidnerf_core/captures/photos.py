@@ -142,7 +142,7 @@ class Nearby:
 
 def nearby(views: Sequence[View]) -> Nearby:
     """Return which photos were taken from nearby places in similar directions: up to eight for each."""
-    i, j = likely_pairs(views, 8).unbind(-1) if len(views) > 1 else torch.zeros(2, 0).long()
+    i, j = likely_pairs([view.T_ref_camera for view in views], 8).unbind(-1)
     return Nearby(len(views), torch.cat([i, j]), torch.cat([j, i]))
 
 

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from bidnerf_core.captures.pose_readings import AS_GIVEN, SWAP, Y_AND_Z_REVERSED, Reading, changed, readings
 from bidnerf_core.geometry import SE3
-from bidnerf_core.mapping import LEAST_BASELINE, ImageKeypoints, likely_pairs_of_poses, squared_distances
+from bidnerf_core.mapping import LEAST_BASELINE, ImageKeypoints, likely_pairs, squared_distances
 
 MOST_PAIRS = 40
 """Largest number of examined pairs among those suggested by poses and order, and among those suggested by
@@ -93,7 +93,7 @@ def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | 
         return None
     # Two images that do not agree with each other, but each with a neighbour, show places that look alike.
     disputes = [{pair.first, pair.second} for pair, agreed in zip(pairs, agrees, strict=True) if not agreed]
-    near = likely_pairs_of_poses([image.T_ref_camera for image in images], 2).tolist()
+    near = likely_pairs([image.T_ref_camera for image in images], 2).tolist()
     nearby = [matched_pair(images, i, j) for i, j in near if any({i, j} & both for both in disputes)]
     sound = {
         i
@@ -224,9 +224,8 @@ def _pairs(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
     """
     count = len(images)
     pairs = {(i, i + step) for step in (1, 3) for i in range(count - step)}
-    if count > 1:
-        near = likely_pairs_of_poses([image.T_ref_camera for image in images], 2)
-        pairs |= {(i, j) for i, j in near.tolist()}
+    near = likely_pairs([image.T_ref_camera for image in images], 2)
+    pairs |= {(i, j) for i, j in near.tolist()}
     ordered = sorted(pairs)
     return ordered[:: max(1, -(-len(ordered) // MOST_PAIRS))]
 

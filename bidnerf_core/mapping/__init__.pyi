@@ -43,7 +43,6 @@ from .landmarks.landmark_map import concatenated as concatenated
 from .landmarks.tracks import LEAST_BASELINE as LEAST_BASELINE
 from .landmarks.tracks import TrackedKeypoints as TrackedKeypoints
 from .landmarks.tracks import likely_pairs as likely_pairs
-from .landmarks.tracks import likely_pairs_of_poses as likely_pairs_of_poses
 from .landmarks.tracks import matches_of_points as matches_of_points
 from .landmarks.vocabulary import BLOCK as BLOCK
 from .landmarks.vocabulary import Vocabulary as Vocabulary

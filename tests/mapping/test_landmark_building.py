@@ -208,11 +208,12 @@ def test_a_match_that_would_join_two_keypoints_of_an_image_is_left_out() -> None
 def test_likely_pairs_are_neighbours_on_the_ring() -> None:
     points = Points(count=10)
     views = [points.view(looking_in(2 * math.pi * i / 24)) for i in range(24)]
-    pairs = likely_pairs(views, 4)
+    poses = [view.T_ref_camera for view in views]
+    pairs = likely_pairs(poses, 4)
     apart = (pairs[:, 1] - pairs[:, 0]).minimum(24 - pairs[:, 1] + pairs[:, 0])
     assert int(apart.max()) <= 5
     assert int((apart == 1).sum()) == 24
-    assert likely_pairs(views[:2], 8).tolist() == [[0, 1]]
+    assert likely_pairs(poses[:2], 8).tolist() == [[0, 1]]
 
 
 def test_robust_covariance_is_right_for_normal_values_and_holds_with_outliers(

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.geometry import inlier_weight, mad_deviation
 from bidnerf_core.mapping.geometry.observations import Sightings, summed
 from bidnerf_core.mapping.resection.states import by_camera_point, pinhole
-
-TRIANGULATION_STEPS = 8
-"""Number of Gauss-Newton steps; from the linear solution, four or five suffice."""
-DAMPING = 1e-6
-"""Damping relative to the mean diagonal, which keeps the equations solvable for rays without parallax."""
 
 
 def intersected(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
@@ -26,9 +21,10 @@ def intersected(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
 
 
 def refined_points(
-    sightings: Sightings, points: Float[Tensor, "n 3"], scale: float, steps: int = TRIANGULATION_STEPS
+    sightings: Sightings, points: Float[Tensor, "n 3"], scale: float, steps: int = 8
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """Minimize the reprojection errors under a Cauchy loss of ``scale`` pixels by a number of Gauss-Newton ``steps``.
+    """Minimize the reprojection errors under a Cauchy loss of ``scale`` pixels by a number of Gauss-Newton ``steps``; from the
+    linear solution, four or five suffice.
 
     Returns the points and their covariances for a noise of one pixel (the inverses of their normal matrices).
     """
@@ -62,10 +58,6 @@ def parallax(sightings: Sightings, points: Float[Tensor, "n 3"]) -> Float[Tensor
     return 2 * largest.scatter_reduce(0, sightings.point, off, "amax").clamp(max=1).asin()
 
 
-def observations_per_point(sightings: Sightings, count: int) -> Int[Tensor, "n"]:
-    return torch.bincount(sightings.point, minlength=count)
-
-
 def fitting(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:
     """Return a mask of the observations within ``tolerance`` pixels of the projection of their point."""
     return torch.linalg.vector_norm(sightings.residuals(points), dim=-1) <= tolerance
@@ -75,12 +67,13 @@ def noise(sightings: Sightings, points: Float[Tensor, "n 3"]) -> float:
     """Return a robust standard deviation of the observations along each axis (pixels), corrected for the fitted points."""
     if not len(sightings):
         return 1.0
-    seen = observations_per_point(sightings, len(points))
+    seen = torch.bincount(sightings.point, minlength=len(points))
     spare = (1 - 1.5 / seen[sightings.point]).clamp(min=0.25)  # (2 m - 3) / 2 m for m observations
     residual = sightings.residuals(points) / spare.sqrt()[:, None]
     return mad_deviation(residual)
 
 
 def _damped(matrix: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
+    """Return matrices that are solvable for rays without parallax, too."""
     size = matrix.diagonal(dim1=-2, dim2=-1).mean(-1).clamp(min=1e-30)
-    return matrix + DAMPING * size[:, None, None] * torch.eye(3, dtype=matrix.dtype)
+    return matrix + 1e-6 * size[:, None, None] * torch.eye(3, dtype=matrix.dtype)

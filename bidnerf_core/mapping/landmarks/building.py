@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from math import ceil, radians
 from typing import Annotated, TypeVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bidnerf_core.errors import InputError, enumeration
@@ -17,11 +17,9 @@ from bidnerf_core.frames import SeenLandmarks, View
 from bidnerf_core.geometry import SE3, chi_squared_quantile, inlier_weight
 from bidnerf_core.mapping.geometry.observations import Sightings, summed
 from bidnerf_core.mapping.geometry.triangulation import (
-    TRIANGULATION_STEPS,
     fitting,
     intersected,
     noise,
-    observations_per_point,
     parallax,
     refined_points,
 )
@@ -41,7 +39,7 @@ from bidnerf_core.mapping.landmarks.tracks import (
     epipolar_matches,
     fused_landmarks,
     joined_tracks,
-    likely_pairs_of_poses,
+    likely_pairs,
     seen_landmarks,
 )
 from bidnerf_core.mapping.resection.resection import resections
@@ -53,25 +51,8 @@ LEAST_VISIBLE_POINTS = 20
 """Minimum number of points from which the pose of an image is estimated."""
 ENOUGH_IMAGES = 8
 """Minimum number of images from which the 6x6 covariance is estimated."""
-WEIGHT_ROUNDS = 10
-"""Number of reweighting iterations; after five, the weights hardly change."""
 _Item = TypeVar("_Item")
 Result = TypeVar("Result")
-TOLERANCES = (10.0, 4.0, 2.0)
-"""Largest reprojection error (pixels) of an observation that stays in its track, round by round."""
-SCATTERED_IMAGES = 200
-"""Largest number of images whose poses are estimated again for the scatter of poses: deviations are then known to 7 %."""
-TWO_VIEW_TOLERANCE = 1.5
-"""Largest reprojection error (pixels) in a track of only two images."""
-
-
-def pose_scatter(tracked: TrackedKeypoints, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "6 6"]:
-    """Return the covariance of the right updates from given to resected poses; zero if there are too few images.
-
-    The points from which an image is resected were triangulated from it as well, so its pose scatters too little: with k views
-    of a point, by 1 - 1/k of the true variance, against 1 + 1/k for a new image. The updates are rescaled accordingly.
-    """
-    return update_scatter(list(pose_updates(tracked, positions, SCATTERED_IMAGES).values()))
 
 
 def update_scatter(updates: Sequence[Float[Tensor, "6"] | None]) -> Float[Tensor, "6 6"]:
@@ -89,7 +70,8 @@ def pose_updates(
 
     With ``most``, no more than that many of them, at regular intervals, are resected.
 
-    They are corrected for each image's influence on its points, see ``pose_scatter``.
+    The points from which an image is resected were triangulated from it as well, so its pose scatters too little: with k views
+    of a point, by 1 - 1/k of the true variance, against 1 + 1/k for a new image. The updates are rescaled accordingly.
     """
     sightings, image = tracked.sightings, tracked.image
     count = torch.bincount(image)
@@ -112,7 +94,7 @@ def robust_covariance(values: Float[Tensor, "n c"]) -> Float[Tensor, "c c"]:
     channels = values.shape[1]
     scale = values.square().median(0).values.clamp(min=1e-30)
     covariance = torch.diag(scale)
-    for _ in range(WEIGHT_ROUNDS):
+    for _ in range(10):  # after five, the weights hardly change
         squared = (values @ torch.linalg.inv(covariance) * values).sum(-1).clamp(min=1e-12)
         squared = squared * (chi_squared_quantile(0.5, channels) / float(squared.median()))
         weight = inlier_weight(squared, channels**0.5)
@@ -181,7 +163,10 @@ class TrackedViews:
         moving = float((self.motion != 0).any(1).double().mean())
         name = self.features if isinstance(self.features, str) else ""
         name = USUAL_FEATURES if isinstance(self.features, Sift) else name
-        return replace(_bounded(found, config.most, report), moving=moving, features=name)
+        if len(found) > config.most:
+            report(f"{len(found)} landmarks found, {config.most} kept: those seen in the most images")
+            found = found[found.views.argsort(descending=True, stable=True)[: config.most].sort().values]
+        return replace(found, moving=moving, features=name)
 
     def seen(self, config: LandmarkConfig) -> list[SeenLandmarks]:
         """Return the triangulated landmarks seen in each image; training uses their depth where none was measured."""
@@ -228,9 +213,10 @@ class TrackedViews:
     def matched_anew(self, config: LandmarkConfig) -> TrackedViews:
         """Return tracks of the same keypoints, matched again with the present poses."""
         images = self.observations.images
-        pairs = _pairs([image.T_ref_camera for image in images], config)
-        steps = _Steps("poses", "image pairs", len(pairs))
-        return replace(self, observations=_joined(images, pairs, steps))
+        pairs = likely_pairs([image.T_ref_camera for image in images], config.neighbours)
+        return replace(
+            self, observations=_joined(images, pairs, _counter("poses", "image pairs", len(pairs)))
+        )
 
     def without(self, images: Sequence[int]) -> TrackedViews:
         """Return the tracks without the keypoints of the given images, from which known points may be: they are not known then."""
@@ -260,42 +246,35 @@ def tracked_views(
     detector = find_features(features) if isinstance(features, str) else features
     if not views:
         raise InputError("nothing to build landmarks from:", expected="at least one view")
-    pairs = _pairs([view.T_ref_camera for view in views], config)
-    steps = _Steps("landmarks", "steps", len(views) + len(pairs))
-    images = steps.over(_mapped(lambda view: image_keypoints(view, detector), views))
+    pairs = likely_pairs([view.T_ref_camera for view in views], config.neighbours)
+    step = _counter("landmarks", "steps", len(views) + len(pairs))
+    images = _mapped(lambda view: image_keypoints(view, detector), views, step)
     lengths = sorted({image.keypoints.descriptors.shape[1] for image in images})
     if len(lengths) > 1:
         raise PluginError(
             f"descriptors have {enumeration([*map(str, lengths)])} channels in different images",
             expected="the same number",
         )
-    return TrackedViews(_joined(images, pairs, steps, known(images)), features)
-
-
-def _pairs(poses: Sequence[SE3], config: LandmarkConfig) -> list[list[int]]:
-    """Return the pairs of images that are matched."""
-    pairs: list[list[int]] = (
-        likely_pairs_of_poses(poses, config.neighbours).tolist() if len(poses) > 1 else []
-    )
-    return pairs
+    return TrackedViews(_joined(images, pairs, step, known(images)), features)
 
 
 def _joined(
     images: Sequence[ImageKeypoints],
-    pairs: list[list[int]],
-    steps: _Steps,
+    pairs: Int[Tensor, "p 2"],
+    step: Callable[[], None],
     known: Sequence[tuple[int, int, Matches]] = (),
 ) -> TrackedKeypoints:
     """Match the keypoints of the pairs of images, and join the matches into tracks, ``known`` ones of ambiguity 0 first."""
-    matches = steps.over(_mapped(lambda ij: epipolar_matches(images[ij[0]], images[ij[1]]), pairs))
-    found = [(i, j, m) for (i, j), m in zip(pairs, matches, strict=True)]
+    listed = pairs.tolist()
+    matches = _mapped(lambda ij: epipolar_matches(images[ij[0]], images[ij[1]]), listed, step)
+    found = [(i, j, m) for (i, j), m in zip(listed, matches, strict=True)]
     label = joined_tracks([*known, *found], [len(image.keypoints) for image in images])
     return TrackedKeypoints(images, label, torch.arange(len(label)))
 
 
 def posed_keypoints(views: Sequence[View], features: Features) -> list[ImageKeypoints]:
     """Detect the keypoints of ``views`` without matching them."""
-    return list(_mapped(lambda view: image_keypoints(view, features), views))
+    return _mapped(lambda view: image_keypoints(view, features), views)
 
 
 def _located(
@@ -307,7 +286,8 @@ def _located(
     pixel_noise = noise(sightings, positions)
     triangulated = replace(
         fused_landmarks(kept, positions, pixel_noise**2 * covariance, pixel_noise),
-        pose_covariance=pose_scatter(kept, positions),
+        # 200 images tell deviations to within 7 %.
+        pose_covariance=update_scatter(list(pose_updates(kept, positions, 200).values())),
     )
     relative = keypoint_depth_noise(kept, positions)
     left = ~torch.isin(observations.number, kept.number)
@@ -332,9 +312,10 @@ def _triangulated(
     count = observations.count
     covariance = torch.zeros((count, 3, 3), dtype=torch.float64)
     points = intersected(observations.sightings, count) if known is None else known[former]
-    for tolerance in TOLERANCES if known is None else TOLERANCES[-1:]:
-        steps = TRIANGULATION_STEPS if known is None else 0
-        points, covariance = refined_points(observations.sightings, points, tolerance / 2, steps)
+    # The largest reprojection error of an observation that stays in its track, round by round, is that of two pixels at last.
+    for tolerance in (10.0, 4.0, 2.0) if known is None else (2.0,):
+        scale, steps = tolerance / 2, 8 if known is None else 0
+        points, covariance = refined_points(observations.sightings, points, scale, steps)
         observations = observations[_inliers(observations.sightings, points, tolerance)]
     wide = parallax(observations.sightings, points) >= least
     observations, numbers = observations[wide[observations.point]].compacted()
@@ -342,40 +323,29 @@ def _triangulated(
 
 
 def _inliers(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:
-    """Return a mask of the keypoints that fit their points, for points with at least two such keypoints."""
+    """Return a mask of the keypoints that fit their points, for points with at least two such keypoints; two alone must fit to
+    within 1.5 pixels.
+    """
     fit = fitting(sightings, points, tolerance)
-    seen = observations_per_point(sightings[fit], len(points))
-    pairs = seen[sightings.point] == 2
-    fit &= ~pairs | fitting(sightings, points, min(tolerance, TWO_VIEW_TOLERANCE))
-    return fit & (observations_per_point(sightings[fit], len(points)) >= 2)[sightings.point]
+    seen = torch.bincount(sightings.point[fit], minlength=len(points))
+    fit &= (seen[sightings.point] != 2) | fitting(sightings, points, min(tolerance, 1.5))
+    return fit & (torch.bincount(sightings.point[fit], minlength=len(points)) >= 2)[sightings.point]
 
 
-def _bounded(landmarks: LandmarkMap, most: int, report: Callable[[str], None]) -> LandmarkMap:
-    """Return at most ``most`` landmarks: those seen in the most images."""
-    if len(landmarks) <= most:
-        return landmarks
-    report(f"{len(landmarks)} landmarks found, {most} kept: those seen in the most images")
-    order = landmarks.views.argsort(descending=True, stable=True)[:most]
-    return landmarks[order.sort().values]
-
-
-def _mapped(work: Callable[[_Item], Result], items: Sequence[_Item]) -> Iterator[Result]:
-    """Apply ``work`` to each item and yield the results in order, with as many threads as torch uses."""
+def _mapped(
+    work: Callable[[_Item], Result], items: Sequence[_Item], step: Callable[[], None] = lambda: None
+) -> list[Result]:
+    """Apply ``work`` to each item, with as many threads as torch uses, and call ``step`` after each."""
+    results = []
     with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
-        yield from pool.map(work, items)
+        for result in pool.map(work, items):
+            step()
+            results.append(result)
+    return results
 
 
-class _Steps:
-    """Steps of several loops, whose number is reported to the current job from 0 to the total."""
-
-    def __init__(self, stage: str, unit: str, total: int) -> None:
-        self._report, self._total, self._done = counter(stage, unit), total, 0
-        self._report(0, total)
-
-    def over(self, results: Iterable[Result]) -> list[Result]:
-        found = []
-        for result in results:
-            self._done += 1
-            self._report(self._done, self._total)
-            found.append(result)
-        return found
+def _counter(stage: str, unit: str, total: int) -> Callable[[], None]:
+    """Return a function that reports one more step of ``total`` to the current job."""
+    report, done = counter(stage, unit), iter(range(total + 1))
+    report(next(done), total)
+    return lambda: report(next(done), total)

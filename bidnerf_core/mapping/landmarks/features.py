@@ -6,15 +6,15 @@ Any detector that turns an image into ``Keypoints``, a learned one included, can
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from threading import Lock
-from typing import Annotated, Any, Protocol, runtime_checkable
+from typing import Annotated, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from bidnerf_core.camera import reduced_size
@@ -26,8 +26,6 @@ NORM = 512.0
 """Norm of a quantised descriptor, as usual for SIFT: it makes good use of the range of a byte."""
 MANY = 2**16
 """Number of descriptors converted to floats at a time; all of a large map would take gigabytes."""
-STRIP = 2**22
-"""Number of pixels converted to grey at a time."""
 FIRST_CENTRE = 0.5
 """Offset from OpenCV's pixel coordinates to ours: the centre of the first pixel is (0, 0) there, (0.5, 0.5) here."""
 
@@ -87,28 +85,35 @@ class Sift(Settings):
         sift = cv2.SIFT.create(
             nfeatures=self.count, contrastThreshold=self.contrast, enable_precise_upscale=True
         )
-        grey, scale = _reduced(grey_image(rgb), self.largest)
+        grey = grey_image(rgb)
+        height, width = grey.shape
+        size, scale = reduced_size(width, height, self.largest), np.ones(2, dtype=np.float32)
+        if size != (width, height):
+            scale = np.array([size[0] / width, size[1] / height], dtype=np.float32)
+            grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
         found, descriptors = sift.detectAndCompute(grey, None)
         if descriptors is None or not len(found):
             return Keypoints(torch.zeros(0, 2), torch.zeros(0), torch.zeros((0, 128), dtype=torch.uint8))
         order = np.argsort([-keypoint.response for keypoint in found], kind="stable")
         pixels = (np.asarray(cv2.KeyPoint.convert(found), dtype=np.float32) + FIRST_CENTRE)[order] / scale
         sizes = np.array([found[i].size for i in order], dtype=np.float32) / scale.mean()
-        root = root_normalized(torch.from_numpy(np.asarray(descriptors, dtype=np.float32)[order]))
-        return Keypoints(torch.from_numpy(pixels), torch.from_numpy(sizes), quantized(root))
+        raw = torch.from_numpy(np.asarray(descriptors, dtype=np.float32)[order])
+        total = raw.sum(-1, keepdim=True).clamp(min=torch.finfo(raw.dtype).tiny)
+        # Euclidean distances of the roots are Hellinger distances.
+        return Keypoints(torch.from_numpy(pixels), torch.from_numpy(sizes), quantized((raw / total).sqrt()))
 
 
 SIFT = Sift()
 """OpenCV's SIFT (Lowe 2004), with root normalisation."""
 
 
-def _defects(features: Any) -> Iterator[str]:
-    yield from interface_defects(features, (), {"__call__": ("rgb",)})
-
-
 USUAL_FEATURES = "sift"
 """The name of the default detector."""
-FEATURES: Plugins[Features] = Plugins("features", _defects, first=(USUAL_FEATURES,))
+FEATURES: Plugins[Features] = Plugins(
+    "features",
+    lambda features: interface_defects(features, (), {"__call__": ("rgb",)}),
+    first=(USUAL_FEATURES,),
+)
 """The detectors by name."""
 
 
@@ -125,22 +130,16 @@ def detected(features: Features, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
             f"returned a {type(found).__name__}", where=who, expected="Keypoints(pixels, sizes, descriptors)"
         )
     parts = (found.pixels, found.sizes, found.descriptors)
-    if not all(isinstance(part, Tensor) for part in parts):
-        kinds = enumeration([type(part).__name__ for part in parts])
-        raise PluginError(f"pixels, sizes and descriptors are {kinds}", where=who, expected="tensors")
-    shapes = tuple(tuple(part.shape) for part in parts)
-    count = len(found.descriptors)
-    if shapes[:2] != ((count, 2), (count,)) or found.descriptors.ndim != 2:
+    kinds = [f"{p.dtype} {list(p.shape)}" if isinstance(p, Tensor) else type(p).__name__ for p in parts]
+    shapes = [list(part.shape) for part in parts]
+    count = shapes[2][0] if shapes[2] else 0
+    is_tensor = all(isinstance(part, Tensor) for part in parts)
+    fits = shapes[:2] == [[count, 2], [count]] and len(shapes[2]) == 2
+    if not (is_tensor and fits and found.descriptors.dtype == torch.uint8):
         raise PluginError(
-            f"pixels, sizes and descriptors have shapes {enumeration([str(shape) for shape in shapes])}",
+            f"pixels, sizes and descriptors are {enumeration(kinds)}",
             where=who,
-            expected="(n, 2), (n) and (n, d)",
-        )
-    if found.descriptors.dtype != torch.uint8:
-        raise PluginError(
-            f"descriptors have dtype {found.descriptors.dtype}",
-            where=who,
-            expected="torch.uint8; quantized converts floats",
+            expected="tensors (n, 2), (n) and (n, d), the last in torch.uint8; quantized converts floats",
         )
     size = torch.tensor([rgb.shape[1], rgb.shape[0]])
     if not bool(((found.pixels >= 0) & (found.pixels <= size)).all()):
@@ -148,18 +147,6 @@ def detected(features: Features, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
             f"keypoints lie outside the image of {size[0]}x{size[1]} pixels", where=who, expected="all inside"
         )
     return found
-
-
-def visible_keypoints(keypoints: Keypoints, hidden: Bool[Tensor, "h w"] | None) -> Keypoints:
-    """Return the keypoints whose neighbourhoods contain no hidden pixels of the image."""
-    if hidden is None or not len(keypoints):
-        return keypoints
-    visible = np.ascontiguousarray((~hidden.cpu().numpy()).astype(np.uint8))
-    away = torch.from_numpy(cv2.distanceTransform(visible, cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
-    columns, rows = keypoints.pixels.long().unbind(-1)
-    height, width = hidden.shape
-    reached = away[rows.clamp(0, height - 1), columns.clamp(0, width - 1)]
-    return keypoints[reached > keypoints.sizes.to(reached) / 2]
 
 
 @dataclass(frozen=True)
@@ -195,12 +182,6 @@ class FoundOnce:
             return self._found[-1][1]
 
 
-def root_normalized(descriptors: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
-    """Return the square roots of L1-normalised, non-negative descriptors; Euclidean distance is then Hellinger distance."""
-    total = descriptors.sum(-1, keepdim=True).clamp(min=torch.finfo(descriptors.dtype).tiny)
-    return (descriptors / total).sqrt()
-
-
 def quantized(descriptors: Float[Tensor, "n d"]) -> UInt8[Tensor, "n d"]:
     """Return unit descriptors as bytes; if any channel is negative, all are shifted, which preserves distances."""
     negative = len(descriptors) > 0 and float(descriptors.min()) < 0
@@ -210,14 +191,11 @@ def quantized(descriptors: Float[Tensor, "n d"]) -> UInt8[Tensor, "n d"]:
 
 def unrelated_distance(descriptors: UInt8[Tensor, "n d"]) -> float:
     """Return the root mean square distance between unrelated descriptors, which is the scale of a detector's distances."""
-    total, squares, count = (
-        torch.zeros(descriptors.shape[1], dtype=torch.float64),
-        0.0,
-        max(1, len(descriptors)),
-    )
+    total, squares = torch.zeros(descriptors.shape[1], dtype=torch.float64), 0.0
     for part in descriptors.cpu().split(MANY):
         total += part.sum(0)
         squares += float(part.double().square().sum())
+    count = max(1, len(descriptors))
     return math.sqrt(max(0.0, 2 * (squares / count - float((total / count).square().sum()))))
 
 
@@ -256,18 +234,7 @@ def paired_squared_distances(
 
 def grey_image(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
     """Return the brightness of an image as bytes (h, w)."""
-    strips = (
-        rgb.detach().cpu().split(max(1, STRIP // rgb.shape[1]))
-    )  # copying a whole phone photo takes a gigabyte
+    # Copying a whole phone photo takes a gigabyte.
+    strips = rgb.detach().cpu().split(max(1, 2**22 // rgb.shape[1]))
     clean = (part.float().nan_to_num(0.0).clamp_(0, 1).mul_(255).round_().to(torch.uint8) for part in strips)
     return np.concatenate([cv2.cvtColor(part.contiguous().numpy(), cv2.COLOR_RGB2GRAY) for part in clean])
-
-
-def _reduced(grey: np.ndarray, largest: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the image with at most ``largest`` pixels along its longer side, and its scale (x, y)."""
-    height, width = grey.shape
-    size = reduced_size(width, height, largest)
-    if size == (width, height):
-        return grey, np.ones(2, dtype=np.float32)
-    scale = np.array([size[0] / width, size[1] / height], dtype=np.float32)
-    return cv2.resize(grey, size, interpolation=cv2.INTER_AREA), scale

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -11,12 +13,7 @@ from torch import Tensor
 from bidnerf_core.camera import AT_REST, Intrinsics, exposure_times
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.mapping.landmarks.features import Features, Keypoints, detected, visible_keypoints
-
-DEPTH_EDGE = 0.05
-"""Largest relative change of the depth around a keypoint; more indicates a depth edge."""
-LEAST_MEASURED = 6
-"""Minimum number of the nine pixels around a keypoint that must have measured depth."""
+from bidnerf_core.mapping.landmarks.features import Features, Keypoints, detected
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +43,14 @@ def image_keypoints(view: View, features: Features) -> ImageKeypoints:
     """Detect the keypoints of ``view`` outside of its hidden pixels."""
     frame = view.frame
     hidden = None if frame.hidden is None else frame.hidden.cpu()
-    keypoints = visible_keypoints(detected(features, frame.rgb), hidden)
+    keypoints = detected(features, frame.rgb)
+    if hidden is not None and len(keypoints):
+        # Those whose neighbourhoods contain no hidden pixel
+        visible = np.ascontiguousarray((~hidden.numpy()).astype(np.uint8))
+        away = torch.from_numpy(cv2.distanceTransform(visible, cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
+        columns, rows = keypoints.pixels.long().unbind(-1)
+        reached = away[rows.clamp(0, hidden.shape[0] - 1), columns.clamp(0, hidden.shape[1] - 1)]
+        keypoints = keypoints[reached > keypoints.sizes.to(reached) / 2]
     return ImageKeypoints(
         keypoints, frame.intrinsics.unproject(keypoints.pixels.double()), measured_depth(frame, keypoints.pixels),
         frame.intrinsics, view.T_ref_camera.to("cpu", torch.float64),
@@ -57,7 +61,7 @@ def image_keypoints(view: View, features: Features) -> ImageKeypoints:
 def measured_depth(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
     """Return the median depth (metres) of the 3x3 pixels around each of ``pixels`` (u, v).
 
-    It is 0 at depth edges and where too few pixels have measured depth.
+    It is 0 at depth edges, where depth changes by over 5 %, and where fewer than six of the pixels have measured depth.
     """
     if frame.depth is None or not len(pixels):
         return torch.zeros(len(pixels), dtype=torch.float64)
@@ -73,5 +77,5 @@ def measured_depth(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, 
     known = around.isfinite()
     low = torch.where(known, around, torch.inf).amin(1)
     high = torch.where(known, around, 0).amax(1)
-    smooth = (known.sum(1) >= LEAST_MEASURED) & (high - low <= DEPTH_EDGE * median)
+    smooth = (known.sum(1) >= 6) & (high - low <= 0.05 * median)
     return torch.where(smooth, median, 0)

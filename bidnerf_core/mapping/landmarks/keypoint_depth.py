@@ -8,13 +8,11 @@ from torch import Tensor
 
 from bidnerf_core.depth import UNKNOWN
 from bidnerf_core.geometry import mad_deviation
-from bidnerf_core.mapping.geometry.observations import Sightings
+from bidnerf_core.mapping.geometry.observations import summed
 from bidnerf_core.mapping.landmarks.tracks import TrackedKeypoints
 
 ENOUGH_DEPTHS = 30
 """Minimum number of triangulated observations with depth from which the depth noise is estimated."""
-OUTLIER_DEVIATIONS = 3.0
-"""Distance from the track's mean, in standard deviations, beyond which a depth is an outlier."""
 
 
 def keypoint_depth_noise(observations: TrackedKeypoints, points: Float[Tensor, "n 3"]) -> float:
@@ -49,10 +47,15 @@ def placed(
     sightings, depth = observations.sightings, observations.depth
     ray = torch.cat([sightings.image, torch.ones_like(sightings.image[:, :1])], dim=-1) * depth[:, None]
     world = (sightings.rotation.mT @ ray[..., None])[..., 0] + sightings.centre
-    information = _information(sightings, depth, relative, pixel_noise)
+    # Depth has noise along the ray, and the keypoint across it.
+    d = sightings.directions()
+    along = d[:, :, None] * d[:, None]
+    sideways = (pixel_noise * depth / sightings.focal) ** -2
+    information = (torch.eye(3, dtype=d.dtype) - along) * sideways[:, None, None]
+    information = along * ((relative * depth) ** -2)[:, None, None] + information
     mean, _ = _weighted(world, information, observations.point)
     off = (world - mean[observations.point])[..., None]
-    agree = (off.mT @ information @ off)[:, 0, 0] <= OUTLIER_DEVIATIONS**2
+    agree = (off.mT @ information @ off)[:, 0, 0] <= 3**2  # standard deviations
     tracks = torch.bincount(observations.point)
     majority = 2 * torch.bincount(observations.point[agree], minlength=len(tracks)) > tracks
     kept = agree & majority[observations.point]
@@ -60,24 +63,12 @@ def placed(
     return observations, *_weighted(world[kept], information[kept], observations.point)
 
 
-def _information(
-    sightings: Sightings, depth: Float[Tensor, "m"], relative: float, pixel_noise: float
-) -> Float[Tensor, "m 3 3"]:
-    """Return the inverse covariance of back-projected points: depth noise along the ray, keypoint noise across it."""
-    d = sightings.directions()
-    along = d[:, :, None] * d[:, None]
-    across = torch.eye(3, dtype=d.dtype) - along
-    sideways = (pixel_noise * depth / sightings.focal) ** -2
-    return along * ((relative * depth) ** -2)[:, None, None] + across * sideways[:, None, None]
-
-
 def _weighted(
     values: Float[Tensor, "m 3"], information: Float[Tensor, "m 3 3"], point: Int[Tensor, "m"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Return each point's weighted mean of its values, and its covariance."""
     count = int(point.max()) + 1 if len(point) else 0
-    total = torch.zeros((count, 3, 3), dtype=values.dtype).index_add_(0, point, information)
-    weighted = (information @ values[..., None])[..., 0]
-    summed = torch.zeros((count, 3), dtype=values.dtype).index_add_(0, point, weighted)
+    total = summed(information, point, count)
+    weighted = summed((information @ values[..., None])[..., 0], point, count)
     covariance = torch.linalg.inv(total)
-    return (covariance @ summed[..., None])[..., 0], covariance
+    return (covariance @ weighted[..., None])[..., 0], covariance

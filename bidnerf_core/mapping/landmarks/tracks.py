@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,70 +12,48 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from bidnerf_core.camera import poses_of_rows
-from bidnerf_core.frames import SeenLandmarks, View
+from bidnerf_core.frames import SeenLandmarks
 from bidnerf_core.geometry import SE3
-from bidnerf_core.mapping.geometry.observations import Sightings
+from bidnerf_core.mapping.geometry.observations import Sightings, summed
 from bidnerf_core.mapping.landmarks.features import MANY, byte_of_zero, squared_distances
 from bidnerf_core.mapping.landmarks.image_keypoints import ImageKeypoints
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, Tracks
 
 EPIPOLAR_BAND = 2.0
 """Maximum distance (pixels) of a match from the epipolar line."""
-TRACK_RATIO = 0.95
-"""Maximum ratio of the best to the second-best descriptor distance among all keypoints of the image."""
-RATIO_IN_BAND = 0.85
-"""Maximum ratio of the best to the second-best descriptor distance near the epipolar line."""
-DUPLICATE_DISTANCE = 4.0
-"""Distance (pixels) below which keypoints are duplicates: SIFT returns one for each dominant orientation. Keypoints within the
-radius of a keypoint's neighbourhood also have similar descriptors.
-"""
 LEAST_BASELINE = 1e-12
 """Distance (metres) between two cameras below which epipolar lines are undefined."""
-
-
-def likely_pairs(views: Sequence[View], neighbours: int) -> Int[Tensor, "p 2"]:
-    """Return pairs (i < j) of each view with ``neighbours`` views that probably overlap it, without duplicates."""
-    return likely_pairs_of_poses([view.T_ref_camera for view in views], neighbours)
-
-
-def likely_pairs_of_poses(poses: Sequence[SE3], neighbours: int) -> Int[Tensor, "p 2"]:
-    """Return pairs (i < j) of cameras with similar ``poses`` (T_world_camera), without duplicates.
-
-    Half of the neighbours are those with the most similar poses. The others are spread over the next ones, every third,
-    because successive images of a video have too little baseline for triangulation.
-    """
-    ranks = torch.tensor(_ranks(neighbours, len(poses) - 1), dtype=torch.long)
-    chosen = torch.cat([order[:, ranks] for order in _by_similarity(poses)])
-    own = torch.arange(len(poses))[:, None].expand_as(chosen)
-    pairs = torch.stack([own.minimum(chosen), own.maximum(chosen)], dim=-1).reshape(-1, 2)
-    return pairs.unique(dim=0)
-
-
-def _ranks(count: int, others: int) -> list[int]:
-    """Return the ranks of the chosen neighbours: the first half are consecutive, then every third is taken."""
-    near = (count + 1) // 2
-    ranks = [*range(near), *(near + 2 + 3 * i for i in range(count - near))]
-    return [rank for rank in ranks if rank < others] or list(range(others))
 
 
 ROWS = 1024
 """Number of views whose dissimilarity to all others is computed at a time, to avoid a matrix of all pairs."""
 
 
-def _by_similarity(poses: Sequence[SE3]) -> Iterator[Int[Tensor, "r v"]]:
-    """Yield, block by block of views, the order of all views from the most to the least similar pose.
+def likely_pairs(poses: Sequence[SE3], neighbours: int) -> Int[Tensor, "p 2"]:
+    """Return pairs (i < j) of cameras with similar ``poses`` (T_world_camera), without duplicates.
 
     The dissimilarity is the distance between the centres relative to the mean over all pairs, plus 1 - cosine between the
-    optical axes; a view itself comes last.
+    optical axes. Half of the neighbours are those with the most similar poses. The others are spread over the next ones, every
+    third, because successive images of a video have too little baseline for triangulation.
     """
+    others = len(poses) - 1
+    if others < 1:
+        return torch.zeros((0, 2), dtype=torch.long)
+    near = (neighbours + 1) // 2
+    wanted = [*range(near), *(near + 2 + 3 * i for i in range(neighbours - near))]
+    ranks = [rank for rank in wanted if rank < others] or list(range(others))
     centres = torch.stack([pose.translation.cpu().double() for pose in poses])
     axes = torch.stack([pose.rotation[:, 2].cpu().double() for pose in poses])
     blocks = torch.arange(len(poses)).split(ROWS)
     usual = sum(float(torch.cdist(centres[own], centres).sum()) for own in blocks) / len(poses) ** 2
+    pairs = []
     for own in blocks:
         unlike = torch.cdist(centres[own], centres) / max(usual, 1e-12) + 1 - axes[own] @ axes.T
         unlike[torch.arange(len(own)), own] = torch.inf
-        yield unlike.argsort(dim=1, stable=True)
+        chosen = unlike.argsort(dim=1, stable=True)[:, ranks]
+        ends = own[:, None].expand_as(chosen)
+        pairs.append(torch.stack([ends.minimum(chosen), ends.maximum(chosen)], dim=-1).reshape(-1, 2))
+    return torch.cat(pairs).unique(dim=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,11 +78,13 @@ def epipolar_matches(a: ImageKeypoints, b: ImageKeypoints) -> Matches:
     mutual = banded.argmin(dim=0)[partner] == torch.arange(len(partner))
     rows = (mutual & best.isfinite()).nonzero()[:, 0]
     best, partner = best[rows], partner[rows]
-    reach = (b.keypoints.sizes[partner, None] / 2).clamp(min=DUPLICATE_DISTANCE)
+    # SIFT returns a keypoint for each dominant orientation, and keypoints within the radius of a keypoint's neighbourhood also have
+    # similar descriptors.
+    reach = (b.keypoints.sizes[partner, None] / 2).clamp(min=4.0)  # pixels
     near = torch.cdist(b.keypoints.pixels[partner], b.keypoints.pixels) < reach
     next_best = distance[rows].masked_fill(near, torch.inf).amin(dim=1)
     next_in_band = banded[rows].masked_fill(near, torch.inf).amin(dim=1)
-    good = (best < RATIO_IN_BAND**2 * next_in_band) & (best < TRACK_RATIO**2 * next_best)
+    good = (best < 0.85**2 * next_in_band) & (best < 0.95**2 * next_best)
     ambiguity = (best / next_best.clamp(min=1)).sqrt()
     return Matches(torch.stack([rows, partner], dim=-1)[good], ambiguity[good])
 
@@ -297,10 +277,14 @@ def fused_landmarks(
     directions = mean / torch.linalg.vector_norm(mean, dim=-1, keepdim=True).clamp(min=1e-300)
     cosine = (towards * directions[sightings.point]).sum(-1).clamp(-1, 1)
     least = torch.ones(count, dtype=cosine.dtype).scatter_reduce(0, sightings.point, cosine, "amin")
+    along = (directions[:, None] @ covariance @ directions[..., None])[:, 0, 0]
+    across = (
+        covariance.diagonal(dim1=-2, dim2=-1).sum(-1) - along
+    ) / 2  # the variances of both axes averaged
     metres = observations.sizes * sightings.in_camera(positions)[:, 2].clamp(min=0) / sightings.focal
     return LandmarkMap(
         positions.float(),
-        _across_and_along(covariance, directions).float(),
+        torch.stack([across, along], dim=-1).clamp(min=0).sqrt().float(),
         _mean_descriptors(observations.descriptors, sightings.point, count),
         directions.float(),
         least.acos().float(),
@@ -325,15 +309,6 @@ def seen_landmarks(
     return [SeenLandmarks(*(part[image == i] for part in parts)) for i in range(len(observations.images))]
 
 
-def _across_and_along(
-    covariance: Float[Tensor, "n 3 3"], directions: Float[Tensor, "n 3"]
-) -> Float[Tensor, "n 2"]:
-    """Return the standard deviations across a direction (the variances of both axes averaged) and along it."""
-    along = (directions[:, None] @ covariance @ directions[..., None])[:, 0, 0]
-    across = (covariance.diagonal(dim1=-2, dim2=-1).sum(-1) - along) / 2
-    return torch.stack([across, along], dim=-1).clamp(min=0).sqrt()
-
-
 def _mean_descriptors(
     descriptors: UInt8[Tensor, "m d"], point: Int[Tensor, "m"], count: int
 ) -> UInt8[Tensor, "n d"]:
@@ -351,5 +326,4 @@ def _mean_descriptors(
 
 
 def _mean(values: Float[Tensor, "m c"], index: Int[Tensor, "m"], count: int) -> Float[Tensor, "n c"]:
-    total = torch.zeros((count, values.shape[1]), dtype=values.dtype).index_add_(0, index, values)
-    return total / torch.bincount(index, minlength=count).clamp(min=1)[:, None]
+    return summed(values, index, count) / torch.bincount(index, minlength=count).clamp(min=1)[:, None]

@@ -21,31 +21,18 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping.landmarks.features import squared_distances
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
-WORDS = 32
-SAMPLE = 20_000
-"""Maximum number of descriptors from which a vocabulary is built."""
-SAMPLED = 20
-"""Number of descriptors per cell in the sample on which k-means runs."""
-ROUNDS = 6
-"""Iterations of Lloyd's algorithm; the cells need to be balanced, not optimal."""
 BLOCK = 2**20
 """Number of distances to cell centres computed at a time, which bounds the memory."""
-VIEWPOINTS = 48
-"""Maximum number of cameras of a map that are pooled; if there are more, evenly spaced ones are chosen."""
-VISIBLE_BEYOND_DEG = 10.0
-"""Margin around a landmark's cone of viewing directions within which it still counts as visible."""
-FEWEST = 8
-"""Minimum number of visible landmarks for a camera to be pooled."""
 
 
 def k_means(
     descriptors: UInt8[Tensor, "n d"], count: int, generator: torch.Generator
 ) -> Float[Tensor, "c d"]:
-    """Return the centres of k-means clusters (Lloyd 1982) of a sample; the centre of an emptied cluster stays in place."""
-    sample = torch.randperm(len(descriptors), generator=generator)[: SAMPLED * count]
+    """Return the centres of k-means clusters (Lloyd 1982) of a sample of twenty a cluster; the centre of an emptied cluster stays in place."""
+    sample = torch.randperm(len(descriptors), generator=generator)[: 20 * count]
     values = descriptors[sample.to(descriptors.device)].float()
     centres = values[:count].clone()
-    for _ in range(ROUNDS):
+    for _ in range(6):  # the cells need to be balanced, not optimal
         cell = nearest_centre(values, centres)
         sizes = torch.bincount(cell, minlength=count)
         total = torch.zeros_like(centres).index_add_(0, cell, values)
@@ -67,11 +54,11 @@ class Vocabulary:
 
     @staticmethod
     def of(descriptors: Sequence[UInt8[Tensor, "n d"]], seed: int = 0) -> Vocabulary:
-        """Build a vocabulary from an equal number of descriptors from each map."""
+        """Build a vocabulary of 32 words from 20,000 descriptors, an equal number from each map."""
         generator = torch.Generator().manual_seed(seed)
-        share = -(-SAMPLE // len(descriptors))
+        share = -(-20_000 // len(descriptors))
         some = torch.cat([one[torch.randperm(len(one), generator=generator)[:share]] for one in descriptors])
-        return Vocabulary(k_means(some, min(WORDS, len(some)), generator))
+        return Vocabulary(k_means(some, min(32, len(some)), generator))
 
     def pooled(self, descriptors: UInt8[Tensor, "n d"], word: Tensor | None = None) -> Float[Tensor, "p"]:
         """Return the VLAD vector of descriptors, of unit length; ``word`` is each one's nearest word, if known."""
@@ -88,17 +75,20 @@ class Vocabulary:
 def pooled_views(
     vocabulary: Vocabulary, landmarks: LandmarkMap, cameras: Sequence[tuple[Intrinsics, SE3]]
 ) -> Float[Tensor, "v p"]:
-    """Return the VLAD vectors of the landmarks visible to a map's cameras (T_world_camera), and of all landmarks last."""
+    """Return the VLAD vectors of the landmarks visible to a map's cameras (T_world_camera), and of all landmarks last.
+
+    At most 48 cameras are pooled, evenly spaced, of those with at least eight such landmarks.
+    """
     word = vocabulary.nearest(landmarks.descriptors)
     found = []
-    for camera, pose in cameras[:: max(1, math.ceil(len(cameras) / VIEWPOINTS))]:
+    for camera, pose in cameras[:: max(1, math.ceil(len(cameras) / 48))]:
         seen = visible(landmarks, camera, pose)
-        if len(seen) >= FEWEST:
+        if len(seen) >= 8:
             found.append(vocabulary.pooled(landmarks.descriptors[seen], word[seen]))
     return torch.stack([*found, vocabulary.pooled(landmarks.descriptors, word)])
 
 
 def visible(landmarks: LandmarkMap, camera: Intrinsics, T_world_camera: SE3) -> Int[Tensor, "m"]:
-    """Return the numbers of the landmarks visible to a camera, ignoring occlusion."""
+    """Return the numbers of the landmarks visible to a camera, ignoring occlusion, also up to 10 degrees beyond their cones."""
     slopes = torch.tensor([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy])
-    return landmarks.in_view(T_world_camera, slopes, math.radians(VISIBLE_BEYOND_DEG))[0]
+    return landmarks.in_view(T_world_camera, slopes, math.radians(10))[0]
