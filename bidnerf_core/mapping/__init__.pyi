@@ -59,7 +59,6 @@ from .resection.descend import log_evidence as log_evidence
 from .resection.descend import prior as prior
 from .resection.descend import total as total
 from .resection.reprojection import LEAST_NOISE as LEAST_NOISE
-from .resection.reprojection import MAD as MAD
 from .resection.reprojection import Landmarks as Landmarks
 from .resection.reprojection import point_variance as point_variance
 from .resection.resection import resections as resections

@@ -13,12 +13,11 @@ from bidnerf_core.camera import exposure_times
 from bidnerf_core.devices import moved
 from bidnerf_core.fields import Observations
 from bidnerf_core.frames import View
-from bidnerf_core.geometry import inlier_weight
+from bidnerf_core.geometry import MAD_TO_SIGMA, inlier_weight
 from bidnerf_core.localization.settings import LEAST_POINTS
 from bidnerf_core.localization.terms.exposure import fit_exposure
 from bidnerf_core.mapping import (
     DEPTH,
-    MAD,
     MOTION,
     Normal,
     Sights,
@@ -183,7 +182,7 @@ class Surface:
     def fitted_noise(self, states: States) -> Surface:
         """Return the term with the noise of the points at the first state."""
         r = self._offsets(moved(states[:1], self.surface.device))[0].abs()
-        found = (MAD * r.median()).clamp(min=0.25 * self.surface.cell)
+        found = (MAD_TO_SIGMA * r.median()).clamp(min=0.25 * self.surface.cell)
         return replace(self, noise=found.clamp(max=3 * self.noise))
 
     def exposed(self, states: States) -> Surface:

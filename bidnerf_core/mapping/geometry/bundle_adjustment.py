@@ -21,18 +21,12 @@ from bidnerf_core.geometry import SE3, cauchy_loss, inlier_weight
 from bidnerf_core.mapping.geometry.observations import Sightings, summed
 from bidnerf_core.mapping.resection.states import by_camera_point, by_update, pinhole
 
-ADJUSTMENT_STEPS = 30
-"""Maximum number of steps; from poses that are off by a few pixels, about ten suffice."""
 SMALL_DECREASE = 1e-4
 """Relative decrease of the cost below which the iteration has converged."""
-LARGEST_DAMPING = 1e6
-"""Damping (relative to the diagonal) beyond which no smaller step is tried."""
 RESIDUAL_SCALE, PRIOR_SCALE = 2.0, 5.0
 """Scales of the Cauchy losses of an observation and of a pose (six components), in standard deviations. The prior hardly
 constrains a pose that is plainly wrong.
 """
-ALMOST_SINGULAR = 1e-9
-"""Damping relative to the mean diagonal, which makes the blocks of points without parallax invertible."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,12 +65,15 @@ def adjusted(
     """
     state, damping = start, 1e-4
     system = linearized(sightings, state, prior, noise, correlation)
-    for _ in range(ADJUSTMENT_STEPS):
-        moved = _retracted(state, *system.step(damping))
+    for _ in range(30):  # from poses that are off by a few pixels, about ten suffice
+        of_images, of_points = system.step(damping)
+        motion = state.motion + of_images[:, 6:] if of_images.shape[1] > 6 else state.motion
+        poses = state.T_world_camera.retract(of_images[:, :6])
+        moved = Adjustment(poses, state.points + of_points, motion)
         tried = linearized(sightings, moved, prior, noise, correlation)
         if not tried.cost <= system.cost:
             damping *= 10
-            if damping > LARGEST_DAMPING:
+            if damping > 1e6:  # relative to the diagonal
                 break
             continue
         gained = system.cost - tried.cost
@@ -84,13 +81,6 @@ def adjusted(
         if gained <= tolerance * system.cost:
             break
     return replace(state, T_world_camera=state.T_world_camera.normalized(), cost=system.cost)
-
-
-def _retracted(
-    state: Adjustment, of_images: Float[Tensor, "v k"], of_points: Float[Tensor, "n 3"]
-) -> Adjustment:
-    motion = state.motion + of_images[:, 6:] if of_images.shape[1] > 6 else state.motion
-    return Adjustment(state.T_world_camera.retract(of_images[:, :6]), state.points + of_points, motion)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,27 +147,22 @@ def linearized(
         by_view = torch.cat([by_view, times[:, None, None] * by_view], dim=-1)
     views, count = len(state.motion), len(state.points)
     view_weighted, point_weighted = (by.mT * weight[:, None, None] for by in (by_view, by_point))
-    term = _prior_term(state, prior)
+    prior_cost, pull, precision = _prior_term(state, prior)
     column = off[..., None]
     return AdjustmentSystem(
-        cost + term.cost,
-        summed((view_weighted @ column)[..., 0], view, views) + term.gradient,
+        cost + prior_cost,
+        summed((view_weighted @ column)[..., 0], view, views) + pull,
         summed((point_weighted @ column)[..., 0], point, count),
-        summed(view_weighted @ by_view, view, views) + torch.diag_embed(term.precision),
+        summed(view_weighted @ by_view, view, views) + torch.diag_embed(precision),
         summed(point_weighted @ by_point, point, count),
         view_weighted @ by_point, view, point,
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class _PriorTerm:
-    cost: float
-    gradient: Float[Tensor, "v k"]
-    precision: Float[Tensor, "v k"]
-
-
-def _prior_term(state: Adjustment, prior: PosePrior) -> _PriorTerm:
-    """Return the prior term: the deviations from the given poses under a Cauchy loss, and the motions under a quadratic
+def _prior_term(
+    state: Adjustment, prior: PosePrior
+) -> tuple[float, Float[Tensor, "v k"], Float[Tensor, "v k"]]:
+    """Return cost, gradient and precision of the prior: the deviations from the given poses under a Cauchy loss, and the motions under a quadratic
     loss, in standard deviations.
     """
     given, T = prior.T_world_camera, state.T_world_camera
@@ -192,10 +177,11 @@ def _prior_term(state: Adjustment, prior: PosePrior) -> _PriorTerm:
         of_motion = (prior.motion.deviations**-2).expand_as(state.motion)
         cost += 0.5 * float((of_motion * state.motion.square()).sum())
         off, precision = torch.cat([off, state.motion], dim=-1), torch.cat([precision, of_motion], dim=-1)
-    return _PriorTerm(cost, precision * off, precision)
+    return cost, precision * off, precision
 
 
 def _damped(blocks: Float[Tensor, "b k k"], damping: float) -> Float[Tensor, "b k k"]:
+    """Return damped blocks; those of points without parallax become invertible."""
     diagonal = blocks.diagonal(dim1=-2, dim2=-1)
-    least = ALMOST_SINGULAR * diagonal.mean(-1, keepdim=True).clamp(min=1e-30)
+    least = 1e-9 * diagonal.mean(-1, keepdim=True).clamp(min=1e-30)
     return blocks + torch.diag_embed(damping * diagonal + least)

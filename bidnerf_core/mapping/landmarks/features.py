@@ -131,11 +131,12 @@ def detected(features: Features, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
         )
     parts = (found.pixels, found.sizes, found.descriptors)
     kinds = [f"{p.dtype} {list(p.shape)}" if isinstance(p, Tensor) else type(p).__name__ for p in parts]
-    shapes = [list(part.shape) for part in parts]
-    count = shapes[2][0] if shapes[2] else 0
-    is_tensor = all(isinstance(part, Tensor) for part in parts)
-    fits = shapes[:2] == [[count, 2], [count]] and len(shapes[2]) == 2
-    if not (is_tensor and fits and found.descriptors.dtype == torch.uint8):
+    fits = all(isinstance(part, Tensor) for part in parts) and found.descriptors.dtype == torch.uint8
+    if not fits or [list(p.shape) for p in parts] != [
+        [n := len(parts[2]), 2],
+        [n],
+        [n, *parts[2].shape[1:2]],
+    ]:
         raise PluginError(
             f"pixels, sizes and descriptors are {enumeration(kinds)}",
             where=who,

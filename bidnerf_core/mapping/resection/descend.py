@@ -16,7 +16,6 @@ from bidnerf_core.mapping.resection.states import P, States
 
 SETTLED = 0.01
 """Predicted decrease of the cost below which a hypothesis has converged."""
-FIRST_DAMPING, WHEN_BETTER, WHEN_WORSE = 1e-3, 1 / 5, 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +67,7 @@ def descend(
     of the visible scene, rotation and translation decouple. Poses and costs before each step are added to ``path``.
     """
     here = total(states, terms)
-    damping = torch.full_like(here.cost, FIRST_DAMPING)
+    damping = torch.full_like(here.cost, 1e-3)
     about = None if pivot is None else _about(pivot.to(here.hessian))
     for _ in range(steps):
         if path is not None:
@@ -81,7 +80,7 @@ def descend(
         there = total(moved, terms)
         better = (there.cost < here.cost) & ~settled  # false for NaN
         states, here = moved.where(better, states), there.where(better, here)
-        damping = torch.where(better, damping * WHEN_BETTER, damping * WHEN_WORSE)
+        damping = torch.where(better, damping * 0.2, damping * 8)
     return states, here
 
 

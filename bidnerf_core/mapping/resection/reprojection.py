@@ -15,11 +15,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from bidnerf_core.geometry import MAD_TO_SIGMA
 from bidnerf_core.mapping.resection.descend import Normal
 from bidnerf_core.mapping.resection.states import Projections, Sights, States, jacobian, project
 
-MAD = 1.4826
-"""Ratio of the standard deviation to the median absolute deviation of a Gaussian."""
 LEAST_NOISE = 0.05
 """Pixels: no detector is more accurate."""
 SCALE = 2.0
@@ -110,7 +109,7 @@ class Landmarks:
         off, valid = own._residuals(states)[1], own.valid > 0
         sizes = torch.where(valid[..., None], off.abs(), torch.nan).flatten(1)
         by_points = torch.where(valid, own.variance, torch.nan).nanmedian(-1).values
-        spread = (MAD * sizes.nanmedian(-1).values).square()
+        spread = (MAD_TO_SIGMA * sizes.nanmedian(-1).values).square()
         noise = (spread - by_points).clamp(LEAST_NOISE**2, self.most_noise**2).nan_to_num(1.0).sqrt()
         return replace(states, noise=noise)
 

@@ -22,8 +22,6 @@ from bidnerf_core.mapping.resection.states import MOTION, N, Sights, States
 
 BATCH = 32
 """Number of images whose poses are estimated at once, which bounds the memory; they see similar numbers of points."""
-ROUNDS, STEPS = 3, 10
-"""Number of estimates of the noise, and the largest number of steps after each."""
 
 
 def resections(
@@ -76,9 +74,9 @@ def resections(
             SE3(torch.eye(3, dtype=torch.float64).expand(h, 3, 3), zero[:, :3]), zero, zero,
             deviation.repeat_interleave(b, 0), zero[:, 0], zero[:, 0], mode, torch.arange(h) // b,
         )  # fmt: skip
-        for _ in range(ROUNDS):
-            states, _ = descend(term.with_noise(states), [term], STEPS)
+        for _ in range(3):  # estimates of the noise
+            states, _ = descend(term.with_noise(states), [term], 10)
         states = term.with_noise(states)
         noise = states.noise.view(-1, b).amin(0).repeat(len(motions))
         states = replace(states, noise=noise)
-        yield some, *descend(states, [term.weighted_for(states[-b:])], STEPS)
+        yield some, *descend(states, [term.weighted_for(states[-b:])], 10)
