@@ -85,7 +85,7 @@ def run(
     from bidnerf_core.evaluation import read_results
     from bidnerf_core.localization import Localizer
     from bidnerf_core.maps import load_info, load_map
-    from bidnerf_core.viewer import LiveView, ShownRow, page_of, serve_view, shown_trajectory
+    from bidnerf_core.viewer import LiveView, page_of, serve_view, shown_row, shown_trajectory
 
     if frame and not query:
         raise UsageError("--frame names frames of a dataset", expected="the dataset as QUERY")
@@ -93,7 +93,7 @@ def run(
         check_output(page.save, (*query, *queries.depth, page.results, page.trajectory))
     info = load_info(map)
     path = None if page.trajectory is None else shown_trajectory(page.trajectory, info.unit, info.origin)
-    rows = () if page.results is None else tuple(ShownRow.of(row) for row in read_results([page.results]))
+    rows = () if page.results is None else tuple(shown_row(row) for row in read_results([page.results]))
     scene = load_map(map, server.device)
     localizer = Localizer(scene, server.method, warm_up=page.save is None)
     source = None

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -33,16 +32,15 @@ from bidnerf_core.viewer.explanations import (
     APART,
     HERE,
     TURNED_DEG,
-    Contest,
     contests,
     earlier,
     last_answer,
     probable_poses,
 )
 from bidnerf_core.viewer.figures import Figure, acceptance_figures
-from bidnerf_core.viewer.packing import Packed, Picture, drawing, packed, photograph
+from bidnerf_core.viewer.packing import Json, drawing, packed, photograph
 from bidnerf_core.viewer.rendering import quick_image
-from bidnerf_core.viewer.scene import CameraShape, rows_of
+from bidnerf_core.viewer.scene import frustum, rows_of
 
 PICTURE_SIDE, RUNNER_UP_SIDE = 320, 240
 """Longer sides (pixels) of a photo and its rendering, and of the runner-up and its rendering; rendering takes time."""
@@ -52,60 +50,6 @@ SIGMAS = 2.0
 """Semi-axes of the ellipsoid of the position, in standard deviations."""
 TOO_NEAR, RIGHT, TOO_FAR = (0.70, 0.09, 0.17), (0.97, 0.97, 0.96), (0.13, 0.40, 0.67)
 """Colours for rendered depth that is smaller than, equal to and larger than the measured depth."""
-
-
-@dataclass(frozen=True)
-class Ellipsoid:
-    """The ellipsoid of two standard deviations of the position, and the standard deviations of the orientation."""
-
-    axes: tuple[float, ...]  # semi-axes in the world, 9 numbers: an axis a row, the longest first
-    lengths: tuple[float, float, float]  # of the semi-axes
-    rotation_deg: tuple[float, float, float]  # standard deviations about the camera's x, y and z axes
-
-
-@dataclass(frozen=True)
-class ShownStep:
-    """Poses that were considered at the same time."""
-
-    caption: str
-    poses: Packed  # T_world_camera without the last row, float32 (h, 12), best first
-    scores: tuple[float | None, ...]
-    kept: int
-    loss: float | None = None  # of a step of a descent
-
-
-@dataclass(frozen=True)
-class ShownMatches:
-    """Keypoints and the projections of their matched landmarks, at the last pose that was estimated from landmarks."""
-
-    keypoints: Packed  # float32 (m, 2), as fractions of the image's width and height
-    projections: Packed  # the same; NaN behind the camera
-    accepted: Packed  # uint8 (m)
-    agreeing: int
-    refused: int
-    by_appearance: (
-        int  # of these, matched by descriptors alone; the others were matched near their projections
-    )
-    pose: str  # which one it is, if not the pose found
-
-
-@dataclass(frozen=True)
-class DepthDifference:
-    """The difference between rendered and measured depth, as a colour image."""
-
-    picture: Picture
-    range: float  # difference at the ends of the scale
-    median: float  # of its absolute value
-
-
-@dataclass(frozen=True)
-class RunnerUp:
-    """The best other pose."""
-
-    reason: str
-    pose: tuple[float, ...]  # T_world_camera, 16 numbers by rows
-    rendered: Picture | None
-    probability: float | None = None  # against the pose found alone; None if they were not compared
 
 
 @dataclass(frozen=True)
@@ -127,18 +71,18 @@ class ShownAnswer:
     pose: tuple[float, ...] | None = None  # T_world_camera, 16 numbers by rows; None if it is not finite
     truth: tuple[float, ...] | None = None
     error: tuple[float, float] | None = None  # of the position, and of the orientation in degrees
-    shape: CameraShape | None = None
+    shape: Json | None = None
     camera: str = ""  # whose intrinsics were taken
-    ellipsoid: Ellipsoid | None = None
-    observed: Picture | None = None
-    rendered: Picture | None = None
-    depth: DepthDifference | None = None
-    steps: tuple[ShownStep, ...] = ()
+    ellipsoid: Json | None = None
+    observed: Json | None = None
+    rendered: Json | None = None
+    depth: Json | None = None
+    steps: tuple[Json, ...] = ()
     path: tuple[tuple[float, float, float], ...] = ()  # positions from the start to the pose found
-    matches: ShownMatches | None = None
+    matches: Json | None = None
     figures: tuple[Figure, ...] = ()
-    contests: tuple[Contest, ...] = ()
-    runner_up: RunnerUp | None = None
+    contests: tuple[Json, ...] = ()
+    runner_up: Json | None = None
 
 
 def shown_answer(
@@ -154,13 +98,16 @@ def shown_answer(
     truth = None if truth is None else truth.translated(-origin_of(scene))
     T = found.T_world_camera.to("cpu", torch.float64)
     finite = bool(T.matrix().isfinite().all())
-    given, frame = frame, None if frame is None else found.frame_as_taken(frame)
-    observed = rendered = depth = None
+    observed, rendered, depth, camera = None, None, None, ""
     if frame is not None:
-        camera = frame.intrinsics.at_most(PICTURE_SIDE)
-        observed = photograph(reduced(frame.rgb, camera.width, camera.height))
+        camera = frame.camera_source or "intrinsics as given"
+        if found.intrinsics is not None:
+            camera = f"intrinsics taken or estimated by the localization, focal length times {found.focal_factor:.3f}"
+        frame = found.frame_as_taken(frame)
+        small = frame.intrinsics.at_most(PICTURE_SIDE)
+        observed = photograph(reduced(frame.rgb, small.width, small.height))
         if finite:
-            rendered, depth = _compared(scene, camera, T, frame, quick)
+            rendered, depth = _compared(scene, small, T, frame, quick)
     error = None if truth is None or not finite else pose_error(T, truth, found.unit)
     advice = ADVICE.get(found.outcome)
     other = None if record is None or not finite else _runner_up(scene, found, record, frame, quick)
@@ -184,8 +131,8 @@ def shown_answer(
         pose=rows_of(T) if finite else None,
         truth=None if truth is None else rows_of(truth),
         error=None if error is None else (float(error.translation), float(error.rotation_deg)),
-        shape=None if frame is None else CameraShape.of(frame.intrinsics),
-        camera=_camera(given, found),
+        shape=None if frame is None else frustum(frame.intrinsics),
+        camera=camera,
         ellipsoid=ellipsoid(T, found.covariance) if finite else None,
         observed=observed,
         rendered=rendered,
@@ -199,21 +146,28 @@ def shown_answer(
     )
 
 
-def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> Ellipsoid | None:
-    """Return the ellipsoid of a pose's position; None if its covariance is unknown or not finite."""
+def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> Json | None:
+    """Return the ellipsoid of ``SIGMAS`` standard deviations of a pose's position; None if its covariance is unknown or not finite.
+
+    ``axes`` are its semi-axes in the world, 9 numbers: an axis a row, the longest first, with their ``lengths``; ``rotation_deg``
+    the standard deviations about the camera's x, y and z axes.
+    """
     if covariance is None or not bool(covariance.isfinite().all()):
         return None
-    turn = T_world_camera.rotation.double().cpu()
-    covariance = covariance.detach().cpu().double()
+    turn, covariance = T_world_camera.rotation.double().cpu(), covariance.detach().cpu().double()
     variances, axes = torch.linalg.eigh(turn @ covariance[:3, :3] @ turn.mT)
     lengths = (SIGMAS * variances.clamp(min=0).sqrt()).flip(0)
-    a, b, c = lengths.tolist()
-    x, y, z = torch.rad2deg(covariance.diagonal()[3:].clamp(min=0).sqrt()).tolist()
-    return Ellipsoid(tuple((axes.flip(1) * lengths).mT.flatten().tolist()), (a, b, c), (x, y, z))
+    return {
+        "axes": (axes.flip(1) * lengths).mT.flatten().tolist(), "lengths": lengths.tolist(),
+        "rotation_deg": torch.rad2deg(covariance.diagonal()[3:].clamp(min=0).sqrt()).tolist(),
+    }  # fmt: skip
 
 
-def depth_difference(image: RenderedImage, frame: Frame) -> DepthDifference | None:
-    """Return rendered minus measured depth at the pixels that have both; None if there are none."""
+def depth_difference(image: RenderedImage, frame: Frame) -> Json | None:
+    """Return rendered minus measured depth at the pixels that have both, as a colour image; None if there are none.
+
+    ``range`` is the difference at the ends of its scale, and ``median`` that of the absolute values.
+    """
     if frame.depth is None or not frame.has_depth:
         return None
     height, width = image.depth.shape
@@ -229,77 +183,58 @@ def depth_difference(image: RenderedImage, frame: Frame) -> DepthDifference | No
     towards = torch.where((share > 0)[..., None], far, near)
     rgb = middle + share.abs()[..., None] * (towards - middle)
     pixels = torch.cat([rgb, known[..., None].float()], dim=-1)
-    return DepthDifference(
-        drawing((pixels * 255 + 0.5).to(torch.uint8).numpy()), most, float(off.abs().median())
-    )
+    picture = drawing((pixels * 255 + 0.5).to(torch.uint8).numpy())
+    return {"picture": picture, "range": most, "median": float(off.abs().median())}
 
 
 def _compared(
     scene: SceneMap, camera: Intrinsics, T: SE3, frame: Frame, quick: bool
-) -> tuple[Picture, DepthDifference | None]:
+) -> tuple[Json, Json | None]:
     if quick or not has_field(scene.field):
         return photograph(quick_image(scene, camera, T)), None
     image = render_picture(scene.field, camera, T, scene.bounds)
     return photograph(image.rgb), depth_difference(image, frame)
 
 
-def _camera(frame: Frame | None, found: Localization) -> str:
-    if frame is None:
-        return ""
-    if found.intrinsics is not None:
-        return (
-            f"intrinsics taken or estimated by the localization, focal length times {found.focal_factor:.3f}"
-        )
-    return frame.camera_source or "intrinsics as given"
-
-
-def _steps(found: Localization, record: SearchRecord | None) -> tuple[ShownStep, ...]:
+def _steps(found: Localization, record: SearchRecord | None) -> tuple[Json, ...]:
     """Return the steps of the search, or else of the descent, then the pose with each of its rivals, and the pose found."""
-    shown, last = list[ShownStep](), found.T_world_camera.to("cpu", torch.float64)
-    if record is not None:
-        shown += [ShownStep(s.caption, _poses(s.T), _numbers(s.scores), s.kept) for s in record.steps]
+    last = found.T_world_camera.to("cpu", torch.float64)
+    shown = [] if record is None else [_step(s.caption, s.T, s.scores.tolist(), s.kept) for s in record.steps]
     if not shown:
-        shown += _descent(found)
+        count = min(len(found.losses), len(found.poses.translation) - 1)
+        for number in range(0, count, max(1, math.ceil(count / MOST_STEPS))):
+            T, loss = found.poses[number : number + 1], float(found.losses[number])
+            if bool(T.matrix().isfinite().all()):
+                shown.append(_step(f"step {number} of {count}", T, [loss], 1, loss))
     if not bool(last.matrix().isfinite().all()):
         return tuple(shown)
     answer = last_answer(record)
     if answer is not None and len(answer.modes) > 1:
         _, poses, probabilities = zip(*probable_poses(answer), strict=True)
-        scores = -torch.tensor(probabilities, dtype=torch.float64).log()
-        shown.append(
-            ShownStep(
-                "the pose and others that explain the image",
-                _poses(SE3.stack(list(poses))),
-                _numbers(scores),
-                len(poses),
-            )
-        )
-    return (*shown, ShownStep(HERE, _poses(last[None]), (0.0,), 1, shown[-1].loss if shown else None))
+        scores = (-torch.tensor(probabilities, dtype=torch.float64).log()).tolist()
+        caption = "the pose and others that explain the image"
+        shown.append(_step(caption, SE3.stack(list(poses)), scores, len(poses)))
+    return (*shown, _step(HERE, last[None], [0.0], 1, shown[-1]["loss"] if shown else None))
 
 
-def _descent(found: Localization) -> Iterator[ShownStep]:
-    """Yield the poses of a descent with their losses, but the last, which is the pose found."""
-    count = min(len(found.losses), len(found.poses.translation) - 1)
-    for number in range(0, count, max(1, math.ceil(count / MOST_STEPS))):
-        T, loss = found.poses[number : number + 1], _finite(float(found.losses[number]))
-        if bool(T.matrix().isfinite().all()):
-            yield ShownStep(f"step {number} of {count}", _poses(T), (loss,), 1, loss)
-
-
-def _poses(T: SE3) -> Packed:
-    return packed(T.matrix()[:, :3].detach().cpu().double().flatten(1).numpy())
-
-
-def _numbers(values: Float[Tensor, "h"]) -> tuple[float | None, ...]:
-    return tuple(_finite(value) for value in values.tolist())
+def _step(caption: str, T: SE3, scores: list[float], kept: int, loss: float | None = None) -> Json:
+    """Return poses that were considered at the same time, the best first, with the ``loss`` of a step of a descent."""
+    poses = packed(T.matrix()[:, :3].detach().cpu().double().flatten(1).numpy())
+    known = tuple(map(_finite, scores))
+    return {"caption": caption, "poses": poses, "scores": known, "kept": kept, "loss": _finite(loss)}
 
 
 def _finite(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
 
 
-def _matches(scene: SceneMap, found: Localization, answer: Answer) -> ShownMatches | None:
-    """Return the matches in the last image at the last pose by landmarks: those by projection, then others by descriptors."""
+def _matches(scene: SceneMap, found: Localization, answer: Answer) -> Json | None:
+    """Return the matches in the last image at the last pose by landmarks: those by projection, then others by descriptors.
+
+    ``keypoints`` and ``projections`` of their landmarks (NaN behind the camera) are fractions of the image's size, float32 (m, 2);
+    ``accepted`` is uint8 (m). Of the ``refused``, those ``by_appearance`` were matched by descriptors alone. ``pose`` says at which
+    pose, if not at the one found.
+    """
     if scene.landmarks is None:
         return None
     mode, best = answer.mode, answer.posterior.best
@@ -320,20 +255,20 @@ def _matches(scene: SceneMap, found: Localization, answer: Answer) -> ShownMatch
     if mode.name == MIRROR:  # drawn on the image as it is
         shares = [torch.stack([1 - share[:, 0], share[:, 1]], dim=-1) for share in shares]
     every = max(1, math.ceil(len(keypoint) / MOST_MATCHES))
-    return ShownMatches(
-        packed(shares[0][::every].numpy()),
-        packed(shares[1][::every].numpy()),
-        packed(agree[::every].to(torch.uint8).numpy()),
-        int(agree.sum()),
-        int((~agree).sum()),
-        by_descriptors,
-        earlier(found, answer),
-    )
+    return {
+        "keypoints": packed(shares[0][::every].numpy()),
+        "projections": packed(shares[1][::every].numpy()),
+        "accepted": packed(agree[::every].to(torch.uint8).numpy()),
+        "agreeing": int(agree.sum()),
+        "refused": int((~agree).sum()),
+        "by_appearance": by_descriptors,
+        "pose": earlier(found, answer),
+    }
 
 
 def _runner_up(
     scene: SceneMap, found: Localization, record: SearchRecord, frame: Frame | None, quick: bool
-) -> RunnerUp | None:
+) -> Json | None:
     """Return the most probable other place, or else an earlier pose by landmarks, or the best different pose of the search."""
     answer = last_answer(record)
     if answer is not None:
@@ -342,7 +277,7 @@ def _runner_up(
         for mode, T, probability in probable_poses(answer):
             if mode != answer.posterior.mode and answer.modes[mode].name != MIRROR:
                 shown = _rendered(scene, T, "the next most probable pose by landmarks", frame, quick)
-                return replace(shown, probability=probability)
+                return shown | {"probability": probability}
     T = found.T_world_camera.to("cpu", torch.float64)
     x, y, z = scene.bounds.centre
     reach = APART * float((T.translation - torch.tensor([x, y, z], dtype=torch.float64)).norm())
@@ -355,9 +290,9 @@ def _runner_up(
     return None
 
 
-def _rendered(scene: SceneMap, T: SE3, reason: str, frame: Frame | None, quick: bool) -> RunnerUp:
+def _rendered(scene: SceneMap, T: SE3, reason: str, frame: Frame | None, quick: bool) -> Json:
+    """Return another pose; its ``probability`` against the pose found alone is known if they were compared."""
     picture = None
     if frame is not None:
-        camera = frame.intrinsics.at_most(RUNNER_UP_SIDE)
-        picture, _ = _compared(scene, camera, T, frame, quick)
-    return RunnerUp(reason, rows_of(T), picture)
+        picture, _ = _compared(scene, frame.intrinsics.at_most(RUNNER_UP_SIDE), T, frame, quick)
+    return {"reason": reason, "pose": rows_of(T), "rendered": picture, "probability": None}

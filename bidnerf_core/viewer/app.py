@@ -47,12 +47,10 @@ from bidnerf_core.service import (
     read_upload,
 )
 from bidnerf_core.viewer.jobs import Jobs, Read
-from bidnerf_core.viewer.packing import jpeg
+from bidnerf_core.viewer.packing import Json, jpeg
 from bidnerf_core.viewer.rendering import field_image, quick_image
 from bidnerf_core.viewer.saving import PageState, page_html
 from bidnerf_core.viewer.scene import shown_map, thumbnail_jpeg
-from bidnerf_core.viewer.table import ShownRow
-from bidnerf_core.viewer.trajectories import ShownTrajectory
 
 COOKIE = "bidnerf_token"
 LARGEST_RENDERING = 1024
@@ -70,8 +68,8 @@ class LiveView:
 
     localizer: Localizer
     source: QuerySource | None = None
-    trajectory: ShownTrajectory | None = None
-    results: tuple[ShownRow, ...] = ()
+    trajectory: Json | None = None
+    results: tuple[Json, ...] = ()
     camera: CameraSource | None = None
 
     @property
@@ -149,7 +147,7 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
         try:
             yield
         finally:
-            jobs.close()
+            jobs.queue.close()
             painter.shutdown(wait=False, cancel_futures=True)
 
     app = Application(
@@ -214,7 +212,7 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
 
     @app.get("/api/job/{id}", responses=errors(404), summary="The state of a localization, and its answer.")
     async def job(id: str, known: str = "") -> Response:
-        found = jobs.find(id)
+        found = jobs.shown.get(id)
         if found is None:
             raise Refused(404, "no such localization")
         return JSONResponse(found.plain(known))

@@ -16,6 +16,7 @@ from bidnerf_core.localization import (
     Support,
 )
 from bidnerf_core.viewer.explanations import earlier, last_answer
+from bidnerf_core.viewer.packing import Json
 
 MEASURES = {
     "log10_nfa": ("poses as good by chance", ".0e", "number expected of wrong poses; the bar compares exponents"),
@@ -54,19 +55,15 @@ WITHOUT_LANDMARKS = {
 """Label, format and meaning of each measure of a pose that landmarks did not find."""
 
 
-@dataclass(frozen=True)
-class Bar:
-    """A value on a linear scale from 0 to 1, whose middle is the threshold and whose end is twice that or more."""
+def bar(value: float, threshold: float, at_least: bool) -> Json | None:
+    """Return a value on a linear scale from 0 to 1, whose middle is the threshold and whose end is twice that or more.
 
-    value: float
-    at_least: bool  # whether values below the threshold fail, else those above
-
-    @staticmethod
-    def of(value: float, threshold: float, at_least: bool) -> Bar | None:
-        """Return the bar for a value and a threshold; None if the value is not finite or the threshold is not positive."""
-        if not math.isfinite(value) or threshold <= 0:
-            return None
-        return Bar(min(max(0.0, value / threshold / 2), 1.0), at_least)
+    ``at_least`` says whether values below the threshold fail, else those above. None if the value is not finite or the threshold not
+    positive.
+    """
+    if not math.isfinite(value) or threshold <= 0:
+        return None
+    return {"value": min(max(0.0, value / threshold / 2), 1.0), "at_least": at_least}
 
 
 @dataclass(frozen=True)
@@ -77,7 +74,7 @@ class Figure:
     value: str
     threshold: str  # with "at least" or "at most"; empty for a measure without one
     passed: bool | None  # None if there is no threshold
-    bar: Bar | None
+    bar: Json | None
     meaning: str
     pose: str = ""  # which one is measured, if not the pose found
 
@@ -91,7 +88,7 @@ class Figure:
             return Figure(name, format(value, spec), "", None, None, meaning)
         bound = f"{'at least' if is_least else 'at most'} {format(limit, spec)}"
         passed = value >= limit if is_least else value <= limit
-        return Figure(name, format(value, spec), bound, passed, Bar.of(value, limit, is_least), meaning)
+        return Figure(name, format(value, spec), bound, passed, bar(value, limit, is_least), meaning)
 
 
 def acceptance_figures(found: Localization, record: SearchRecord | None) -> tuple[Figure, ...]:
@@ -121,8 +118,8 @@ def _of_landmarks(evidence: Evidence) -> Iterator[Figure]:
             yield Figure.of(text, value)
         elif measure == "log10_nfa":
             chance, limit = (10.0 ** min(max(power, -300), 300) for power in (value, bound.limit))
-            bar = Bar.of(bound.limit / min(value, -0.01), 1.0, False)
-            yield replace(Figure.of(text, chance, limit, bound.is_least), bar=bar)
+            exponents = bar(bound.limit / min(value, -0.01), 1.0, False)
+            yield replace(Figure.of(text, chance, limit, bound.is_least), bar=exponents)
         else:
             yield Figure.of(text, value, bound.limit, bound.is_least)
 

@@ -51,7 +51,7 @@ class ShownJob:
         self.state = "searching"
         try:
             query, start, seed = read()
-            self.answer = localized(localizer, query, start, seed, begun=self._search, found_pose=self._show)
+            self.answer = localized(localizer, query, start, seed, self._follow)
         except Cancelled:
             self.answer = ShownAnswer(self.name, "stopped", False, "the viewer was closed")
         except InputError as error:
@@ -64,41 +64,33 @@ class ShownJob:
         finally:
             self.state = "done"
 
-    def _search(self, record: SearchRecord) -> None:
-        self.record = record
-
-    def _show(self, answer: ShownAnswer) -> None:
-        self.answer, self.state = answer, "rendering"
+    def _follow(self, record: SearchRecord, answer: ShownAnswer | None) -> None:
+        self.record, self.answer, self.state = record, answer, "rendering" if answer else "searching"
 
 
 class Jobs:
-    """Runs localizations in a thread, in the order in which they were requested."""
+    """Runs localizations in a thread, in the order in which they were requested.
+
+    ``shown`` has them by their ids. Closing the queue discards those that wait, and stops the one in progress soon.
+    """
 
     def __init__(self, localizer: Localizer) -> None:
-        self.queue, self._localizer, self._shown = Queue(PLACES), localizer, dict[str, ShownJob]()
+        self.queue, self._localizer, self.shown = Queue(PLACES), localizer, dict[str, ShownJob]()
         threading.Thread(target=self._work, name="localizing", daemon=True).start()
 
     def put(self, job: Job, read: Read) -> ShownJob:
         """Queue a localization of what ``read`` returns, for a job of the queue."""
-        shown = self._shown[job.id] = ShownJob(job.id, job.name)
-        done = [each.id for each in self._shown.values() if each.state == "done"]
-        for old in done[: max(0, len(self._shown) - KEPT)]:
-            del self._shown[old]
+        shown = self.shown[job.id] = ShownJob(job.id, job.name)
+        done = [each.id for each in self.shown.values() if each.state == "done"]
+        for old in done[: max(0, len(self.shown) - KEPT)]:
+            del self.shown[old]
         self.queue.put(job, read)
         return shown
-
-    def find(self, id: str) -> ShownJob | None:
-        """Return a localization by its id; None if it is unknown or no longer kept."""
-        return self._shown.get(id)
-
-    def close(self) -> None:
-        """Discard the localizations in the queue, and stop the one in progress soon."""
-        self.queue.close()
 
     def _work(self) -> None:
         with job_context(cancel=lambda: self.queue.closed):
             while not self.queue.closed:
                 job = self.queue.next()
                 if job is not None:
-                    self._shown[job.id].run(self._localizer, job.task)
+                    self.shown[job.id].run(self._localizer, job.task)
                     job.result.set_result(None)

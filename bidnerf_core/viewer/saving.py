@@ -14,9 +14,7 @@ from pathlib import Path
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import to_plain, write_file
 from bidnerf_core.viewer.answer import ShownAnswer
-from bidnerf_core.viewer.scene import ShownMap
-from bidnerf_core.viewer.table import ShownRow
-from bidnerf_core.viewer.trajectories import ShownTrajectory
+from bidnerf_core.viewer.packing import Json
 
 MODULES = ("data", "space", "compare", "panel", "table", "track", "live", "main")
 """The modules of the page, each after those that it imports. They share one scope, so their names must differ."""
@@ -30,13 +28,13 @@ ESCAPED = str.maketrans({c: f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"})
 class PageState:
     """A map, and the localizations in it."""
 
-    map: ShownMap
+    map: Json
     answers: tuple[ShownAnswer, ...] = ()
     title: str = ""
     live: bool = False  # whether a server answers
     queries: tuple[str, ...] = ()  # names of images that the server can localize
-    trajectory: ShownTrajectory | None = None
-    results: tuple[ShownRow, ...] = ()
+    trajectory: Json | None = None
+    results: tuple[Json, ...] = ()
     hfov: float | None = None  # horizontal field of view (degrees) with which the page's field is filled in
     camera_given: bool = (
         False  # whether photos without a field of view have a given camera, not that of EXIF or the map

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -16,16 +15,7 @@ from bidnerf_core.devices import moved
 from bidnerf_core.fields import SplatField
 from bidnerf_core.geometry import SE3, symbol
 from bidnerf_core.maps import Map
-from bidnerf_core.viewer.packing import (
-    Packed,
-    PackedPoints,
-    Picture,
-    jpeg,
-    packed,
-    packed_colours,
-    packed_points,
-    photograph,
-)
+from bidnerf_core.viewer.packing import Json, jpeg, packed, packed_colours, packed_points, photograph
 from bidnerf_core.viewer.rendering import quick_image
 
 MOST_SURFELS, MOST_LANDMARKS = 120_000, 20_000
@@ -34,88 +24,49 @@ THUMBNAIL, THUMBNAIL_QUALITY = 80, 75
 """Longer side of a thumbnail (pixels), and its JPEG quality."""
 MOST_THUMBNAILS = 60
 """Maximum number of thumbnails in a saved page, since each has to be rendered."""
-LEAST_OPACITY = 0.2
-"""Minimum opacity of a splat that is shown."""
-MOST_OF_SCENE = 0.98
-"""Fraction of the points that the initial view of a scene encloses; a few may be far away."""
 
 
-@dataclass(frozen=True)
-class Points:
-    """Points of the surface or of the landmarks; a subset if there are many."""
+def shown_map(scene: Map, thumbnails: int = MOST_THUMBNAILS) -> Json:
+    """Return a map as JSON values; ``thumbnails`` is the maximum number of cameras whose view is rendered.
 
-    points: PackedPoints
-    colours: Packed | None
-    count: int  # in the map
-    radius: float  # in the unit of the map
-    sizes: Packed | None = None  # float32 (n): radii of points that differ in size
-    normals: Packed | None = None  # int8 (n, 3), in 127ths, towards the cameras; back faces are culled
-
-
-@dataclass(frozen=True)
-class CameraShape:
-    """The viewing frustum of a camera: its sides' slopes on the plane z = 1, and the size of its image (pixels)."""
-
-    left: float
-    right: float
-    top: float
-    bottom: float
-    width: int
-    height: int
-
-    @staticmethod
-    def of(camera: Intrinsics) -> CameraShape:
-        """Return the viewing frustum of a camera, without lens distortion."""
-        return CameraShape(
-            -camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx,
-            -camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy, camera.width, camera.height,
-        )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class ShownCamera:
-    """A camera of the map's images."""
-
-    name: str
-    pose: tuple[float, ...]  # T_world_camera, 16 numbers by rows
-    shape: CameraShape
-    thumbnail: Picture | None
-
-
-@dataclass(frozen=True)
-class ShownMap:
-    """A map as the page shows it."""
-
-    name: str
-    facts: tuple[tuple[str, str], ...]
-    unit: str  # symbol that follows a length
-    up: tuple[float, float, float]
-    up_source: str  # what the upward direction was found from
-    centre: tuple[float, float, float]
-    extent: float  # in the unit of the map: size of what the initial view should show
-    surface: Points | None
-    landmarks: Points | None
-    splats: Points | None
-    cameras: tuple[ShownCamera, ...]
-
-
-def shown_map(scene: Map, thumbnails: int = MOST_THUMBNAILS) -> ShownMap:
-    """Return a map as JSON values; ``thumbnails`` is the maximum number of cameras whose view is rendered."""
+    ``unit`` is the symbol that follows a length, ``up_source`` what the upward direction was found from, and ``extent`` (in the unit
+    of the map) the size of what the initial view should show.
+    """
     up = scene.up
     centre, extent = _framing(scene)
-    return ShownMap(
-        name=scene.folder.resolve().name if scene.folder is not None else "map in memory",
-        facts=_facts(scene),
-        unit=symbol(scene.unit),
-        up=(0.0, 0.0, 1.0) if up is None else up.direction,
-        up_source="not known" if up is None else up.source,
-        centre=centre,
-        extent=extent,
-        surface=_surface(scene),
-        landmarks=_landmarks(scene),
-        splats=_splats(scene),
-        cameras=_cameras(scene, thumbnails),
-    )
+    every = max(1, math.ceil(len(scene.info.cameras) / max(thumbnails, 1)))
+    return {
+        "name": scene.folder.resolve().name if scene.folder is not None else "map in memory",
+        "facts": _facts(scene),
+        "unit": symbol(scene.unit),
+        "up": (0.0, 0.0, 1.0) if up is None else up.direction,
+        "up_source": "not known" if up is None else up.source,
+        "centre": centre,
+        "extent": extent,
+        "surface": _surface(scene),
+        "landmarks": _landmarks(scene),
+        "splats": _splats(scene),
+        "cameras": [
+            {
+                "name": camera.name,
+                "pose": rows_of(camera.pose),
+                "shape": frustum(camera.intrinsics),
+                "thumbnail": photograph(_small_image(scene, camera), THUMBNAIL_QUALITY)
+                if thumbnails and number % every == 0
+                else None,
+            }
+            for number, camera in enumerate(scene.info.cameras)
+        ],
+    }
+
+
+def frustum(camera: Intrinsics) -> Json:
+    """Return a camera's viewing frustum, without lens distortion: its sides' slopes on the plane z = 1, and its image's size (pixels)."""
+    return {
+        "left": -camera.cx / camera.fx, "right": (camera.width - camera.cx) / camera.fx,
+        "top": -camera.cy / camera.fy, "bottom": (camera.height - camera.cy) / camera.fy,
+        "width": camera.width, "height": camera.height,
+    }  # fmt: skip
 
 
 def thumbnail_jpeg(scene: Map, camera: StoredCamera) -> bytes:
@@ -149,7 +100,19 @@ def _facts(scene: Map) -> tuple[tuple[str, str], ...]:
     )
 
 
-def _surface(scene: Map) -> Points | None:
+def _points(
+    points: Float[Tensor, "n 3"], count: int, radius: float, colours: Json | None = None, sizes: Json | None = None,
+    normals: Json | None = None,
+) -> Json:  # fmt: skip
+    """Return points of a map that holds ``count``: their ``radius``, in the map's unit, times their ``sizes``, float32 (n), if these
+    differ; and their ``normals``, int8 (n, 3) in 127ths, towards the cameras, since back faces are culled.
+    """
+    return {
+        "points": packed_points(points), "count": count, "radius": radius, "colours": colours, "sizes": sizes, "normals": normals
+    }  # fmt: skip
+
+
+def _surface(scene: Map) -> Json | None:
     if scene.surface is None:
         return None
     surfels = scene.surface.surfels
@@ -157,8 +120,8 @@ def _surface(scene: Map) -> Points | None:
     radius = scene.surface.cell * max(1.0, (len(surfels) / max(len(some), 1)) ** 0.5) / 2
     positions, keyframes = surfels.positions[some].cpu(), scene.surface.keyframes[:, :3, 3].cpu()
     normals = towards(positions, surfels.normals[some].cpu(), keyframes)
-    return Points(
-        packed_points(positions), packed_colours(surfels.rgb[some]), len(surfels), radius,
+    return _points(
+        positions, len(surfels), radius, packed_colours(surfels.rgb[some]),
         normals=packed((127 * normals).round().to(torch.int8).numpy()),
     )  # fmt: skip
 
@@ -174,44 +137,28 @@ def towards(
     return torch.where(ahead < 0, -normals, normals)
 
 
-def _landmarks(scene: Map) -> Points | None:
+def _landmarks(scene: Map) -> Json | None:
     if scene.landmarks is None:
         return None
     some = _some(len(scene.landmarks), MOST_LANDMARKS)
-    return Points(packed_points(scene.landmarks.positions[some]), None, len(scene.landmarks), 0.0)
+    return _points(scene.landmarks.positions[some], len(scene.landmarks), 0.0)
 
 
-def _splats(scene: Map) -> Points | None:
+def _splats(scene: Map) -> Json | None:
     """Return the splats of the field that are not nearly transparent, as points with their own radii."""
     if not isinstance(scene.field, SplatField):
         return None
     splats = moved(scene.field.splats(), "cpu")
-    seen = (splats.opacity >= LEAST_OPACITY).nonzero()[:, 0]
+    seen = (splats.opacity >= 0.2).nonzero()[:, 0]
     some = seen[_some(len(seen), MOST_SURFELS)]
-    return Points(
-        packed_points(splats.positions[some]), packed_colours(splats.rgb[some]), len(splats.positions), 1.0,
+    return _points(
+        splats.positions[some], len(splats.positions), 1.0, packed_colours(splats.rgb[some]),
         packed(splats.radius[some].float().numpy()),
     )  # fmt: skip
 
 
 def _some(count: int, most: int) -> Tensor:
     return torch.randperm(count, generator=torch.Generator().manual_seed(0))[:most]
-
-
-def _cameras(scene: Map, thumbnails: int) -> tuple[ShownCamera, ...]:
-    cameras = scene.info.cameras
-    every = max(1, math.ceil(len(cameras) / max(thumbnails, 1)))
-    return tuple(
-        ShownCamera(
-            camera.name,
-            rows_of(camera.pose),
-            CameraShape.of(camera.intrinsics),
-            photograph(_small_image(scene, camera), THUMBNAIL_QUALITY)
-            if thumbnails and number % every == 0
-            else None,
-        )
-        for number, camera in enumerate(cameras)
-    )
 
 
 def _framing(scene: Map) -> tuple[tuple[float, float, float], float]:
@@ -227,7 +174,6 @@ def _framing(scene: Map) -> tuple[tuple[float, float, float], float]:
     if scene.info.cameras:  # weighted so that all cameras together count as a hundredth of the points
         places = poses_of(scene.info.cameras).translation
         points = torch.cat([points, places.repeat(1 + len(points) // (100 * len(places)), 1)])
-    beyond = (1 - MOST_OF_SCENE) / 2
-    low, high = (points.quantile(q, dim=0) for q in (beyond, 1 - beyond))
+    low, high = (points.quantile(q, dim=0) for q in (0.01, 0.99))  # a few may be far away
     x, y, z = ((low + high) / 2).tolist()
     return (x, y, z), max(float((high - low).max()), 1e-9)

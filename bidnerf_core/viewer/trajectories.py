@@ -6,7 +6,6 @@ import logging
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -17,7 +16,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3, LengthUnit, pose_from_matrix
 from bidnerf_core.io import read_file
 from bidnerf_core.results import pose_entries, standard_deviations
-from bidnerf_core.viewer.packing import Packed, packed
+from bidnerf_core.viewer.packing import Json, packed
 
 log = logging.getLogger("bidnerf")
 
@@ -25,24 +24,14 @@ MOST_POSES = 20_000
 """Maximum number of poses that are shown; longer trajectories are subsampled at a regular stride."""
 
 
-@dataclass(frozen=True)
-class ShownTrajectory:
-    """The poses of a trajectory; values missing from its file are None, or an empty string."""
-
-    name: str
-    poses: Packed  # T_world_camera without the last row, float32 (n, 12)
-    frames: tuple[str, ...]
-    times: tuple[float | None, ...]  # seconds
-    sigmas: tuple[float | None, ...]  # standard deviation of the position
-    outcomes: tuple[str, ...]
-
-
 def shown_trajectory(
     path: Path, unit: LengthUnit | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)
-) -> ShownTrajectory:
+) -> Json:
     """Read a trajectory: a JSON file of 'bidnerf track' or 'localize', which has uncertainties, or one of TUM, EuRoC or KITTI.
 
     Its poses are shown relative to ``origin``, that of the map. A remark is logged if the file states another unit than the map's ``unit``. Raises ``InputError`` for a file without poses.
+    The ``poses`` are T_world_camera without the last row, float32 (n, 12), ``times`` in seconds, and ``sigmas`` standard deviations of
+    the position; what the file does not state is None, or an empty string.
     """
     content = read_file(path, "a trajectory")
     if path.suffix.lower() in (".json", ".jsonl"):
@@ -66,7 +55,10 @@ def shown_trajectory(
             "%s: is in %s, but the map is in %s; its poses are shown as they are", path, other.pop(), unit
         )
     shown = SE3.stack(list(T)).translated(-torch.tensor(origin).double()).matrix()[:, :3]
-    return ShownTrajectory(path.name, packed(shown.flatten(1).numpy()), frames, times, sigmas, outcomes)
+    return {
+        "name": path.name, "poses": packed(shown.flatten(1).numpy()), "frames": frames, "times": times, "sigmas": sigmas,
+        "outcomes": outcomes,
+    }  # fmt: skip
 
 
 _Posed: TypeAlias = tuple[SE3 | None, str, float | None, float | None, str, str | None]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from bidnerf_core.datasets import Query, QuerySource
 from bidnerf_core.errors import InputError, amount
@@ -15,10 +17,10 @@ from bidnerf_core.localization import Localization, Localizer, SearchRecord, rec
 from bidnerf_core.maps import Map
 from bidnerf_core.results import BAD_INPUT
 from bidnerf_core.viewer.answer import ShownAnswer, shown_answer
+from bidnerf_core.viewer.packing import Json
 from bidnerf_core.viewer.saving import PageState, page_html, save_page
 from bidnerf_core.viewer.scene import shown_map
-from bidnerf_core.viewer.table import ShownRow
-from bidnerf_core.viewer.trajectories import ShownTrajectory, shown_trajectory
+from bidnerf_core.viewer.trajectories import shown_trajectory
 
 HEIGHT = 620
 """Height (pixels) of the page in a notebook."""
@@ -32,7 +34,7 @@ class MapView:
 
     def __repr__(self) -> str:
         """A one-line description, without the content of the page."""
-        return f"<MapView of {self.state.map.name} with {amount(len(self.state.answers), 'localization')}>"
+        return f"<MapView of {self.state.map['name']} with {amount(len(self.state.answers), 'localization')}>"
 
     def _repr_html_(self) -> str:
         """Return the page in an iframe, as notebooks show it."""
@@ -85,38 +87,48 @@ def localized(
     query: Query,
     start: SE3 | None = None,
     seed: int = 0,
-    begun: Callable[[SearchRecord], None] | None = None,
-    found_pose: Callable[[ShownAnswer], None] | None = None,
+    follow: Callable[[SearchRecord, ShownAnswer | None], None] | None = None,
 ) -> ShownAnswer:
-    """Localize a query, and return the answer with a record of its search, or an answer that states why the query is unusable.
+    """Localize a query, and return the answer with a record of its search. Raises ``InputError`` for an unusable query.
 
-    ``begun`` is called with the record of the search before it begins, and ``found_pose`` with an answer whose pictures are of
-    the surface, before the field is rendered.
+    ``follow`` is called with the record of the search before it begins, and again with an answer whose pictures are of the surface,
+    before the field is rendered.
     """
-    try:
-        with recorded() as record:
-            if begun is not None:
-                begun(record)
-            found = localizer(query.views, start, query.depth_rays, seed)
-    except InputError as error:
-        return ShownAnswer(query.name, BAD_INPUT, False, str(error))
+    with recorded() as record:
+        if follow is not None:
+            follow(record, None)
+        found = localizer(query.views, start, query.depth_rays, seed)
     known = (localizer.scene, query.name, found, query.frame, record, query.truth)
-    if found_pose is not None:
-        found_pose(shown_answer(*known, quick=True))
+    if follow is not None:
+        follow(record, shown_answer(*known, quick=True))
     return shown_answer(*known)
 
 
 def read_and_localized(localizer: Localizer, source: QuerySource, place: int) -> ShownAnswer:
-    """Localize the query at index ``place`` of a source; if it cannot be read, the answer states why."""
+    """Localize the query at index ``place`` of a source; if it cannot be used, the answer states why."""
     try:
-        query = source.read(place)
+        return localized(localizer, source.read(place))
     except InputError as error:
         return ShownAnswer(source.names[place], BAD_INPUT, False, str(error))
-    return localized(localizer, query)
 
 
 def page_of(
-    scene: Map, answers: Iterable[ShownAnswer], trajectory: ShownTrajectory | None = None, results: Iterable[ShownRow] = (),
+    scene: Map, answers: Iterable[ShownAnswer], trajectory: Json | None = None, results: Iterable[Json] = (),
 ) -> MapView:  # fmt: skip
     """Build the viewer page of a map with answers, a trajectory and rows of results."""
     return MapView(PageState(shown_map(scene), tuple(answers), trajectory=trajectory, results=tuple(results)))
+
+
+def shown_row(row: Any) -> Json:
+    """Return a row of the results of an evaluation, whose pose and covariance are rows of their matrices, as the page's table shows it.
+
+    ``error`` is that of the position, and of the orientation in degrees; ``sigma`` the standard deviation of the position.
+    """
+    variance = math.nan if row.covariance is None else sum(row.covariance[i][i] for i in range(3))
+    return {
+        "frame": row.frame, "method": row.method, "outcome": row.outcome, "accepted": row.converged, "reason": row.reason,
+        "confidence": row.confidence,
+        "error": None if row.error is None else (row.error.translation, row.error.rotation_deg),
+        "sigma": math.sqrt(variance) if 0 <= variance < math.inf else None,
+        "pose": None if row.T_world_camera is None else [float(value) for each in row.T_world_camera for value in each],
+    }  # fmt: skip

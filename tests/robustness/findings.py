@@ -1,22 +1,17 @@
 """Defects that an earlier search with hostile inputs found and that only processes show: signals, pipes, limits of memory.
 
 Those that show in one process are tests of the parts that had them.
-
-python tests/robustness/findings.py [--only NUMBER ...]
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import shutil
 import signal
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from bidnerf_core import Frame
@@ -128,29 +123,3 @@ def memory_of_inputs(work: Work) -> Checks:
 
 
 FINDINGS: tuple[Callable[[Work], Checks], ...] = (poses_lost, trajectories_lost, memory_of_inputs)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--only", type=int, nargs="+", default=range(1, len(FINDINGS) + 1))
-    given = parser.parse_args()
-    failed = 0
-    with TemporaryDirectory() as place:
-        work = Work(Path(place))
-        for number in given.only:
-            found = list(FINDINGS[number - 1](work))
-            bad = [check for check in found if check.wrong]
-            failed += len(bad)
-            print(
-                f"{FINDINGS[number - 1].__doc__}  {len(found) - len(bad)} of {len(found)} cases sound",
-                flush=True,
-            )
-            for check in bad:
-                print(f"  {check.name}: {'; '.join(check.wrong)}")
-    sys.exit(failed > 0)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,5 @@
 """Kills, signals at random moments, full disks, folders that cannot be written, and processes that meet each other.
 
-    python tests/robustness/stops.py [--kills 25] [--signals 50] [--minutes 12] [--seed 0]
-
 Each command runs in a child that is forked from this process, so that a stop costs no imports. After every kill the same
 command goes on, and what it leaves must be whole; its last result must equal that of an undisturbed run but for times. A
 signal may not lose an answer that was printed before it. A write fails as on a full disk by a failing ``fsync``, the first,
@@ -10,7 +8,6 @@ the second and so on until the command comes to its end.
 
 from __future__ import annotations
 
-import argparse
 import errno
 import gc
 import json
@@ -18,14 +15,12 @@ import os
 import random
 import shutil
 import signal
-import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -424,31 +419,3 @@ def checks(
     if "crowds" in kinds:
         yield from replaced_while_read(sound, work, seconds)
         yield from threads(sound, seconds)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--only", nargs="+", default=["kills", "signals", "disks", "read-only", "crowds"], metavar="KIND"
-    )
-    parser.add_argument("--kills", type=int, default=25, help="of each command")
-    parser.add_argument("--signals", type=int, default=50, help="to each command")
-    parser.add_argument(
-        "--seconds", type=float, default=60, help="of reading a map that is replaced, and of eight threads"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of the moments")
-    given = parser.parse_args()
-    count = wrong = 0
-    with TemporaryDirectory() as place:
-        for check in checks(Path(place), given.only, given.kills, given.signals, given.seconds, given.seed):
-            count, wrong = count + 1, wrong + bool(check.wrong)
-            if check.wrong:
-                print(check.name, *check.wrong, sep="\n  ", flush=True)
-    print(f"{count} cases, {wrong} with defects")
-    sys.exit(wrong > 0)
-
-
-if __name__ == "__main__":
-    main()

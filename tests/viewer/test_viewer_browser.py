@@ -24,7 +24,7 @@ from playwright.sync_api import sync_playwright
 import viewed
 from bidnerf_core import SE3, Localizer, Map
 from bidnerf_core.camera import CameraSource
-from bidnerf_core.viewer import ShownRow, page_of, shown_trajectory
+from bidnerf_core.viewer import page_of, shown_trajectory
 
 # Inside: an answer whose descent is given, and the page as a saved file
 from bidnerf_core.viewer.answer import shown_answer
@@ -89,7 +89,17 @@ def saved(room: Map, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "track.json").write_text(json.dumps(entries))
     pose = tuple(viewed.walk(12)[4].matrix().flatten().tolist())
     rows = [
-        ShownRow(name, "auto", outcome, outcome == "converged", "why", 0.9, (0.01, 0.2), None, pose)
+        {
+            "frame": name,
+            "method": "auto",
+            "outcome": outcome,
+            "accepted": outcome == "converged",
+            "reason": "why",
+            "confidence": 0.9,
+            "error": (0.01, 0.2),
+            "sigma": None,
+            "pose": pose,
+        }
         for name, outcome in (
             ("unseen", "converged"),
             (viewed.HOSTILE, "ambiguous"),

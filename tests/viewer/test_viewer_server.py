@@ -166,7 +166,7 @@ def test_closing_ends_the_localization_at_work(room: Map, method: str) -> None:
     until(lambda: running.state == "searching")
     time.sleep(0.3)
     began = time.monotonic()
-    jobs.close()
+    jobs.queue.close()
     until(lambda: running.state == "done")
     assert time.monotonic() - began < 20  # of hours; a busy machine takes seconds to end a step
     assert running.answer is not None
