@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from typing import Any, cast
+import json
+from collections.abc import Callable, Iterator
+from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor, nn
 
-from bidnerf_core.backend import Backend
+from bidnerf_core.backend import Backend, load_backend
 from bidnerf_core.fields import RadianceField, levels
+from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.testing import derivatives, recipes, samples, values
 from bidnerf_core.testing.device import check_steps
 from bidnerf_core.testing.faults import calling, query, require_that
-from bidnerf_core.testing.scene import awkward_rays, joined, points, rgb_views, rgbd_views
-from bidnerf_core.testing.subject import Subject, called, frozen, precise
+from bidnerf_core.testing.scene import SCENE_BOUNDS, awkward_rays, joined, points, rgb_views, rgbd_views
 
 
-class BackendContract(Subject):
+class BackendContract:
     """Tests of a backend: derive a class whose name begins with ``Test``, and set ``backend`` or ``name``.
 
     ``backend`` is the object that the entry point names, ``name`` the entry point's name. ``config`` should
@@ -26,20 +28,24 @@ class BackendContract(Subject):
     pixels. By default, the default config is used with fewer steps.
     """
 
+    backend: ClassVar[Any] = None
+    name: ClassVar[str | None] = None
+    config: ClassVar[Any] = None
+
     # The object that the entry point names.
 
     def test_backend_says_what_it_is(self) -> None:
         backend = self._backend()
         require_that(
             isinstance(backend, Backend),
-            f"{called(backend)} lacks some of summary, config_type, build, train",
+            f"{type(backend).__name__} lacks some of summary, config_type, build, train",
         )
         summary = backend.summary
         one_line = isinstance(summary, str) and summary.strip() != "" and "\n" not in summary
-        require_that(one_line, f"{called(backend)}.summary is {summary!r}, expected one line of text")
+        require_that(one_line, f"{type(backend).__name__}.summary is {summary!r}, expected one line of text")
 
     def test_config_is_a_frozen_dataclass_with_defaults_and_steps(self) -> None:
-        kind, who = self._backend().config_type, f"{called(self._backend())}.config_type"
+        kind, who = self._backend().config_type, f"{type(self._backend()).__name__}.config_type"
         require_that(
             isinstance(kind, type) and dataclasses.is_dataclass(kind),
             f"{who} is {kind!r}, expected a dataclass",
@@ -71,7 +77,7 @@ class BackendContract(Subject):
 
     def test_build_gives_a_field(self) -> None:
         field = self._build()
-        who = f"{called(self._backend())}.build returned a {type(field).__name__}"
+        who = f"{type(self._backend()).__name__}.build returned a {type(field).__name__}"
         require_that(
             isinstance(field, nn.Module), f"{who}, expected an nn.Module, whose state_dict is what is saved"
         )
@@ -83,7 +89,7 @@ class BackendContract(Subject):
         for name, value in first.items():
             require_that(
                 torch.equal(value, second[name]),
-                f"{called(self._backend())}.build: {name!r} differs between two builds of one config,"
+                f"{type(self._backend()).__name__}.build: {name!r} differs between two builds of one config,"
                 " expected all randomness to come from a seed in the config",
             )
 
@@ -194,6 +200,72 @@ class BackendContract(Subject):
 
     def test_training_stops_and_resumes(self) -> None:
         recipes.check_resuming(self._backend(), self._build, self._config())
+
+    # Fields that are built and trained.
+
+    def _backend(self) -> Any:
+        if self.name is not None:
+            return load_backend(self.name)
+        require_that(
+            self.backend is not None,
+            f"{type(self).__name__} has neither backend nor name, expected one of them",
+        )
+        return self.backend
+
+    def _config(self) -> Any:
+        if self.config is not None:
+            return self.config
+        return dataclasses.replace(self._backend().config_type(), steps=40)
+
+    def _reread(self, config: Any) -> Any:
+        """Return the config as it would be read back from a map on disk."""
+        with calling(f"{type(config).__name__} to JSON and back"):
+            text = json.dumps(to_plain(config, "config"), allow_nan=False)
+            return from_plain(self._backend().config_type, json.loads(text), "config")
+
+    def _build(self, config: Any = None) -> Any:
+        with calling(f"{type(self._backend()).__name__}.build"):
+            return self._backend().build(self._config() if config is None else config, SCENE_BOUNDS)
+
+    def _trained(self) -> Any:
+        """Return a field trained on RGB-D views and frozen like that of a loaded map; trained once per test class."""
+        kept = type(self).__dict__.get("_kept")
+        if kept is None:
+            kept = self._build()
+            with calling(f"{type(self._backend()).__name__}.train"):
+                self._backend().train(kept, rgbd_views(), self._config(), recipes.Recorder())
+            type(self)._kept = frozen(kept)  # type: ignore[attr-defined]
+        return type(self).__dict__["_kept"]
+
+    def _fields(self) -> Iterator[Any]:
+        yield frozen(self._build())
+        yield self._trained()
+
+    def _each(self, check: Callable[[RadianceField], None]) -> None:
+        """Run ``check`` on all levels of an untrained and of a trained field."""
+        for field in self._fields():
+            for level in levels(field):
+                check(level)
+
+
+def frozen(field: Any) -> Any:
+    return field.requires_grad_(False).eval() if isinstance(field, nn.Module) else field
+
+
+def precise(field: RadianceField) -> tuple[RadianceField, torch.dtype]:
+    """Return a copy in float64 if the field supports it, else the field itself, and the dtype."""
+    try:
+        doubled: Any = copy.deepcopy(field)
+        # A level need not be a module: the modules that it holds are converted.
+        for part in [doubled] if isinstance(doubled, nn.Module) else vars(doubled).values():
+            if isinstance(part, nn.Module):
+                part.double()
+        positions, directions = (x.double() for x in points(2))
+        if query(doubled, positions, directions, "points").density.dtype == torch.float64:
+            return doubled, torch.float64
+    except Exception:  # reported by the test of dtypes
+        pass
+    return field, torch.float32
 
 
 def _answers(field: RadianceField) -> Tensor:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from bidnerf_core.devices import moved, without_waiting
-from bidnerf_core.fields import RadianceField, SceneBounds, levels
+from bidnerf_core.fields import RadianceField, levels
 from bidnerf_core.localization import (
     AdamSettings,
     AdamSteps,
@@ -29,25 +28,14 @@ from bidnerf_core.localization import (
     rig,
     states_at,
 )
-from bidnerf_core.mapping import LandmarkMap, SurfaceMap, descend
+from bidnerf_core.mapping import descend
 from bidnerf_core.testing.faults import calling, require_that
 from bidnerf_core.testing.scene import SCENE_BOUNDS, rgbd_views
 from bidnerf_core.testing.simulated_device import DEVICE, DeviceFault, Elsewhere
+from bidnerf_core.testing.textured_field import MapWithLandmarks
 from bidnerf_core.testing.values import close
 
 CHECKED_RAYS = 48
-OFF = (0.05, -0.03, 0.04, 0.01, -0.02, 0.01)
-"""Tangent vector (metres, radians) from the true pose to the pose at which steps begin."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Scene:
-    field: RadianceField
-    bounds: SceneBounds = SCENE_BOUNDS
-    surface: SurfaceMap | None = None
-    landmarks: LandmarkMap | None = None
-    colour_noise: float | None = None
-    has_distances: bool = True
 
 
 def check_steps(field: RadianceField) -> None:
@@ -90,8 +78,9 @@ def _naming(what: str) -> Iterator[None]:
 
 def _problem(field: RadianceField) -> Problem:
     view = rgbd_views(coverage=False)[0]
-    start = view.T_ref_camera.to("cpu", torch.float64).retract(torch.tensor(OFF, dtype=torch.float64))
-    return rig(_Scene(field), [view], start)
+    off = torch.tensor((0.05, -0.03, 0.04, 0.01, -0.02, 0.01), dtype=torch.float64)  # metres, radians
+    start = view.T_ref_camera.to("cpu", torch.float64).retract(off)
+    return rig(MapWithLandmarks(field, SCENE_BOUNDS, None), [view], start)
 
 
 def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import ClassVar, TypeVar
 
 import torch
 from torch import Generator, Tensor
 
 from bidnerf_core.fields import FieldValues, RadianceField, Rays, RaySamples
+
+T = TypeVar("T")
 
 
 def require_that(condition: bool, fault: str) -> None:
@@ -26,6 +29,18 @@ def calling(doing: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise AssertionError(f"{doing} raised {type(error).__name__}: {error}") from error
+
+
+class Named:
+    """A contract of parts that are registered by ``name``."""
+
+    name: ClassVar[str] = ""
+
+    def _part(self, load: Callable[[str], T]) -> T:
+        require_that(
+            self.name != "", f"{type(self).__name__} has no name, expected the one that is registered"
+        )
+        return load(self.name)
 
 
 def query(field: RadianceField, positions: Tensor, directions: Tensor, of: str) -> FieldValues:

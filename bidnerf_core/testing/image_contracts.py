@@ -11,10 +11,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import FAULTS, Fault
+from bidnerf_core.evaluation import FAULTS
 from bidnerf_core.frames import Frame
-from bidnerf_core.mapping import Features, Keypoints, find_features, squared_distances
-from bidnerf_core.testing.faults import calling, require_that
+from bidnerf_core.mapping import Keypoints, find_features, squared_distances
+from bidnerf_core.testing.faults import Named, calling, require_that
 from bidnerf_core.testing.textured_field import training_views
 
 SHIFT = 6
@@ -23,7 +23,7 @@ NEAR = 1.5
 """Largest distance (pixels) between keypoints that count as the same."""
 
 
-class FeaturesContract:
+class FeaturesContract(Named):
     """Tests of a detector: derive a class whose name begins with ``Test``, and set ``name``, under which it
     is registered.
 
@@ -31,7 +31,6 @@ class FeaturesContract:
     matched by their descriptors, in an image shifted by a few pixels.
     """
 
-    name: ClassVar[str] = ""
     repeated: ClassVar[float] = 0.5
 
     def test_keypoints_are_well_formed(self) -> None:
@@ -99,22 +98,16 @@ class FeaturesContract:
 
     def _found(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
         with calling(f"detector {self.name!r}"):
-            return self._features()(rgb)
-
-    def _features(self) -> Features:
-        require_that(self.name != "", f"{type(self).__name__} has no name, expected that of a detector")
-        return find_features(self.name)
+            return self._part(find_features)(rgb)
 
 
-class FaultContract:
+class FaultContract(Named):
     """Tests of a fault: derive a class whose name begins with ``Test``, and set ``name``, under which it is
     registered.
     """
 
-    name: ClassVar[str] = ""
-
     def test_fault_says_what_it_is(self) -> None:
-        fault, who = self._fault(), f"fault {self.name!r}"
+        fault, who = self._part(FAULTS.load), f"fault {self.name!r}"
         for what, text in (("summary", fault.summary), ("unit", fault.unit)):
             one_line = isinstance(text, str) and text.strip() != "" and "\n" not in text
             require_that(one_line, f"{who}: {what} is {text!r}, expected one line of text")
@@ -127,15 +120,15 @@ class FaultContract:
 
     def test_other_sizes_change_something(self) -> None:
         frame = _frame()
-        for size in self._fault().sizes:
+        for size in self._part(FAULTS.load).sizes:
             found = self._changed(frame, size)
             changed = not _same(found, frame) or found.intrinsics != frame.intrinsics
             changed = changed or found.focal_is_approximate != frame.focal_is_approximate
-            changed = changed or self._fault().T_true_faulty is not None
+            changed = changed or self._part(FAULTS.load).T_true_faulty is not None
             require_that(changed, f"fault {self.name!r}: size {size:g} changes nothing, expected a fault")
 
     def test_same_seed_gives_the_same_image(self) -> None:
-        for size in self._fault().sizes:
+        for size in self._part(FAULTS.load).sizes:
             first, second = (self._changed(_frame(), size) for _ in range(2))
             require_that(
                 _same(first, second),
@@ -143,7 +136,7 @@ class FaultContract:
             )
 
     def test_image_stays_an_image(self) -> None:
-        for size in self._fault().sizes:
+        for size in self._part(FAULTS.load).sizes:
             found, who = self._changed(_frame(), size), f"fault {self.name!r} of size {size:g}"
             shape = found.intrinsics.height, found.intrinsics.width
             require_that(
@@ -166,17 +159,19 @@ class FaultContract:
 
     def test_given_image_is_left_alone(self) -> None:
         frame, before = _frame(), _frame()
-        for size in self._fault().sizes:
+        for size in self._part(FAULTS.load).sizes:
             self._changed(frame, size)
         require_that(
             _same(frame, before), f"fault {self.name!r}: writes into the given image, expected a new one"
         )
 
     def test_fault_of_depth_needs_depth(self) -> None:
-        if not self._fault().needs_depth:
+        if not self._part(FAULTS.load).needs_depth:
             return
         try:
-            self._fault().change(_frame().replace(depth=None), self._fault().sizes[0], _generator())
+            self._part(FAULTS.load).change(
+                _frame().replace(depth=None), self._part(FAULTS.load).sizes[0], _generator()
+            )
         except InputError:
             return
         require_that(
@@ -184,13 +179,9 @@ class FaultContract:
             f"fault {self.name!r} changes depth, but accepts an image without it, expected an InputError",
         )
 
-    def _fault(self) -> Fault:
-        require_that(self.name != "", f"{type(self).__name__} has no name, expected that of a fault")
-        return FAULTS.load(self.name)
-
     def _changed(self, frame: Frame, size: float) -> Frame:
         with calling(f"fault {self.name!r} of size {size:g}"):
-            return self._fault().change(frame, size, _generator())
+            return self._part(FAULTS.load).change(frame, size, _generator())
 
 
 def _images() -> tuple[Float[Tensor, "h w 3"], ...]:

@@ -8,9 +8,9 @@ import torch
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import METHODS, Localization, Localizer, Method
+from bidnerf_core.localization import METHODS, Localization, Localizer
 from bidnerf_core.registry import interface_defects
-from bidnerf_core.testing.faults import calling, require_that
+from bidnerf_core.testing.faults import Named, calling, require_that
 from bidnerf_core.testing.textured_field import (
     CAMERA,
     POSES,
@@ -26,7 +26,7 @@ START_OFF = (0.02, -0.015, 0.02, 0.01, -0.008, 0.012)
 """Tangent vector (metres, radians) from the true pose to the start of methods that need one."""
 
 
-class MethodContract:
+class MethodContract(Named):
     """Tests of a localization method: derive a class whose name begins with ``Test``, and set ``name``.
 
     ``name`` is the name under which the method is registered, ``config`` a config for small images; without
@@ -35,12 +35,11 @@ class MethodContract:
     pose.
     """
 
-    name: ClassVar[str] = ""
     config: ClassVar[Any] = None
     largest_error: ClassVar[float] = 0.03
 
     def test_method_says_what_it_is(self) -> None:
-        method = self._method()
+        method = self._part(METHODS.load)
         wrong = next(
             interface_defects(method, ("summary", "config_type"), {"solve": ("problem", "config", "seed")}),
             "",
@@ -113,7 +112,7 @@ class MethodContract:
         )
 
     def test_missing_start_is_refused(self) -> None:
-        if not self._method().needs_start:
+        if not self._part(METHODS.load).needs_start:
             return
         try:
             Localizer(textured_map(surface=True), self.name, self.config, warm_up=False)(unseen().frame)
@@ -123,10 +122,6 @@ class MethodContract:
             False, f"method {self.name!r} needs a start, but does without one, expected an InputError"
         )
 
-    def _method(self) -> Method:
-        require_that(self.name != "", f"{type(self).__name__} has no name, expected that of a method")
-        return METHODS.load(self.name)
-
     def _found(self, scene: MapWithLandmarks, moved: bool = False) -> Localization:
         truth = unseen().T_ref_camera
         return self._localized(scene, unseen().frame, T_MOVED_WORLD @ truth if moved else truth)
@@ -135,7 +130,7 @@ class MethodContract:
         near = truth.to("cpu", torch.float64).retract(torch.tensor(START_OFF, dtype=torch.float64))
         with calling(f"method {self.name!r}"):
             localizer = Localizer(scene, self.name, self.config, warm_up=False)
-            return localizer(frame, near if self._method().needs_start else None)
+            return localizer(frame, near if self._part(METHODS.load).needs_start else None)
 
 
 def _difference(found: SE3, truth: SE3) -> float:

@@ -12,10 +12,10 @@ from typing import ClassVar
 import torch
 
 from bidnerf_core.captures import pose_contradiction
-from bidnerf_core.datasets import READERS, Capture, DatasetOptions, Reader
+from bidnerf_core.datasets import READERS, Capture, DatasetOptions
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, TrackedViews, depth_ratio, tracked_views
-from bidnerf_core.testing.faults import calling, require_that
+from bidnerf_core.testing.faults import Named, calling, require_that
 
 ENOUGH_POINTS = 30
 """Smallest number of points that several images must agree on for their poses to be judged."""
@@ -25,7 +25,7 @@ MOST_VIEWS = 24
 """Largest number of images that are compared with each other."""
 
 
-class ReaderContract:
+class ReaderContract(Named):
     """Tests of a reader: derive a class whose name begins with ``Test``, and set ``name`` and ``folder``.
 
     ``name`` is the name under which the reader is registered, ``folder`` a capture in its format: at least
@@ -33,12 +33,11 @@ class ReaderContract:
     ``options``.
     """
 
-    name: ClassVar[str] = ""
     folder: ClassVar[Path | str] = ""
     options: ClassVar[DatasetOptions] = DatasetOptions()
 
     def test_folder_is_recognised_and_an_empty_one_is_not(self) -> None:
-        reader, who = self._reader(), f"reader {self.name!r}"
+        reader, who = self._part(READERS.load), f"reader {self.name!r}"
         require_that(reader.recognises(Path(self.folder)), f"{who} does not recognise {self.folder}")
         with tempfile.TemporaryDirectory() as empty, calling(f"{who}.recognises of an empty folder"):
             require_that(not reader.recognises(Path(empty)), f"{who} recognises an empty folder")
@@ -62,7 +61,7 @@ class ReaderContract:
     def test_background_is_the_one_that_is_asked_for(self) -> None:
         colour = (1.0, 0.5, 0.0)
         with calling(f"reader {self.name!r}: read of {self.folder}"):
-            data = replace(self.options, background=colour).open(self.folder, [self._reader()])
+            data = replace(self.options, background=colour).open(self.folder, [self._part(READERS.load)])
         require_that(
             tuple(data.background) == colour,
             f"reader {self.name!r}: the background is {data.background}, expected {colour}, as its options say",
@@ -120,7 +119,7 @@ class ReaderContract:
 
     def test_sequence_is_in_order_of_time(self) -> None:
         with calling(f"reader {self.name!r}: read of {self.folder}"):
-            sequence = self.options.open_sequence(self.folder, [self._reader()])
+            sequence = self.options.open_sequence(self.folder, [self._part(READERS.load)])
         times = [timed.time for timed in sequence]
         require_that(
             len(times) == len(sequence),
@@ -148,16 +147,9 @@ class ReaderContract:
             )
             require_that(same, f"reader {self.name!r}: {a.frame.name} differs when it is read again")
 
-    def _reader(self) -> Reader:
-        require_that(
-            self.name != "" and str(self.folder) != "",
-            f"{type(self).__name__}: expected name and folder to be set",
-        )
-        return READERS.load(self.name)
-
     def _dataset(self) -> Capture:
         with calling(f"reader {self.name!r}: read of {self.folder}"):
-            return self.options.open(self.folder, [self._reader()])
+            return self.options.open(self.folder, [self._part(READERS.load)])
 
     def _views(self, split: str | None = None) -> list[View]:
         data = self._dataset()

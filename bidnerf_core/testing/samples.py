@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 from torch import Generator, Tensor
 
@@ -31,10 +33,15 @@ def check_intervals(field: RadianceField) -> None:
     for of, rays in awkward_rays().items():
         for jitter, how in ((None, ""), (_generator(), " with jitter")):
             _check_order(field, rays, sample(field, rays, of + how, jitter), of + how)
-    every = awkward_rays()["rays from outside"]
+    for arranged in _arrangements():
+        sample(field, arranged, f"rays arranged as {tuple(arranged.near.shape)}")
+
+
+def _arrangements() -> Iterator[Rays]:
+    """Yield rays with any number of axes, also empty ones."""
     for shape in ((), (1,), (2, 3), (0,), (2, 0)):
-        count = torch.Size(shape).numel()
-        sample(field, picked(every, torch.arange(count).reshape(shape)), f"rays arranged as {shape}")
+        index = torch.arange(torch.Size(shape).numel()).reshape(shape)
+        yield picked(awkward_rays()["rays from outside"], index)
 
 
 def _check_order(field: RadianceField, rays: Rays, samples: RaySamples, of: str) -> None:
@@ -125,12 +132,6 @@ def check_levels(field: RadianceField) -> None:
     )
 
 
-FINE_INTERVALS = 1024
-"""Number of intervals per ray over which the density of a field with hits is summed."""
-SAME_OPACITY = 0.05
-"""Largest difference between the opacity of a ray's hits and that of the field's density, for nine rays out of ten."""
-
-
 def check_hits(field: RadianceField) -> None:
     """Check the hits of a field that provides them: values in range, distances in [near, far], and the opacity of its
     density.
@@ -139,17 +140,15 @@ def check_hits(field: RadianceField) -> None:
         return
     for of, rays in awkward_rays().items():
         _check_hits(field, rays, of)
-    every = awkward_rays()["rays from outside"]
-    for shape in ((), (1,), (2, 3), (0,), (2, 0)):
-        count = torch.Size(shape).numel()
-        arranged = picked(every, torch.arange(count).reshape(shape))
+    for arranged in _arrangements():
+        shape = tuple(arranged.near.shape)
         found = _hits(field, arranged, f"rays arranged as {shape}")
         require_that(
             tuple(found.distance.shape[:-1]) == shape,
             f"{type(field).__name__}.hits of rays arranged as {shape}: distance has shape {tuple(found.distance.shape)},"
             " expected the rays' shape and one more axis",
         )
-    _check_density(field, every)
+    _check_density(field, awkward_rays()["rays from outside"])
 
 
 def _hits(field: HitField, rays: Rays, of: str) -> RayHits:
@@ -179,14 +178,14 @@ def _check_density(field: HitField, rays: Rays) -> None:
     """Check that the density of ``query``, summed along rays, absorbs as much light as the hits do."""
     hits = _hits(field, rays, "rays")
     expected = 1 - torch.prod(1 - hits.alpha, dim=-1)
-    samples = Stratified(FINE_INTERVALS)(rays)
+    samples = Stratified(1024)(rays)
     with calling(f"{type(field).__name__}.query along rays"), torch.no_grad():
         places = rays.at(samples.middles)
         density = field.query(places, rays.directions[..., None, :].expand_as(places)).density
     found = rendering_weights(density, samples).sum(-1)
     off = (found - expected).abs()
     require_that(
-        float((off <= SAME_OPACITY).float().mean()) >= 0.9,
+        float((off <= 0.05).float().mean()) >= 0.9,
         f"{type(field).__name__}: query's density stops {float(found.mean()):.0%} of the light of rays on average and hits stop"
         f" {float(expected.mean()):.0%}, up to {float(off.max()):.0%} apart; expected the integral of the density along a ray to"
         " give the opacity of its hits",
@@ -202,10 +201,7 @@ def seen(field: RadianceField, rays: Rays, of: str) -> Tensor:
 
 
 def _same(a: RaySamples, b: RaySamples) -> bool:
-    def equal(x: Tensor, y: Tensor) -> bool:
-        return x.shape == y.shape and bool((x == y).all())
-
-    return equal(a.starts, b.starts) and equal(a.ends, b.ends) and equal(a.valid, b.valid)
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("starts", "ends", "valid"))
 
 
 def _generator() -> Generator:

@@ -17,14 +17,12 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.scenes import demo_object, orbit
 from bidnerf_core.scenes import views as seen_from
 
-SIZE = 24
-CAMERA = Intrinsics(32.0, 32.0, SIZE / 2, SIZE / 2, SIZE, SIZE)
+CAMERA = Intrinsics(32.0, 32.0, 12.0, 12.0, 24, 24)
 SCENE_BOUNDS = demo_object().bounds
 SIDE = max(SCENE_BOUNDS.size)  # metres
 DIMMED = 0.6
 """Brightness of the views of ``exposed_views`` and of the background behind them, so that no exposure saturates."""
-_R, _G, _B = SCENE_BOUNDS.background
-DIMMED_BOUNDS = replace(SCENE_BOUNDS, background=(DIMMED * _R, DIMMED * _G, DIMMED * _B))
+DIMMED_BOUNDS = replace(SCENE_BOUNDS, background=(DIMMED,) * 3)  # that of the toy is white
 
 
 @cache

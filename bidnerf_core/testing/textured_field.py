@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -20,34 +20,22 @@ BOUNDS = SceneBounds((-1.2, -1.2, -0.3), (1.2, 1.2, 0.3), 0.1, 6.0)
 CAMERA = Intrinsics(130.0, 130.0, 64.0, 48.0, 128, 96)
 POSES = orbit(1.7, 3, elevation=(50.0, 70.0), seed=5)
 """Poses (T_world_camera) that no training image has."""
-DENSITY = 120.0  # per metre, well below the ground
-SOFTNESS = 0.01  # metres over which the density rises
 
 
-@dataclass(frozen=True, eq=False)
 class TexturedGround:
     """A ground of height ``h(x, y)`` whose colours are sums of random waves; infinitely differentiable."""
 
-    seed: int = 0
-    sampler: RaySampler = field(default_factory=lambda: Stratified(64))
-    waves: Float[Tensor, "2 w"] = field(init=False)  # radians per metre
-    phases: Float[Tensor, "w"] = field(init=False)
-    weights: Float[Tensor, "w 3"] = field(init=False)
-
-    def __post_init__(self) -> None:
-        generator = torch.Generator().manual_seed(self.seed)
-        values = {
-            "waves": 18 * torch.randn((2, 24), generator=generator),
-            "phases": 6.3 * torch.rand(24, generator=generator),
-            "weights": 0.3 * torch.randn((24, 3), generator=generator),
-        }
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+    def __init__(self, seed: int = 0) -> None:
+        self.sampler: RaySampler = Stratified(64)
+        generator = torch.Generator().manual_seed(seed)
+        self.waves = 18 * torch.randn((2, 24), generator=generator)  # radians per metre
+        self.phases = 6.3 * torch.rand(24, generator=generator)
+        self.weights = 0.3 * torch.randn((24, 3), generator=generator)
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         x, y, z = positions.unbind(-1)
         height = 0.12 * (3 * x).sin() * (2.5 * y + 1).sin()
-        density = DENSITY * torch.sigmoid((height - z) / SOFTNESS)
+        density = 120 * torch.sigmoid((height - z) / 0.01)  # per metre; it rises within a centimetre
         signal = (positions[..., :2] @ self.waves.to(positions) + self.phases.to(positions)).sin()
         return FieldValues(density, torch.sigmoid(2 * signal @ self.weights.to(positions)))
 
@@ -116,9 +104,11 @@ class MovedField:
         return self.field.query(back.apply(positions), back.rotate(directions))
 
 
-QUARTER_TURN = SE3.exp(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, torch.pi / 2], dtype=torch.float64))
-T_MOVED_WORLD = SE3(QUARTER_TURN.rotation, torch.tensor([3.0, -2.0, 0.5], dtype=torch.float64))
-"""The ground's world in another one in which its box is still axis-aligned."""
+T_MOVED_WORLD = SE3(
+    torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64),
+    torch.tensor([3.0, -2.0, 0.5], dtype=torch.float64),
+)
+"""The ground's world in another one in which its box is still axis-aligned: a quarter turn about z."""
 
 
 @functools.cache
