@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import _lab
+import cv2
 import imageio.v3 as iio
 import numpy as np
 import torch
@@ -43,13 +44,26 @@ from bidnerf_core.fields import levels, render_image
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.io import to_plain
 from bidnerf_core.maps import Map, import_map
-from bidnerf_core.results import CRITERIA, depth_to_rgb, tile
+from bidnerf_core.results import CRITERIA, tile
 
 LEVELS = {"coarse": 0, "fine": 1}
 Cell = tuple[str, str]
 CELLS = [(level, sensor) for level in LEVELS for sensor in ("RGB-D", "RGB")]
 DESCENT = {"rays": 1024}  # half of the default, which suits one thread
 SHRINK = 2  # of images, for their PSNR
+
+
+def coloured(depth: torch.Tensor) -> np.ndarray:
+    """Return depth (metres) in colours from red, the first percentile, to blue, the 99th; dark where there is none."""
+    array = depth.double().cpu().numpy()
+    known = np.isfinite(array) & (array > 0)
+    low, high = np.percentile(array[known], (1, 99)) if known.any() else (0.0, 1.0)
+    share = ((np.where(known, array, low) - low) / max(high - low, 1e-9)).clip(0, 1)
+    levels = (
+        (255 * (0.96 - 0.9 * share)).round().astype(np.uint8)
+    )  # the ends of the colour map are nearly black
+    turbo = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[..., ::-1]  # to RGB
+    return np.where(known[..., None], turbo, np.array((38, 38, 42), np.uint8))
 
 
 def quick_name(given: argparse.Namespace) -> str:
@@ -83,7 +97,7 @@ def seen(stored: Map, view: View, picture: Path | None) -> dict[str, float]:
     ]
     if picture is not None:
         row = {"real": frame.rgb, **dict(zip(LEVELS, (image.rgb for image in images), strict=True))}
-        row["depth, fine"] = depth_to_rgb(images[-1].depth)
+        row["depth, fine"] = coloured(images[-1].depth)
         iio.imwrite(picture, np.concatenate([tile(image, name) for name, image in row.items()], axis=1))
     found = {n: float(psnr(i.rgb, frame.rgb, 1.0)) for n, i in zip(LEVELS, images, strict=True)}
     print(

@@ -85,7 +85,7 @@ def which(scenes: list[Scene], count: int, frames: int) -> dict[str, Any]:
         collection.localizer(name)  # so that times are those of queries
     for truth, frame in queries:
         began = time.process_time()
-        ranking = collection.ranked(frame)
+        ranking = list(collection.ranked(frame))
         ranked = time.process_time() - began
         began = time.process_time()
         try:
@@ -93,7 +93,7 @@ def which(scenes: list[Scene], count: int, frames: int) -> dict[str, Any]:
         except InputError:
             rows.append(
                 {
-                    "first": ranking[0].map == truth,
+                    "first": ranking[0] == truth,
                     "right": False,
                     "wrong": False,
                     "rank": ranked,
@@ -104,9 +104,9 @@ def which(scenes: list[Scene], count: int, frames: int) -> dict[str, Any]:
             continue
         rows.append(
             {
-                "first": ranking[0].map == truth, "right": placed.converged and placed.map == truth,
+                "first": ranking[0] == truth, "right": placed.converged and placed.map == truth,
                 "wrong": placed.converged and placed.map != truth, "rank": ranked, "all": time.process_time() - began,
-                "asked": len(placed.asked), "rank_of_truth": [each.map for each in ranking].index(truth) + 1,
+                "asked": len(placed.asked), "rank_of_truth": ranking.index(truth) + 1,
             }
         )  # fmt: skip
     each_asked = bn.MapCollection(maps, asked=len(maps))

@@ -28,9 +28,9 @@ from bidnerf_core.camera import (
     Raster,
     same_aspect,
 )
-from bidnerf_core.datasets.names import positions, unique_names
+from bidnerf_core.datasets.names import in_other_split, unique_names
 from bidnerf_core.depth import DepthCamera, DepthImage
-from bidnerf_core.errors import InputError, InputWarning, amount
+from bidnerf_core.errors import InputError, InputWarning, amount, refuse_text, spelling_hint
 from bidnerf_core.frames import (
     BLACK,
     Frame,
@@ -333,14 +333,23 @@ class Capture:
 
     def select(self, split: str, names: Sequence[str] | None = None) -> list[Shot]:
         """Return the frames ``names`` of a split, in that order, or all. Raises ``InputError`` for an unknown split or name."""
-        chosen = self.split(split)
+        chosen, where = list(self.split(split).shots), f"{self.path}: split {split!r}"
         if names is None:
-            return list(chosen.shots)
-        stems, where = [shot.stem for shot in chosen.shots], f"{self.path}: split {split!r}"
-        found = positions(
-            chosen.names, stems, names, where, lambda: {s: self.frame_names(s) for s in self.splits}
-        )
-        return [chosen.shots[index] for index in found]
+            return chosen
+        refuse_text(f"{where}: names", names)
+        by_name = {shot.name: shot for shot in chosen}
+        for name in (name for name in names if name not in by_name):
+            splits = {each: self.frame_names(each) for each in self.splits}
+            if (elsewhere := in_other_split(name, splits)) is not None:
+                raise InputError(elsewhere, where=where)
+            if meant := [shot.name for shot in chosen if shot.stem == name]:
+                listed = ", ".join(meant[:4]) + (", ..." if len(meant) > 4 else "")
+                raise InputError(f"frame {name!r} is ambiguous", where=where, expected=f"one of {listed}")
+            hint = spelling_hint(name, by_name)
+            expected = f"a name such as {chosen[0].name!r}" if chosen and not hint else None
+            found = f"no frame {name!r} among its {len(chosen)} frames{hint}"
+            raise InputError(found, where=where, expected=expected)
+        return [by_name[name] for name in names]
 
     def views(
         self,

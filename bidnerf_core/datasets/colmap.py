@@ -16,20 +16,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.datasets.colmap_files import ModelImage, ModelPoints, read_model
+from bidnerf_core.datasets.colmap_files import ModelImage, read_model
 from bidnerf_core.depth import nearest_depth
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import Observations
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, fit_similarity, spread
-
-MODEL_SPLITS = frozenset({"train", "val", "test"})
-LARGEST_MISFIT = 0.2
-"""Largest median distance between the training cameras and the model's, relative to their spread. A larger
-one indicates a different scene; a hand-held camera that moved by decimetres reaches 0.03."""
-OUTLIER = 3.0
-"""Cameras off by more than this many medians are left out ..."""
-ALWAYS_FITS = 0.01  # ... but never those off by less than this fraction of the spread
 
 
 @dataclass(frozen=True)
@@ -46,18 +38,12 @@ class SparseChoice:
             raise InputError(f"points_views is {self.points_views}", expected="1 or more")
 
 
-@dataclass(frozen=True)
-class Unit:
-    """The length of the model's unit, and how well it is determined."""
-
-    metres: float
-    cameras: int  # training cameras that it was estimated from
-    misfit: float  # their median distance from the model's cameras, relative to their spread
-
-
 class SparsePoints:
     """The points of the model in ``folder``, scaled with the training cameras ``places`` (frame name,
     T_world_camera).
+
+    Its unit is ``metres`` long according to ``cameras`` of these, whose median distance from those of the model is ``misfit``,
+    relative to their spread.
 
     Raises ``InputError`` if the folder holds no valid model, and if its cameras are not the training cameras.
     """
@@ -68,26 +54,51 @@ class SparsePoints:
         self.folder = folder
         images, self._points = read_model(folder)
         self._images = _Names(folder, images)
-        self._kept = _kept(self._points, choice)
-        if not bool(self._kept.any()):
+        points = self._points
+        sound = points.positions.isfinite().all(-1) & ~points.errors.isnan()
+        # A negative error was never computed and excludes no point.
+        self._chosen = sound & (points.errors <= choice.points_error) & (points.tracks >= choice.points_views)
+        if not bool(self._chosen.any()):
             raise InputError(
-                f"none of its {len(self._kept)} points has a reprojection error of {choice.points_error:g}"
+                f"none of its {len(self._chosen)} points has a reprojection error of {choice.points_error:g}"
                 f" pixels or less and {choice.points_views} observations or more",
                 where=folder,
             )
-        self.unit = self._measured(places, split)
+        pairs = [(self._images.find(name, split), T.translation) for name, T in places]
+        known = [(image.T_camera_model.inverse().translation, place) for image, place in pairs if image]
+        if len(known) < 2:
+            raise InputError(
+                f"has {len(known)} of the {len(places)} training cameras",
+                where=folder,
+                expected=f"at least 2 to determine its unit; it has {self._images.some}",
+            )
+        there, here = (torch.stack([pair[i].double().cpu() for pair in known]) for i in (0, 1))
+        try:
+            off = torch.linalg.vector_norm(fit_similarity(there, here).apply(there) - here, dim=-1)
+            # Once more without outliers: cameras off by several medians, but never by hardly anything.
+            fits = off <= max(3 * float(off.median()), 0.01 * spread(here))
+            there, here, self.cameras = there[fits], here[fits], int(fits.sum())
+            fit = fit_similarity(there, here)
+            off = torch.linalg.vector_norm(fit.apply(there) - here, dim=-1)
+            self.metres, self.misfit = fit.scale, float(off.median()) / spread(here)
+        except InputError as error:
+            where = f"{folder}: the unit cannot be estimated from the training cameras"
+            raise InputError(error, where=where) from error
+        if self.misfit > 0.2:  # a hand-held camera that moved by decimetres reaches 0.03
+            raise InputError(
+                f"its cameras are {self.misfit:.0%} of their spread away from the training cameras",
+                where=folder,
+                expected="at most 20%; is it a model of these images?",
+            )
 
     @property
     def summary(self) -> str:
         """One line about the model's unit."""
-        unit = self.unit
         checked = (
-            f", positions agree to {unit.misfit:.2%} of their spread" if unit.cameras > 2 else ", unchecked"
+            f", positions agree to {self.misfit:.2%} of their spread" if self.cameras > 2 else ", unchecked"
         )
-        return (
-            f"{self.folder}: its unit is {unit.metres:.4g} m according to {unit.cameras} training"
-            f" cameras{checked}"
-        )
+        unit = f"its unit is {self.metres:.4g} m according to {self.cameras} training cameras{checked}"
+        return f"{self.folder}: {unit}"
 
     def seen(self, name: str, split: str) -> Float[Tensor, "n 3"]:
         """Return the points that a frame observes (metres, camera frame); none if the model lacks the frame."""
@@ -95,8 +106,8 @@ class SparsePoints:
         if image is None:
             return torch.zeros((0, 3), dtype=torch.float64)
         place = torch.searchsorted(self._points.ids, image.points).clamp(max=len(self._points.ids) - 1)
-        place = place[(self._points.ids[place] == image.points) & self._kept[place]]
-        points = image.T_camera_model.apply(self._points.positions[place]) * self.unit.metres
+        place = place[(self._points.ids[place] == image.points) & self._chosen[place]]
+        points = image.T_camera_model.apply(self._points.positions[place]) * self.metres
         return points[points[:, 2] > 0]
 
     def rays(self, views: Sequence[View], split: str) -> Observations:
@@ -130,34 +141,6 @@ class SparsePoints:
         depth = nearest_depth(points, view.frame.intrinsics)
         return View(view.frame.replace(depth=depth), view.T_ref_camera)
 
-    def _measured(self, places: Sequence[tuple[str, SE3]], split: str) -> Unit:
-        """Estimate the unit from the training cameras, and again without outliers."""
-        pairs = [(self._images.find(name, split), T.translation) for name, T in places]
-        known = [(image.T_camera_model.inverse().translation, place) for image, place in pairs if image]
-        if len(known) < 2:
-            raise InputError(
-                f"has {len(known)} of the {len(places)} training cameras",
-                where=self.folder,
-                expected=f"at least 2 to determine its unit; it has {self._images.some}",
-            )
-        there, here = (torch.stack([pair[i].double().cpu() for pair in known]) for i in (0, 1))
-        try:
-            off = _off(there, here)
-            fits = off <= max(OUTLIER * float(off.median()), ALWAYS_FITS * spread(here))
-            unit = fit_similarity(there[fits], here[fits]).scale
-            misfit = float(_off(there[fits], here[fits]).median()) / spread(here[fits])
-        except InputError as error:
-            raise InputError(
-                error, where=f"{self.folder}: the unit cannot be estimated from the training cameras"
-            ) from error
-        if misfit > LARGEST_MISFIT:
-            raise InputError(
-                f"its cameras are {misfit:.0%} of their spread away from the training cameras",
-                where=self.folder,
-                expected=f"at most {LARGEST_MISFIT:.0%}; is it a model of these images?",
-            )
-        return Unit(unit, int(fits.sum()), misfit)
-
 
 class _Names:
     """The images of a model by frame name: the stem, or folders and stem as joined by datasets ("left_0001")."""
@@ -176,7 +159,7 @@ class _Names:
 
         Raises ``InputError`` if the name is ambiguous.
         """
-        others = MODEL_SPLITS - {split}
+        others = {"train", "val", "test"} - {split}
         fits = [
             (folders, image) for folders, image in self._by_name.get(name, []) if not others & set(folders)
         ]
@@ -198,14 +181,3 @@ class _Names:
         return f"{len(self._images)} images" + (
             f" ({names}{', ...' if len(self._images) > 3 else ''})" if names else ""
         )
-
-
-def _kept(points: ModelPoints, choice: SparseChoice) -> Tensor:
-    """Return the mask of the points that meet the criteria. A negative error was never computed and excludes no point."""
-    sound = points.positions.isfinite().all(-1) & ~points.errors.isnan()
-    return sound & (points.errors <= choice.points_error) & (points.tracks >= choice.points_views)
-
-
-def _off(there: Float[Tensor, "n 3"], here: Float[Tensor, "n 3"]) -> Float[Tensor, n]:
-    """Return the distances (metres) between corresponding cameras after a similarity alignment."""
-    return torch.linalg.vector_norm(fit_similarity(there, here).apply(there) - here, dim=-1)

@@ -20,8 +20,6 @@ import torch
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import FIRST_CENTRE, Keypoints, quantized
 
-PER_SCALE = 2.0
-"""Diameter of a keypoint, as OpenCV defines it, per scale of the Gaussian at which it was found."""
 UNKNOWN_SCALE = 4.0
 """Scale (pixels) of keypoints that state none."""
 
@@ -42,7 +40,8 @@ def stored_keypoints(path: Path) -> Iterator[tuple[str, Keypoints]]:
                 where=path,
                 expected="finite numbers for each keypoint",
             )
-        sizes = torch.from_numpy(PER_SCALE * np.asarray(scales, dtype=np.float32))
+        # OpenCV's diameter of a keypoint is twice the scale of the Gaussian at which it was found.
+        sizes = torch.from_numpy(2 * np.asarray(scales, dtype=np.float32))
         numbers = torch.from_numpy(np.array(descriptors))
         if numbers.dtype != torch.uint8:
             numbers = quantized(numbers.float())

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 DepthRegistration: TypeAlias = Union[bool, "DepthCamera", str, Path]
 """How depth is registered to colour images: from a given sensor or its file, from the format's own sensor
 (True), or not at all (False)."""
-UNREGISTERED = "no"
-"""The value of ``register_depth`` with which depth is used as it is, besides False."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +124,7 @@ class DatasetOptions:
     @property
     def registration(self) -> DepthRegistration | None:
         """``register_depth``, which is False if depth is used as it is."""
-        return False if self.register_depth == UNREGISTERED else self.register_depth
+        return False if self.register_depth == "no" else self.register_depth
 
     def sensor(self, where: Path | str, own: DepthCamera | None = None) -> DepthCamera | None:
         """Return the sensor from which depth is registered, or None if depth is used as it is; ``own`` is the format's.

@@ -9,7 +9,7 @@ import torch
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import Observations
-from bidnerf_core.geometry import SE3
+from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.io import read_archive, read_array, read_rows
 
 EXPECTED_POINTS = "n rows of x, y, z in metres"
@@ -23,7 +23,29 @@ def read_depth_points(path: Path) -> Observations:
     the camera. A .npz file holds ``points`` and, for a separate sensor such as a lidar, ``T_camera_sensor``
     (4x4); the points are then in the sensor's frame. Raises ``InputError`` for anything else.
     """
-    points, T_camera_sensor = _read(path)
+    points: np.ndarray = np.zeros(0)
+    T_camera_sensor = SE3.identity()
+    if path.suffix == ".npz":
+        arrays = read_archive(path, ("points", "T_camera_sensor"), "a .npz file of points")
+        if "points" not in arrays:
+            raise InputError("no array 'points'", where=path, expected=f"one with {EXPECTED_POINTS}")
+        points = arrays["points"]
+        if (given := arrays.get("T_camera_sensor")) is not None:
+            matrix = (
+                torch.from_numpy(given.astype(np.float64)) if given.dtype.kind in "fiu" else torch.empty(0)
+            )
+            T_camera_sensor = pose_from_matrix(matrix, "T_camera_sensor", path)
+    elif path.suffix == ".npy":
+        points = read_array(path, "a .npy file of points")
+    else:
+        rows = read_rows(path, "a file of points", EXPECTED_POINTS)
+        # A row with commas has no other separator: "1,5 2,5" has decimal commas and is rejected.
+        words = [(row, row.text.split("," if "," in row.text else None)[:3]) for row in rows]
+        lengths = {len(found) for _, found in words}
+        if len(lengths) > 1:
+            found = f"has rows of {min(lengths)} and of {max(lengths)} numbers"
+            raise InputError(found, where=path, expected=EXPECTED_POINTS)
+        points = np.array([row.numbers(found) for row, found in words], dtype=np.float64)
     if points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
         raise InputError(
             f"has an array of shape {points.shape} and type {points.dtype}",
@@ -35,34 +57,3 @@ def read_depth_points(path: Path) -> Observations:
         return Observations.from_points(xyz, T_camera_sensor)
     except InputError as error:
         raise InputError(error, where=path) from error
-
-
-def _read(path: Path) -> tuple[np.ndarray, SE3]:
-    """Return the array in a file, and T_camera_sensor of the sensor that measured it."""
-    if path.suffix == ".npz":
-        return _from_archive(path)
-    if path.suffix == ".npy":
-        return read_array(path, "a .npy file of points"), SE3.identity()
-    rows = read_rows(path, "a file of points", EXPECTED_POINTS)
-    # A row with commas has no other separator: "1,5 2,5" has decimal commas and is rejected.
-    words = [(row, row.text.split("," if "," in row.text else None)[:3]) for row in rows]
-    lengths = {len(found) for _, found in words}
-    if len(lengths) > 1:
-        raise InputError(
-            f"has rows of {min(lengths)} and of {max(lengths)} numbers", where=path, expected=EXPECTED_POINTS
-        )
-    return np.array([row.numbers(found) for row, found in words], dtype=np.float64), SE3.identity()
-
-
-def _from_archive(path: Path) -> tuple[np.ndarray, SE3]:
-    arrays = read_archive(path, ("points", "T_camera_sensor"), "a .npz file of points")
-    if "points" not in arrays:
-        raise InputError("no array 'points'", where=path, expected=f"one with {EXPECTED_POINTS}")
-    if "T_camera_sensor" not in arrays:
-        return arrays["points"], SE3.identity()
-    given = arrays["T_camera_sensor"]
-    matrix = torch.from_numpy(given.astype(np.float64)) if given.dtype.kind in "fiu" else torch.empty(0)
-    pose = SE3.from_matrix(matrix) if matrix.shape == (4, 4) else None
-    if pose is None or not bool(pose.is_rigid()):
-        raise InputError("T_camera_sensor is not a rigid transform", where=path, expected="4x4")
-    return arrays["points"], pose.normalized()

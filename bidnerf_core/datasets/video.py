@@ -21,12 +21,6 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.io import LARGEST_IMAGE, looks_like_image, open_binary, reason
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".3gp", ".ts", ".mts")
-MICROSECONDS = 1_000_000
-"""The unit of a file's start time, per second."""
-MATROSKA = b"\x1aE\xdf\xa3"
-"""First bytes of Matroska and WebM."""
-BT_2020 = 9
-"""The YCbCr-to-RGB matrix (ITU-T H.273) used in place of those that FFmpeg lacks."""
 OPTIONS = {
     "protocol_whitelist": "file",  # a playlist disguised as a video must not open connections ...
     "format_whitelist": "mov,matroska,avi,mpeg,mpegts,mpegvideo",  # ... nor other files
@@ -53,7 +47,7 @@ class Video:
                 found = [packet for packet in container.demux(stream) if packet.pts is not None]
             except (OSError, ValueError) as error:
                 raise _no_video(path, reason(error)) from error
-            start = (container.start_time or 0) / MICROSECONDS
+            start = (container.start_time or 0) / 1e6  # microseconds
             shown = [(p.pts, float(p.pts * stream.time_base) - start) for p in found if not p.is_discard]
         shown = sorted(
             frame for frame in shown if frame[1] >= 0
@@ -148,7 +142,7 @@ def is_video(path: Path) -> bool:
     except InputError:
         return False
     mp4 = head[4:8] == b"ftyp" and not looks_like_image(path)
-    return mp4 or head[:4] == MATROSKA or (head[:4] == b"RIFF" and head[8:12] == b"AVI ")
+    return mp4 or head[:4] == b"\x1aE\xdf\xa3" or (head[:4] == b"RIFF" and head[8:12] == b"AVI ")
 
 
 def require_av(path: Path) -> None:
@@ -189,6 +183,6 @@ def _pixels(picture: Any) -> UInt8[np.ndarray, "h w 3"]:
     try:
         pixels: np.ndarray = picture.to_ndarray(format="rgb24")
     except OSError:  # FFmpeg does not support the colour space that the file names, such as BT.2020 with constant luminance
-        picture.colorspace = BT_2020
+        picture.colorspace = 9
         pixels = picture.to_ndarray(format="rgb24")
     return pixels

@@ -18,8 +18,6 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import png_bytes, write_file
 
-OPENCV_TO_OPENGL = (1.0, -1.0, -1.0, 1.0)  # signs of the camera axes: y and z are reversed
-LENS = ("k1", "k2", "p1", "p2", "k3")
 LARGEST_DEPTH = 65534  # readers interpret the largest 16-bit number as "not measured"
 
 
@@ -74,29 +72,18 @@ def frame_entry(
 
     Raises ``InputError`` for a lens that the format cannot describe.
     """
+    lens = ("k1", "k2", "p1", "p2", "k3")
+    if len(camera.distortion) > len(lens):
+        found = f"the lens has {len(camera.distortion)} coefficients"
+        raise InputError(found, where=f"frame {name}", expected=f"at most {len(lens)}")
     matrix = T_world_camera.to("cpu", torch.float64).matrix()
     return {
         "file_path": file_path,
-        "transform_matrix": (matrix * matrix.new_tensor(OPENCV_TO_OPENGL)).tolist(),
+        "transform_matrix": (matrix * matrix.new_tensor([1.0, -1.0, -1.0, 1.0])).tolist(),
         **({} if time is None else {"time": time}),
-        **camera_entry(camera, name),
-    }
-
-
-def camera_entry(camera: Intrinsics, name: str) -> dict[str, float]:
-    """Return the ``transforms.json`` entries of a camera. Raises ``InputError`` for a lens that the format cannot describe."""
-    if len(camera.distortion) > len(LENS):
-        found = len(camera.distortion)
-        raise InputError(
-            f"the lens has {found} coefficients", where=f"frame {name}", expected=f"at most {len(LENS)}"
-        )
-    sizes = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
-    return {
-        **sizes,
-        "w": camera.width,
-        "h": camera.height,
-        **dict(zip(LENS, camera.distortion, strict=False)),
-    }
+        "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": camera.width, "h": camera.height,
+        **dict(zip(lens, camera.distortion, strict=False)),
+    }  # fmt: skip
 
 
 def _colours(frame: Frame, background: tuple[float, float, float]) -> np.ndarray:

@@ -10,12 +10,7 @@ from dataclasses import replace
 import torch
 
 from bidnerf_core.captures import (
-    CaptureReport,
-    UpDirection,
     pose_updates,
-    stored_cameras,
-    summary,
-    surveyed,
     tried_landmarks,
 )
 from bidnerf_core.errors import InputError
@@ -23,7 +18,6 @@ from bidnerf_core.fields import RadianceField
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import (
     BakeConfig,
-    HeldOutTrial,
     LandmarkMap,
     SurfaceMap,
     TrackedViews,
@@ -39,12 +33,6 @@ from bidnerf_core.progress import counter
 log = logging.getLogger("bidnerf")
 
 NO_CAMERAS = "holds no cameras to render from; give a dataset of its views with --data"
-
-
-UNLIKE, UNLIKE_ITS_OWN, UNLIKE_ANY = 0.2, 2.0, 0.3
-"""Smallest difference (RMS) between rendered and photographed colours that indicates another scene: absolute;
-relative to that between the field and the photos the map was built from; and absolute if the latter is
-unknown, as in a map that was never baked."""
 
 
 def bake_surface(
@@ -121,17 +109,6 @@ def bake_landmarks(
     return info, landmarks, tracked
 
 
-def surveyed_photos(
-    tracked: TrackedViews, views: Sequence[View], trial: HeldOutTrial, up: UpDirection | None
-) -> CaptureReport:
-    """Return the capture record of photos whose keypoints were ``tracked``, and log its summary."""
-    counter("surveying the photos", "stage")(0, 1)
-    capture = surveyed(tracked, views, trial=trial, up=up)
-    for line in summary(capture):
-        log.info(line)
-    return capture
-
-
 def with_tracks_in(info: MapInfo, landmarks: LandmarkMap, names: Sequence[str]) -> LandmarkMap:
     """Return landmarks that were built from images with these names, with tracks in the images of the map."""
     if landmarks.tracks is None:
@@ -141,21 +118,12 @@ def with_tracks_in(info: MapInfo, landmarks: LandmarkMap, names: Sequence[str]) 
     return replace(landmarks, tracks=landmarks.tracks.renumbered(images=images))
 
 
-def check_same_scene(info: MapInfo, field: RadianceField, views: Sequence[View], where: str) -> None:
-    """Raise ``InputError`` for photos of another scene: none of them was used to build the map, and they are
-    unlike its field.
-
-    The message begins with ``where``.
-    """
-    own = {(camera.name, camera.T_world_camera) for camera in info.cameras}
-    if own and not any((c.name, c.T_world_camera) in own for c in stored_cameras(views)):
-        check_alike(info, field, views, where)
-
-
 def check_alike(info: MapInfo, field: RadianceField, views: Sequence[View], where: str) -> None:
     """Raise ``InputError`` for photos that are unlike the field, regardless of whether the map was built from them."""
+    # The difference (RMS) between rendered and photographed colours is compared with that between the field and the photos
+    # the map was built from, which is unknown in a map that was never baked.
     off, usual = colour_noise(field, info.bounds, views), info.colour_noise
-    if off > (UNLIKE_ANY if usual is None else max(UNLIKE, UNLIKE_ITS_OWN * usual)):
+    if off > (0.3 if usual is None else max(0.2, 2 * usual)):
         raise InputError(
             f"built from {info.data or 'other views'!r}, and its renderings differ from the photos by"
             f" {off:.0%} of the range of colours;",

@@ -41,14 +41,6 @@ KEPT = 6
 """Number of maps from folders that stay in memory after use."""
 
 
-@dataclass(frozen=True)
-class MapSimilarity:
-    """Similarity of an image to a map: the cosine between pooled descriptors, -1 if the map has none."""
-
-    map: str
-    cosine: float
-
-
 @dataclass(frozen=True, eq=False)
 class Placement:
     """The map that an image shows, its pose there, and the runner-up."""
@@ -56,7 +48,9 @@ class Placement:
     map: str  # the map of the best answer, even if that was rejected
     found: Localization
     runner_up: tuple[str, Localization] | None  # the second best answer; None if only one map was tried
-    ranking: tuple[MapSimilarity, ...]  # all maps, most similar first
+    ranking: Mapping[
+        str, float
+    ]  # all maps, most similar first: the cosine between pooled descriptors, -1 if a map has none
     asked: tuple[str, ...]  # maps in which the image was localized, in order
     backend: str = ""  # of the map
 
@@ -67,14 +61,13 @@ class Placement:
 
     def plain(self) -> dict[str, Any]:
         """Return the JSON values of the map, its similarity, and the runner-up."""
-        cosines = {similarity.map: round(similarity.cosine, 4) for similarity in self.ranking}
-        runner_up = None
+        runner_up, similarity = None, {name: round(cosine, 4) for name, cosine in self.ranking.items()}
         if self.runner_up is not None:
             name, other = self.runner_up
             runner_up = {
-                "map": name, "outcome": str(other.outcome), "converged": other.converged, "similarity": cosines[name],
+                "map": name, "outcome": str(other.outcome), "converged": other.converged, "similarity": similarity[name],
             }  # fmt: skip
-        return {"map": self.map, "similarity": cosines[self.map], "runner_up": runner_up}
+        return {"map": self.map, "similarity": similarity[self.map], "runner_up": runner_up}
 
     @property
     def rival(self) -> str | None:
@@ -152,21 +145,18 @@ class MapCollection:
         self._localizers.move_to_end(name)
         return self._localizers[name]
 
-    def ranked(self, frame: Frame) -> list[MapSimilarity]:
-        """Return all maps by their similarity to an image, most similar first; maps without landmarks come last."""
+    def ranked(self, frame: Frame) -> dict[str, float]:
+        """Return the similarity of each map to an image, most similar first; that of maps without landmarks is -1."""
         vectors: dict[tuple[str, int], Float[Tensor, "p"]] = {}
         for key, vocabulary in self._vocabularies.items():
             descriptors = detected(find_features(key[0]), frame.rgb).descriptors if frame.has_colour else None
             if descriptors is not None and len(descriptors) and descriptors.shape[1] == key[1]:
                 vectors[key] = vocabulary.pooled(descriptors)
-        found = []
-        for name in self._maps:
-            own = self._key.get(name)
-            cosine = -1.0
-            if own is not None and own in vectors:
-                cosine = float((self._pooled[name] @ vectors[own]).max())
-            found.append(MapSimilarity(name, cosine))
-        return sorted(found, key=lambda similarity: -similarity.cosine)
+        found = dict.fromkeys(self._maps, -1.0)
+        for name, own in self._key.items():
+            if own in vectors:
+                found[name] = float((self._pooled[name] @ vectors[own]).max())
+        return dict(sorted(found.items(), key=lambda item: -item[1]))
 
     def __call__(self, frame: Frame, seed: int = 0) -> Placement:
         """Find the map that a frame shows, and its pose there.
@@ -177,9 +167,9 @@ class MapCollection:
         """
         ranking = self.ranked(frame)
         quick: dict[str, Localization] = {}
-        for similarity in ranking[: self.asked]:
+        for name in list(ranking)[: self.asked]:
             recognised = any(found.converged for found in quick.values())
-            quick[similarity.map] = self._by_landmarks(similarity.map, frame, seed)
+            quick[name] = self._by_landmarks(name, frame, seed)
             if recognised:
                 break
         chosen = max(quick, key=lambda name: _merit(quick[name]))  # the first of equal ones
@@ -188,7 +178,7 @@ class MapCollection:
         second = max(others, key=lambda name: _merit(quick[name]), default=None)
         runner_up = None if second is None else (second, quick[second])
         backend = self._infos[chosen].backend
-        return Placement(chosen, found, runner_up, tuple(ranking), tuple(quick), backend)
+        return Placement(chosen, found, runner_up, ranking, tuple(quick), backend)
 
     def _by_landmarks(self, name: str, frame: Frame, seed: int) -> Localization:
         """Localize a frame with the landmarks of a map; the full method is used for maps without landmarks,

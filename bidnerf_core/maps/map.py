@@ -21,6 +21,9 @@ from bidnerf_core.captures import (
     at_stored_poses,
     given_up,
     poses_of,
+    stored_cameras,
+    summary,
+    surveyed,
     up_direction,
 )
 from bidnerf_core.datasets import DatasetOptions
@@ -51,7 +54,7 @@ from bidnerf_core.mapping import (
     find_features,
 )
 from bidnerf_core.maps.anchor import Anchor
-from bidnerf_core.maps.baking import bake_landmarks, bake_surface, check_same_scene, surveyed_photos
+from bidnerf_core.maps.baking import bake_landmarks, bake_surface, check_alike
 from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info
 from bidnerf_core.maps.store import (
     checked_weights,
@@ -67,7 +70,7 @@ from bidnerf_core.maps.store import (
 )
 from bidnerf_core.maps.summary import MapSummary
 from bidnerf_core.maps.views import AS_STORED, Images, read_views
-from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, job_context
+from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context
 from bidnerf_core.training import TrainingState
 
 log = logging.getLogger("bidnerf")
@@ -283,7 +286,10 @@ class Map:
                     images = replace(images, background=self.bounds.background)
                 found = read_views(data, images, folder=self.folder)
                 views = at_stored_poses(found.about(self.origin).views, self.info.cameras)
-                check_same_scene(self.info, self.field, views, self.name)
+                own = {(camera.name, camera.T_world_camera) for camera in self.info.cameras}
+                if own and not any((c.name, c.T_world_camera) in own for c in stored_cameras(views)):
+                    # None of them was used to build the map: they may be of another scene.
+                    check_alike(self.info, self.field, views, self.name)
             return scene.with_baked_parts(views, config, rendered_landmarks)
 
     def with_baked_parts(
@@ -343,8 +349,12 @@ class Map:
         check_cancelled("survey")
         noise = colour_noise(self.field, self.bounds, views) if self.has_field else None
         scene = replace(self, info=replace(self.info, colour_noise=noise))
+        counter("surveying the photos", "stage")(0, 1)
         trial = HeldOutTrial() if self.landmarks is None else self.landmarks.trial
-        return scene.with_parts(None, None, surveyed_photos(tracked, views, trial, self.up))
+        capture = surveyed(tracked, views, trial=trial, up=self.up)
+        for line in summary(capture):
+            log.info(line)
+        return scene.with_parts(None, None, capture)
 
     def with_parts(
         self,

@@ -91,9 +91,11 @@ class StructureImporter:
                 f"none of its {amount(len(images), 'image')} can be used, such as {left_out[0]}", where=model
             )
         found += [f"left out: {line}" for line in left_out]
+        poses = [image.T_camera_model.inverse() for image in images]
+        scaled = [SE3(T.rotation, placement.scale * T.translation) for T in poses]
         names = unique_names([shots[number].parts for number in kept])
         posed = [
-            replace(shots[number], name=name, T_world_camera=_placed(images[number].T_camera_model.inverse(), placement), splits=("train",))
+            replace(shots[number], name=name, T_world_camera=placement.T_target_source @ scaled[number], splits=("train",))
             for number, name in zip(kept, names, strict=True)
         ]  # fmt: skip
         structure = Structure(
@@ -110,10 +112,6 @@ def _numbers(observed: Tensor, ids: Tensor, sound: Tensor) -> Tensor:
         return torch.full_like(observed, -1)
     place = torch.searchsorted(ids, observed).clamp(max=len(ids) - 1)
     return torch.where((ids[place] == observed) & sound[place], place, -1)
-
-
-def _placed(T: SE3, placement: Similarity) -> SE3:
-    return placement.T_target_source @ SE3(T.rotation, placement.scale * T.translation)
 
 
 def _misfit(known: Mapping[str, Keypoints], counts: Mapping[str, int], cameras: list[object]) -> str | None:

@@ -27,12 +27,6 @@ if TYPE_CHECKING:
     from bidnerf_core.maps.map import Map
 
 
-OF_DESCRIPTION = (
-    "backend", "data", "added", "unit", "distances", "step", "complete", "bounds", "origin", "config", "bidnerf", "colour_noise",
-)  # fmt: skip
-"""The facts that are those of the map's description."""
-
-
 @dataclass(frozen=True)
 class SurfaceSize:
     """The size of a map's surface."""
@@ -104,7 +98,23 @@ class MapSummary:
             moved=tuple(moved_cameras(info.cameras)),
             capture=capture,
             remarks=tuple(remarks),
-            **{name: getattr(info, name) for name in OF_DESCRIPTION},
+            **{
+                name: getattr(info, name)
+                for name in (
+                    "backend",
+                    "data",
+                    "added",
+                    "unit",
+                    "distances",
+                    "step",
+                    "complete",
+                    "bounds",
+                    "origin",
+                    "config",
+                    "bidnerf",
+                    "colour_noise",
+                )
+            },
         )
 
     def plain(self) -> dict[str, Any]:
@@ -144,13 +154,16 @@ class MapSummary:
         if self.surface is not None:
             cells = f"{amount(self.surface.cells, 'cell')} with a side of {self.surface.cell:.3g}"
             surface = f"{amount(self.surfels, 'surfel')}, indexed by {cells}, {self.surface.MiB:.1f} MiB"
+        bounds, beyond = self.bounds, "more" if self.bounds.contracted else "nothing"
+        box = f"a box of {' x '.join(f'{side:.3g}' for side in bounds.size)} from {_shown(bounds.lower)}, {beyond} beyond it"
+        box += f"; seen from {bounds.near:.3g} to {bounds.far:.3g}"
         origin = {"origin": f"{_shown(self.origin)}, to which positions are relative"}
         return {
             "map": f"{place}, written by bidnerf {self.bidnerf}",
             "made from": f"{self.data or 'views in memory'}, {photos}{added}",
             "training": training,
             "field": field,
-            "scene": _scene_line(self.bounds),
+            "scene": f"{box} away; background {_shown(bounds.background)}",
             **(origin if any(self.origin) else {}),
             "distances": "known" if self.distances else "unknown, since all images were taken from one place",
             "frame": frame,
@@ -158,16 +171,6 @@ class MapSummary:
             "landmarks": str(self.landmarks or "none; 'bidnerf bake MAP --data DATA' builds them"),
             **({"settings": _shown(self.config)} if self.config else {}),
         }
-
-
-def _scene_line(bounds: SceneBounds) -> str:
-    beyond = "more beyond it" if bounds.contracted else "nothing beyond it"
-    box = (
-        f"a box of {' x '.join(f'{side:.3g}' for side in bounds.size)} from {_shown(bounds.lower)}, {beyond}"
-    )
-    return (
-        f"{box}; seen from {bounds.near:.3g} to {bounds.far:.3g} away; background {_shown(bounds.background)}"
-    )
 
 
 def _shown(value: Any) -> str:

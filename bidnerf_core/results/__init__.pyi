@@ -21,7 +21,6 @@ from .export import ply as ply
 from .overlays import Painter as Painter
 from .overlays import as_array as as_array
 from .overlays import as_picture as as_picture
-from .overlays import depth_to_rgb as depth_to_rgb
 from .overlays import overlay as overlay
 from .overlays import save_gif as save_gif
 from .overlays import tile as tile

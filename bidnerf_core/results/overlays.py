@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy.typing import ArrayLike
@@ -23,7 +22,6 @@ from bidnerf_core.localization import Localization, SceneMap, Start, checked_map
 SIDE = 240
 """Pixels on the longer side of a picture: larger photos are downscaled, since each rendered pixel takes time, and smaller images
 are enlarged to about this, so that captions fit."""
-NO_DEPTH = (38, 38, 42)  # colour where no depth was measured
 
 
 def overlay(
@@ -122,31 +120,6 @@ def as_picture(image: ArrayLike | Tensor, what: str = "image") -> UInt8[np.ndarr
         return array
     finite = np.nan_to_num(array.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
     return (finite.clip(0, 1) * 255 + 0.5).astype(np.uint8)
-
-
-def depth_to_rgb(
-    depth: ArrayLike | Tensor, near: float | None = None, far: float | None = None
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Colour depth (h w, metres) from red (near) to blue (far), dark where none was measured (0 or not
-    finite).
-
-    ``near`` and ``far`` (metres) are the ends of the scale; by default the 1st and 99th percentile of the
-    measured depth.
-    """
-    array = as_array(depth).astype(np.float64)
-    if array.ndim != 2 or array.size == 0:
-        raise InputError(f"expected an image (height, width), got shape {array.shape}", where="depth")
-    measured = np.isfinite(array) & (array > 0)
-    if not measured.any():
-        return np.full((*array.shape, 3), NO_DEPTH, dtype=np.uint8)
-    low, high = np.percentile(array[measured], (1, 99))
-    low, high = low if near is None else near, high if far is None else far
-    share = ((np.where(measured, array, low) - low) / max(high - low, 1e-9)).clip(0, 1)
-    levels = (
-        (255 * (0.96 - 0.9 * share)).round().astype(np.uint8)
-    )  # the ends of the colour map are nearly black
-    turbo = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[..., ::-1]  # to RGB
-    return np.where(measured[..., None], turbo, np.array(NO_DEPTH, np.uint8))
 
 
 def blend(observed: ArrayLike | Tensor, rendered: ArrayLike | Tensor) -> UInt8[np.ndarray, "h w 3"]:

@@ -146,8 +146,8 @@ def test_a_folder_without_a_model_is_told(tmp_path: Path, scene: Known) -> None:
 
 def test_the_points_that_a_frame_observes_come_back_in_metres(model: Path, scene: Known) -> None:
     sparse = opened(model, scene)
-    assert sparse.unit.metres == pytest.approx(sparse_model.UNIT, rel=1e-9)
-    assert sparse.unit.misfit < 1e-9
+    assert sparse.metres == pytest.approx(sparse_model.UNIT, rel=1e-9)
+    assert sparse.misfit < 1e-9
     for place, view in enumerate(scene.views):
         found, truth = sparse.seen(view.frame.name, "train"), scene.truth(place)
         assert len(found) == len(truth) > 5
@@ -185,7 +185,7 @@ def test_a_moved_world_leaves_the_points_as_they_are(model: Path, scene: Known) 
 def test_no_pose_of_another_split_is_looked_at(model: Path, scene: Known) -> None:
     """The frame that is sought is not among the places, and its points are right all the same."""
     sparse = SparsePoints(model, places(scene)[1:], CHOICE)
-    assert sparse.unit.cameras == 5
+    assert sparse.cameras == 5
     torch.testing.assert_close(sparse.seen(scene.views[0].frame.name, "train"), scene.truth(0))
 
 
@@ -193,8 +193,8 @@ def test_a_few_misplaced_cameras_do_not_change_the_unit(model: Path, scene: Know
     wrong = [(name, T @ SE3.exp(torch.tensor([2.0, 0, 0, 0, 0, 0], dtype=torch.float64)) if i == 3 else T)
              for i, (name, T) in enumerate(places(scene))]  # fmt: skip
     sparse = SparsePoints(model, wrong, CHOICE)
-    assert sparse.unit.cameras < len(wrong)
-    assert sparse.unit.metres == pytest.approx(sparse_model.UNIT, rel=0.02)
+    assert sparse.cameras < len(wrong)
+    assert sparse.metres == pytest.approx(sparse_model.UNIT, rel=0.02)
 
 
 def test_cameras_that_tell_no_unit_are_refused(model: Path, scene: Known) -> None:
@@ -216,7 +216,7 @@ def test_cameras_that_tell_no_unit_are_refused(model: Path, scene: Known) -> Non
         with refused(where=model, found=found, expected=expected):
             SparsePoints(model, wrong, CHOICE)
     two = SparsePoints(model, places(scene)[:2], CHOICE)
-    assert two.unit.metres == pytest.approx(sparse_model.UNIT)
+    assert two.metres == pytest.approx(sparse_model.UNIT)
     assert "unchecked" in two.summary
 
 

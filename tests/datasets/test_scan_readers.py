@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 # Inside: a limit of size that small images reach
 from bidnerf_core.datasets import (
@@ -19,16 +17,12 @@ from bidnerf_core.datasets import (
     lidar,
     open_dataset,
     open_sequence,
-    read_trajectory,
 )
-from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames import View
-from bidnerf_core.geometry import SE3
 from bidnerf_core.maps import read_views
-from bidnerf_core.results import PosedImage, write_poses
 from bidnerf_core.testing import ReaderContract, training_views
 from refusals import refused
-from scan_layouts import LAYOUTS, PERIOD, SMALL, message, read_all, small_views
+from scan_layouts import LAYOUTS, PERIOD, message, read_all, small_views
 
 COUNT = 10
 LAWS = [name for name in dir(ReaderContract) if name.startswith("test_")]
@@ -176,29 +170,6 @@ def test_photos_of_phone_apps_have_the_size_that_is_asked_for(
         assert {max(frame.rgb.shape[:2]) for frame in frames} == {side}
         found, expected = frames[0].intrinsics, whole.scaled(side / max(whole.width, whole.height))
         torch.testing.assert_close(found.matrix(), expected.matrix(), atol=1e-4, rtol=0)
-
-
-@settings(max_examples=20)
-@given(logs=st.lists(st.tuples(*[st.floats(-9, 9)] * 6), min_size=3, max_size=6))
-@pytest.mark.parametrize("name", ["path.kitti.txt", "path.euroc.csv", "path.tum"])
-def test_poses_that_are_written_are_read_again(
-    name: str, logs: list[tuple[float, ...]], tmp_path: Path
-) -> None:
-    poses = [SE3.exp(torch.tensor(log, dtype=torch.float64)) for log in logs]
-    times = [PERIOD * number for number in range(len(poses))]
-    posed = [
-        PosedImage(f"{number}", number, SMALL, pose, time=time)
-        for number, (pose, time) in enumerate(zip(poses, times, strict=True))
-    ]
-    write_poses(tmp_path / name, posed)
-    path = read_trajectory(tmp_path / name, times)
-    assert path.times.tolist() == pytest.approx(times)
-    for number, pose in enumerate(poses):
-        torch.testing.assert_close(path.translations[number], pose.translation, atol=1e-9, rtol=0)
-        torch.testing.assert_close(path.rotations[number], pose.rotation, atol=1e-9, rtol=0)
-    if name.endswith(".kitti.txt"):
-        with pytest.warns(InputWarning, match="image 1 has no pose; KITTI rows do not state their image"):
-            write_poses(tmp_path / name, [posed[0], *posed[2:]])
 
 
 @pytest.mark.parametrize(

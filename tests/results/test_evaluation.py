@@ -211,7 +211,9 @@ def test_bid_has_the_lengths_of_its_tangent(widest: float, size: float) -> None:
     starts = SE3.stack([bid_start(true, size, seed, widest) for seed in range(200)])
     tangents = (true.inverse() @ starts).log()
     assert tangents[:, :3].norm(dim=-1).tolist() == pytest.approx([size] * 200)
-    assert tangents[:, 3:].norm(dim=-1).tolist() == pytest.approx([np.interp(size, (0.5, 3.4), (0.2, widest))] * 200)
+    assert tangents[:, 3:].norm(dim=-1).tolist() == pytest.approx(
+        [np.interp(size, (0.5, 3.4), (0.2, widest))] * 200
+    )
     directions = torch.nn.functional.normalize(tangents.reshape(-1, 2, 3), dim=-1)
     assert (
         directions.mean(0).abs().max() < 0.15

@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from bidnerf_core.evaluation import convergence_plot
-from bidnerf_core.results import PoseError, as_picture, depth_to_rgb, save_gif, tile
+from bidnerf_core.results import PoseError, as_picture, save_gif, tile
 
 # Inside: single tiles of an overlay, before they are put together
-from bidnerf_core.results.overlays import NO_DEPTH, blend, chequered, comparison, edges
+from bidnerf_core.results.overlays import blend, chequered, comparison, edges
 from refusals import refused
 
 
@@ -95,30 +95,6 @@ def test_edges_are_where_the_image_changes() -> None:
 def test_small_images_are_enlarged_and_large_ones_are_not() -> None:
     assert tile(disc(20), "small").shape[1] > 200
     assert tile(np.zeros((300, 400, 3)), "large").shape[1] < 420
-
-
-def test_depth_goes_from_red_to_blue_and_marks_what_is_missing() -> None:
-    depth = torch.linspace(1, 4, 100).reshape(10, 10)
-    depth[0, 5], depth[1, 5], depth[2, 5], depth[3, 5] = 0, float("nan"), float("inf"), -1
-    picture = depth_to_rgb(depth)
-    assert picture.dtype == np.uint8
-    assert all(tuple(picture[row, 5]) == NO_DEPTH for row in range(4))
-    near, far = picture[0, 0].astype(int), picture[-1, -1].astype(int)
-    assert near[0] > near[2] + 50
-    assert far[2] > far[0] + 50
-    for nothing in (torch.zeros(3, 4), torch.full((3, 4), float("nan"))):
-        assert (depth_to_rgb(nothing) == NO_DEPTH).all()
-    flat = depth_to_rgb(torch.ones(3, 4))
-    assert (flat == flat[0, 0]).all()
-    for wrong in (torch.zeros(0, 4), torch.zeros(4), torch.zeros(2, 3, 3)):
-        with refused(where="depth", found=f"(height, width), got shape {tuple(wrong.shape)}"):
-            depth_to_rgb(wrong)
-
-
-def test_depth_of_one_scale_has_comparable_colours() -> None:
-    depth = torch.tensor([[1.0, 2.0, 3.0]])
-    wide = depth_to_rgb(torch.tensor([[2.0, 5.0, 9.0]]), near=1.0, far=9.0)
-    assert np.array_equal(depth_to_rgb(depth, near=1.0, far=9.0)[0, 1], wide[0, 0])
 
 
 def test_gif_keeps_frames_and_speed(tmp_path: Path) -> None:

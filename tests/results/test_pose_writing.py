@@ -138,6 +138,12 @@ def test_any_poses_that_are_written_are_read_again(
         torch.testing.assert_close(one.matrix(), other.matrix(), atol=1e-9, rtol=0)
 
 
+def test_rows_of_kitti_do_not_state_their_image(tmp_path: Path) -> None:
+    first, _, *others = images(["a", "b", "c"])
+    with pytest.warns(InputWarning, match="image 1 has no pose; KITTI rows do not state their image"):
+        write_poses(tmp_path / "path.kitti.txt", [first, *others])
+
+
 def timed_images(count: int) -> list[PosedImage]:
     generator = torch.Generator().manual_seed(5)
     roots = torch.randn((count, 6, 6), generator=generator, dtype=torch.float64)
