@@ -11,7 +11,7 @@ from torch import Generator, Tensor
 
 from bidnerf_adanerf import AdaNerfConfig, AdaNerfField, backend
 from bidnerf_adanerf.bins import Bins, chosen
-from bidnerf_adanerf.dense import dense_samples, opacity, render_softly, soft_weights
+from bidnerf_adanerf.dense import dense_samples, render_softly, soft_weights
 from bidnerf_adanerf.oracle_loss import ENOUGH, by_depth, by_weight, oracle_loss
 from bidnerf_adanerf.recipe import Phase, phase_at, room_for_matter, sparsity
 from bidnerf_core.camera import Intrinsics
@@ -95,13 +95,6 @@ def test_at_least_one_and_at_most_n_bins_are_chosen(field: AdaNerfField, rays: R
         assert int(count[~hit(rays)].max()) == 0
 
 
-def test_a_higher_threshold_chooses_fewer_bins(field: AdaNerfField, rays: Rays) -> None:
-    chosen_bins = [replace(field.sampler, threshold=t, most=16)(rays) for t in (0.0, 0.3, 0.5, 0.7, 1.0)]
-    counts = torch.stack([s.valid.sum(-1) for s in chosen_bins])
-    assert bool((counts[1:] <= counts[:-1]).all())
-    assert int(counts[0].sum()) > int(counts[2].sum()) > int(counts[-1].sum())
-
-
 def test_the_best_bins_are_chosen_nearest_first() -> None:
     edges = torch.linspace(0, 6, 7)
     samples = RaySamples(edges[None, :-1], edges[None, 1:], torch.ones(1, 6, dtype=torch.bool))
@@ -111,13 +104,6 @@ def test_the_best_bins_are_chosen_nearest_first() -> None:
     assert chosen(samples, scores, threshold=0.85, most=3).valid.sum() == 1
     few = chosen(samples, scores, threshold=0.95, most=3)
     assert few.starts[few.valid].tolist() == [1.0]
-
-
-def test_the_oracle_is_asked_once_a_call(field: AdaNerfField, rays: Rays) -> None:
-    asked: list[int] = []
-    field.oracle.register_forward_hook(lambda module, given, found: asked.append(len(given[0])))
-    render(field, rays)
-    assert asked == [len(rays.near)]
 
 
 def test_the_pose_is_felt_through_positions_and_not_through_the_choice(
@@ -134,13 +120,6 @@ def test_the_pose_is_felt_through_positions_and_not_through_the_choice(
     (expected,) = torch.autograd.grad((weights[..., None] * values.rgb).sum(), origins)
     torch.testing.assert_close(found, expected)
     assert float(found.abs().max()) > 0
-
-
-def test_without_a_threshold_all_bins_are_shaded(field: AdaNerfField, rays: Rays) -> None:
-    everything = replace(field.sampler, threshold=-1.0, most=SMALL.bins)
-    found, all_bins = everything(rays), field.bins(rays)
-    assert torch.equal(found.valid, all_bins.valid)
-    torch.testing.assert_close(found.starts, all_bins.starts)
 
 
 # Dense training.
@@ -181,14 +160,6 @@ def test_bins_that_will_be_shaded_count_fully_in_the_soft_phase() -> None:
     assert scores.grad is not None
     assert bool((scores.grad[0, :3] > 0).all())  # what a picture lacks, the oracle can call back
     assert torch.equal(soft_weights(scores.detach(), 0.0)[0, 1:], torch.ones(5))
-
-
-def test_opacity_is_that_of_the_bins_asked_about(rays: Rays) -> None:
-    samples, values = Bins(BOUNDS, 16)(rays), made_values(len(rays.near))
-    which = samples.valid & (torch.arange(16) == 3)
-    expected = 1 - torch.exp(-values.density * (samples.ends - samples.starts))
-    torch.testing.assert_close(opacity(values, samples, which), expected[which].mean())
-    assert float(opacity(values, samples, torch.zeros_like(which))) == 0
 
 
 def test_gradients_of_soft_rendering_are_finite_where_all_is_opaque(rays: Rays) -> None:

@@ -73,16 +73,6 @@ def position_gradient(encoding: HashEncoding, positions: Tensor) -> Tensor:
     return positions.grad
 
 
-def test_levels_of_the_default_configuration() -> None:
-    encoding = HashEncoding(HashEncodingConfig())
-    resolutions = [level.resolution for level in encoding.levels]
-    assert (resolutions[0], resolutions[-1], encoding.width) == (16, 512, 32)
-    assert resolutions == sorted(resolutions)
-    for resolution, table in zip(resolutions, encoding.tables, strict=True):
-        assert table.shape == (min((resolution + 1) ** 3, 2**19), 2)
-        assert 0 < table.abs().max() <= 1e-4
-
-
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -109,13 +99,6 @@ def test_agrees_with_the_reference(features: int, interpolation: Interpolation, 
     # The path that also keeps derivatives computes the value in another way.
     with_slopes = encoding(positions.clone().requires_grad_()).detach()
     np.testing.assert_allclose(with_slopes, expected, rtol=1e-10, atol=1e-10)
-
-
-def test_frozen_levels_get_no_gradient() -> None:
-    encoding = make()
-    encoding.tables[1].requires_grad_(False)
-    encoding(inner_points(encoding)).sum().backward()
-    assert [table.grad is not None for table in encoding.tables] == [True, False, True, True]
 
 
 @both_interpolations

@@ -12,7 +12,6 @@ from torch import Tensor
 import tiny
 from bidnerf_core.fields import (
     FieldValues,
-    RadianceField,
     Rays,
     RaySampler,
     SceneBounds,
@@ -128,12 +127,6 @@ def test_leaving_out_empty_cells_changes_no_image(seed: int) -> None:
 # What the grid takes note of.
 
 
-def test_a_new_grid_holds_everything() -> None:
-    grid = OccupancyGrid(BOUNDS, RESOLUTION)
-    assert bool(grid.occupied.all())
-    assert bool(grid.near_occupied.all())
-
-
 def test_peaks_rise_at_once_fade_when_visited_and_stay_when_not() -> None:
     grid = grid_of(torch.zeros((RESOLUTION,) * 3, dtype=torch.bool))
     grid.peak.fill_(0.5)
@@ -221,14 +214,6 @@ def random_points(shape: tuple[int, ...], seed: int = 0) -> tuple[Tensor, Tensor
     return positions, torch.nn.functional.normalize(directions, dim=-1)
 
 
-def test_levels_are_coarse_and_fine(field: HashGridField) -> None:
-    coarse, fine = field.levels
-    assert fine is field
-    assert isinstance(coarse, RadianceField)
-    assert coarse.sampler is field.coarse_sampler
-    assert coarse.sampler.grid.shape[0] * 2 == field.occupancy.grid.shape[0]
-
-
 def test_density_is_finite_whatever_the_network_says(field: HashGridField) -> None:
     wild = copy.deepcopy(field)
     with torch.no_grad():
@@ -265,19 +250,6 @@ def test_the_coarse_level_does_not_see_the_fine_tables(field: HashGridField) -> 
     assert [gradient is None for gradient in gradients] == [False, False, True, True]
 
 
-def test_the_coarse_level_is_smoother(field: HashGridField) -> None:
-    """Measured by how much the slope changes over a tenth of the scene, where the fine level has several cells."""
-    start, directions = random_points((300,), seed=2)
-    shift = torch.tensor([0.03, -0.02, 0.025], dtype=torch.float64) * field.side
-
-    def roughness(level: RadianceField) -> float:
-        a, b, c = (torch.log(level.query(start + k * shift, directions).density) for k in (-1, 0, 1))
-        return float((a - 2 * b + c).detach().abs().mean() / b.detach().std())
-
-    coarse, fine = field.levels
-    assert roughness(coarse) < 0.75 * roughness(fine)
-
-
 def test_a_scene_of_another_size_is_the_same_scene() -> None:
     """An untrained field is as opaque with lengths in millimetres as in metres."""
     opacity = []
@@ -291,12 +263,6 @@ def test_a_scene_of_another_size_is_the_same_scene() -> None:
         moved = scaled.rays((rays.origins * unit).float(), rays.directions.float())
         opacity.append(render(made, moved).opacity.detach())
     torch.testing.assert_close(opacity[0], opacity[1], atol=2e-3, rtol=1e-2)
-
-
-def test_building_leaves_the_global_chance_alone() -> None:
-    state = torch.get_rng_state()
-    backend.build(HashGridConfig(encoding=tiny.ENCODING, grid_resolution=8, coarse_levels=1), BOUNDS)
-    assert torch.equal(torch.get_rng_state(), state)
 
 
 def test_a_state_without_densities_is_taken_and_samples_as_it_did(field: HashGridField) -> None:
@@ -342,13 +308,6 @@ def test_the_limit_holds_from_the_beginning_where_the_scene_is_contracted(field:
     for level in opened.levels:
         assert int(level.occupancy(rays).valid.sum(-1).max()) > 12
         assert int(level.sampler(rays).valid.sum(-1).max()) <= 12
-
-
-def test_todays_state_is_taken_as_it_is(field: HashGridField) -> None:
-    state = field.state_dict()
-    upgraded = field.upgraded_state(state)
-    assert upgraded.keys() == state.keys()
-    assert all(torch.equal(upgraded[name], value) for name, value in state.items())
 
 
 def test_a_state_with_infinite_densities_is_refused(field: HashGridField) -> None:

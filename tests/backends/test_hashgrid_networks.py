@@ -92,28 +92,6 @@ def test_what_is_frozen_gets_no_gradient_and_changes_no_other(frozen: str) -> No
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
 
 
-def test_the_graph_can_be_used_again() -> None:
-    geometry, colour = made()
-    points = inputs(21)
-    log_density, rgb = log_density_and_rgb(geometry, colour, *points)
-    first, again = (
-        torch.autograd.grad(rgb[:, 0].sum() + log_density.sum(), points, retain_graph=True) for _ in range(2)
-    )
-    assert all(map(torch.equal, first, again))
-
-
-def test_without_gradients_nothing_is_kept() -> None:
-    geometry, colour = made()
-    with torch.no_grad():
-        log_density, rgb = log_density_and_rgb(geometry, colour, *inputs(21))
-    assert not log_density.requires_grad
-    assert not rgb.requires_grad
-    with torch.inference_mode():
-        again = log_density_and_rgb(geometry, colour, *inputs(21))
-    assert torch.equal(again[0], log_density)
-    assert torch.equal(again[1], rgb)
-
-
 def test_refuses_double_backward() -> None:
     geometry, colour = made()
     encoded, harmonics = inputs(3)

@@ -58,12 +58,6 @@ def test_pools_follow_torch_again_after_an_error() -> None:
     assert threads_for(THREADED, CPU) == 2
 
 
-def test_on_a_gpu_torch_keeps_its_threads() -> None:
-    torch.set_num_threads(3)
-    with pools_only(torch.device("cuda")):
-        assert torch.get_num_threads() == 3
-
-
 @pytest.mark.parametrize(
     ("footprint", "contracted", "finest"),
     [(0.02, False, 250), (0.02, True, 500), (0.001, False, 1024), (1.0, False, 16), (0.0, False, 1024)],
@@ -74,10 +68,6 @@ def test_the_finest_level_follows_the_images(footprint: float, contracted: bool,
     assert backend.build(HashGridConfig(), bounds).encoding.levels[-1].resolution == finest
     fixed = backend.build(HashGridConfig(cells_per_pixel=0), bounds)
     assert fixed.encoding.levels[-1].resolution == (2048 if contracted else 1024)
-
-
-def test_settings_stay_where_the_scene_is_not_contracted() -> None:
-    assert adapted(HashGridConfig(), BOX) == HashGridConfig()
 
 
 def test_contracted_scenes_are_pruned_later_and_learned_more_slowly() -> None:

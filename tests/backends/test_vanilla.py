@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,14 +12,9 @@ import torch
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import (
-    Importance,
-    OccupancyMask,
     OccupiedOnly,
-    RadianceField,
     RaySampler,
     RaySamples,
-    Stratified,
-    VoxelGrid,
     encoded_width,
     frequency_encoding,
     levels,
@@ -28,12 +23,11 @@ from bidnerf_core.fields import (
 )
 from bidnerf_core.frames import View
 from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
-from bidnerf_core.testing import SIDE, BackendContract, Recorder, points, rgb_views, rgbd_views
+from bidnerf_core.testing import SIDE, BackendContract, Recorder, rgb_views, rgbd_views
 from bidnerf_core.training import RayBank, Supervision, ray_termination, supervised_loss
 from bidnerf_vanilla import VanillaConfig, VanillaField, backend
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
 from bidnerf_vanilla.recipe import step_outcome
-from voxels import cell_centres
 
 SMALL = VanillaConfig(
     layers=3, width=32, skip=1, position_frequencies=4, direction_frequencies=1, coarse_samples=24, fine_samples=8,
@@ -71,11 +65,6 @@ def test_encoding_is_equation_4(frequencies: int, include_input: bool) -> None:
         assert row == pytest.approx(expected, abs=1e-10)
 
 
-def test_encoding_of_nothing_is_nothing() -> None:
-    nothing = torch.zeros(0, 3)
-    assert frequency_encoding(nothing, octaves(3, nothing)).shape == (0, 21)
-
-
 def test_the_order_of_sines_and_cosines_is_all_that_differs() -> None:
     given = torch.rand(5, 2, 3)
     found = frequency_encoding(given, octaves(4, given), False, sines_first=True).unflatten(-1, (2, 4, 3))
@@ -111,12 +100,6 @@ def test_density_does_not_depend_on_the_direction_and_colour_does() -> None:
     assert bool((rgb != other).any())
 
 
-def test_the_paper_has_the_papers_network() -> None:
-    net = NerfNetwork(NetworkConfig(8, 256, skip=5, position_frequencies=10, direction_frequencies=4))
-    assert [layer.in_features for layer in net.trunk] == [63, 256, 256, 256, 256, 319, 256, 256]
-    assert (net.view.in_features, net.view.out_features) == (256 + 27, 128)
-
-
 # The field.
 
 
@@ -135,28 +118,6 @@ def test_an_untrained_field_is_nearly_transparent() -> None:
 def inner(sampler: RaySampler) -> RaySampler:
     assert isinstance(sampler, OccupiedOnly)
     return sampler.sampler
-
-
-def test_the_fine_level_is_asked_where_the_coarse_one_says() -> None:
-    field = built()
-    coarse, fine = levels(field)
-    assert coarse is field.coarse
-    assert fine is field
-    assert inner(coarse.sampler) == Stratified(24, BOUNDS)
-    placed = inner(fine.sampler)
-    assert isinstance(placed, Importance)
-    assert placed.field is field.coarse
-    assert placed.count == 8
-
-
-def test_levels_have_weights_of_their_own() -> None:
-    field = built()
-    shared = {id(p) for p in field.coarse.parameters()} & {id(p) for p in field.fine.parameters()}
-    assert not shared
-    positions, directions = points(10)
-    assert bool(
-        (field.coarse.query(positions, directions).rgb != field.query(positions, directions).rgb).any()
-    )
 
 
 def test_more_samples_go_near_the_surface() -> None:
@@ -193,15 +154,6 @@ def test_no_gradient_flows_through_the_choice_of_place() -> None:
 # Room for matter.
 
 
-def test_room_is_everywhere_until_it_is_carved() -> None:
-    room = OccupancyMask(VoxelGrid.cube(BOUNDS, 8))
-    positions = torch.randn(100, 3) * 3 * SIDE
-    assert bool(room.holds(positions).all())
-    room.cells[:] = False
-    room.cells[2, 3, 5] = True
-    assert torch.equal(room.holds(cell_centres(room.grid)), room.cells)
-
-
 def carve(field: VanillaField, views: Sequence[View]) -> None:
     field.room.cells.copy_(occupied_voxels(views, field.room.grid))
 
@@ -217,22 +169,6 @@ def test_nothing_is_asked_where_there_is_no_room() -> None:
         assert torch.equal(found.valid, everywhere.valid & held)
         possible = int((rays.far > rays.near).sum()) * found.valid.shape[-1]
         assert int(found.valid.sum()) < 0.6 * possible
-
-
-def test_carving_leaves_what_is_seen() -> None:
-    """Each pixel that shows matter has room on its ray where its depth was measured."""
-    field = built(room_resolution=32)
-    carve(field, rgbd_views())
-    batch = RayBank(rgbd_views(), BOUNDS).draw(2000, torch.Generator().manual_seed(1))
-    hit = batch.observed.distance > 0
-    places = batch.rays.at(batch.observed.distance[:, None])[:, 0]
-    assert float(field.room.holds(places[hit]).float().mean()) > 0.99
-
-
-def test_views_without_silhouette_or_depth_carve_nothing() -> None:
-    field = built()
-    carve(field, rgb_views())
-    assert bool(field.room.cells.all())
 
 
 # Training.
@@ -272,21 +208,6 @@ def test_both_levels_learn_from_a_step() -> None:
     assert outcome.samples_per_ray > 0
 
 
-@pytest.mark.slow
-def test_loss_falls_at_both_levels() -> None:
-    field = built()
-    views = rgbd_views()
-
-    def error(level: RadianceField) -> float:
-        batch = RayBank(views, BOUNDS).draw(1000, torch.Generator().manual_seed(5))
-        return float(((render(level, batch.rays, batch.background).rgb - batch.observed.rgb) ** 2).mean())
-
-    before = [error(level) for level in levels(field)]
-    backend.train(field, views, replace(SMALL, steps=150), Recorder())
-    after = [error(level) for level in levels(field)]
-    assert all(b < 0.3 * a for a, b in zip(before, after, strict=True))
-
-
 def test_a_step_takes_more_rays_where_there_is_little_room() -> None:
     counted = []
     for carve in (True, False):
@@ -298,20 +219,6 @@ def test_a_step_takes_more_rays_where_there_is_little_room() -> None:
 
 
 # Configuration.
-
-
-NUMBERS = [f.name for f in fields(VanillaConfig) if type(getattr(VanillaConfig(), f.name)) is not bool]
-
-
-@pytest.mark.parametrize("name", NUMBERS)
-def test_settings_that_make_no_sense_are_refused(name: str) -> None:
-    with pytest.raises(InputError, match=f"{name} is -1, expected "):
-        VanillaConfig(**{name: -1})
-
-
-def test_a_learning_rate_of_zero_is_refused() -> None:
-    with pytest.raises(InputError, match="learning_rate is 0, expected more than 0"):
-        VanillaConfig(learning_rate=0)
 
 
 def test_an_encoding_of_nothing_is_refused() -> None:

@@ -183,10 +183,6 @@ def test_focal_length_and_field_of_view_agree() -> None:
     assert found(focal=3000.0, raster=PORTRAIT).width == 3024
 
 
-def test_what_the_user_gives_goes_before_exif() -> None:
-    assert found(Exif(equivalent_mm=26), focal=1234.0).fx == 1234
-
-
 @pytest.mark.parametrize(
     "arguments",
     [{"focal": 1.0, "hfov": 2.0}, {"focal": 1.0, "camera": "a.json"}, {"hfov": 1.0, "camera": "a"}],
@@ -214,10 +210,6 @@ def test_numbers_that_no_camera_has_are_refused(
 ) -> None:
     with refused(where="a.jpg", found=value, expected=expected):
         found(**arguments)
-
-
-def test_the_focal_length_of_a_telescope_is_taken() -> None:
-    assert found(focal=999.0 * max(SIZE)).fx == 999.0 * max(SIZE)
 
 
 def test_a_camera_of_another_resolution_is_scaled() -> None:
@@ -307,15 +299,3 @@ def test_files_that_hold_no_camera(
     path.write_text(content)
     with refused(where=f"{path}{where}", found=why, expected=expected):
         found(camera=path)
-
-
-def test_what_is_no_file_of_text(tmp_path: Path) -> None:
-    binary = tmp_path / "binary"
-    binary.write_bytes(b"\xff\xfe\x00")
-    for path, why in (
-        (tmp_path / "none", "no such file"),
-        (tmp_path, "is a folder"),
-        (binary, "is not text"),
-    ):
-        with refused(where=path, found=why, expected="cameras.txt"):
-            found(camera=path)

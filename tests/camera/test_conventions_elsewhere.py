@@ -138,10 +138,3 @@ def test_quaternions_are_those_of_scipy() -> None:
         T.quaternion("xyz")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="length 0"):
         SE3.from_quaternion(torch.zeros(4), torch.zeros(3), "xyzw")
-
-
-def test_an_unknown_covariance_stays_unknown() -> None:
-    assert found(None).covariance_in("ros") is None
-    with pytest.raises(InputError, match="expected one of bidnerf, gtsam, ros"):
-        found().covariance_in("mavros")  # type: ignore[arg-type]
-    assert torch.equal(found().covariance_in("bidnerf"), COVARIANCE)  # type: ignore[arg-type]

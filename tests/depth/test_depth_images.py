@@ -51,13 +51,6 @@ def test_the_largest_integer_stands_for_nothing(kind: str) -> None:
     assert found.replaced == {str(largest): 1}
 
 
-def test_no_value_is_counted_twice() -> None:
-    raw = np.array([[np.nan, np.inf, -np.inf, -1, -1e12, 1e30, 65535, 65.535, 0, 1]])
-    found = depth_image(raw, 1.0, "depth")
-    assert sum(found.replaced.values()) == 8
-    assert int((found.metres > 0).sum()) == 1
-
-
 @pytest.mark.parametrize(("kind", "unit"), [("uint16", 0.001), ("int32", 0.001), ("float32", 1.0)])
 def test_a_unit_that_is_missing_is_assumed_and_said(kind: str, unit: float) -> None:
     found = depth_image(np.array([[0, 1000, 2000, 3000]], dtype=kind), None, "depth")
@@ -66,15 +59,6 @@ def test_a_unit_that_is_missing_is_assumed_and_said(kind: str, unit: float) -> N
     expected = f"depth_unit is not given, {unit:g} m per step is assumed: median depth {2000 * unit:g} m"
     assert found.remark(unit_assumed=True) == expected
     assert found.remark(unit_assumed=False) is None
-
-
-def test_depth_without_any_measurement_has_no_median() -> None:
-    found = depth_image(np.zeros((2, 3), dtype=np.uint16), None, "depth")
-    assert found.median is None
-    said = "the depth image holds no measurement, so only colour is used"
-    assert found.remark(unit_assumed=True) == found.remark(unit_assumed=False) == said
-    saturated = depth_image(np.full((2, 3), 65535, dtype=np.uint16), None, "depth")
-    assert saturated.remark(unit_assumed=True) == f"{said}; treated as not measured: 6 x 65535"
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -61,12 +61,6 @@ def test_exact_depth_has_no_noise(slant: float) -> None:
     assert relative(found, 2.0) < 1e-4
 
 
-def test_noise_does_not_depend_on_the_unit_of_length(generator: Generator) -> None:
-    depth = noisy(corridor(), lambda z: 0.004 * z**2, generator)
-    metres, feet = estimated_depth_noise(depth, CAMERA), estimated_depth_noise(depth / 0.3048, CAMERA)
-    assert relative(feet, 2.0 / 0.3048) == pytest.approx(relative(metres, 2.0), rel=1e-3)
-
-
 def test_walls_that_face_the_camera_show_the_rounding_though_their_depths_are_all_the_same() -> None:
     depth = torch.full((240, 320), 2.0, dtype=torch.float64)
     depth[:, 160:] = torch.linspace(1.0, 3.0, 41).repeat_interleave(4)[:160]

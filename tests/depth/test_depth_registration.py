@@ -20,7 +20,6 @@ from bidnerf_core.datasets import DepthCamera, TimedFrame, open_dataset, open_se
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
-from scan_layouts import small_views, write_nerfstudio
 from tum_folder import Recorded, write_recording
 
 COLOUR = Intrinsics(131.0, 132.0, 79.0, 61.0, 160, 120)
@@ -157,15 +156,6 @@ def test_a_recording_like_tums_is_registered_from_a_sensor(recording: Path, tmp_
     assert found.truth is not None
     assert bool(torch.equal(view.T_ref_camera.translation, found.truth.translation))
     assert torch.equal(first(recording, camera=COLOUR, register_depth=False).frame.depth, stored)  # type: ignore[arg-type]
-
-
-def test_no_registration_where_there_is_none_to_do(recording: Path, tmp_path: Path) -> None:
-    posed = write_nerfstudio(tmp_path / "posed", small_views(2))
-    with pytest.raises(InputError, match=r"its depth sensor is not known, expected the file"):
-        open_sequence(recording, register_depth=True)
-    assert open_dataset(posed, register_depth=False).splits
-    with pytest.raises(InputError, match=r"depth is already registered to its images"):
-        open_dataset(posed, register_depth=SENSOR)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,6 @@ from bidnerf_core.depth import (
 )
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization import AutoConfig, settings_of
-from commands import Run
 from problems import FieldMap
 
 
@@ -40,10 +39,6 @@ def test_the_realsenses_noise_is_about_that_of_intels_formula() -> None:
         assert DEPTH_SENSORS["realsense"].noise.deviation(z) == pytest.approx(
             0.08 * z**2 / (focal * 0.050), rel=0.6
         )
-
-
-def test_an_unknown_sensor_has_no_lengths_in_metres() -> None:
-    assert UNKNOWN.offset == UNKNOWN.noise.constant == UNKNOWN.noise.quadratic == 0
 
 
 @pytest.mark.parametrize("name", DEPTH_SENSORS)
@@ -73,13 +68,6 @@ def test_another_name_is_an_error_that_lists_the_names() -> None:
         find_depth_sensor("kinekt")
 
 
-def test_the_commands_take_a_sensor_by_name(bidnerf: Run) -> None:
-    for words in (("track", "MAP", "DATA", "--out", "t.txt"), ("localize", "MAP", "DATA")):
-        failed = bidnerf(*words, "--depth-sensor", "sonar")
-        assert failed.status != 0
-        assert "expected one of unknown, kinect," in " ".join(failed.err.replace("│", " ").split())
-
-
 def test_localize_compares_a_named_sensor_with_the_image(generator: Generator) -> None:
     camera = Intrinsics.from_focal(100.0, 120, 90)
     depth = torch.linspace(1.0, 1.3, 120).expand(90, 120) * (
@@ -89,14 +77,6 @@ def test_localize_compares_a_named_sensor_with_the_image(generator: Generator) -
     assert remark is not None
     assert re.search(r"is about (1\.[6-9]|2\.[0-4])\d%; 'kinect' usually has 0\.\d+%", remark)
     assert noise_remark(torch.zeros_like(depth), camera, "kinect") is None
-
-
-def test_the_localizer_has_the_sensor_of_its_settings() -> None:
-    scene = FieldMap(baked.FIELD, baked.BOUNDS, baked.toy())
-    assert Localizer(scene, warm_up=False).depth_sensor == UNKNOWN
-    assert Localizer(scene, "bid", warm_up=False).depth_sensor == UNKNOWN
-    config = settings_of("auto", {"depth_sensor": "kinect"})
-    assert Localizer(scene, config=config, warm_up=False).depth_sensor == DEPTH_SENSORS["kinect"]
 
 
 def test_the_covariance_of_a_pose_by_depth_grows_with_the_scale_of_the_sensor() -> None:

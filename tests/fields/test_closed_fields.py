@@ -8,9 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidnerf_core.errors import InputError
-from bidnerf_core.fields import RadianceField, Rays, SceneBounds, Stratified, render
-from bidnerf_core.geometry import SE3
+from bidnerf_core.fields import RadianceField, Rays, SceneBounds, render
 from bidnerf_core.scenes import GaussianBlobs, HomogeneousBall, orbit
 from bidnerf_core.testing import (
     check_background,
@@ -84,27 +82,3 @@ def test_blobs_are_differentiable_in_position(generator: torch.Generator) -> Non
 
     assert torch.autograd.gradcheck(answer, (positions,))
     assert torch.autograd.gradgradcheck(answer, (positions,))
-
-
-def test_moved_blobs_have_there_what_they_had_here(generator: torch.Generator) -> None:
-    field = GaussianBlobs.random(seed=2)
-    move = SE3.exp(torch.tensor([0.4, -2.0, 1.0, 0.3, 1.0, -0.7], dtype=torch.float64))
-    points = torch.rand((50, 3), generator=generator, dtype=torch.float64) * 2 - 1
-    here, there = field.query(points, points), field.moved(move).query(move.apply(points), points)
-    torch.testing.assert_close(there.density, here.density, atol=1e-10, rtol=0)
-    torch.testing.assert_close(there.rgb, here.rgb, atol=1e-10, rtol=0)
-    again = SE3.exp(torch.tensor([-1.0, 0.2, 0.5, -0.8, 0.1, 0.4], dtype=torch.float64))
-    twice = field.moved(move).moved(again).query((again @ move).apply(points), points)
-    torch.testing.assert_close(twice.density, here.density, atol=1e-10, rtol=0)
-
-
-def test_blobs_are_seen_from_everywhere_and_differ_by_seed(generator: torch.Generator) -> None:
-    rays = rays_towards_the_middle(200, generator)
-    one = render(GaussianBlobs.random(seed=0, samples=128), rays)
-    assert one.opacity.max() > 0.9
-    assert one.opacity.mean() > 0.3
-    assert one.rgb[one.opacity > 0.5].std(dim=0).min() > 0.03
-    assert (one.rgb - render(GaussianBlobs.random(seed=1), rays).rgb).abs().mean() > 0.05
-    assert GaussianBlobs.random(samples=7).sampler == Stratified(7)
-    with pytest.raises(InputError, match="at least 1"):
-        GaussianBlobs.random(0)

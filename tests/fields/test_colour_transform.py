@@ -65,11 +65,6 @@ def test_fitted_colours_are_those_of_numpys_least_squares() -> None:
         np.testing.assert_allclose(fitted[:, channel], np.polyval(line, rgb[:, channel].numpy()), atol=1e-5)
 
 
-def test_an_even_image_is_fitted_by_its_mean() -> None:
-    flat = torch.full((20, 3), 0.4)
-    torch.testing.assert_close(fitted_colours(flat, flat + 0.25), flat + 0.25)
-
-
 @pytest.mark.parametrize("alpha", [True, False])
 def test_images_with_a_background_have_no_exposure_to_learn(alpha: bool) -> None:
     views = tiny.views()

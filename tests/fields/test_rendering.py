@@ -20,7 +20,6 @@ from bidnerf_core.fields import (
     SceneBounds,
     Stratified,
     inverse_transform,
-    levels,
     query_samples,
     render,
     render_image,
@@ -243,11 +242,6 @@ def test_a_rendered_image_has_planar_depth() -> None:
     torch.testing.assert_close(image.depth, torch.full((16, 20), 2.0), atol=5e-3, rtol=0)
     assert image.rgb.shape == (16, 20, 3)
     assert float(image.opacity.min()) > 0.999
-
-
-def test_levels_fall_back_on_the_field_itself() -> None:
-    ball = HomogeneousBall(1.0, 5.0)
-    assert levels(ball) == (ball,)
 
 
 @pytest.mark.parametrize("size", [(64, 48), (63, 49), (1, 1), (2, 3)])

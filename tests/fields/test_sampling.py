@@ -25,7 +25,6 @@ from bidnerf_core.fields import (
 from bidnerf_core.scenes import GaussianBlobs, HomogeneousBall
 from bidnerf_core.testing import check_background, check_intervals, check_rays_alone, check_repeatable
 from bidnerf_hashgrid.occupancy import OccupancyGrid
-from refusals import refused
 from voxels import cell_centres
 
 BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.05, 8.0)
@@ -117,16 +116,6 @@ def test_what_was_covered_stays_covered_and_nothing_else(name: str, jittered: bo
     assert int(covers(cut).max()) == 1
     agree = covers(rough).clamp(max=1) == covers(cut)
     assert float(agree.float().mean()) > 0.9999  # but for rounding at borders
-
-
-@pytest.mark.parametrize("name", [name for name in SAMPLERS if name != "none"])
-def test_there_are_so_many_more_of_them(name: str) -> None:
-    sampler, where = SAMPLERS[name](), rays()
-    rough, cut = sampler(where), finer(sampler)(where)
-    asked = rough.valid.any(-1)
-    assert bool(asked.any())
-    assert bool((cut.valid.sum(-1) == rough.valid.sum(-1) + COUNT * asked).all())
-    assert bool(cut.starts.isfinite().all() & cut.ends.isfinite().all())
 
 
 def test_borders_of_a_contiguous_sampler_are_sorted_together() -> None:
@@ -227,9 +216,3 @@ def test_stratified_samples_of_an_open_scene_are_even_in_its_coordinate() -> Non
     torch.testing.assert_close(widths, widths.mean(-1, keepdim=True).expand_as(widths), rtol=1e-2, atol=1e-4)
     torch.testing.assert_close(samples.starts[:, 0], where.near)
     torch.testing.assert_close(samples.ends[:, -1], where.far, rtol=1e-3, atol=0)
-
-
-@pytest.mark.parametrize("channel", [1e308, -0.1, 1.1, float("nan"), float("inf")])
-def test_a_background_that_is_no_colour_is_refused(channel: float) -> None:
-    with refused(where="scene bounds", found="background is", expected="three numbers in [0, 1]"):
-        replace(BOUNDS, background=(0.0, channel, 1.0))

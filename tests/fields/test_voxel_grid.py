@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -53,27 +52,11 @@ def test_any_number_at_all_has_a_cell() -> None:
     assert not bool(GRID.contains(torch.tensor([[math.nan, 0.0, 0.5], [math.inf, 0.0, 0.5]])).any())
 
 
-def test_points_may_be_arranged_in_any_shape(generator: Generator) -> None:
-    points, values = torch.rand((24, 3), generator=generator), numbered(GRID)
-    flat = GRID.at(values, points)
-    assert torch.equal(GRID.at(values, points.reshape(2, 3, 4, 3)), flat.reshape(2, 3, 4))
-    assert GRID.at(values, points[0]) == flat[0]
-    assert GRID.at(values, points[:0]).shape == (0,)
-
-
 def test_a_look_up_carries_no_gradient_and_leaves_the_points_as_they_are() -> None:
     points = torch.rand(5, 3, requires_grad=True)
     before = points.detach().clone()
     assert not GRID.numbers(points).requires_grad
     assert torch.equal(points.detach(), before)
-
-
-def test_a_moved_grid_has_the_same_cells(generator: Generator) -> None:
-    offset = (3.0, -5.0, 11.0)
-    x, y, z = (a + b for a, b in zip(GRID.lower, offset, strict=True))
-    points = torch.rand((1000, 3), generator=generator, dtype=torch.float64)
-    moved = replace(GRID, lower=(x, y, z))
-    assert torch.equal(moved.numbers(points + torch.tensor(offset)), GRID.numbers(points))
 
 
 def test_the_cube_has_the_centre_and_the_longest_side_of_the_box() -> None:

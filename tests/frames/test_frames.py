@@ -72,19 +72,6 @@ def test_what_is_no_frame_is_refused_where_it_is_made(
         Frame(**parts | changed)
 
 
-def test_depth_counts_where_something_was_measured() -> None:
-    depth = torch.zeros(16, 24)
-    assert not Frame("f", GOOD["rgb"], LENS).has_depth
-    assert not Frame("f", GOOD["rgb"], LENS, depth).has_depth
-    depth[2, 3] = 1.5
-    assert Frame("f", GOOD["rgb"], LENS, depth).has_depth
-
-
-def test_real_lenses_have_rays() -> None:
-    for distortion in ((-0.3, 0.1, 0.0, 0.0), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)):
-        assert Frame("a", GOOD["rgb"], replace(LENS, distortion=distortion)).intrinsics.distortion
-
-
 def test_depth_that_is_no_number_was_not_measured() -> None:
     depth = torch.tensor([1.0, torch.nan, torch.inf, -torch.inf]).repeat(16, 6)
     found = Frame("a", GOOD["rgb"], LENS, depth).depth

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core import Frame, InputError, InputWarning, Intrinsics, View, open_dataset, open_sequence, train
+from bidnerf_core import Frame, InputError, InputWarning, Intrinsics, View, open_dataset, open_sequence
 from bidnerf_core.camera import Orientation, Raster
 
 # Inside: each quantity computed from pixels, which is equal whatever a mask hides
@@ -26,13 +25,13 @@ from bidnerf_core.localization.by_surface import is_blank
 from bidnerf_core.localization.terms.images import Thumbnail
 from bidnerf_core.localization.terms.rays import averaged
 from bidnerf_core.mapping import SIFT, image_keypoints, tracked_views
-from bidnerf_core.maps import TrainOptions, rendering_scores
+from bidnerf_core.maps import rendering_scores
 from bidnerf_core.scenes import demo_object
 from bidnerf_core.training import RayBank
 from commands import Run
 from photo_files import write_photo
 from refusals import refused
-from tiny import config, options, views, write_dataset
+from tiny import options, views, write_dataset
 
 SIZE = (12, 8)  # width, height
 
@@ -67,12 +66,6 @@ def test_masks_of_every_kind_hide_what_is_black(tmp_path: Path, stored: np.ndarr
     hidden = read_mask(path, Raster(*SIZE), SIZE)
     assert torch.equal(hidden, torch.from_numpy(left() == 0))
     assert torch.equal(read_mask(path, Raster(*SIZE), SIZE, "white"), ~hidden)
-
-
-def test_a_mask_of_the_upright_image_is_left_so(tmp_path: Path) -> None:
-    path, turned = saved(tmp_path / "upright.png", left(*SIZE[::-1])), Orientation.from_exif(6)
-    hidden = read_mask(path, Raster(*SIZE, turned), SIZE[::-1])
-    assert torch.equal(hidden, torch.from_numpy(left(*SIZE[::-1]) == 0))
 
 
 def test_a_mask_that_fits_both_orientations_is_turned_by_its_own_exif(tmp_path: Path) -> None:
@@ -323,12 +316,3 @@ def test_training_says_what_is_hidden(tmp_path: Path, bidnerf: Run) -> None:
         saved(masks / f"{name}.png", 0 * left(24, 24))
     failed = bidnerf("train", data, "--out", tmp_path / "m3", "--masks", masks, *options())
     assert (failed.status, "masks hide every image" in failed.err) == (1, True)
-
-
-def test_training_in_memory_takes_hidden_pixels(caplog: pytest.LogCaptureFixture) -> None:
-    generator = torch.Generator().manual_seed(0)
-    seen = [hiding(view, torch.rand(view.frame.rgb.shape, generator=generator)) for view in views(3)]
-    with caplog.at_level(logging.INFO, "bidnerf"):
-        scene = train(seen, config=config(), bake=False, options=TrainOptions(refine_poses="never"))
-    assert scene.info.hidden == sum(int(v.frame.hidden.sum()) for v in seen if v.frame.hidden is not None)
-    assert any("inverted" not in r.message and "masks hide 50 %" in r.message for r in caplog.records)

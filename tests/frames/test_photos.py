@@ -67,12 +67,6 @@ def test_a_point_stays_on_the_same_content(tmp_path: Path, code: int) -> None:
     torch.testing.assert_close(frame.depth[row, column], expected)
 
 
-def test_depth_that_is_upright_already_is_left_so(tmp_path: Path) -> None:
-    path = write_photo(tmp_path / "a.jpg", noise(HEIGHT, WIDTH), 6, FocalLengthIn35mmFilm=26)
-    depth = quiet(path, save_depth(tmp_path / "d.png", STEPS.T), depth_unit=0.001).depth
-    torch.testing.assert_close(depth, torch.from_numpy(STEPS.T.astype(np.float32)) * 0.001)
-
-
 # Reading.
 
 
@@ -188,17 +182,6 @@ def test_files_and_arrays_make_the_same_frame(photo: Path, tmp_path: Path) -> No
         assert (made.name, made.intrinsics) == ("a", CAMERA)
 
 
-def test_alpha_apart_or_as_a_channel() -> None:
-    pixels = noise(HEIGHT, WIDTH, 4)
-    whole = Frame.from_numpy(pixels, CAMERA, background="white")
-    apart = Frame.from_numpy(pixels[..., :3], CAMERA, alpha=pixels[..., 3], background="white")
-    assert whole.alpha is not None
-    torch.testing.assert_close(whole.rgb, apart.rgb)
-    torch.testing.assert_close(whole.alpha, apart.alpha)
-    grey = Frame.from_numpy(pixels[..., 0], CAMERA)
-    assert grey.rgb[..., 0].equal(grey.rgb[..., 2])
-
-
 def test_arrays_that_do_not_fit_are_refused() -> None:
     rgb, where = noise(HEIGHT, WIDTH), "frame image"
     assert Frame.from_numpy(rgb, CAMERA.scaled(2)).intrinsics.fx == pytest.approx(CAMERA.fx)
@@ -216,12 +199,6 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         Frame.from_numpy(noise(HEIGHT, WIDTH, 4), CAMERA, alpha=rgb[..., 0])
     with refused(where=where, found="alpha is 40x30x1", expected="30x40 as rgb"):
         Frame.from_numpy(rgb, CAMERA, alpha=rgb[..., 0].T)
-
-
-@pytest.mark.parametrize(("depth", "unit"), [(np.uint16, "0.001"), (np.float32, "1")])
-def test_arrays_without_a_unit_are_warned_of(depth: type, unit: str) -> None:
-    with pytest.warns(InputWarning, match=f"frame image: depth_unit is not given, {unit} m per step"):
-        Frame.from_numpy(noise(HEIGHT, WIDTH), CAMERA, depth=np.ones((HEIGHT, WIDTH), dtype=depth))
 
 
 # Folders.

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from bidnerf_core.geometry import SE3
 
 # Inside: the rotation vector and its Jacobian are compared with SciPy's
-from bidnerf_core.geometry.rotations import cross_matrix, left_jacobian, rotation_matrix, rotation_vector
+from bidnerf_core.geometry.rotations import left_jacobian, rotation_matrix, rotation_vector
 
 ANGLES = [0.0, 1e-9, 9e-5, 1.1e-4, 1e-2, 1.0, 2.49, 2.51, 3.1, math.pi - 1e-7]
 
@@ -35,8 +35,3 @@ def test_the_jacobian_is_that_of_the_exponential(angle: float) -> None:
     phi, rho = vector(angle), np.array([0.3, -2.0, 0.7])
     expected = SE3.exp(torch.from_numpy(np.concatenate([rho, phi]))).translation
     np.testing.assert_allclose(left_jacobian(phi) @ rho, expected, atol=1e-9)
-
-
-def test_the_cross_matrix_multiplies_as_the_cross_product() -> None:
-    a, b = np.random.default_rng(0).normal(size=(2, 3))
-    np.testing.assert_allclose(cross_matrix(a) @ b, np.cross(a, b), atol=1e-15)

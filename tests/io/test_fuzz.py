@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import json
 import os
@@ -33,13 +32,12 @@ from bidnerf_core.evaluation import read_results
 from bidnerf_core.io import (
     read_archive,
     read_array,
-    read_file,
     read_image,
     read_record,
     read_tensors,
     to_plain,
 )
-from bidnerf_core.maps import MapInfo, load_info, write_parts
+from bidnerf_core.maps import MapInfo, write_parts
 from bidnerf_core.maps import load_map as load
 from bidnerf_core.results import read_pose
 from bidnerf_core.training import TrainingState
@@ -180,21 +178,6 @@ JSON_VALUES = st.recursive(
 )
 
 
-@pytest.mark.slow
-@settings(max_examples=30)
-@given(
-    values=st.dictionaries(
-        st.sampled_from([f.name for f in dataclasses.fields(MapInfo)]), JSON_VALUES, max_size=4
-    )
-)
-def test_any_value_in_the_description_of_a_map_is_judged(values: dict[str, Any], folder: Path) -> None:
-    place = folder / "described"
-    place.mkdir(exist_ok=True)
-    sound = json.loads((folder / "map" / "map.json").read_text())
-    (place / "map.json").write_text(json.dumps(sound | values))
-    refused(lambda: load_info(place))
-
-
 @settings(max_examples=30)
 @given(content=st.binary(max_size=60), header=JSON_VALUES, length=st.none() | st.integers(0, 2**64 - 1))
 def test_any_header_of_tensors_is_judged(
@@ -261,12 +244,6 @@ def test_what_is_no_file_of_a_usable_size_is_refused_before_it_is_read(
         FILES[kind](tmp_path / "x")
 
 
-def test_a_size_that_is_too_large_is_named(tmp_path: Path) -> None:
-    hollow(tmp_path / "x")
-    with pytest.raises(InputError, match="has 4,096 MiB, expected a pose of at most 128 MiB"):
-        read_file(tmp_path / "x", "a pose")
-
-
 @pytest.mark.parametrize(
     ("kind", "shape"),
     [("<f8", "(100000, 100000)"), ("<f8", "(1000000000000,)"), ("<f8", "(-1, 3)"), ("<f8", "(1, 2"), ("<f8", "(" * 500),
@@ -281,22 +258,6 @@ def test_arrays_are_judged_by_their_header(kind: str, shape: str, tmp_path: Path
         archive.writestr("points.npy", content)
     with pytest.raises(InputError, match="not readable as an array"):
         read_depth_points(tmp_path / "a.npz")
-
-
-def test_arrays_come_back_as_they_were(tmp_path: Path) -> None:
-    for array in (
-        np.arange(6.0).reshape(2, 3),
-        np.asfortranarray(np.eye(3, dtype="u2")),
-        np.zeros((0, 3)),
-    ):
-        np.save(tmp_path / "a.npy", array)
-        np.savez_compressed(tmp_path / "a.npz", points=array)
-        for found in (
-            read_array(tmp_path / "a.npy", "x"),
-            read_archive(tmp_path / "a.npz", ["points"], "x")["points"],
-        ):
-            assert found.dtype == array.dtype
-            np.testing.assert_array_equal(found, array)
 
 
 def test_an_archive_that_unpacks_to_more_than_an_image_is_refused(

@@ -17,18 +17,14 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from PIL import Image, features
+from PIL import Image
 
-from bidnerf_core.errors import InputError
 from bidnerf_core.frames import as_floats, photos_in
 
 # Inside: the header of an image alone, and a system that refuses to open a file
 from bidnerf_core.io import (
-    IMAGE_SUFFIXES,
-    LARGEST_IMAGE,
     decode,
     files,
-    open_image,
     over,
     pixel_array,
     read_compact_image,
@@ -72,11 +68,6 @@ def test_images_of_too_many_pixels_take_no_memory(
         read(path)
     assert tracemalloc.get_traced_memory()[1] < 5e6
     tracemalloc.stop()
-
-
-def test_the_limit_lets_large_photos_pass(tmp_path: Path) -> None:
-    side = int(LARGEST_IMAGE**0.5)
-    assert read_header(empty_png(tmp_path / "large.png", side, side)) == ImageHeader(side, side, False)
 
 
 @pytest.mark.parametrize(
@@ -216,13 +207,6 @@ def test_only_formats_of_images_are_decoded_and_no_program_is_started(
     assert not started.exists()
 
 
-def test_the_formats_that_photos_have_are_decoded(tmp_path: Path) -> None:
-    for suffix in (*IMAGE_SUFFIXES, ".gif", *([".avif"] if features.check("avif") else [])):
-        path = tmp_path / f"a{suffix}"
-        Image.fromarray(noise(16, 24)).convert("L" if suffix == ".pgm" else "RGB").save(path)
-        assert read_image(path)[0].shape == (16, 24, 3)
-
-
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA"])
 def test_strips_give_what_the_whole_image_gives(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
@@ -286,13 +270,6 @@ def test_every_cut_of_a_file_is_one_line(tmp_path: Path, suffix: str) -> None:
             read_image(path)
 
 
-def test_an_error_within_the_context_keeps_its_words(tmp_path: Path) -> None:
-    path = tmp_path / "a.png"
-    Image.fromarray(noise(3, 4)).save(path)
-    with pytest.raises(InputError, match=r"^mine$"), open_image(path):
-        raise InputError("mine")
-
-
 # Arrays.
 
 
@@ -344,13 +321,6 @@ def test_reducing_keeps_means_and_commutes_with_compositing() -> None:
     premultiplied = image[..., :3] * image[..., 3:]
     expected = reduced(premultiplied, 5, 3) + 0.3 * (1 - small[..., 3:])
     torch.testing.assert_close(reduced(over(image[..., :3], image[..., 3], (0.3,) * 3), 5, 3), expected)
-
-
-@pytest.mark.parametrize("size", [(29, 17), (40, 30), (41, 1), (8, 6)])
-def test_reducing_is_opencvs_area_filter(size: tuple[int, int]) -> None:
-    image = noise(30, 41).astype(np.float32) / 255
-    expected = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    np.testing.assert_allclose(reduced(torch.from_numpy(image), *size).numpy(), expected, atol=1e-6)
 
 
 def test_resampling_takes_the_nearest_and_invents_nothing() -> None:

@@ -15,18 +15,11 @@ import tiny
 
 # Inside: a lock is taken late, as if between two steps of another process; names of temporary files
 from bidnerf_core.io import FileInUse, files, is_temporary, locked, output_folder
-from bidnerf_core.io.files import temporary
 from bidnerf_core.maps import load_map
 from commands import Run
 
 BAKE = ["--cells", "2000"]
 QUICK = ["--trials", "2", "--workers", "1", "--method", "bid", "--max-steps", "1", "--rays", "32"]
-
-
-def test_temporary_names_are_recognised_and_others_are_not(tmp_path: Path) -> None:
-    assert is_temporary(temporary(tmp_path / "map.json").name)
-    for name in ("map.json", ".hidden", ".map.json.bak", "a.0123abcd", ".gitignore"):
-        assert not is_temporary(name)
 
 
 def test_a_training_killed_before_its_first_checkpoint_begins_anew(

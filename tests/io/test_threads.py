@@ -23,12 +23,6 @@ def in_new_thread() -> int:
         return pool.submit(torch.get_num_threads).result()
 
 
-def test_the_usual_number_is_told_and_restored() -> None:
-    with threads_at_most(1) as usual:
-        assert (usual, torch.get_num_threads()) == (3, 1)
-    assert torch.get_num_threads() == 3
-
-
 def test_the_usual_number_is_restored_after_an_error() -> None:
     with pytest.raises(KeyboardInterrupt), threads_at_most(1):
         raise KeyboardInterrupt

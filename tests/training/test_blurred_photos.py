@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -43,23 +42,10 @@ def test_only_the_blurred_photo_weighs_less() -> None:
     assert 0 < float(kept[BLURRED]) < 2**-0.5  # half an octave is the least that counts
 
 
-def test_the_more_a_photo_is_blurred_the_less_it_weighs() -> None:
-    weights = [float(detail_kept(photos(blur))[BLURRED]) for blur in (0.0, 1.5, 3.0)]
-    assert weights[0] == 1
-    assert weights[0] > weights[1] > weights[2]
-
-
 def test_exposure_does_not_count_as_blur() -> None:
     views = photos()
     dark = replace(views[3], frame=replace(views[3].frame, rgb=0.3 * views[3].frame.rgb))
     assert bool((detail_kept([*views[:3], dark, *views[4:]]) == 1).all())
-
-
-@pytest.mark.parametrize("views", [photos(), photos()[:1]])
-def test_captures_without_blurred_photos_have_no_weights(views: Sequence[View]) -> None:
-    assert Supervision(views, BOUNDS, SupervisionConfig()).image_weight is None
-    off = replace(SupervisionConfig(), sharpness=False)
-    assert Supervision(photos(3.0), BOUNDS, off).image_weight is None
 
 
 def test_the_loss_is_that_of_weighted_squares() -> None:

@@ -15,7 +15,7 @@ from bidnerf_adanerf import backend as adanerf
 from bidnerf_core.fields import Rays, RaySamples, Rendering, render, rendering_weights
 from bidnerf_core.frames import SeenLandmarks, View
 from bidnerf_core.scenes import demo_object
-from bidnerf_core.training import RayBank, Silent, TrainingBatch, ray_termination, supervised_loss
+from bidnerf_core.training import RayBank, Silent, TrainingBatch, ray_termination
 
 # Inside: single terms of the loss are compared with their definitions, integrals and differences
 from bidnerf_core.training.loss import distortion, expected_distance
@@ -64,37 +64,12 @@ def test_the_derivative_is_the_numerical_one() -> None:
     )
 
 
-def test_weight_is_pulled_to_where_depth_was_measured() -> None:
-    """Matter at the measured place lowers the term most in thin fog, and the farther from it, the less it does."""
-    slope = by_density(torch.full((10,), 0.01, dtype=torch.float64), 3.25)  # the middle of cell 6
-    assert int(slope.argmin()) == 6
-    assert bool((slope < 0).all())  # any matter beats none: what a ray lacks counts as at the camera
-    assert bool((slope[:7].diff() < 0).all())
-    assert bool((slope[6:].diff() > 0).all())
-
-
-def test_matter_in_front_of_a_surface_is_removed() -> None:
-    density = torch.full((10,), 0.01, dtype=torch.float64)
-    density[6] = 50.0
-    slope = by_density(density, 3.25)
-    assert bool((slope[:6] > 0).all())
-    assert float(slope[7:].abs().max()) < 1e-9  # nobody sees what is behind it
-
-
 def test_a_wall_behind_the_measured_surface_is_moved_forward() -> None:
     density = torch.full((10,), 0.01, dtype=torch.float64)
     density[9] = 50.0
     slope = by_density(density, 3.25)
     assert int(slope.argmin()) == 6
     assert float(slope[6]) < 0
-
-
-def test_rays_without_depth_do_not_count() -> None:
-    density = torch.full((10,), 0.3, dtype=torch.float64)
-    assert float(ray_termination(*ray(density, 0.0))) == 0
-    assert float(by_density(density, 0.0).abs().max()) == 0
-    rendering, batch = ray(density, 3.25)
-    assert supervised_loss(rendering, batch, 2.0, 0.0)[0] == 0
 
 
 def test_the_loss_is_the_mean_over_measured_rays() -> None:
@@ -165,13 +140,6 @@ def test_the_expected_distance_is_the_mean_of_draws(sigma: float) -> None:
     expected = (offset + errors).abs().mean(0)
     found = expected_distance(offset, torch.tensor(sigma, dtype=torch.float64).expand(5))
     torch.testing.assert_close(found, expected, rtol=0, atol=4 * sigma / 200_000**0.5)
-
-
-def test_without_deviation_the_expected_distance_is_the_distance() -> None:
-    offset = torch.linspace(-4, 4, 41, dtype=torch.float64)
-    assert torch.equal(expected_distance(offset, torch.zeros(41, dtype=torch.float64)), offset.abs())
-    barely = expected_distance(offset, torch.full((41,), 1e-9, dtype=torch.float64))
-    torch.testing.assert_close(barely, offset.abs(), rtol=0, atol=1e-8)
 
 
 def test_the_expected_distance_has_the_derivative_that_differences_show() -> None:

@@ -228,16 +228,6 @@ def test_the_schedule_warms_up_and_then_falls_to_its_last_value() -> None:
     assert max(abs(a - b) for a, b in pairwise(factors)) <= 0.0101
 
 
-@pytest.mark.parametrize(("depth_weight", "left"), [(0.1, 0.5), (0.0, 0.8)], ids=["depth", "colour"])
-def test_loss_falls_on_a_closed_form_scene(
-    depth_weight: float, left: float, scene: tuple[list[View], SceneBounds]
-) -> None:
-    report = Kept()
-    trained(scene, report, steps=100, learning_rate=0.02, depth_weight=depth_weight)
-    losses = [progress.loss for progress in report.told]
-    assert sum(losses[-20:]) < left * sum(losses[:20])
-
-
 # Rays of the training views.
 
 
@@ -343,18 +333,6 @@ def test_where_few_pixels_have_depth_a_share_of_the_rays_goes_through_them() -> 
         assert int(here.sum()) > 10
         torch.testing.assert_close(batch.rays.directions[here], seen.directions.expand(int(here.sum()), 3))
     assert len(batch.observed.distance[~measured]) > 250
-
-
-def test_the_same_generator_draws_the_same_rays(generator: torch.Generator) -> None:
-    bank = RayBank(random_views(3, True, True), BOUNDS)
-    state = generator.get_state()
-    one = bank.draw(50, generator)
-    other = bank.draw(50, generator)
-    generator.set_state(state)
-    again = bank.draw(50, generator)
-    assert torch.equal(one.observed.rgb, again.observed.rgb)
-    assert torch.equal(one.background, again.background)
-    assert not torch.equal(one.observed.rgb, other.observed.rgb)
 
 
 def test_a_batch_on_another_device_is_that_of_the_cpu() -> None:
