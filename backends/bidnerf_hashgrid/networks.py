@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -23,22 +23,6 @@ NETWORK_CHUNK = 4096
 
 Layers = list[tuple[Tensor, Tensor]]
 """Weights (out in) and biases (out) of linear layers with ReLUs between them."""
-
-
-class _Networks(NamedTuple):
-    """The layers of both networks, or their gradients."""
-
-    geometry: Layers
-    colour: Layers
-
-
-class _Chunk(NamedTuple):
-    """The activations of both networks for m points: the inputs of their layers, and their results."""
-
-    geometry: list[Tensor]
-    colour: list[Tensor]
-    log_density: Float[Tensor, "m"]
-    rgb: Float[Tensor, "m 3"]
 
 
 def log_density_and_rgb(
@@ -59,9 +43,10 @@ def log_density_and_rgb(
     return found
 
 
-def _networks(flat: Sequence[Tensor], geometry_layers: int) -> _Networks:
+def _networks(flat: Sequence[Tensor], geometry_layers: int) -> tuple[Layers, Layers]:
+    """Return the layers of both networks, or their gradients."""
     layers = list(zip(flat[::2], flat[1::2], strict=True))
-    return _Networks(layers[:geometry_layers], layers[geometry_layers:])
+    return layers[:geometry_layers], layers[geometry_layers:]
 
 
 def _forward(x: Float[Tensor, "m i"], layers: Layers) -> tuple[list[Tensor], Float[Tensor, "m o"]]:
@@ -87,45 +72,23 @@ def _backward(
     return gradient
 
 
-def _evaluate(encoded: Float[Tensor, "m e"], harmonics: Float[Tensor, "m h"], networks: _Networks) -> _Chunk:
-    inputs, features = _forward(encoded, networks.geometry)
-    of_colour, logits = _forward(torch.cat([features[:, 1:], harmonics], dim=-1), networks.colour)
-    return _Chunk(inputs, of_colour, features[:, 0], logits.sigmoid_())
-
-
-def _differentiate(
-    chunk: _Chunk,
-    to_log_density: Float[Tensor, "m"],
-    to_rgb: Float[Tensor, "m 3"],
-    networks: _Networks,
-    to_networks: _Networks | None,
-) -> tuple[Float[Tensor, "m e"], Float[Tensor, "m h"]]:
-    """Return the gradients with respect to the encoding and the harmonics, and write those of the layers to ``to_networks``."""
-    to_logits = to_rgb * (chunk.rgb * (1 - chunk.rgb))
-    gradient = _backward(to_logits, chunk.colour, networks.colour, to_networks and to_networks.colour)
-    passed = len(networks.geometry[-1][1]) - 1  # features passed from one network to the other
-    to_features = torch.cat([to_log_density[:, None], gradient[:, :passed]], dim=-1)
-    to_encoded = _backward(
-        to_features, chunk.geometry, networks.geometry, to_networks and to_networks.geometry
-    )
-    return to_encoded, gradient[:, passed:]
-
-
 class _Evaluate(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, differentiable: bool, geometry_layers: int, encoded: Float[Tensor, "n e"], harmonics: Float[Tensor, "n h"],
         *flat: Tensor,
     ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:  # fmt: skip
-        networks, chunks = _networks(flat, geometry_layers), slices(len(encoded), NETWORK_CHUNK)
+        geometry, colour = _networks(flat, geometry_layers)
+        chunks = slices(len(encoded), NETWORK_CHUNK)
         log_density, rgb = encoded.new_empty(len(encoded)), encoded.new_empty(len(encoded), 3)
         kept: list[list[Tensor]] = [[] for _ in chunks]
 
         def evaluate(chunk: slice, keep: list[Tensor]) -> None:
-            found = _evaluate(encoded[chunk], harmonics[chunk], networks)
-            log_density[chunk], rgb[chunk] = found.log_density, found.rgb
+            of_geometry, features = _forward(encoded[chunk], geometry)
+            of_colour, logits = _forward(torch.cat([features[:, 1:], harmonics[chunk]], dim=-1), colour)
+            log_density[chunk], rgb[chunk] = features[:, 0], logits.sigmoid_()
             if differentiable:
-                keep.extend([*found.geometry[1:], *found.colour])
+                keep.extend([*of_geometry[1:], *of_colour])
 
         tasks = [partial(evaluate, chunk, keep) for chunk, keep in zip(chunks, kept, strict=True)]
         concurrently(tasks, threads_for(len(encoded), encoded.device))
@@ -141,9 +104,10 @@ class _Evaluate(torch.autograd.Function):
         _, _, wants_encoded, wants_harmonics, *wanted = ctx.needs_input_grad
         encoded, rgb, *rest = ctx.saved_tensors
         flat, inputs = rest[: len(wanted)], rest[len(wanted) :]
-        networks, chunks = _networks(flat, ctx.geometry_layers), slices(len(encoded), NETWORK_CHUNK)
+        geometry, colour = _networks(flat, ctx.geometry_layers)
+        chunks, passed = slices(len(encoded), NETWORK_CHUNK), len(geometry[-1][1]) - 1
         each = len(inputs) // max(len(chunks), 1)
-        width = networks.colour[0][0].shape[1] - len(networks.geometry[-1][1]) + 1
+        width = colour[0][0].shape[1] - passed  # of what the geometry does not pass to the colour
         to_encoded = torch.empty_like(encoded) if wants_encoded else None
         to_harmonics = encoded.new_empty(len(encoded), width) if wants_harmonics else None
         sizes = [part.numel() for part in flat]
@@ -153,15 +117,17 @@ class _Evaluate(torch.autograd.Function):
         def differentiate(number: int) -> None:
             own, at = inputs[number * each : (number + 1) * each], chunks[number]
             split = ctx.geometry_layers - 1
-            chunk = _Chunk([encoded[at], *own[:split]], own[split:], to_log_density[at], rgb[at])
-            to_networks = None
+            to_geometry: Layers | None = None
+            to_colour: Layers | None = None
             if sums is not None:
                 rows = [
                     row.view(part.shape) for row, part in zip(sums[number].split(sizes), flat, strict=True)
                 ]
-                to_networks = _networks(rows, ctx.geometry_layers)
-            found = _differentiate(chunk, to_log_density[at], to_rgb[at], networks, to_networks)
-            for target, part in zip((to_encoded, to_harmonics), found, strict=True):
+                to_geometry, to_colour = _networks(rows, ctx.geometry_layers)
+            gradient = _backward(to_rgb[at] * (rgb[at] * (1 - rgb[at])), own[split:], colour, to_colour)
+            to_features = torch.cat([to_log_density[at, None], gradient[:, :passed]], dim=-1)
+            found = _backward(to_features, [encoded[at], *own[:split]], geometry, to_geometry)
+            for target, part in ((to_encoded, found), (to_harmonics, gradient[:, passed:])):
                 if target is not None:
                     target[at] = part
 

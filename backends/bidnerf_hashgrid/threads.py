@@ -71,27 +71,22 @@ def _run(task: Callable[[], None], inference: bool) -> None:
 
 
 def _pool(threads: int) -> ThreadPoolExecutor:
-    with _opening:
-        if threads not in _pools:
-            _pools[threads] = _opened(threads)
-        return _pools[threads]
-
-
-def _opened(threads: int) -> ThreadPoolExecutor:
     """Return a pool whose threads are all running, each limited to one core, so that a fork finds none of
     them starting.
     """
-    all_run = Barrier(threads + 1)
+    with _opening:
+        if threads in _pools:
+            return _pools[threads]
+        all_run, pool = Barrier(threads + 1), ThreadPoolExecutor(threads, "bidnerf-hashgrid")
 
-    def begin() -> None:
-        set_threads_here(1)
+        def begin() -> None:
+            set_threads_here(1)
+            all_run.wait()
+
+        for _ in range(threads):
+            pool.submit(begin)
         all_run.wait()
-
-    pool = ThreadPoolExecutor(threads, "bidnerf-hashgrid")
-    for _ in range(threads):
-        pool.submit(begin)
-    all_run.wait()
-    return pool
+        return _pools.setdefault(threads, pool)
 
 
 def _forget() -> None:

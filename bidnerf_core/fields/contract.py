@@ -255,25 +255,23 @@ class SceneBounds:
     footprint: float = 0.0
 
     def __post_init__(self) -> None:
-        if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
-            raise InputError(
-                f"lower corner {self.lower} is not below upper corner {self.upper}", where="scene bounds"
-            )
-        if not 0 <= self.near < self.far:
-            raise InputError(
-                f"expected 0 <= near < far, got near {self.near}, far {self.far}", where="scene bounds"
-            )
-        if not self.footprint >= 0:
-            raise InputError(f"footprint is {self.footprint}", where="scene bounds", expected="0 or more")
-        if not all(0 <= channel <= 1 for channel in self.background):
-            raise InputError(
-                f"background is {self.background}", where="scene bounds", expected="three numbers in [0, 1]"
-            )
         largest = max(map(abs, (*self.lower, *self.upper, self.far, self.footprint)))
-        if not largest <= LARGEST_LENGTH:
-            raise InputError(
-                f"{largest:g} m is too large", where="scene bounds", expected=f"at most {LARGEST_LENGTH:g} m"
-            )
+        checks = (
+            (
+                all(low < high for low, high in zip(self.lower, self.upper, strict=True)),
+                f"lower corner {self.lower} is not below upper corner {self.upper}", None,
+            ),
+            (0 <= self.near < self.far, f"expected 0 <= near < far, got near {self.near}, far {self.far}", None),
+            (self.footprint >= 0, f"footprint is {self.footprint}", "0 or more"),
+            (
+                all(0 <= channel <= 1 for channel in self.background),
+                f"background is {self.background}", "three numbers in [0, 1]",
+            ),
+            (largest <= LARGEST_LENGTH, f"{largest:g} m is too large", f"at most {LARGEST_LENGTH:g} m"),
+        )  # fmt: skip
+        for holds, found, expected in checks:
+            if not holds:
+                raise InputError(found, where="scene bounds", expected=expected)
 
     @property
     def size(self) -> tuple[float, float, float]:

@@ -239,7 +239,15 @@ def concentrated(
     """Resample rays to ``count`` intervals that are short where the ``weights`` of ``samples`` are large, see ``Concentrated``."""
     length = torch.where(samples.valid, samples.ends - samples.starts, 0)
     laid = pad(length.cumsum(-1), (1, 0))  # borders of the intervals, laid end to end
-    border = _borders(weights, length, laid, count, jitter)
+    # Borders by equal weight and by equal length, in the coordinate of the concatenated intervals.
+    blurred = max_pool1d(weights.reshape(-1, 1, weights.shape[-1]), 3, stride=1, padding=1).view_as(weights)
+    mass = torch.where(length > 0, blurred, 0) + 1e-5 * length / laid[..., -1:].clamp(min=1e-30)
+    cdf = pad(mass.cumsum(-1) / mass.sum(-1, keepdim=True).clamp(min=1e-30), (1, 0))
+    even = max(2, round(EVEN_SHARE * (count + 1)))
+    dense = TAIL + (1 - 2 * TAIL) * _levels(count + 1 - even, laid, jitter)
+    by_weight = _interpolated(dense, cdf, laid)
+    by_length = _levels(even, laid, jitter) * laid[..., -1:]
+    border = torch.cat([by_weight, by_length], dim=-1).sort(dim=-1).values
     middle, half = (border[..., 1:] + border[..., :-1]) / 2, border.diff(dim=-1) / 2
     owner = torch.searchsorted(laid[..., 1:].contiguous(), middle.contiguous()).clamp(
         max=length.shape[-1] - 1
@@ -251,21 +259,6 @@ def concentrated(
     starts = torch.cat([starts[..., :1], torch.maximum(starts[..., 1:], between)], dim=-1)
     ends = torch.cat([torch.minimum(ends[..., :-1], between), ends[..., -1:]], dim=-1)
     return RaySamples(starts, torch.maximum(starts, ends), (half > 0) & samples.valid.any(-1, keepdim=True))
-
-
-def _borders(
-    weights: Float[Tensor, "*r s"], length: Float[Tensor, "*r s"], laid: Float[Tensor, "*r b"], count: int,
-    jitter: Generator | None,
-) -> Float[Tensor, "*r n"]:  # fmt: skip
-    """Return ``count + 1`` borders, by equal weight and by equal length, in the coordinate of the concatenated intervals."""
-    blurred = max_pool1d(weights.reshape(-1, 1, weights.shape[-1]), 3, stride=1, padding=1).view_as(weights)
-    mass = torch.where(length > 0, blurred, 0) + 1e-5 * length / laid[..., -1:].clamp(min=1e-30)
-    cdf = pad(mass.cumsum(-1) / mass.sum(-1, keepdim=True).clamp(min=1e-30), (1, 0))
-    even = max(2, round(EVEN_SHARE * (count + 1)))
-    dense = TAIL + (1 - 2 * TAIL) * _levels(count + 1 - even, laid, jitter)
-    by_weight = _interpolated(dense, cdf, laid)
-    by_length = _levels(even, laid, jitter) * laid[..., -1:]
-    return torch.cat([by_weight, by_length], dim=-1).sort(dim=-1).values
 
 
 def _levels(count: int, like: Float[Tensor, "*r b"], jitter: Generator | None) -> Float[Tensor, "*r n"]:

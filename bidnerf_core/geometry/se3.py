@@ -100,8 +100,7 @@ class SE3:
         ``order`` is ``"xyzw"`` (ROS, TUM, scipy, glTF, Unity) or ``"wxyz"`` (COLMAP, Eigen's constructor,
         Blender, nerfstudio). Raises ``InputError`` for any other value.
         """
-        if order not in get_args(QuaternionOrder):
-            raise InputError(f"order is {order!r}", expected=f"one of {', '.join(get_args(QuaternionOrder))}")
+        _check_order(order)
         found = torch.nn.functional.normalize(rotation_matrix_to_quaternion(self.rotation), dim=-1)
         found = torch.where(found[..., :1] < 0, -found, found)
         return found if order == "wxyz" else found.roll(-1, dims=-1)
@@ -114,8 +113,7 @@ class SE3:
 
         Raises ``InputError`` for a quaternion whose length is 0 or not finite.
         """
-        if order not in get_args(QuaternionOrder):
-            raise InputError(f"order is {order!r}", expected=f"one of {', '.join(get_args(QuaternionOrder))}")
+        _check_order(order)
         length = torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)
         if not bool((length.isfinite() & (length > 0)).all()):
             raise InputError("a quaternion has length 0 or is not finite", expected="a rotation")
@@ -209,6 +207,11 @@ class SE3:
     def cat(batches: list[SE3]) -> SE3:
         """Concatenate batches of transforms along the first axis."""
         return SE3(torch.cat([b.rotation for b in batches]), torch.cat([b.translation for b in batches]))
+
+
+def _check_order(order: str) -> None:
+    if order not in get_args(QuaternionOrder):
+        raise InputError(f"order is {order!r}", expected=f"one of {', '.join(get_args(QuaternionOrder))}")
 
 
 def skew(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
