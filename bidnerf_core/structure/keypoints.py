@@ -6,7 +6,7 @@ EXIF, or a typical one, and is estimated with the poses. A given camera is kept 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +19,6 @@ from bidnerf_core.camera import (
     CameraSource,
     Exif,
     Intrinsics,
-    Orientation,
     Raster,
     camera_from_exif,
     read_exif,
@@ -36,10 +35,6 @@ LARGEST = 1600
 """Pixels along the longer side to which photos are downscaled: more give slightly more accurate poses, but
 take far longer."""
 DETECTOR = Sift(count=4096, largest=LARGEST)
-USUAL_FOCAL = 1.2
-"""Focal length, relative to the image's longer side, of an unknown camera (COLMAP's default)."""
-HALF = 0.5
-"""Opacity below which a pixel shows the background."""
 
 
 @dataclass(frozen=True)
@@ -52,10 +47,6 @@ class ListedPhoto:
     reduced: tuple[int, int]
     exif: Exif
     camera: int = 0  # in the database, from 1
-
-    @property
-    def orientation(self) -> Orientation:
-        return self.exif.orientation
 
 
 @dataclass(frozen=True)
@@ -102,7 +93,7 @@ def _first_guess(photo: ListedPhoto, given: Intrinsics | str | Path | None) -> t
             return camera_from_exif(str(photo.image.file), raster, exif).intrinsics, True
         except InputError:  # cropped after it was taken
             pass
-    return Intrinsics.from_focal(USUAL_FOCAL * max(photo.size), *photo.size), False
+    return Intrinsics.from_focal(1.2 * max(photo.size), *photo.size), False  # COLMAP's default
 
 
 def key(number: int) -> str:
@@ -117,9 +108,13 @@ def write_cameras(database: Any, found: Described, fixed: bool, pycolmap: Any) -
     """Write cameras and photos to an empty database. A camera that is not ``fixed`` has one radial coefficient."""
     with pycolmap.DatabaseTransaction(database):
         for number, intrinsics in found.cameras.items():
-            camera = (
-                to_colmap(intrinsics, number, pycolmap) if fixed else _unknown(intrinsics, number, pycolmap)
-            )
+            camera = to_colmap(intrinsics, number, pycolmap)
+            if not fixed:
+                width, height = intrinsics.width, intrinsics.height
+                camera = pycolmap.Camera(
+                    camera_id=number, model="SIMPLE_RADIAL", width=width, height=height,
+                    params=[intrinsics.fx, width / 2, height / 2, 0.0],
+                )  # fmt: skip
             camera.has_prior_focal_length = found.known_focal[number]
             database.write_camera(camera, use_camera_id=True)
             rig = pycolmap.Rig(rig_id=number)
@@ -133,13 +128,6 @@ def write_cameras(database: Any, found: Described, fixed: bool, pycolmap: Any) -
             database.write_frame(frame, use_frame_id=True)
 
 
-def _unknown(guess: Intrinsics, number: int, pycolmap: Any) -> Any:
-    parameters = [guess.fx, guess.width / 2, guess.height / 2, 0.0]
-    return pycolmap.Camera(
-        camera_id=number, model="SIMPLE_RADIAL", width=guess.width, height=guess.height, params=parameters
-    )
-
-
 def write_keypoints(database: Any, found: Described, pycolmap: Any) -> dict[str, str]:
     """Find the keypoints missing from the database, and return by name why photos could not be decoded.
 
@@ -149,23 +137,23 @@ def write_keypoints(database: Any, found: Described, pycolmap: Any) -> dict[str,
     missing = [photo for photo in found.photos if not database.exists_keypoints(photo.number)]
     done, total = len(found.photos) - len(missing), len(found.photos)
     unusable = dict[str, str]()
-    for photo, keypoints in _detected(missing):
-        if isinstance(keypoints, InputError):
-            unusable[photo.image.name] = _without_file(keypoints, photo.image)
-        else:
-            with pycolmap.DatabaseTransaction(database):
-                _write(database, photo.number, keypoints, pycolmap)
-        done += 1
-        count(done, total)
-    return unusable
-
-
-def _detected(photos: Sequence[ListedPhoto]) -> Iterator[tuple[ListedPhoto, Keypoints | InputError]]:
     with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
         try:
-            yield from zip(photos, pool.map(_keypoints, photos), strict=True)
+            for photo, keypoints in zip(missing, pool.map(_keypoints, missing), strict=True):
+                if isinstance(keypoints, InputError):
+                    unusable[photo.image.name] = _without_file(keypoints, photo.image)
+                else:
+                    kind, found_there = pycolmap.FeatureExtractorType.SIFT, keypoints.descriptors.numpy()
+                    with pycolmap.DatabaseTransaction(database):
+                        database.write_keypoints(photo.number, keypoints.pixels.float().numpy())
+                        database.write_descriptors(
+                            photo.number, pycolmap.FeatureDescriptors(kind, found_there)
+                        )
+                done += 1
+                count(done, total)
         finally:
             pool.shutdown(cancel_futures=True)
+    return unusable
 
 
 def _keypoints(photo: ListedPhoto) -> Keypoints | InputError:
@@ -178,14 +166,8 @@ def _keypoints(photo: ListedPhoto) -> Keypoints | InputError:
     if alpha is None:
         return found
     columns, rows = found.pixels.long().unbind(-1)
-    inside = alpha[rows.clamp(0, alpha.shape[0] - 1), columns.clamp(0, alpha.shape[1] - 1)] > HALF
+    inside = alpha[rows.clamp(0, alpha.shape[0] - 1), columns.clamp(0, alpha.shape[1] - 1)] > 0.5
     return found[inside]
-
-
-def _write(database: Any, number: int, found: Keypoints, pycolmap: Any) -> None:
-    database.write_keypoints(number, found.pixels.float().numpy())
-    descriptors = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, found.descriptors.numpy())
-    database.write_descriptors(number, descriptors)
 
 
 def _without_file(error: InputError, image: SourceImage) -> str:

@@ -7,9 +7,6 @@ from typing import Any
 from bidnerf_core.camera import Intrinsics, colmap_camera, colmap_model
 from bidnerf_core.errors import InputError
 
-NEWEST_NEEDED = "CancellationToken"
-"""A name that exists in pycolmap from 4.2 on, the oldest supported version."""
-
 
 def pycolmap_for(what: str) -> Any:
     """Import pycolmap, silenced. Raises ``InputError``, whose message begins with ``what``, if it is not installed."""
@@ -19,7 +16,7 @@ def pycolmap_for(what: str) -> Any:
         raise InputError(
             "finding the poses of photos needs the extra 'sfm' (pip install 'bidnerf[sfm]')", where=what
         ) from error
-    if not hasattr(pycolmap, NEWEST_NEEDED):
+    if not hasattr(pycolmap, "CancellationToken"):  # which exists from 4.2 on
         raise InputError(
             f"pycolmap is {pycolmap.__version__}",
             where=what,

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from bidnerf_core.captures import up_direction
 from bidnerf_core.errors import amount
@@ -19,45 +19,22 @@ from bidnerf_core.structure.matching import Overlaps
 
 LEAST_PHOTOS = 3
 """Photos in the smallest model: two have a single baseline, which allows no check."""
-LEAST_POINTS = 15
-"""Minimum number of triangulated points that a registered photo observes. COLMAP also registers photos by matches without
-depth, which occur between photos from one place.
-"""
-FEW_KEYPOINTS = 100
-"""Number of keypoints below which an unregistered photo is reported as showing too little."""
-MOST_MODELS = 20
-
-
-@dataclass(frozen=True, eq=False)
-class Models:
-    """The reconstructions of the photos, largest first; parts without overlap have one each."""
-
-    all: list[Any]
-
-    @property
-    def largest(self) -> Any:
-        return self.all[0]
-
-    @property
-    def sizes(self) -> list[int]:
-        """Numbers of photos."""
-        return [model.num_reg_images() for model in self.all]
 
 
 def reconstructed(
     database: Path, folder: Path, found: Described, fixed: bool, threads: int, pycolmap: Any
-) -> Models:
+) -> list[Any]:
     """Reconstruct the photos of a database, keeping their cameras if ``fixed``; models are written to
     ``folder``.
 
-    There may be no model at all.
+    Returns the models, largest first; parts without overlap have one each. There may be no model at all.
     """
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=threads,
         random_seed=0,
         extract_colors=False,
         min_model_size=LEAST_PHOTOS,
-        max_num_models=MOST_MODELS,
+        max_num_models=20,
     )
     if fixed:
         options.constant_cameras = set(found.cameras)
@@ -65,26 +42,23 @@ def reconstructed(
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     total, placed, count = len(found.photos), 0, counter("placing photos", "photos")
 
-    def begin() -> None:
+    def show(number: int) -> None:
         nonlocal placed
-        placed = 2
-        count(placed, total)
-
-    def place() -> None:
-        nonlocal placed
-        placed = min(placed + 1, total)
+        placed = min(number, total)
         count(placed, total)
 
     folder.mkdir(parents=True, exist_ok=True)
     models = pycolmap.incremental_mapping(
-        database, folder, folder, options, initial_image_pair_callback=begin, next_image_callback=place
-    )
+        database, folder, folder, options,
+        initial_image_pair_callback=lambda: show(2), next_image_callback=lambda: show(placed + 1),
+    )  # fmt: skip
+    # COLMAP also registers photos by matches without depth, which occur between photos from one place.
     for model in models.values():
         for number in list(model.reg_image_ids()):
-            if model.image(number).num_points3D < LEAST_POINTS:
+            if model.image(number).num_points3D < 15:
                 model.deregister_frame(model.image(number).frame_id)
     good = [model for model in models.values() if model.num_reg_images() >= LEAST_PHOTOS]
-    return Models(sorted(good, key=lambda model: (-model.num_reg_images(), -model.num_points3D())))
+    return sorted(good, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
 def turn_upright(model: Any, photos: Mapping[int, ListedPhoto], pycolmap: Any) -> None:
@@ -98,28 +72,19 @@ def turn_upright(model: Any, photos: Mapping[int, ListedPhoto], pycolmap: Any) -
         rotations.append(R_world_camera @ upright)
         centres.append(image.projection_center())
     poses = SE3(torch.from_numpy(np.stack(rotations)), torch.from_numpy(np.stack(centres)))
-    R = _rotation_to_z(np.array(up_direction(poses).direction))
+    rotation, _ = Rotation.align_vectors([[0, 0, 1]], [up_direction(poses).direction])
+    R = rotation.as_matrix()
     centre = np.mean(centres, axis=0)
     model.transform(pycolmap.Sim3d(np.concatenate([R, -(R @ centre)[:, None]], axis=1)))
 
 
 def _upright_axes(photo: ListedPhoto) -> tuple[np.ndarray, np.ndarray]:
     """Return the right and up axes of the upright photo, in the camera of the photo as stored (x right, y down)."""
-    turned = photo.orientation
+    turned = photo.exif.orientation
     x, y = (-1.0 if flips else 1.0 for flips in (turned.mirrors_columns, turned.mirrors_rows))
     if turned.transposes:
         return np.array([0.0, y, 0.0]), np.array([-x, 0.0, 0.0])
     return np.array([x, 0.0, 0.0]), np.array([0.0, -y, 0.0])
-
-
-def _rotation_to_z(direction: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation that maps a unit vector to the z axis."""
-    x, y, z = direction
-    if z < -1 + 1e-9:
-        return np.diag([1.0, -1.0, -1.0])
-    cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0.0]])  # of direction x (0, 0, 1)
-    found: np.ndarray = np.eye(3) + cross + cross @ cross / (1 + z)
-    return found
 
 
 def full_size(model: Any, photos: Mapping[int, ListedPhoto]) -> None:
@@ -137,32 +102,23 @@ def full_size(model: Any, photos: Mapping[int, ListedPhoto]) -> None:
 
 
 def left_out(
-    found: Described, models: Models, overlaps: Overlaps, keypoints: Mapping[int, int]
+    found: Described, models: list[Any], overlaps: Overlaps, keypoints: Mapping[int, int]
 ) -> dict[str, str]:
     """Return by name why photos are in no model, or not in the largest; ``keypoints`` are their numbers of keypoints."""
-    of_model = {
-        number: place
-        for place, model in reversed(list(enumerate(models.all)))
-        for number in model.reg_image_ids()
-    }
+    of_model = {number: model for model in reversed(models) for number in model.reg_image_ids()}
     reasons = dict(found.unusable)
     for photo in found.photos:
-        place = of_model.get(photo.number)
-        if place != 0:
-            reasons[photo.image.name] = _reason(
-                photo, None if place is None else models.sizes[place], overlaps, keypoints
-            )
+        model, partners = of_model.get(photo.number), overlaps.partners[photo.number]
+        count = keypoints.get(photo.number, 0)
+        if model is models[0]:
+            continue
+        reason = f"overlaps with {amount(partners, 'other photo')}, but too little with the placed ones"
+        if model is not None:
+            size = amount(model.num_reg_images(), "photo")
+            reason = f"belongs to another model, with {size}, that has no connection to the largest"
+        elif not partners and count < 100:
+            reason = f"has only {amount(count, 'keypoint')}: a plain surface, blurred, or dark"
+        elif not partners:
+            reason = "overlaps with no other photo, judging by its keypoints"
+        reasons[photo.image.name] = reason
     return reasons
-
-
-def _reason(photo: ListedPhoto, model: int | None, overlaps: Overlaps, keypoints: Mapping[int, int]) -> str:
-    count, partners = keypoints.get(photo.number, 0), overlaps.partners[photo.number]
-    if model is not None:
-        return (
-            f"belongs to another model, with {amount(model, 'photo')}, that has no connection to the largest"
-        )
-    if not partners and count < FEW_KEYPOINTS:
-        return f"has only {amount(count, 'keypoint')}: a plain surface, blurred, or dark"
-    if not partners:
-        return "overlaps with no other photo, judging by its keypoints"
-    return f"overlaps with {amount(partners, 'other photo')}, but too little with the placed ones"

@@ -12,22 +12,17 @@ from bidnerf_core.progress import counter
 from bidnerf_core.structure.keypoints import key
 from bidnerf_core.structure.pairs import Pairs
 
-FIRST_BATCH, BATCH_SECONDS = 32, 2.0
-"""Number of pairs in the first uninterruptible batch, and duration (seconds) of later batches."""
-FROM_ONE_PLACE = ("PANORAMIC", "PLANAR_OR_PANORAMIC")
-"""Configurations of pairs without parallax."""
-
 
 def match(database: Path, numbers: Sequence[int], pairs: Pairs, threads: int, pycolmap: Any) -> None:
     """Match the ``pairs`` of photos that are missing from the database; ``numbers`` are the photos' numbers
     there.
 
-    Matches found until the job is cancelled are stored.
+    Matches found until the job is cancelled are stored. A batch, which cannot be interrupted, takes about two seconds.
     """
     count = counter("matching photos", "pairs")
     with pycolmap.Database.open(database) as stored:
         todo = [(i, j) for i, j in pairs if not stored.exists_two_view_geometry(numbers[i], numbers[j])]
-    done, size = len(pairs) - len(todo), FIRST_BATCH
+    done, size = len(pairs) - len(todo), 32
     matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
@@ -42,7 +37,7 @@ def match(database: Path, numbers: Sequence[int], pairs: Pairs, threads: int, py
             device=pycolmap.Device.cpu,
         )  # fmt: skip
         each = (time.monotonic() - began) / len(batch)
-        size = max(1, min(2 * size, round(BATCH_SECONDS / max(each, 1e-6))))
+        size = max(1, min(2 * size, round(2 / max(each, 1e-6))))
         done += len(batch)
         count(done, len(pairs))
 
@@ -53,15 +48,13 @@ class Overlaps:
     def __init__(self, database: Any, pycolmap: Any) -> None:
         self.partners: Counter[int] = Counter()  # number of photos that each overlaps with, by number
         self.pairs = self.from_one_place = 0
-        still = [int(getattr(pycolmap.TwoViewGeometryConfiguration, name)) for name in FROM_ONE_PLACE]
+        still = [
+            int(getattr(pycolmap.TwoViewGeometryConfiguration, name))
+            for name in ("PANORAMIC", "PLANAR_OR_PANORAMIC")
+        ]
         for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
             if not len(geometry.inlier_matches):
                 continue
             self.partners.update(pycolmap.pair_id_to_image_pair(pair))
             self.pairs += 1
             self.from_one_place += int(geometry.config) in still
-
-    @property
-    def without_parallax(self) -> bool:
-        """Whether most pairs look as if the camera had only rotated."""
-        return self.pairs > 0 and self.from_one_place > self.pairs / 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import logging
 import time
@@ -18,20 +19,18 @@ from bidnerf_core.datasets import is_video
 from bidnerf_core.errors import Cancelled, InputError, InputWarning, amount
 from bidnerf_core.io import output_folder, write_file
 from bidnerf_core.progress import Cancel, ProgressCallback, job_context
-from bidnerf_core.structure import video_frames
 from bidnerf_core.structure.agreement import agreement
 from bidnerf_core.structure.keypoints import Described, described, write_cameras, write_keypoints
 from bidnerf_core.structure.library import pycolmap_for
 from bidnerf_core.structure.mapping import (
     LEAST_PHOTOS,
-    Models,
     full_size,
     left_out,
     reconstructed,
     turn_upright,
 )
 from bidnerf_core.structure.matching import Overlaps, match
-from bidnerf_core.structure.pairs import Pairs, all_pairs, chosen_pairs, few
+from bidnerf_core.structure.pairs import Pairs, chosen_pairs, few
 from bidnerf_core.structure.record import (
     DATABASE,
     FRAMES,
@@ -39,11 +38,10 @@ from bidnerf_core.structure.record import (
     FoundPoses,
     LeftOut,
     begin,
-    begun_with,
+    begun,
     clear,
     digest,
     give_up,
-    gives_way,
     is_ours,
     read_found,
     relative,
@@ -53,10 +51,9 @@ from bidnerf_core.structure.record import (
     write_found,
 )
 from bidnerf_core.structure.sources import SourceImage, photos_of, refuse_panoramas
+from bidnerf_core.structure.video_frames import chosen, measured, write_frames
 
 log = logging.getLogger("bidnerf")
-
-GOOD_PHOTOS = "photos that overlap by two thirds, taken while moving sideways"
 
 
 def find_poses(
@@ -89,7 +86,9 @@ def find_poses(
     source, folder = Path(photos), Path(out)
     pycolmap = pycolmap_for(str(source))
     images = [] if is_video(source) else photos_of(source, folder)
-    inputs = digest([image.file for image in images] or [_video(source)], camera)
+    if not images and not source.is_file():
+        raise InputError("no such file", where=source, expected="a video or a folder of photos")
+    inputs = digest([image.file for image in images] or [source], camera)
     known = found_before(folder, inputs, overwrite) if reuse or not overwrite else None
     if known is not None:
         log.info(f"{folder}: already has the poses of these photos")
@@ -123,21 +122,15 @@ def found_before(folder: Path, inputs: str, overwrite: bool) -> FoundPoses | Non
     return known if known is not None and known.inputs == inputs else None
 
 
-def _video(path: Path) -> Path:
-    if not path.is_file():
-        raise InputError("no such file", where=path, expected="a video or a folder of photos")
-    return path
-
-
 @contextlib.contextmanager
 def _folder(out: Path, inputs: str, overwrite: bool) -> Iterator[None]:
     """Hold the lock of the pose folder, which is empty, or holds interrupted work on the same photos."""
-    goes_on = begun_with(out) == inputs or gives_way(out)
+    goes_on = begun(out).get("inputs") == inputs or begun(out).get("failed") is True
 
     def describe(folder: Path) -> str | None:
         if (folder / RECORD).exists():
             return "holds the poses of other photos"
-        return "holds interrupted work on other photos" if begun_with(folder) else None
+        return "holds interrupted work on other photos" if begun(folder).get("inputs") else None
 
     with output_folder(out, overwrite, lambda file: goes_on and is_ours(file), describe):
         yield
@@ -166,7 +159,10 @@ class _Search:
             images = self._frames()
         found = self._described(images)
         keypoints = self._keypoints(found)
-        self._match(found, keypoints, ordered)
+        numbers = [photo.number for photo in found.photos]
+        pairs = self._pairs(numbers, ordered)
+        pairs = [(i, j) for i, j in pairs if keypoints[numbers[i]] and keypoints[numbers[j]]]
+        match(self._database, numbers, pairs, self._threads, self._pycolmap)
         models = reconstructed(
             self._database,
             self._work / "models",
@@ -177,8 +173,12 @@ class _Search:
         )
         with self._pycolmap.Database.open(self._database) as database:
             overlaps = Overlaps(database, self._pycolmap)
-        if not models.all:
-            raise InputError(f"{_unplaced(found, overlaps)};", where=self._source, expected=GOOD_PHOTOS)
+        if not models:
+            raise InputError(
+                f"{_unplaced(found, overlaps)};",
+                where=self._source,
+                expected="photos that overlap by two thirds, taken while moving sideways",
+            )
         return self._written(images, found, models, left_out(found, models, overlaps, keypoints))
 
     def _frames(self) -> list[SourceImage]:
@@ -187,12 +187,12 @@ class _Search:
         known = stored_rows(listed, tuple[str, str, float])
         if known is not None and all(Path(file).is_file() for _, file, _ in known):
             return [SourceImage(name, Path(file), at) for name, file, at in known]
-        measures = video_frames.measured(self._source)
-        wanted = video_frames.chosen(measures)
+        measures = measured(self._source)
+        wanted = chosen(measures)
         log.info(
             f"{self._source}: {len(wanted)} of {amount(len(measures), 'frame')} chosen by motion and sharpness"
         )
-        images = video_frames.write_frames(self._source, self._folder / FRAMES, wanted)
+        images = write_frames(self._source, self._folder / FRAMES, wanted)
         rows = [[image.name, str(image.file), image.time] for image in images]
         write_file(listed, json.dumps(rows).encode())
         return images
@@ -232,15 +232,9 @@ class _Search:
             self._require_enough(found, len(found.photos) + len(found.unusable))
             return {photo.number: database.num_keypoints_for_image(photo.number) for photo in found.photos}
 
-    def _match(self, found: Described, keypoints: dict[int, int], ordered: bool) -> None:
-        numbers = [photo.number for photo in found.photos]
-        pairs = self._pairs(numbers, ordered)
-        pairs = [(i, j) for i, j in pairs if keypoints[numbers[i]] and keypoints[numbers[j]]]
-        match(self._database, numbers, pairs, self._threads, self._pycolmap)
-
     def _pairs(self, numbers: list[int], ordered: bool) -> Pairs:
         if few(len(numbers), ordered):
-            return all_pairs(len(numbers))
+            return list(itertools.combinations(range(len(numbers)), 2))
         stored = self._work / "pairs.json"
         pairs = stored_rows(stored, tuple[int, int])
         if pairs is None:
@@ -251,12 +245,12 @@ class _Search:
         return pairs
 
     def _written(
-        self, images: list[SourceImage], found: Described, models: Models, reasons: dict[str, str]
+        self, images: list[SourceImage], found: Described, models: list[Any], reasons: dict[str, str]
     ) -> FoundPoses:
-        photos, model = {photo.number: photo for photo in found.photos}, models.largest
+        photos, model = {photo.number: photo for photo in found.photos}, models[0]
         error = model.compute_mean_reprojection_error()
         with self._pycolmap.Database.open(self._database) as database:
-            found_in = agreement(model, database, self._pycolmap)
+            sure, contradicting = agreement(model, database, self._pycolmap)
         turn_upright(model, photos, self._pycolmap)
         full_size(model, photos)
         base = self._folder / FRAMES if is_video(self._source) else self._source
@@ -268,10 +262,10 @@ class _Search:
             if image.name in reasons
         ]
         result = FoundPoses(
-            self._source.name, len(images), model.num_reg_images(), tuple(models.sizes), tuple(left), model.num_points3D(),
+            self._source.name, len(images), model.num_reg_images(), tuple(each.num_reg_images() for each in models), tuple(left), model.num_points3D(),
             error, round(time.monotonic() - self._began, 1), self._inputs, self._pycolmap.__version__,
-            is_video(self._source), found_in.pairs, found_in.contradicting,
-            sum(photos[number].orientation != UPRIGHT for number in model.reg_image_ids()),
+            is_video(self._source), sure, contradicting,
+            sum(photos[number].exif.orientation != UPRIGHT for number in model.reg_image_ids()),
         )  # fmt: skip
         write_found(self._folder, result)
         for line in str(result).splitlines():
@@ -286,6 +280,6 @@ def _unplaced(found: Described, overlaps: Overlaps) -> str:
     of = f"no three of {amount(len(found.photos), 'photo')} could be placed"
     if not overlaps.pairs:
         return f"{of}: no two of them overlap enough"
-    if overlaps.without_parallax:
+    if overlaps.from_one_place > overlaps.pairs / 2:  # as if the camera had only rotated
         return f"{of}: they seem to be taken from one place, which does not determine distances"
     return f"{of}, although {amount(overlaps.pairs, 'pair')} overlap"

@@ -31,12 +31,6 @@ Row = TypeVar("Row")
 RECORD, TRANSFORMS, WORK, MODEL, FRAMES = "poses.json", "transforms.json", "work", "sparse/0", "images"
 DATABASE = "database.db"
 """The file of keypoints and matches in the work folder."""
-MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
-FRAME_FILE = re.compile(r"\d{6,}\.jpg")
-CONTRADICTING = 0.005
-"""Fraction of contradicting pairs, among those with many matches, above which poses are doubtful; repeated details cause a few."""
-LARGEST_NAMED = 5
-"""Number of photos named in a remark."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +71,11 @@ class FoundPoses:
 
     @property
     def doubt(self) -> str | None:
-        """Why the poses may be wrong as a whole, with a remedy; None if there is no sign of that."""
-        if self.contradicting <= CONTRADICTING * self.sure_pairs:
+        """Why the poses may be wrong as a whole, with a remedy; None if there is no sign of that.
+
+        Repeated details cause a few contradicting pairs among those with many matches.
+        """
+        if self.contradicting <= 0.005 * self.sure_pairs:
             return None
         return (
             f"{self.contradicting} of {self.sure_pairs} pairs of photos that share many keypoints contradict the poses found:"
@@ -101,10 +98,9 @@ class FoundPoses:
                 f"{amount(self.turned, 'photo')} turned by EXIF: the dataset has the cameras of the images as stored, while"
                 " a photo is localized upright"
             )
-        lines += [f"left out {left.photo}: {left.reason}" for left in self.left_out[:LARGEST_NAMED]]
-        more = len(self.left_out) - LARGEST_NAMED
-        if more > 0:
-            lines.append(f"left out {more} more, see {RECORD}")
+        lines += [f"left out {left.photo}: {left.reason}" for left in self.left_out[:5]]
+        if len(self.left_out) > 5:
+            lines.append(f"left out {len(self.left_out) - 5} more, see {RECORD}")
         return "\n".join(lines)
 
 
@@ -124,16 +120,6 @@ def read_found(folder: Path) -> FoundPoses | None:
     )
 
 
-def begun_with(folder: Path) -> str | None:
-    """Return the digest of the photos with which interrupted work in a folder began, or None if there is none."""
-    return _begun(folder).get("inputs")
-
-
-def gives_way(folder: Path) -> bool:
-    """Return whether the work in a folder ended without poses, so that work on other photos may replace it."""
-    return _begun(folder).get("failed") is True
-
-
 def give_up(folder: Path) -> None:
     """Mark the work in a folder as failed: its keypoints and matches are kept for another attempt with the same photos.
 
@@ -142,7 +128,7 @@ def give_up(folder: Path) -> None:
     if not (folder / WORK / DATABASE).exists():
         clear(folder)
         return
-    content = json.dumps(_begun(folder) | {"failed": True})
+    content = json.dumps(begun(folder) | {"failed": True})
     write_file(folder / WORK / "begun.json", content.encode())
 
 
@@ -174,7 +160,10 @@ def stored_rows(file: Path, kind: type[Row]) -> list[Row] | None:
     return rows
 
 
-def _begun(folder: Path) -> dict[str, Any]:
+def begun(folder: Path) -> dict[str, Any]:
+    """Return the state of interrupted work in a folder: the digest of its ``inputs``, whether they are a ``video``, and whether it
+    ``failed``, so that work on other photos may replace it.
+    """
     try:
         found = read_json(folder / WORK / "begun.json", "the state of interrupted work")
     except InputError:
@@ -188,7 +177,7 @@ def begin(folder: Path, inputs: str, video: bool) -> Path:
     Raises ``InputError`` if the frames of a video would be written among other images.
     """
     work = folder / WORK
-    if begun_with(folder) != inputs:
+    if begun(folder).get("inputs") != inputs:
         clear(folder)
         if video and (folder / FRAMES).exists():
             raise InputError(
@@ -203,7 +192,7 @@ def begin(folder: Path, inputs: str, video: bool) -> Path:
 def is_ours(file: Path) -> bool:
     """Return whether a file or folder in a pose folder was written by this module."""
     if file.name == FRAMES:
-        return file.is_dir() and all(FRAME_FILE.fullmatch(each.name) for each in file.iterdir())
+        return file.is_dir() and all(re.fullmatch(r"\d{6,}\.jpg", each.name) for each in file.iterdir())
     return file.name in (RECORD, TRANSFORMS, WORK, MODEL.partition("/")[0])
 
 
@@ -212,20 +201,16 @@ def clear(folder: Path) -> None:
     name as the frames folder.
     """
     (folder / TRANSFORMS).unlink(missing_ok=True)  # first: without it, the record counts as incomplete
-    if _has_frames(folder) and (folder / FRAMES).is_dir() and is_ours(folder / FRAMES):
-        shutil.rmtree(folder / FRAMES)
-    (folder / RECORD).unlink(missing_ok=True)
-    shutil.rmtree(folder / WORK, ignore_errors=True)
-    for name in MODEL_FILES:
-        (folder / MODEL / name).unlink(missing_ok=True)
-
-
-def _has_frames(folder: Path) -> bool:
-    """Return whether video frames were written into a pose folder."""
     record: Any = {}
     with contextlib.suppress(InputError):
         record = read_json(folder / RECORD, "the record of found poses")
-    return any(isinstance(part, dict) and part.get("video") is True for part in (record, _begun(folder)))
+    of_video = any(isinstance(part, dict) and part.get("video") is True for part in (record, begun(folder)))
+    if of_video and (folder / FRAMES).is_dir() and is_ours(folder / FRAMES):
+        shutil.rmtree(folder / FRAMES)
+    (folder / RECORD).unlink(missing_ok=True)
+    shutil.rmtree(folder / WORK, ignore_errors=True)
+    for name in ("cameras", "frames", "images", "points3D", "rigs"):
+        (folder / MODEL / f"{name}.bin").unlink(missing_ok=True)
 
 
 def write_dataset(
@@ -240,7 +225,8 @@ def write_dataset(
         photo, image = photos[number], model.image(number)
         image.name = names[number]
         camera = from_colmap(model.camera(image.camera_id))
-        T_world_camera = _pose(image.cam_from_world()).inverse()
+        matrix = torch.from_numpy(image.cam_from_world().matrix()).double()
+        T_world_camera = SE3(matrix[:, :3].clone(), matrix[:, 3].clone()).inverse()
         place = relative(photo.image.file, folder)
         entries.append(frame_entry(place, photo.image.name, camera, T_world_camera, photo.image.time))
     (folder / MODEL).mkdir(parents=True, exist_ok=True)
@@ -263,8 +249,3 @@ def relative(file: Path, folder: Path) -> str:
         return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
     except ValueError:
         return file.resolve().as_posix()
-
-
-def _pose(rigid: Any) -> SE3:
-    matrix = torch.from_numpy(rigid.matrix()).double()
-    return SE3(matrix[:, :3].clone(), matrix[:, 3].clone())

@@ -13,11 +13,6 @@ from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.frames import natural_order, photos_in
 from bidnerf_core.io import open_binary, read_header
 
-XMP = 2**18
-"""First bytes of a photo, which contain its XMP: a segment has at most 64 KiB, and EXIF precedes it."""
-NOT_PHOTOS = ("depth", "depths", "mask", "masks", "confidence", "conf", "thumbnails")
-"""Names of folders whose images are not photos."""
-
 
 @dataclass(frozen=True)
 class SourceImage:
@@ -111,7 +106,9 @@ def refuse_panoramas(photos: Sequence[SourceImage]) -> None:
             continue
         wide += 1
         with open_binary(photo.file, "a photo") as file:
-            if b"equirectangular" in file.read(XMP):
+            if b"equirectangular" in file.read(
+                2**18
+            ):  # XMP: a segment has at most 64 KiB, and EXIF precedes it
                 expected = (
                     "poses with camera_model EQUIRECTANGULAR in transforms.json, or pinhole views cut from it"
                 )
@@ -128,15 +125,11 @@ def _below(folder: Path, out: Path | None) -> Iterator[Path]:
             name
             for name in inside
             if not name.startswith(".")
-            and name.lower() not in NOT_PHOTOS
-            and not _same(Path(place, name), out)
+            and name.lower() not in ("depth", "depths", "mask", "masks", "confidence", "conf", "thumbnails")
+            and not (out is not None and out.exists() and Path(place, name).samefile(out))
         )
         if Path(place) != folder:
             if find_reader(Path(place)) is not None:
                 inside.clear()
                 continue
             yield from photos_in(place)[0]
-
-
-def _same(folder: Path, out: Path | None) -> bool:
-    return out is not None and out.exists() and folder.samefile(out)

@@ -10,8 +10,8 @@ turns.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -25,53 +25,61 @@ from bidnerf_core.structure.sources import SourceImage
 
 STEP = 0.04
 """Image motion between chosen frames, in diagonals."""
-ANCHOR = 0.02
-"""Image motion, in diagonals, after which corners are redetected."""
 MOST = 400
 """Largest number of chosen frames: longer videos use longer steps."""
-WINDOW = 0.3
-"""Fraction of a step on either side within which the sharpest frame is chosen."""
-LEAST_TRACKED = 0.5
-"""Fraction of the corners that must still be tracked."""
-CORNERS, QUALITY, APART = 200, 0.01, 7
-"""Number of corners, their minimum quality relative to the best, and their minimum distance in pixels (Shi
-and Tomasi 1994)."""
-WIDTH = 320
-"""Pixels along the longer side of the images in which corners are tracked."""
-JPEG_QUALITY = 95
+
+Measure: TypeAlias = tuple[float, float]
+"""The accumulated motion (diagonals) until a frame, and its sharpness (octaves)."""
 
 
-@dataclass(frozen=True)
-class FrameMeasure:
-    """The time of a frame (seconds), the accumulated motion until then (diagonals), and its sharpness (octaves)."""
+def measured(video: Path) -> list[Measure]:
+    """Measure each frame of a video.
 
-    time: float
-    motion: float
-    sharpness: float
-
-
-def measured(video: Path) -> list[FrameMeasure]:
-    """Measure each frame of a video."""
+    Up to 200 corners (Shi and Tomasi 1994) are tracked in images of at most 320 pixels a side, from an anchor frame until they have
+    moved by two percent of the diagonal or half of them are lost.
+    """
     count = counter("measuring frames", "frames")
-    frames = Video(video)
+    frames, found = Video(video), list[Measure]()
     total = len(frames)
-    path, found = _Motion(), list[FrameMeasure]()
-    for time, pixels in frames:
-        grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
-        found.append(FrameMeasure(time, path.advance(_small(grey)), sharpness(grey.astype(np.float32) / 255)))
+    before: np.ndarray | None = None
+    points = start = np.zeros((0, 1, 2), np.float32)
+    corners, until_anchor, motion = 0, 0.0, 0.0
+    for _, pixels in frames:
+        whole = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+        size = reduced_size(whole.shape[1], whole.shape[0], 320)
+        grey = whole if size == whole.shape[::-1] else cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
+        is_anchor = not len(points)
+        if before is not None and is_anchor:  # nothing to track: unknown motion, assumed to be one step
+            motion += STEP
+        elif before is not None:
+            moved, kept, _ = cv2.calcOpticalFlowPyrLK(before, grey, points, np.empty_like(points))
+            ok = kept.reshape(-1) == 1
+            points, start = moved[ok], start[ok]
+            if len(points):
+                away = float(np.median(np.linalg.norm(points - start, axis=-1))) / float(
+                    np.hypot(*grey.shape)
+                )
+                motion = max(motion, until_anchor + away)
+                is_anchor = away > 0.02 or len(points) < 0.5 * corners
+        if is_anchor:
+            until_anchor = motion
+            detected = cv2.goodFeaturesToTrack(grey, 200, 0.01, 7)  # quality, distance (pixels)
+            points = start = np.zeros((0, 1, 2), np.float32) if detected is None else np.asarray(detected)
+            corners = len(points)
+        before = grey
+        found.append((motion, sharpness(whole.astype(np.float32) / 255)))
         count(min(len(found), total), total)
     return found
 
 
-def chosen(frames: Sequence[FrameMeasure]) -> list[int]:
+def chosen(frames: Sequence[Measure]) -> list[int]:
     """Return the indices of the frames to place: one for each step of motion, the sharpest near it."""
-    motion = np.array([frame.motion for frame in frames])
-    sharp = np.array([frame.sharpness for frame in frames])
+    motion, sharp = np.array(frames).T
     step = max(STEP, float(motion[-1]) / (MOST - 1))
     found = set[int]()
     for place in np.arange(round(float(motion[-1]) / step) + 1) * step:
         away = np.abs(motion - place)
-        near = np.flatnonzero(away <= WINDOW * step)
+        near = np.flatnonzero(away <= 0.3 * step)
         found.add(int(near[sharp[near].argmax()]) if len(near) else int(away.argmin()))
     return sorted(found)
 
@@ -83,59 +91,9 @@ def write_frames(video: Path, folder: Path, wanted: Sequence[int]) -> list[Sourc
     for number, (time, pixels) in enumerate(Video(video)):
         if number in asked:
             image = SourceImage(f"{number:06d}", folder / f"{number:06d}.jpg", time)
-            Image.fromarray(pixels).save(image.file, quality=JPEG_QUALITY, subsampling=0)
+            Image.fromarray(pixels).save(image.file, quality=95, subsampling=0)
             found.append(image)
             count(len(found), len(asked))
         if len(found) == len(asked):
             break
     return found
-
-
-class _Motion:
-    """The accumulated image motion, in diagonals."""
-
-    def __init__(self) -> None:
-        self._before: np.ndarray | None = None
-        self._points: np.ndarray = np.zeros((0, 1, 2), np.float32)
-        self._start = self._points
-        self._found = 0
-        self._until_anchor = self._total = 0.0
-
-    def advance(self, grey: np.ndarray) -> float:
-        """Return the motion up to the next frame."""
-        if self._before is None:
-            self._anchor(grey)
-        elif not len(self._points):  # nothing to track: unknown motion, assumed to be one step
-            self._until_anchor = self._total = self._total + STEP
-            self._anchor(grey)
-        else:
-            self._follow(grey)
-        self._before = grey
-        return self._total
-
-    def _anchor(self, grey: np.ndarray) -> None:
-        found = cv2.goodFeaturesToTrack(grey, CORNERS, QUALITY, APART)
-        self._points = np.zeros((0, 1, 2), np.float32) if found is None else np.asarray(found)
-        self._start = self._points
-        self._found = len(self._points)
-
-    def _follow(self, grey: np.ndarray) -> None:
-        assert self._before is not None
-        moved, kept, _ = cv2.calcOpticalFlowPyrLK(
-            self._before, grey, self._points, np.empty_like(self._points)
-        )
-        ok = kept.reshape(-1) == 1
-        self._points, self._start = moved[ok], self._start[ok]
-        diagonal = float(np.hypot(*grey.shape))
-        if not len(self._points):
-            return
-        away = float(np.median(np.linalg.norm(self._points - self._start, axis=-1))) / diagonal
-        self._total = max(self._total, self._until_anchor + away)
-        if away > ANCHOR or len(self._points) < LEAST_TRACKED * self._found:
-            self._until_anchor = self._total
-            self._anchor(grey)
-
-
-def _small(grey: np.ndarray) -> np.ndarray:
-    size = reduced_size(grey.shape[1], grey.shape[0], WIDTH)
-    return grey if size == grey.shape[::-1] else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)

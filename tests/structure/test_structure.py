@@ -29,14 +29,14 @@ from bidnerf_core.maps.training import posed_images, poses_folder
 from bidnerf_core.progress import Progress
 from bidnerf_core.results import pose_error
 from bidnerf_core.structure import FoundPoses, lacks_poses
-from bidnerf_core.structure.agreement import Agreement, agreement
+from bidnerf_core.structure.agreement import agreement
 from bidnerf_core.structure.keypoints import described
 from bidnerf_core.structure.library import from_colmap, to_colmap
 from bidnerf_core.structure.pairs import ALL_OF_FRAMES, ALL_OF_PHOTOS, NEIGHBOURS, chosen_pairs, few
 from bidnerf_core.structure.poses import found_before
 from bidnerf_core.structure.record import begin, clear, stored_rows
 from bidnerf_core.structure.sources import SourceImage, photos_of
-from bidnerf_core.structure.video_frames import MOST, STEP, FrameMeasure, chosen, measured, write_frames
+from bidnerf_core.structure.video_frames import MOST, STEP, chosen, measured, write_frames
 from commands import Run
 from photo_files import write_photo
 from photo_room import CAMERA, looking, photograph, walk, write_photos
@@ -343,7 +343,7 @@ def test_upright_axes_are_those_of_the_turned_image(tmp_path: Path) -> None:
 
     stored = torch.zeros(4, 6)
     for code in range(1, 9):
-        orientation = bn_photo(tmp_path, code).orientation
+        orientation = bn_photo(tmp_path, code).exif.orientation
         for axis, pixel in zip(_upright_axes(bn_photo(tmp_path, code)), ((0, -1), (0, 0)), strict=True):
             image = stored.clone()
             v, u = (
@@ -386,11 +386,11 @@ def test_few_photos_are_matched_with_all_and_many_with_neighbours_and_those_that
 
 
 def test_frames_are_chosen_at_equal_steps_of_motion_the_sharpest_near_each() -> None:
-    still = [FrameMeasure(n / 30, 0.0, 0.0) for n in range(20)]
+    still = [(0.0, 0.0)] * 20
     assert chosen(still) == [0]
-    moving = [FrameMeasure(n / 30, 0.1 * STEP * n, -float(n % 10 != 1)) for n in range(101)]
+    moving = [(0.1 * STEP * n, -float(n % 10 != 1)) for n in range(101)]
     assert chosen(moving) == [1, 11, 21, 31, 41, 51, 61, 71, 81, 91, 98]
-    long = [FrameMeasure(float(n), STEP * n, 0.0) for n in range(3 * MOST)]
+    long = [(STEP * n, 0.0) for n in range(3 * MOST)]
     assert MOST / 2 < len(chosen(long)) <= MOST
 
 
@@ -412,8 +412,8 @@ def test_a_video_is_thinned_by_its_motion_and_not_by_its_shaking(tmp_path: Path)
         container.mux(stream.encode())
     measures = measured(tmp_path / "clip.mp4")
     assert len(measures) == len(poses)
-    rest = measures[35].motion - measures[16].motion
-    assert rest < 0.2 * measures[-1].motion
+    rest = measures[35][0] - measures[16][0]
+    assert rest < 0.2 * measures[-1][0]
     frames = chosen(measures)
     assert sum(16 <= number < 36 for number in frames) <= 2
     assert sum(number % 3 == 1 for number in frames) <= len(frames) / 6
@@ -471,10 +471,10 @@ def test_pairs_with_many_matches_tell_a_folded_model() -> None:
             camera=lambda number: camera,
         )
 
-    assert agreement(model(true), database, pycolmap) == Agreement(2, 0)
+    assert agreement(model(true), database, pycolmap) == (2, 0)
     folded = true | {3: pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, 0.6, 0])), [-1.5, 0.5, 0])}
-    assert agreement(model(folded), database, pycolmap) == Agreement(2, 1)
-    assert agreement(model({1: true[1], 3: folded[3]}), database, pycolmap) == Agreement(0, 0)
+    assert agreement(model(folded), database, pycolmap) == (2, 1)
+    assert agreement(model({1: true[1], 3: folded[3]}), database, pycolmap) == (0, 0)
 
 
 def test_poses_that_many_pairs_contradict_are_doubted(search: Search) -> None:
