@@ -7,7 +7,7 @@ from .accept import features as features
 from .accept import judge as judge
 from .adam import AdamSteps as AdamSteps
 from .advice import ADVICE as ADVICE
-from .auto import localization_of as localization_of
+from .auto import localize_by_landmarks as localize_by_landmarks
 from .by_rays import RayTerms as RayTerms
 from .by_surface import is_blank as is_blank
 from .corrector import Corrector as Corrector

@@ -28,10 +28,6 @@ from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.settings import AutoConfig
 from bidnerf_core.mapping import true_intrinsics
 
-TEXTURED = 150
-"""Matches of a usual image of the map from which an image without recognised landmarks shows something else."""
-IN_FRONT = 0.9
-"""Minimum fraction of an occluder's points that must lie in front of the surface."""
 FINAL = (Outcome.MISCALIBRATED, Outcome.MIRRORED, Outcome.AMBIGUOUS)
 """Outcomes of a pose by landmarks that no other measurement can correct."""
 
@@ -55,7 +51,15 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     if problem.matcher is None and problem.surface is not None and not (found.converged or is_blank):
         found = replace(found, reason=f"{found.reason}; the map has no landmarks ('bidnerf bake' makes them)")
     found = replace(found, seconds=time.perf_counter() - began)
-    return found if config.risk is None else within_risk(found, config.risk)
+    return within_risk(found, config.risk)
+
+
+def localize_by_landmarks(problem: Problem, rays: int, seed: int) -> Localization:
+    """Return the answer by landmarks, fused with measured depth and up to ``rays`` rendered rays."""
+    assert problem.matcher is not None
+    began = time.perf_counter()
+    answer = Loop(problem.views, problem.matcher, problem, rays, seed)()
+    return unrecognized(problem) if answer is None else localization_of(problem, answer, began)
 
 
 def _on_surface(
@@ -69,7 +73,9 @@ def _on_surface(
             raise InputError("method 'auto' then needs a start; give one", where=why)
         found = bid(problem, BidConfig(), seed)
         return replace(found, reason=f"{why}; {found.reason}")
-    if surface is None or (loop is not None and loop.landmarks.usual_matches >= TEXTURED):
+    # Matches of a usual image of the map from which an image without recognised landmarks shows something
+    # else
+    if surface is None or (loop is not None and loop.landmarks.usual_matches >= 150):
         return best or unrecognized(problem)
     config = config if loop is None else replace(config, rounds=1)
     occluder = nearest_piece(problem)
@@ -79,7 +85,8 @@ def _on_surface(
             break
         found = by_depth
         if occluder is not None and given is not problem:
-            if not found.converged or occluder.share_in_front(surface, found.T_world_camera) < IN_FRONT:
+            # Minimum fraction of an occluder's points that must lie in front of the surface
+            if not found.converged or occluder.share_in_front(surface, found.T_world_camera) < 0.9:
                 continue
             hidden = (
                 f"without the nearest {occluder.share:.0%} of the measured points, which are on an occluder"
@@ -142,11 +149,15 @@ def unrecognized(problem: Problem) -> Localization:
     return replace(Localization.of(why, path, none, "auto", 0.0, float("nan")), seconds=0.0)
 
 
-def within_risk(found: Localization, risk: float) -> Localization:
+def within_risk(found: Localization, risk: float | None) -> Localization:
     """Return the answer, rejected as ``uncertain`` if landmarks did not find it, or its confidence is lower than the risk requires."""
-    least = least_confidence(risk)
-    known = found.confidence if isinstance(found.diagnostics, Evidence) else None
-    if not found.converged or (known is not None and known >= least):
+    if risk is None or not found.converged:
+        return found
+    least, known = (
+        least_confidence(risk),
+        found.confidence if isinstance(found.diagnostics, Evidence) else None,
+    )
+    if known is not None and known >= least:
         return found
     why = f"the confidence is {'unknown' if known is None else format(known, '.3f')}, a risk of {risk:g} requires {least:.3f}"
     return found.rejected(Verdict(Outcome.UNCERTAIN, why, found.confidence))

@@ -36,12 +36,8 @@ from bidnerf_core.mapping import States, SurfaceMap, cast, descend, trace
 
 ON_SURFACE = 0.02
 """Distance at which a point's inlier weight is one half when poses are compared, as a fraction of the scene's extent."""
-COMPARED_POINTS = 200
-"""Minimum number of points on which poses are compared."""
 SIGHT_LINES = 300
 """Maximum number of lines of sight that are traced."""
-WORSE = 0.05
-"""Maximum increase of the cost on the surface by refinement; beyond it, field and surface contradict each other."""
 POINT_STAGES = (
     # points, steps, poses kept, distance as a fraction of the scene's extent (0: the finest), weight of colours
     (48, 0, 96, 0.3, 0.0),
@@ -51,14 +47,10 @@ POINT_STAGES = (
     (400, 6, 2, 0.05, 0.1),
     (2000, 4, 1, 0.0, 1.0),
 )
-OPEN = 0.2
-"""Fraction of the keyframes' rays that hit nothing above which the map counts as having a background."""
 IMAGE_STAGES = ((16, 0, 48), (16, 8, 12), (24, 8, 4), (48, 8, 2), (96, 5, 2))
 """Pixels of the longer side, steps, poses kept."""
 DETAILED_STAGES = ((32, 0, 64), (32, 6, 16), (48, 8, 6), (96, 6, 2), (192, 4, 1))
 """Stages for partly hidden images: in smaller thumbnails, nearly every pixel would contain part of the occluders."""
-FLAT = 0.02
-"""Standard deviation of an image's colours, in [0, 1], below which a gain and an offset can fit any view to it."""
 
 
 @torch.no_grad()
@@ -94,7 +86,9 @@ def localize_by_depth(
         steps: list[tuple[SE3, Tensor]] = []
         there, _ = descend(best, [refined, rays], config.refine_steps, middle, steps)
         inliers = 0.0
-        if float(score(there)) <= float(score(best)) + WORSE:
+        # Maximum increase of the cost on the surface by refinement; beyond it, field and surface contradict
+        # each other
+        if float(score(there)) <= float(score(best)) + 0.05:
             path = SE3.cat([path, *(T for T, _ in steps[1:]), there.T])
             losses = torch.cat([losses, *(cost for _, cost in steps)])
             best, inliers = there, float(term.agreement(there)[0])
@@ -151,7 +145,8 @@ def by_depth(problem: Problem, points: Surface, count: int, seed: int) -> Propos
     surface, middle, stages = points.surface, points.points.median(0).values, list[Stage]()
     for n, steps, keep, distance, colour in POINT_STAGES:
         noise = distance * surface.extent / 2 or surface.cell
-        score = _score(points.first(max(n, COMPARED_POINTS))) if steps else None
+        # Minimum number of points on which poses are compared
+        score = _score(points.first(max(n, 200))) if steps else None
         stages.append(
             Stage([replace(points.first(n), noise=noise, colour_weight=colour)], steps, keep, score)
         )
@@ -174,7 +169,8 @@ def by_images(
     origins = keyframes.translation[:, None].expand_as(directions)
     seen = cast(surface, origins.reshape(-1, 3), directions.reshape(-1, 3))
     away = float(seen.along[seen.met].median()) if bool(seen.met.any()) else surface.extent
-    has_background = float(seen.met.float().mean()) < 1 - OPEN
+    # Fraction of the keyframes' rays that hit nothing above which the map counts as having a background
+    has_background = float(seen.met.float().mean()) < 1 - 0.2
     middle = torch.tensor([0.0, 0.0, away], dtype=torch.float64)
     renderer = surface_renderer(surface, problem.bounds.background if has_background else None)
     # Wide scales find images that were exposed twice or half as long.
@@ -309,4 +305,6 @@ def _covariance(
 def is_blank(frame: Frame) -> bool:
     """Return whether the image has a single colour, as if the lens were covered, or the frame has no colours at all."""
     shown = frame.rgb.flatten(0, 1) if frame.hidden is None else frame.rgb[~frame.hidden]
-    return not frame.has_colour or float(shown.std(0, correction=0).max()) < FLAT
+    # Standard deviation of an image's colours, in [0, 1], below which a gain and an offset can fit any view
+    # to it
+    return not frame.has_colour or float(shown.std(0, correction=0).max()) < 0.02

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from contextlib import suppress
-from queue import Empty, Full, Queue
-from threading import Thread
+from concurrent.futures import Future, ThreadPoolExecutor
+from threading import Lock
 from types import TracebackType
 
 from bidnerf_core.errors import InputError
@@ -29,11 +28,9 @@ class Corrector:
         """Start the thread."""
         self.T_world_odom: SE3 | None = None  # the correction from the last accepted answer
         self.found: Localization | None = None  # the last answer, accepted or not
-        self._localizer, self._closed = localizer, False
-        self._waiting: Queue[tuple[Frame, SE3] | None] = Queue(1)  # None ends the thread
-        self._errors = deque[BaseException](maxlen=1)
-        self._thread = Thread(target=self._run, name="bidnerf-corrector", daemon=True)
-        self._thread.start()
+        self._localizer, self._errors = localizer, deque[BaseException](maxlen=1)
+        self._pool, self._lock = ThreadPoolExecutor(1, "bidnerf-corrector"), Lock()
+        self._last: Future[None] | None = None  # of the last frame that was taken
 
     def corrected(self, T_odom_camera: SE3) -> SE3 | None:
         """Return T_world_camera for a pose in the odometry's frame; None until an answer has been accepted."""
@@ -46,12 +43,13 @@ class Corrector:
         Raises the error of an earlier frame's localization, and ``InputError`` after ``close``.
         """
         self._raise_error()
-        if self._closed:
-            raise InputError("the corrector is closed and takes no more frames")
-        try:
-            self._waiting.put_nowait((frame, T_odom_camera))
-        except Full:
-            return False
+        with self._lock:
+            if self._last is not None and not (self._last.running() or self._last.done()):
+                return False
+            try:
+                self._last = self._pool.submit(self._localize, frame, T_odom_camera)
+            except RuntimeError as error:
+                raise InputError("the corrector is closed and takes no more frames") from error
         return True
 
     def close(self) -> None:
@@ -59,11 +57,7 @@ class Corrector:
 
         Raises the error of a localization that has not been raised yet.
         """
-        self._closed = True
-        with suppress(Empty):
-            self._waiting.get_nowait()
-        self._waiting.put(None)
-        self._thread.join()
+        self._pool.shutdown(cancel_futures=True)
         self._raise_error()
 
     def __enter__(self) -> Corrector:
@@ -81,13 +75,10 @@ class Corrector:
             return
         raise error
 
-    def _run(self) -> None:
-        while (taken := self._waiting.get()) is not None:
-            frame, T_odom_camera = taken
-            try:
-                self.found = found = self._localizer(frame, start=self.corrected(T_odom_camera))
-            except BaseException as error:  # raised in the caller's thread
-                self._errors.append(error)
-                continue
+    def _localize(self, frame: Frame, T_odom_camera: SE3) -> None:
+        try:
+            self.found = found = self._localizer(frame, start=self.corrected(T_odom_camera))
             if found.converged:
                 self.T_world_odom = found.T_world_camera @ T_odom_camera.inverse()
+        except BaseException as error:  # raised in the caller's thread
+            self._errors.append(error)

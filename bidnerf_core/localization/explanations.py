@@ -51,22 +51,12 @@ ODDS_OF_MAP, ODDS_OF_OTHER = 0.5, 0.05
 NEARLY = (0.002, 0.002, 0.002, 0.002, 0.001, 0.001)
 """Differences of two good calibrations of one camera."""
 SIMILAR = (0.16, 0.06, 0.06, 0.2, 0.02, 0.01)
-MAX_CAMERAS = 9
-"""Maximum number of a map's cameras of one size, evenly chosen by focal length, that are compared with the stated one."""
-MAX_RESIDUAL = 0.002
-"""Root mean square difference, as a fraction of the image's width, above which a correction does not describe a camera."""
-GRID = 7
-"""Number of rows and columns of pixels at which cameras are compared."""
-TRUST_AS_MAP = 0.1
-"""Factor of the probability of other than the stated intrinsics if those are the intrinsics of the map's images."""
 USUAL = ("exact", "right", "inexact", "nominal", "map", "map, about")
 """Explanations by which the stated camera or one of the map's is at least approximately right."""
 MOVING = " moving"
 """Ending of the names of explanations in motion."""
 SHARE_MOVING, SHARE_AS_MAP = 1 / 30, 0.8
 """Prior probability of a motion during the readout, and the same if the map's images move."""
-SIMILAR_TO_OTHERS = ("exact", "inexact", "map")
-"""Explanations that are not tried by themselves at first."""
 MOVE, TURN = 0.005, 0.01
 """Motion from the first row to the last: relative to the scene's distance, and radians."""
 
@@ -114,7 +104,12 @@ class Explanations:
 
         With another focal length or principal point, the camera is moved along its axis and turned so that it sees about the same.
         """
-        kinds = [i for i, name in enumerate(self.names) if name.removesuffix(MOVING) not in SIMILAR_TO_OTHERS]
+        # Explanations that are not tried by themselves at first
+        kinds = [
+            i
+            for i, name in enumerate(self.names)
+            if name.removesuffix(MOVING) not in ("exact", "inexact", "map")
+        ]
         kinds = kinds or list(range(len(self)))
         still = [i for i in kinds if not self.names[i].endswith(MOVING)]
         moving = [i for i in kinds if i not in still]
@@ -160,7 +155,9 @@ def explanations(
         for name, focal, centre, k1, aspect, skew, share, credible in (
             APPROXIMATE if query.approximate else STATED
         ):
-            share *= TRUST_AS_MAP if as_map and name != "exact" else 1
+            # Factor of the probability of other than the stated intrinsics if those are the intrinsics of the
+            # map's images
+            share *= 0.1 if as_map and name != "exact" else 1
             rows.append((name, [0.0] * 6, (focal, centre, centre, k1, aspect, skew), share, credible))
         for c in known:
             if query.approximate or bool((c.abs() > nearly).any()):
@@ -207,13 +204,9 @@ def cameras_of_map(query: Query, landmarks: LandmarkMap) -> list[Float[Tensor, "
     nearly = torch.tensor(NEARLY, dtype=torch.float64)
     for group in groups:
         cameras = sorted(group, key=lambda camera: camera.fx)
-        chosen = (
-            torch.linspace(0, len(cameras) - 1, min(len(cameras), MAX_CAMERAS))
-            .round()
-            .int()
-            .unique()
-            .tolist()
-        )
+        # Maximum number of a map's cameras of one size, evenly chosen by focal length, that are compared with
+        # the stated one
+        chosen = torch.linspace(0, len(cameras) - 1, min(len(cameras), 9)).round().int().unique().tolist()
         corrections = (correction_between(stated, cameras[i]) for i in chosen)
         known = [correction for correction in corrections if correction is not None]
         if known:
@@ -229,7 +222,8 @@ def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "6"
     It minimizes the squared differences in pixels. None if these remain large.
     """
     true = true.resized(given.width, given.height)
-    u, v = (torch.linspace(0, size, GRID, dtype=torch.float64) for size in (given.width, given.height))
+    # Number of rows and columns of pixels at which cameras are compared
+    u, v = (torch.linspace(0, size, 7, dtype=torch.float64) for size in (given.width, given.height))
     pixels = torch.stack(torch.meshgrid(u, v, indexing="ij"), dim=-1).reshape(-1, 2)
     stated, real = (camera.unproject(pixels)[:, :2] for camera in (given, true))
     steps = torch.eye(2, dtype=torch.float64)
@@ -248,7 +242,9 @@ def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "6"
     solved = torch.linalg.lstsq(rows.reshape(-1, 5), target.reshape(-1, 1), driver="gels").solution
     left = (rows @ solved - target)[..., 0].norm(dim=-1)
     across, down, shift_u, shift_v, bent = solved[:, 0]
-    if not bool(left.square().mean().sqrt() <= MAX_RESIDUAL * given.width) or min(across, down) <= 0:
+    # Root mean square difference, as a fraction of the image's width, above which a correction does not
+    # describe a camera
+    if not bool(left.square().mean().sqrt() <= 0.002 * given.width) or min(across, down) <= 0:
         return None
     factor = (across * down).sqrt()
     return torch.stack([factor.log(), shift_u, shift_v, bent / factor, (across / down).log(), 0 * bent])

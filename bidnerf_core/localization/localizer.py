@@ -28,12 +28,11 @@ from bidnerf_core.io import LARGEST_INTEGER
 from bidnerf_core.localization.matching import LandmarkMatcher
 from bidnerf_core.localization.methods import (
     USUAL_METHOD,
-    Method,
     find_method,
     require_use_of_depth,
     settings_of,
 )
-from bidnerf_core.localization.picture import Shown
+from bidnerf_core.localization.picture import shown_in
 from bidnerf_core.localization.problem import (
     Problem,
     SceneMap,
@@ -46,16 +45,11 @@ from bidnerf_core.localization.problem import (
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.progress import counter, current_job, job_context
 
-STREAMS = 8
-"""Number of queries that share an accelerator, which computes for some while the host detects keypoints of others."""
+NO_DISTANCES = "the map's photos are from one place and show no distances"
 LOADERS: list[Callable[[Path], SceneMap]] = []
 """How the map in a folder is loaded. The package of stored maps, which builds on this one, adds its function."""
 Start = SE3 | Float[Tensor, "4 4"] | np.ndarray | Sequence[Sequence[float]]
 """A pose T_world_camera: an ``SE3``, or any 4x4 matrix, by rows."""
-
-
-HOST_THREADS = 4
-"""Largest number of threads on the host of a GPU, which has little to compute."""
 
 
 class Localizer:
@@ -85,7 +79,15 @@ class Localizer:
         self.method = method
         self.scene: SceneMap = scene if device is None else on_device(scene, device)
         self._method = find_method(method)
-        self.config = _checked_config(self._method, method, config, preset)
+        if config is None or isinstance(config, Mapping):
+            config = settings_of(method, dict(config or {}), preset=preset)
+        elif not isinstance(config, self._method.config_type):
+            takes = f"a {self._method.config_type.__name__} or a dictionary"
+            raise InputError(f"method {method!r} takes {takes}, got a {type(config).__name__}")
+        elif preset is not None:
+            both = f"both preset {preset!r} and a {type(config).__name__}"
+            raise InputError(f"got {both}", expected="one, or a dictionary of what differs")
+        self.config = config
         self.shared = self._method.shared(self.config)  # the settings that matter outside of the method
         landmarks = self.scene.landmarks if self._method.uses_landmarks else None
         self.matcher = None if landmarks is None else LandmarkMatcher(landmarks)
@@ -116,7 +118,7 @@ class Localizer:
         origin = origin_of(self.scene)
         near = None if start is None else start_pose(start).translated(-origin)
         problem = self.problem(query, near, depth_rays)
-        found = replace(self.solved(problem, seed), shown=Shown(self.scene, problem.views[-1].frame))
+        found = replace(self.solved(problem, seed), shown=shown_in(self.scene, problem.views[-1].frame))
         return found.translated(origin)
 
     def many(
@@ -133,7 +135,9 @@ class Localizer:
         positive, and ``Cancelled`` as usual.
         """
         device = device_of(self.scene.field)
-        count = (torch.get_num_threads() if device.type == "cpu" else STREAMS) if workers is None else workers
+        # Number of queries that share an accelerator, which computes for some while the host detects
+        # keypoints of others
+        count = (torch.get_num_threads() if device.type == "cpu" else 8) if workers is None else workers
         if count < 1:
             raise InputError(f"workers is {workers!r}", expected="at least 1")
         return self._many(queries, _checked_seed(seed), count, device)
@@ -194,14 +198,19 @@ class Localizer:
     def solved(self, problem: Problem, seed: int = 0) -> Localization:
         """Solve a ``problem`` created by this localizer."""
         # On a CPU, operators are so short that sharing each of them among threads takes longer, and far longer on a busy machine.
-        with threads_at_most(1 if problem.device.type == "cpu" else HOST_THREADS):
+        # Largest number of threads on the host of a GPU, which has little to compute
+        with threads_at_most(1 if problem.device.type == "cpu" else 4):
             found = self._method.solve(problem, self.config, _checked_seed(seed))
         if not isinstance(found, Localization):
             raise InputError(
                 f"method {self.method!r} returned a {type(found).__name__}", expected="a Localization"
             )
         found = replace(found, unit=unit_of(self.scene))
-        return found if self.scene.has_distances else direction_only(found)
+        if self.scene.has_distances:
+            return found
+        outcome = Outcome.IMPRECISE if found.converged else found.outcome
+        why = f"{NO_DISTANCES}, so the position is unknown and only the direction may be right"
+        return replace(found.rejected(Verdict(outcome, why)), covariance=None)
 
     @property
     def depth_sensor(self) -> DepthSensorModel:
@@ -230,15 +239,6 @@ class Localizer:
             self.scene.surface.warm_up()
 
 
-def map_with_distances(localizer: Localizer) -> SceneMap:
-    """Return the localizer's map. Raises ``InputError`` if its photos are from one place, as it then has no positions."""
-    if not localizer.scene.has_distances:
-        raise InputError(
-            f"tracking needs positions, but {NO_DISTANCES};", expected="a map of photos from several places"
-        )
-    return localizer.scene
-
-
 def checked_map(given: object, where: str) -> SceneMap:
     """Return ``given`` if it is a map, or the map in the folder ``given``. Raises ``InputError``, prefixed with ``where``, for
     anything else, and as ``load_map`` does.
@@ -250,38 +250,23 @@ def checked_map(given: object, where: str) -> SceneMap:
     raise InputError(f"got a {type(given).__name__}", where=where, expected="a Map, or the folder of one")
 
 
-def _checked_config(method: Method, name: str, config: Any, preset: str | None) -> Any:
-    if config is None or isinstance(config, Mapping):
-        return settings_of(name, dict(config or {}), preset=preset)
-    expected, found = method.config_type.__name__, type(config).__name__
-    if not isinstance(config, method.config_type):
-        raise InputError(f"method {name!r} takes a {expected} or a dictionary, got a {found}")
-    if preset is not None:
-        raise InputError(
-            f"got both preset {preset!r} and a {found}", expected="one, or a dictionary of what differs"
-        )
-    return config
-
-
 def _checked_seed(seed: Any) -> int:
     if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= int(seed) <= LARGEST_INTEGER:
         raise InputError(f"seed is {seed!r}", expected="a whole number from 0 to 2**63 - 1")
     return int(seed)
 
 
-def _views(query: Frame | View | Sequence[View]) -> Sequence[View]:
-    if isinstance(query, Frame):
-        return [View(query, SE3.identity())]
-    if isinstance(query, View):
-        return [query]
-    if isinstance(query, Sequence) and all(isinstance(item, View) for item in query):
-        return query
-    items: list[Any] = list(query) if isinstance(query, Sequence) else []
-    if len(items) == 1 and isinstance(items[0], Frame):
-        return [View(items[0], SE3.identity())]
-    if any(isinstance(item, Frame) for item in items):
+def _views(query: Any) -> list[View]:
+    views = (
+        [query] if isinstance(query, Frame | View) else list(query) if isinstance(query, Sequence) else [None]
+    )
+    if len(views) == 1 and isinstance(views[0], Frame):
+        views = [View(views[0], SE3.identity())]
+    if all(isinstance(view, View) for view in views):
+        return views
+    if any(isinstance(view, Frame) for view in views):
         raise InputError(
-            f"{len(query)} frames without relative poses", expected="views: View(frame, T_ref_camera)"
+            f"{len(views)} frames without relative poses", expected="views: View(frame, T_ref_camera)"
         )
     raise InputError(
         f"query is a {type(query).__name__}",
@@ -295,14 +280,10 @@ def start_pose(start: Start, what: str = "start") -> SE3:
     Raises ``InputError``, prefixed with ``what``, for anything that is not a single pose.
     """
     if isinstance(start, SE3):
-        found, count = start.translation.shape, start.translation.numel() // 3
-        if len(found) > 1 and found[-1] == 3:
-            raise InputError(f"{what} holds {count} poses", expected="one")
-        if found != (3,) or start.rotation.shape != (3, 3):
-            shapes = f"{tuple(start.rotation.shape)} and {tuple(found)}"
-            raise InputError(
-                f"{what} has a rotation and a translation of shapes {shapes}", expected="(3, 3) and (3)"
-            )
+        shapes = tuple(start.rotation.shape), tuple(start.translation.shape)
+        if shapes != ((3, 3), (3,)):
+            found = f"{what} has a rotation and a translation of shapes {shapes[0]} and {shapes[1]}"
+            raise InputError(found, expected="one pose: (3, 3) and (3)")
         return SE3(start.rotation.detach(), start.translation.detach()).to("cpu", torch.float64)
     if isinstance(start, torch.Tensor):
         start = start.detach().cpu()
@@ -311,13 +292,3 @@ def start_pose(start: Start, what: str = "start") -> SE3:
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{what} is a {type(start).__name__}", expected="an SE3 or a 4x4 matrix") from error
     return pose_from_matrix(matrix, what)
-
-
-NO_DISTANCES = "the map's photos are from one place and show no distances"
-
-
-def direction_only(found: Localization) -> Localization:
-    """Reject an answer, as its position is unknown: as imprecise, or for its own reason if it was already rejected."""
-    outcome = Outcome.IMPRECISE if found.converged else found.outcome
-    why = f"{NO_DISTANCES}, so the position is unknown and only the direction may be right"
-    return replace(found.rejected(Verdict(outcome, why)), covariance=None)

@@ -61,40 +61,17 @@ from bidnerf_core.mapping import (
 
 MIRROR = "mirror image"
 """Name of the mode of an image whose mirror image fits."""
-UNMISTAKABLE = -150.0
-"""Log10 of the number of false alarms below which no mirror image is tried."""
 DEPTH_WIDTH = 2.0
 """Ratio of the prior's deviation of the depth scale to that of the sensor's model, since some sensors are off by far more."""
-LEAST_RIVAL = 0.3
-"""Least number of inliers of another place, as a fraction of those of the first."""
-REFITS = 3
-"""Most fits of a mode until the explanation that it is linearized about is the most probable one."""
-MOST_FIRST = 100
-"""Number of matches on which kinds of cameras are compared."""
 PADDED = 256
 """Matches are padded to multiples of this number on an accelerator, so that few CUDA graphs are captured."""
 RADII = (3.0, 1.5)
 """Radii of the rounds of matching by projection, in units of the inlier threshold."""
-TOLERANCE, ANGLE = 0.03, 0.05
-"""Within which the pose must be: relative to the distance of the scene, and radians."""
-SHARPEST = 0.04
-"""Colour noise of a field on its training images above which its rays add nothing to the landmarks."""
-LEAST_ON_SURFACE = 0.1
-"""Least fraction of the measured points on the surface; with fewer, depth is in another unit or of another scene, and is left out.
-
-No pose on record with fewer was right, nor would any have been accepted without depth.
-"""
-RAYS_BEYOND = 0.6
-"""Standard deviation of the scene's projection by landmarks, in pixels, from which rays add to them."""
 HEAVY_TAILS = 1.7
 """Factor of the covariance by which the ellipsoid of a Gaussian's 95 % holds 95 % of the poses: errors have heavier tails."""
 AGREEING, MANY_MORE = 0.7, 1.3
 """Fraction of the matches by descriptors that agree with a usual camera, from which no other is tried, and how many times more must agree
 with another.
-"""
-FROM_START = 6.0
-"""Log odds of a place per factor e of its distance from the start: in six dimensions, the density of a normal distribution of unknown
-width falls with the sixth power of the distance.
 """
 MANY_VISIBLE, CONTRADICTED = 200, 1.5
 """Number of visible landmarks from which a pose can be contradicted, and multiple of the chance matches below which it is."""
@@ -171,7 +148,8 @@ class Loop:
         self.landmarks: LandmarkMap = matcher.landmarks
         self.query = Query.of(views, features or matcher.features)
         noise = None if problem is None else problem.colour_noise
-        self.rays = rays if problem is not None and (noise is None or noise <= SHARPEST) else 0
+        # Colour noise of a field on its training images above which its rays add nothing to the landmarks
+        self.rays = rays if problem is not None and (noise is None or noise <= 0.04) else 0
         places = {matcher.device} if problem is None else {matcher.device, problem.device}
         self.device = places.pop() if len(places) == 1 else torch.device("cpu")
         self._nearest: dict[int, Nearest] = {}
@@ -312,7 +290,8 @@ class Loop:
     def _compared(self, mode: Mode, seed: Seed, given: Explanations, noise: float) -> States:
         """Return the most probable state of a mode, comparing kinds of cameras, each with its own noise, on some of the matches."""
         count = len(mode.matches)
-        some = torch.linspace(0, count - 1, min(count, MOST_FIRST)).long()
+        # Number of matches on which kinds of cameras are compared
+        some = torch.linspace(0, count - 1, min(count, 100)).long()
         states = given.first(seed, 0, noise)
         term = self._term([replace(mode, matches=mode.matches[some])], states[:1])
         term = replace(term, share=term.share * (count / len(some)))
@@ -355,9 +334,11 @@ class Loop:
         agreeing[nearest.keypoint] = near[:, 0]
         others = nearest.others(near)
         others = others[agreeing[others.keypoint]]
-        if len(others.keypoint.unique()) >= max(LEAST_AGREEING, LEAST_RIVAL * int(agreeing.sum())):
+        # Least number of inliers of another place, as a fraction of those of the first
+        if len(others.keypoint.unique()) >= max(LEAST_AGREEING, 0.3 * int(agreeing.sum())):
             rivals.append(("another place", query, others))
-        if nfa > UNMISTAKABLE and self.landmarks.features == "sift" and len(query.images) == 1:
+        # Log10 of the number of false alarms below which no mirror image is tried
+        if nfa > -150.0 and self.landmarks.features == "sift" and len(query.images) == 1:
             mirrored = query.mirrored
             rivals.append((MIRROR, mirrored, Nearest.of(mirrored, self.matcher, STRONGEST).best))
         for name, there, found in rivals:
@@ -370,7 +351,8 @@ class Loop:
     ) -> Answer:
         """Fuse all measurements under all explanations, and judge the result."""
         problem, terms = self.problem, list[Term]([landmarks])
-        for _ in range(REFITS):
+        # Most fits of a mode until the explanation that it is linearized about is the most probable one
+        for _ in range(3):
             row = best.row
             there, minima, best = run_on(self.device, settle, best, landmarks, given)
             if torch.equal(best.row, row):
@@ -384,14 +366,19 @@ class Loop:
             points = Surface.of(problem.views, problem.depth_rays, problem.surface, self.seed, device=place)
         if points is not None:
             noise, near, _ = run_on(self.device, fit_noise, points, found.chosen)
-            points = replace(points, noise=noise) if float(near) >= LEAST_ON_SURFACE else None
+            # Least fraction of the measured points on the surface; with fewer, depth is in another unit or of
+            # another scene, and is left out. No pose on record with fewer was right, nor would any have been
+            # accepted without depth.
+            points = replace(points, noise=noise) if float(near) >= 0.1 else None
         if points is not None and found.mode == 0:
             terms.append(points)
             fused.append("depth")
             best, minima = run_on(self.device, fit, best, terms, given, 5)
             found = self._posterior(minima, landmarks)
         before = found  # rays about one camera's pose must not decide between cameras
-        blurred = self._blur(found, landmarks) > RAYS_BEYOND
+        # Standard deviation of the scene's projection by landmarks, in pixels, from which rays add to them
+        position = float(found.mixture()[:3, :3].trace().sqrt().nan_to_num(math.inf))
+        blurred = float(landmarks.focal.max()) * position / landmarks.distance(found.chosen) > 0.6
         if problem is not None and self.rays and found.mode == 0 and blurred:
             place = "cpu" if problem.device == self.device else None
             rays = Rays.of(problem.views, problem.field, problem.bounds, self.rays, self.seed, device=place)
@@ -404,14 +391,16 @@ class Loop:
         if points is not None:
             near, both = run_on(self.device, agreement, points, found.chosen)
             others |= {"on_surface": float(near), "colour_inliers": float(both)}
-        mass = min(self._mass(each, landmarks, given) for each in (found, before))
+        mass = min(
+            each.mass(
+                landmarks.distance(each.chosen),
+                self.landmarks.pose_covariance,
+                given.credible[each.states.row],
+            )
+            for each in (found, before)
+        )
         answer = self._judged(found, mass, modes, landmarks, given, searched, others)
         return replace(answer, fused=tuple(fused))
-
-    def _mass(self, found: Posterior, term: Landmarks, given: Explanations) -> float:
-        """Return the probability that the pose is within the tolerance, and its camera credible."""
-        credible, shared = given.credible[found.states.row], self.landmarks.pose_covariance
-        return found.mass(term.distance(found.chosen), shared, TOLERANCE, ANGLE, credible)
 
     def _posterior(self, minima: Minima, landmarks: Landmarks, systematic: Tensor | float = 0.0) -> Posterior:
         quadratic, states, normal = minima
@@ -420,14 +409,11 @@ class Loop:
             # Of two places that look the same, the one nearer to the start is the likelier.
             update = (start.inverse() @ quadratic.here.T).log()
             away = update[:, :3].norm(dim=-1) + self._distance(start) * update[:, 3:].norm(dim=-1)
-            log_odds = -FROM_START * away.clamp(min=1e-9).log()
+            # Log odds of a place per factor e of its distance from the start: in six dimensions, the density
+            # of a normal distribution of unknown width falls with the sixth power of the distance
+            log_odds = -6.0 * away.clamp(min=1e-9).log()
         scatter = self.landmarks.calibration_scatter.double()
         return Posterior.of(states, normal, quadratic, landmarks, scatter, systematic, log_odds, self.device)
-
-    def _blur(self, found: Posterior, term: Landmarks) -> float:
-        """Return the standard deviation of the scene's projection at the best pose, pixels."""
-        position = found.mixture()[:3, :3].trace().sqrt()
-        return float(term.focal.max() * position.nan_to_num(math.inf)) / term.distance(found.chosen)
 
     def _judged(
         self, found: Posterior, mass: float, modes: list[Mode], term: Landmarks, given: Explanations, searched: bool,

@@ -33,26 +33,10 @@ from bidnerf_core.mapping import (
     squared_distances,
 )
 
-EXHAUSTIVE = 4_000
-"""The number of landmarks up to which the search is exhaustive, without cells."""
-SPARE = 4
-"""Number of further landmarks that are looked up by products in half precision, and then compared exactly."""
-PRODUCTS = 2**26
-"""Number of products of descriptors at a time on an accelerator, which bounds the memory."""
-COMPARISONS = 4_000_000
-"""The number of keypoint-landmark pairs up to which comparing all of them is faster than searching cells."""
-USUAL_IN_CELL = 500
-"""Mean number of landmarks per cell in large maps, where comparing them would otherwise take most of the time."""
-PROBED = 12
-"""Number of cells that are searched for each keypoint."""
 STRONGEST, LOOKED_UP = 700, 4
 """Number of an image's keypoints that are matched by descriptors alone at first, and of landmarks looked up for each."""
 AMBIGUITY = 0.9
 """Largest ratio of the descriptor distances of the best and the second-best landmark (Lowe 2004)."""
-LEAST_MATCHES = 60
-"""Number of matches up to which ambiguous ones are added."""
-ALIKE = 0.6
-"""Largest descriptor distance of a match by projection, relative to that of unrelated descriptors."""
 CANDIDATES, OCTAVES, OBLIQUE = 6, 1.0, math.radians(40)
 """For matches by projection: landmarks compared with each keypoint, and limits of the differences in size and direction."""
 
@@ -77,7 +61,8 @@ class LandmarkMatcher:
         self._found_once: FoundOnce | None = None
         if self.device.type != "cpu":
             self._products = _Products(landmarks.descriptors)
-        elif len(landmarks) > EXHAUSTIVE:
+        # The number of landmarks up to which the search is exhaustive, without cells
+        elif len(landmarks) > 4_000:
             self._cells = _Cells(landmarks.descriptors, seed)
 
     @property
@@ -114,7 +99,9 @@ class LandmarkMatcher:
                 f"the map's descriptors have {channels} channels, those of the image {descriptors.shape[1]}; "
                 "use the detector with which the map was baked, or bake it again"
             )
-        if self._cells is not None and len(descriptors) * len(self.landmarks) > COMPARISONS:
+        # The number of keypoint-landmark pairs up to which comparing all of them is faster than searching
+        # cells
+        if self._cells is not None and len(descriptors) * len(self.landmarks) > 4_000_000:
             return self._cells.nearest(descriptors, count)
         distances = torch.full((len(descriptors), count), torch.inf)
         index = torch.zeros(distances.shape, dtype=torch.long)
@@ -143,9 +130,12 @@ class _Products:
     ) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
         """Return squared distances, which are exact, and indices of the nearest; on the CPU."""
         found, n = [], len(self._half)
-        for part in descriptors.split(max(1, PRODUCTS // n)):
+        # Number of products of descriptors at a time on an accelerator, which bounds the memory
+        for part in descriptors.split(max(1, 2**26 // n)):
             alike = 2 * (self._unit(part) @ self._half.T).float() - self._squares
-            index = alike.topk(min(count + SPARE, n)).indices
+            # Number of further landmarks that are looked up by products in half precision, and then compared
+            # exactly
+            index = alike.topk(min(count + 4, n)).indices
             exact = (part[:, None].float() - self._descriptors[index].float()).square().sum(-1)
             distance, best = exact.topk(min(count, n), largest=False)
             found.append(torch.stack([distance.long(), index.gather(1, best)]))
@@ -157,7 +147,9 @@ class _Cells:
     """An inverted file: descriptors sorted by cell."""
 
     def __init__(self, descriptors: UInt8[Tensor, "n d"], seed: int) -> None:
-        count = round(max(math.sqrt(len(descriptors)), len(descriptors) / USUAL_IN_CELL))
+        # Mean number of landmarks per cell in large maps, where comparing them would otherwise take most of
+        # the time
+        count = round(max(math.sqrt(len(descriptors)), len(descriptors) / 500))
         generator = torch.Generator().manual_seed(seed)
         self._centres = k_means(descriptors, count, generator)
         cell = nearest_centre(descriptors, self._centres)
@@ -173,7 +165,8 @@ class _Cells:
         self, descriptors: UInt8[Tensor, "q d"], count: int
     ) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
         queries = len(descriptors)
-        probed = _smallest(squared_distances(descriptors, self._centres), PROBED)[1]
+        # Number of cells that are searched for each keypoint
+        probed = _smallest(squared_distances(descriptors, self._centres), 12)[1]
         cell, order = probed.flatten().sort(stable=True)
         query = order // probed.shape[1]
         distances = torch.full((probed.numel(), count), torch.inf, device=probed.device)
@@ -249,7 +242,8 @@ class Nearest:
     def best(self) -> Matches:
         """The unambiguous matches, filled up with others if they are few."""
         order = self.ambiguity.argsort(stable=True)
-        count = max(LEAST_MATCHES, int((self.ambiguity <= AMBIGUITY).sum()))  # host
+        # Number of matches up to which ambiguous ones are added
+        count = max(60, int((self.ambiguity <= AMBIGUITY).sum()))  # host
         return Matches(self.keypoint[order[:count]], self.landmark[order[:count], 0])
 
     def others(self, near: Bool[Tensor, "k n"]) -> Matches:
@@ -327,7 +321,8 @@ class Projected:
         distance = paired_squared_distances(
             query.keypoints.descriptors, landmarks.descriptors, keypoint, landmark
         )
-        most = (ALIKE * landmarks.unrelated_distance) ** 2
+        # Largest descriptor distance of a match by projection, relative to that of unrelated descriptors
+        most = (0.6 * landmarks.unrelated_distance) ** 2
         q = len(query.view)
         best = torch.full((q,), torch.inf).scatter_reduce_(0, keypoint, distance, "amin")
         is_best = distance == best[keypoint]

@@ -253,8 +253,6 @@ INERF = Method(
 
 IMAGE_STAGES = ((16, 0, 24), (16, 8, 6), (24, 6, 2), (48, 4, 2))
 """The stages of a search with small renderings: pixels of the longer side, steps, poses kept."""
-COARSE_BLUR = 8
-"""Width, in pixels, of the squares over which colours are averaged in coarse steps with depth."""
 
 
 @dataclass(frozen=True)
@@ -304,7 +302,8 @@ def _halved(
     terms, rays = RayTerms(steps.colour, depth, config.exposure), steps.fine_rays
     if depth is not None and problem.has_depth:
         poses = SE3.cat([poses, centred(problem, poses, middle)])
-        coarse = partial(terms.term, problem, level=0, blur=COARSE_BLUR)
+        # Width, in pixels, of the squares over which colours are averaged in coarse steps with depth
+        coarse = partial(terms.term, problem, level=0, blur=8)
         stages: Iterable[Stage] = (
             Stage([coarse(rays // 8, seed, wide=3.0)], 0, 6),
             Stage([coarse(rays // 8, seed + 1, sigma=SHAPE_SIGMA)], 4, 2),

@@ -17,8 +17,6 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.settings import LEAST_POINTS
 from bidnerf_core.mapping import SurfaceMap, cast
 
-JUMP = 0.05
-"""Relative depth difference above which neighbouring pixels belong to different segments."""
 CONSIDERABLE, REST = 0.15, 0.05
 """Minimum fraction of the measured pixels in an occluder, and in the rest."""
 
@@ -55,7 +53,8 @@ def nearest_piece(problem: Problem) -> Occluder | None:
     values, pairs = np.where(measured, depth, 0), []
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         near, far = np.minimum(values[a], values[b]), np.maximum(values[a], values[b])
-        joined = (near > 0) & (far - near <= JUMP * near)
+        # Relative depth difference above which neighbouring pixels belong to different segments
+        joined = (near > 0) & (far - near <= 0.05 * near)
         pairs.append(np.stack([number[a][joined], number[b][joined]]))
     first, second = np.concatenate(pairs, axis=1)
     graph = coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(depth.size, depth.size))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import weakref
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -16,37 +18,41 @@ from bidnerf_core.fields import has_field, render_picture
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.problem import SceneMap, origin_of
+from bidnerf_core.localization.result import Localization
 
 SIDE = 240
 """Longer side (pixels) of the photo and the rendering: each rendered pixel takes time."""
-DOT = (0.0, 0.75, 0.43)
-"""Colour of landmarks, which stand for the rendering in a map without a field."""
 
 
-class Shown:
-    """A map and a small copy of the photo that was localized in it."""
+def shown_in(scene: SceneMap, frame: Frame) -> Callable[[Localization], str]:
+    """Return a function that shows an answer to a frame as an element of a page, and keeps only a small file of the photo.
 
-    def __init__(self, scene: SceneMap, frame: Frame) -> None:
-        self.scene, self.frame = scene, frame.replace(depth=None).at_most(SIDE)
+    Answers may outlive the map, whose memory they do not hold: then, and where it cannot be rendered from the pose, it returns "".
+    """
+    small, kept = frame.replace(depth=None).at_most(SIDE), weakref.ref(scene)
+    stated, photo = (
+        small.intrinsics,
+        cv2.imencode(".png", np.ascontiguousarray(small.rgb_bytes.cpu().numpy()))[1],
+    )
 
-    def html(self, T_world_camera: SE3, intrinsics: Intrinsics | None) -> str | None:
-        """Return the picture as an element of a page; None if the map cannot be rendered from the pose.
-
-        ``intrinsics`` are those of the photo with which the pose was found, if other than the given ones.
-        """
-        camera = self.frame.intrinsics
-        if intrinsics is not None:
-            camera = intrinsics.resized(camera.width, camera.height)
+    def shown(found: Localization) -> str:
+        scene, camera = kept(), stated
+        if scene is None:
+            return ""
+        if found.intrinsics is not None:
+            camera = found.intrinsics.resized(camera.width, camera.height)
         try:
-            rendered = picture_at(self.scene, camera, T_world_camera.translated(-origin_of(self.scene)))
+            rendered = picture_at(scene, camera, found.T_world_camera.translated(-origin_of(scene)))
         except InputError:
-            return None
-        photo = self.frame.rgb.cpu()
-        both = torch.cat([photo, rendered, (photo + rendered) / 2], dim=1)
+            return ""
+        rgb = torch.from_numpy(cv2.imdecode(photo, cv2.IMREAD_COLOR)) / 255
+        both = torch.cat([rgb, rendered, (rgb + rendered) / 2], dim=1)
         pixels = (both.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
         png = cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1]))[1].tobytes()
         title = "the photo, the map at the pose found, and both blended"
         return f'<img alt="{title}" title="{title}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
+
+    return shown
 
 
 def picture_at(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
@@ -62,5 +68,6 @@ def picture_at(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Floa
             T_world_camera.to("cpu", torch.float64).inverse().apply(scene.landmarks.positions.cpu().double())
         )
         rows, columns, inside = camera.cells(local)
-        image[rows[inside], columns[inside]] = torch.tensor(DOT)
+        # Colour of landmarks, which stand for the rendering in a map without a field
+        image[rows[inside], columns[inside]] = torch.tensor((0.0, 0.75, 0.43))
     return image

@@ -15,8 +15,6 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.problem import Problem
 
 PivotName = Literal["scene", "camera", "world"]
-MIDDLE_RAYS = 128
-"""Number of rays whose renderings give the middle of the visible scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +89,8 @@ def rendered_middle(
 ) -> Float[Tensor, "h 3"]:
     """Return the median of the rendered points along each axis, in the last camera's frame; NaN if no ray hits anything."""
     device, generator = device_of(field), torch.Generator().manual_seed(0)
-    some = draw(views, MIDDLE_RAYS, uniform, generator, device=device).flattened()
+    # Number of rays whose renderings give the middle of the visible scene
+    some = draw(views, 128, uniform, generator, device=device).flattened()
     rays = some.rays(T.to(device), bounds)
     seen = render(field, rays, bounds.background)
     distance = torch.where(seen.opacity > 0.5, seen.distance / seen.opacity.clamp(min=0.5), torch.nan)

@@ -16,15 +16,8 @@ from bidnerf_core.mapping import CAMERA, Landmarks, Normal, P, Quadratic, States
 BY_SHARE = 10.0
 """Log odds per factor e between the evidence for two places: it is not proportional to the number of matches, since the right
 place rarely has fewer than two thirds as many as another."""
-LEAST_EVIDENCE = 50.0
-"""Evidence below which places are not compared: a few chance matches are no evidence against even fewer."""
-LEAST_DOUBT = 0.005
-"""Standard deviation of a camera's parameters that no photo rules out: lenses move with focus and image stabilisers."""
-LEAST_CURVATURE = 0.2
-"""Smallest curvature, relative to the reweighted Hessian."""
-CPU = torch.device("cpu")
-DRAWS = 256
-"""Draws of the pose from each explanation's Gaussian, with which the probability mass within a tolerance is integrated."""
+TOLERANCE, ANGLE = 0.03, 0.05
+"""Within which the pose must be: relative to the distance of the scene, and radians."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +41,7 @@ class Posterior:
         scatter: Float[Tensor, "4"],
         systematic: Float[Tensor, "g P P"] | float = 0.0,
         log_odds: Float[Tensor, "g"] | float = 0.0,
-        device: torch.device = CPU,
+        device: torch.device = torch.device("cpu"),  # noqa: B008
     ) -> Posterior:
         """Compare explanations within a mode by their cost, and modes by the evidence of landmarks and their prior ``log_odds``.
 
@@ -59,7 +52,9 @@ class Posterior:
         log = log_evidence(states, normal)
         member = states.mode[None] == torch.arange(len(terms.here))[:, None]
         norm = torch.where(member, log[None], -torch.inf).logsumexp(-1)
-        log = log + (log_odds + BY_SHARE * by_mode.clamp(min=LEAST_EVIDENCE).log() - norm)[states.mode]
+        # Evidence below which places are not compared: a few chance matches are no evidence against even
+        # fewer
+        log = log + (log_odds + BY_SHARE * by_mode.clamp(min=50.0).log() - norm)[states.mode]
         probability = log.nan_to_num(-torch.inf).softmax(0)
         best = int(probability.argmax())
         states, covariance = _true_cameras(states, normal, _robust_covariance(*information), scatter)
@@ -110,33 +105,34 @@ class Posterior:
         own = self._own
         return torch.where(own[:, None, None] > 1e-12, own[:, None, None] * spread, 0).sum(0)
 
-    def mass(
-        self,
-        distance: float,
-        shared: Float[Tensor, "6 6"],
-        tolerance: float,
-        angle: float,
-        credible: Bool[Tensor, "h"],
-    ) -> float:
-        """Return the probability that the pose is within ``tolerance`` (relative to ``distance``) and ``angle`` (radians), and
-        right under an explanation that is ``credible``.
+    def mass(self, distance: float, shared: Float[Tensor, "6 6"], credible: Bool[Tensor, "h"]) -> float:
+        """Return the probability that the pose is right, and under an explanation that is ``credible``.
+
+        ``distance`` (metres) is that of the scene, and ``shared`` a covariance that is added to those of all explanations.
         """
-        covariance = self.covariance + shared
-        sane = covariance.isfinite().all(-1).all(-1)
-        factor, info = torch.linalg.cholesky_ex(
-            torch.where(sane[:, None, None], covariance, torch.eye(6, dtype=covariance.dtype))
-        )
-        off = (self.update - self.mean)[:, None] + normal_draws() @ factor.mT
-        inside = (off[..., :3].norm(dim=-1) <= tolerance * distance) & (off[..., 3:].norm(dim=-1) <= angle)
-        return float(
-            (self.probability * inside.double().mean(-1) * (sane & (info == 0) & credible)).sum()
-        )  # host
+        weight = self.probability * credible
+        return mass_within(weight, self.update - self.mean, self.covariance + shared, distance)
+
+
+def mass_within(
+    weight: Float[Tensor, "h"], off: Float[Tensor, "h 6"], covariance: Float[Tensor, "h 6 6"], distance: float
+) -> float:
+    """Return the mass of a mixture of Gaussians of updates within ``TOLERANCE`` of the ``distance`` (metres) and ``ANGLE``."""
+    sane = covariance.isfinite().all(-1).all(-1)
+    factor, info = torch.linalg.cholesky_ex(
+        torch.where(sane[:, None, None], covariance, torch.eye(6, dtype=covariance.dtype))
+    )
+    drawn = off[:, None] + normal_draws() @ factor.mT
+    inside = (drawn[..., :3].norm(dim=-1) <= TOLERANCE * distance) & (drawn[..., 3:].norm(dim=-1) <= ANGLE)
+    return float((weight * inside.double().mean(-1) * (sane & (info == 0))).sum())  # host
 
 
 @lru_cache(maxsize=1)
 def normal_draws() -> Float[Tensor, "d 6"]:
     """Return draws of a standard normal distribution that cover it evenly (Sobol)."""
-    even = torch.quasirandom.SobolEngine(6, scramble=True, seed=0).draw(DRAWS).double()
+    # Draws of the pose from each explanation's Gaussian, with which the probability mass within a tolerance
+    # is integrated
+    even = torch.quasirandom.SobolEngine(6, scramble=True, seed=0).draw(256).double()
     return torch.distributions.Normal(0.0, 1.0).icdf(even.clamp(1e-6, 1 - 1e-6))
 
 
@@ -175,10 +171,8 @@ def _robust_covariance(
     """
     values, vectors = torch.linalg.eigh(curvature)
     # With few matches the curvature may be indefinite; well-behaved residuals keep it near the Hessian.
-    basis = (
-        torch.linalg.solve_triangular(factor.mT, vectors, upper=True)
-        / values.clamp(min=LEAST_CURVATURE)[:, None]
-    )
+    # Smallest curvature, relative to the reweighted Hessian
+    basis = torch.linalg.solve_triangular(factor.mT, vectors, upper=True) / values.clamp(min=0.2)[:, None]
     bread = basis @ torch.linalg.solve_triangular(factor.mT, vectors, upper=True).mT
     found = unit[..., None] * (bread @ scatter @ bread.mT) * unit[..., None, :]
     return torch.where(sound[:, None, None], found, torch.inf)
@@ -198,7 +192,9 @@ def _true_cameras(
     share, doubt = torch.ones_like(states.z), torch.zeros_like(states.z)
     share[:, :4] = prior / apparent.clamp(min=1e-24)
     # Part of what seems spurious may be real, as image stabilisers shift each image.
-    least = prior.clamp(min=LEAST_DOUBT**2) + scatter.square() / 2
+    # Standard deviation of a camera's parameters that no photo rules out: lenses move with focus and image
+    # stabilisers
+    least = prior.clamp(min=0.005**2) + scatter.square() / 2
     doubt[:, :4] = least * scatter.square() / (least + scatter.square()) / apparent.clamp(min=1e-24)
     follows = -torch.linalg.solve_ex(H[:, :6, :6], H[:, :6, 6:])[0]  # (h 6 N) by the whitened nuisances
     step = (share - 1) * states.z

@@ -107,14 +107,6 @@ class Problem:
     colour_noise: float | None = None
     sensor: DepthSensorModel = UNKNOWN  # model of the sensor that measured the depth
 
-    def __post_init__(self) -> None:
-        if not self.views:
-            raise InputError("nothing to localize:", expected="at least one view")
-        known = [] if self.start is None else [("start", self.start)]
-        for what, pose in (*known, *((v.frame.name, v.T_ref_camera) for v in self.views)):
-            if not bool(pose.is_rigid().all()):
-                raise InputError(f"pose of {what} is not a rigid transform: {pose.matrix().tolist()}")
-
     def start_for(self, method: str) -> SE3:
         """Return the start. Raises ``InputError``, naming ``method``, if there is none."""
         if self.start is None:
@@ -183,6 +175,10 @@ def rig(
     relative = tuple(
         View(v.frame, (T_last_ref @ v.T_ref_camera.to("cpu", torch.float64)).normalized()) for v in views
     )
+    known = [] if start is None else [("start", start)]
+    for what, pose in (*known, *((view.frame.name, view.T_ref_camera) for view in relative)):
+        if not bool(pose.is_rigid().all()):
+            raise InputError(f"pose of {what} is not a rigid transform: {pose.matrix().tolist()}")
     return Problem(
         scene.field, scene.bounds, relative, None if start is None else start.to("cpu", torch.float64),
         depth_rays, scene.surface, None if matcher is None else matcher.for_query(), scene.colour_noise,

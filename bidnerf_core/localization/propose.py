@@ -17,8 +17,6 @@ from bidnerf_core.localization.matching import Matches, log10_nfa
 from bidnerf_core.localization.query import Query
 from bidnerf_core.mapping import LandmarkMap, States, project, rays_through
 
-LADDER = (-0.35, 0.35, -0.7, 0.7)
-"""Logarithms of the focal lengths, relative to the stated one, that are tried if it gives no consensus."""
 CONVINCING = -20.0
 """Log10 of the number of false alarms below which no other camera is tried."""
 LEAST_DRAWS, MOST_DRAWS = 50, 5_000
@@ -45,7 +43,8 @@ def cameras(query: Query, landmarks: LandmarkMap) -> Iterator[Float[Tensor, "6"]
     if not query.has_one_camera:
         return
     c = query.camera
-    for log_focal in LADDER:
+    # Logarithms of the focal lengths, relative to the stated one, that are tried if it gives no consensus
+    for log_focal in (-0.35, 0.35, -0.7, 0.7):
         middle = [log_focal, (c.width / 2 - c.cx) / c.fx, (c.height / 2 - c.cy) / c.fy]
         yield torch.tensor([*middle, 0.0, 0.0, 0.0], dtype=torch.float64)
 

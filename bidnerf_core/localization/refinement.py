@@ -23,9 +23,6 @@ from bidnerf_core.mapping import (
     total,
 )
 
-GRADUATED = (16.0, 8.0, 4.0, 2.0, 1.0)
-"""Noise of graduated fits, relative to that of usual ones."""
-
 
 def most_probable(states: States, term: Landmarks) -> States:
     """Return the most probable state, comparing them with the noise of each."""
@@ -35,7 +32,8 @@ def most_probable(states: States, term: Landmarks) -> States:
 
 
 def graduate(states: States, term: Landmarks) -> States:
-    for factor in GRADUATED:
+    # Noise of graduated fits, relative to that of usual ones
+    for factor in (16.0, 8.0, 4.0, 2.0, 1.0):
         states = replace(states, noise=torch.full_like(states.noise, factor * term.most_noise))
         states, _ = descend(states, [term], 4)
     return states

@@ -6,17 +6,18 @@ import html
 import json
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.errors import InputError, unknown_name
+from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import (
     SE3,
@@ -47,22 +48,6 @@ class Outcome(StrEnum):
     IMPRECISE = "imprecise"  # the pose is too uncertain, relative to the distance to the scene
     UNCERTAIN = "uncertain"  # the diagnostics together make a wrong pose too likely
     TOO_FEW_MATCHES = "too few matches"  # of image features with the map's landmarks
-
-
-@runtime_checkable
-class Picture(Protocol):
-    """What a notebook shows of an answer."""
-
-    def html(self, T_world_camera: SE3, intrinsics: Intrinsics | None) -> str | None:
-        """Return an element of a page for a pose and the intrinsics it was found with, if other than the given; None for none."""
-        ...
-
-
-@runtime_checkable
-class Diagnostics(Protocol):
-    """The measures by which a pose is accepted or rejected: a dataclass of numbers that depends on how the pose was found."""
-
-    __dataclass_fields__: ClassVar[dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -97,15 +82,15 @@ class Localization:
     # Probability that the pose is right: by landmarks, from a learned model of the diagnostics, otherwise by comparison with
     # rivals. None if unknown, and if the pose is rejected for a reason that the model or the comparison ignores.
     confidence: float | None = None
-    diagnostics: Diagnostics | None = None  # the measures by which the pose was accepted or rejected
+    diagnostics: Any = None  # the measures by which the pose was accepted or rejected, a dataclass of numbers
     intrinsics: Intrinsics | None = None  # of the last image, if other than the given ones were used
     unit: LengthUnit = "units"  # of the position and its covariance: that of the map
-    shown: Picture | None = None  # in a notebook; not stored
+    shown: Callable[[Localization], str] | None = None  # returns the picture for a notebook; not stored
 
     def _repr_html_(self) -> str:
         """The answer in a notebook: the photo, the map at the pose found, and both blended, above a line of text."""
-        picture = None if self.shown is None else self.shown.html(self.T_world_camera, self.intrinsics)
-        return f"{picture or ''}<div>{html.escape(repr(self))}</div>"
+        picture = "" if self.shown is None else self.shown(self)
+        return f"{picture}<div>{html.escape(repr(self))}</div>"
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the map, which other processes have no need of."""
@@ -121,7 +106,7 @@ class Localization:
     @staticmethod
     def of(
         verdict: Verdict, poses: SE3, losses: Float[Tensor, "s"], method: str, began: float, loss: float,
-        covariance: Float[Tensor, "6 6"] | None = None, diagnostics: Diagnostics | None = None,
+        covariance: Float[Tensor, "6 6"] | None = None, diagnostics: Any = None,
     ) -> Localization:  # fmt: skip
         """Return the answer whose pose is the last of ``poses``; ``began`` is the time when the search did (``time.perf_counter``)."""
         count, seconds = len(poses.translation) - 1, time.perf_counter() - began
@@ -196,13 +181,9 @@ class Localization:
         rows = _matrix(saved.T_world_camera, 4, "T_world_camera", where)
         T = pose_from_matrix(rows, "T_world_camera", where)
         covariance = None if saved.covariance is None else _matrix(saved.covariance, 6, "covariance", where)
-        try:
-            outcome = Outcome(saved.outcome)
-        except ValueError as error:
-            raise unknown_name("outcome", saved.outcome, [str(outcome) for outcome in Outcome]) from error
         loss = math.nan if saved.loss is None else saved.loss
         return Localization(
-            T, outcome, saved.reason, saved.steps, saved.seconds, loss, saved.method, SE3.stack([T]),
+            T, saved.outcome, saved.reason, saved.steps, saved.seconds, loss, saved.method, SE3.stack([T]),
             torch.tensor([loss], dtype=torch.float64), covariance,
             math.nan if saved.focal_factor is None else saved.focal_factor, saved.confidence, None,
             saved.intrinsics, saved.unit,
@@ -215,7 +196,7 @@ class _Saved:
 
     T_world_camera: list[list[float]] | None
     converged: bool
-    outcome: str
+    outcome: Outcome
     reason: str
     steps: int
     seconds: float

@@ -20,9 +20,6 @@ from bidnerf_core.localization.terms.images import ColourScales, Images, Rendere
 from bidnerf_core.mapping import States, Term, descend
 from bidnerf_core.progress import check_cancelled
 
-RIVALS = 3
-"""Maximum number of other poses with which the best one is compared."""
-
 
 @dataclass(frozen=True, eq=False)
 class Stage:
@@ -71,7 +68,8 @@ def halve(
         other = order[~same_pose(states.T[order[0]], states.T[order], middle, 2 * DISPLACEMENT)]
         kept = order[: stage.keep]
         if len(other):
-            margin, rivals = float(scores[other[0]] - scores[order[0]]), states[other[:RIVALS]]
+            # Maximum number of other poses with which the best one is compared
+            margin, rivals = float(scores[other[0]] - scores[order[0]]), states[other[:3]]
             if stage.keep > 1 and not torch.isin(kept, other).any():
                 kept = torch.cat([kept[:-1], other[:1]])
         if (record := current_record()) is not None:

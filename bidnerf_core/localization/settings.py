@@ -22,8 +22,6 @@ from bidnerf_core.localization.accept import least_confidence
 from bidnerf_core.localization.pivots import PivotName
 from bidnerf_core.settings import EXPERT, Above, Count, NotNegative, OneOf, Positive, Range, Settings
 
-RENDERED_DEPTH_SHARE = 0.038
-"""Depth difference at which outliers begin in rendered rays, as a fraction of the scene's mean side."""
 LEAST_POINTS = 50
 """Minimum number of measured depths from which the shape of the scene can be recognised."""
 
@@ -152,7 +150,8 @@ def rendered_depth_scale(bounds: SceneBounds) -> float:
     A field's resolution, and hence the error of its depth, is a fraction of its box. The resolution of a baked surface does not
     matter: it may come from measured depth, which is more accurate than the field's renderings.
     """
-    return RENDERED_DEPTH_SHARE * mean_side(bounds)
+    # Depth difference at which outliers begin in rendered rays, as a fraction of the scene's mean side
+    return 0.038 * mean_side(bounds)
 
 
 @dataclass(frozen=True)

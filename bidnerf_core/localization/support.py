@@ -26,12 +26,6 @@ DISPLACEMENT = 0.1
 
 It is three times the maximum standard deviation of an accepted position by landmarks.
 """
-LOG_ODDS_PER_DEVIATION = 0.5
-"""Log odds per standard error of the difference between two costs.
-
-Independent measurements would justify more, but the errors of a field's rays are correlated. Chosen on frames held out for
-tuning.
-"""
 NO_RIVAL = 1000.0
 """Log odds against a rival that does not exist; finite, since records contain finite numbers."""
 SUPPORT_BOUNDS = (
@@ -151,7 +145,9 @@ def log_odds(rivals: Float[Tensor, "h n"], here: Float[Tensor, "n"]) -> Float[Te
     """Return the log odds against each rival, from the costs of each measurement for it and the pose; 0 where not finite."""
     difference = rivals - here
     error = difference.std(-1) * difference.shape[-1] ** 0.5
-    odds = LOG_ODDS_PER_DEVIATION * difference.sum(-1) / error.clamp(min=1e-12)
+    # Log odds per standard error of the difference between two costs. Independent measurements would justify
+    # more, but the errors of a field's rays are correlated. Chosen on frames held out for tuning.
+    odds = 0.5 * difference.sum(-1) / error.clamp(min=1e-12)
     return torch.where(odds.isfinite(), odds, 0)
 
 

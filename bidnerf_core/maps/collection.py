@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import time
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,9 +22,8 @@ from bidnerf_core.localization import (
     USUAL_METHOD,
     Localization,
     Localizer,
-    Loop,
     Outcome,
-    localization_of,
+    localize_by_landmarks,
     origin_of,
     unit_of,
 )
@@ -186,17 +184,12 @@ class MapCollection:
         """
         localizer = self.localizer(name)
         try:
-            if not localizer.matches_landmarks or localizer.matcher is None:
+            if not localizer.matches_landmarks:
                 return localizer(frame, seed=seed)
-            began, problem = time.perf_counter(), localizer.problem(frame)
-            matcher = problem.matcher or localizer.matcher
-            answer = Loop(problem.views, matcher, problem, localizer.shared.rays, seed)()
+            found = localize_by_landmarks(localizer.problem(frame), localizer.shared.rays, seed)
         except InputError as error:  # such as a map without a surface
             return _unrecognised(str(error), self.method)
-        if answer is None:
-            return _unrecognised("hardly any landmark of the map is in the image", self.method)
-        found = replace(localization_of(problem, answer, began), unit=unit_of(localizer.scene))
-        return found.translated(origin_of(localizer.scene))
+        return replace(found, unit=unit_of(localizer.scene)).translated(origin_of(localizer.scene))
 
     def _indexed(self) -> dict[str, tuple[str, int]]:
         """Pool the descriptors of all maps; return the detector and the length of the descriptors of those with landmarks."""

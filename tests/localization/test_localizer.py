@@ -147,7 +147,6 @@ FOLDER, TAKES = "a Map, or the folder of one", "method 'bid' takes a BidConfig o
         (FRAME, [[1.0, 2.0], [3.0]], "start is a list", POSE),
         (FRAME, "pose.json", "start is a str", POSE),
         (FRAME, [[10**400] * 4] * 4, "start is a list", POSE),
-        (FRAME, SE3.stack([START, START]), "start holds 2 poses", "one"),
         (FRAME, None, "method 'bid' needs a start; give one, or use a method that needs none", None),
         ([FRAME, FRAME], START, "2 frames without relative poses", VIEWS),
         ([View(FRAME, START), FRAME], START, "2 frames without relative poses", VIEWS),
@@ -310,10 +309,14 @@ def test_a_start_is_one_pose_whose_gradient_plays_no_part() -> None:
     learned = SE3(START.rotation.clone().requires_grad_(), START.translation.clone().requires_grad_())
     for start in (learned, matrix.clone().requires_grad_()):
         torch.testing.assert_close(poses(FRAME, start=start), expected, rtol=0, atol=1e-9)
-    for rotation, translation in ((2, (2,)), (3, (4,)), (3, ())):
-        shapes = f"shapes {(rotation, rotation)} and {translation}"
-        with refused(found=f"start has a rotation and a translation of {shapes}", expected="(3, 3) and (3)"):
-            poses(FRAME, start=SE3(torch.eye(rotation), torch.zeros(translation)))
+    for wrong in (
+        SE3.stack([START, START]),
+        SE3(torch.eye(3), torch.zeros(4)),
+        SE3(torch.eye(3), torch.zeros(())),
+    ):
+        shapes = f"shapes {tuple(wrong.rotation.shape)} and {tuple(wrong.translation.shape)}"
+        with refused(found=f"start has a rotation and a translation of {shapes}", expected="one pose"):
+            poses(FRAME, start=wrong)
 
 
 @pytest.mark.usefixtures("unchecked")

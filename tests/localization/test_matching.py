@@ -13,7 +13,6 @@ from bidnerf_core.localization import LandmarkMatcher
 
 # Inside: the matches, of which answers show only the number
 from bidnerf_core.localization.matching import (
-    LEAST_MATCHES,
     STRONGEST,
     Matches,
     Nearest,
@@ -130,7 +129,7 @@ def test_unambiguous_matches_come_first_and_are_filled_up_if_they_are_few() -> N
     both.descriptors.bitwise_xor_(1)  # neither is exactly that of the keypoint
     unsure = Nearest.of(image, LandmarkMatcher(both), STRONGEST)
     assert bool((unsure.ambiguity == 1).all())
-    assert len(unsure.best) == LEAST_MATCHES
+    assert len(unsure.best) == 60
 
 
 def test_landmarks_of_another_place_that_look_the_same_are_the_other_matches() -> None:

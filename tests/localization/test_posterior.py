@@ -10,6 +10,9 @@ from torch import Generator, Tensor
 
 from bidnerf_core import SE3
 from bidnerf_core.localization import Posterior
+
+# Inside: the tolerance, relative to which the distances of the scene are varied
+from bidnerf_core.localization.posterior import TOLERANCE
 from bidnerf_core.mapping import (
     NUISANCES,
     Landmarks,
@@ -118,19 +121,17 @@ def test_a_free_camera_makes_the_pose_less_certain() -> None:
 
 def test_the_mass_grows_with_the_tolerance_up_to_what_is_credible() -> None:
     found, good = solved(matches(0)), torch.tensor([True])
-    values = [
-        found.mass(4.0, NOTHING, tolerance, 10 * tolerance, good) for tolerance in (0, 1e-4, 1e-3, 1e-2, 0.1)
-    ]
+    values = [found.mass(4.0 * share / TOLERANCE, NOTHING, good) for share in (0, 1e-4, 1e-3, 1e-2, 0.1)]
     assert values == sorted(values)
     assert values[0] == 0
     assert values[-1] == pytest.approx(1, abs=1e-6)
     assert 0.01 < values[2] < 0.99
-    assert found.mass(4.0, NOTHING, 0.1, 1.0, torch.tensor([False])) == 0
+    assert found.mass(4.0, NOTHING, torch.tensor([False])) == 0
 
 
 def test_errors_of_the_map_take_mass_away() -> None:
     found, good = solved(matches(0)), torch.tensor([True])
-    exact, shared = (found.mass(4.0, c, 0.01, 0.05, good) for c in (NOTHING, 0.04**2 * torch.eye(6).double()))
+    exact, shared = (found.mass(4.0 / 3, c, good) for c in (NOTHING, 0.04**2 * torch.eye(6).double()))
     assert shared < exact - 0.1
 
 
@@ -138,7 +139,7 @@ def test_what_is_undetermined_has_no_mass() -> None:
     found = solved(matches(0))
     for value in (torch.inf, torch.nan):
         broken = replace(found, covariance=torch.full_like(found.covariance, value))
-        assert broken.mass(4.0, NOTHING, 0.1, 1.0, torch.tensor([True])) == 0
+        assert broken.mass(4.0, NOTHING, torch.tensor([True])) == 0
 
 
 # Explanations

@@ -261,9 +261,9 @@ def test_a_state_with_damaged_numbers_or_tensors_is_refused_and_changes_nothing(
     fewer = tensors | {"points.landmark": tensors["points.landmark"][1:].clone()}
     wrong: list[tuple[dict[str, torch.Tensor], dict[str, Any], str, str, str | None]] = [
         (tensors, changed("frames", "3"), ": frames", "found '3'", "int"),
-        (tensors, changed("age", -1), "", "age is -1", "0 or more"),
+        (tensors, changed("age", -1), "", "a number of frames or landmarks is negative", None),
         (tensors, numbers | {"interval": 0}, "", "no field 'interval'", "any of clock"),
-        (tensors, changed("motion.reach", 0.0), "", "reach is 0.0", "a positive distance"),
+        (tensors, changed("motion.reach", 0.0), "", "the reach is not positive", None),
         (tensors, changed("motion.reach", None), ": motion: reach", "found None", "float"),
         (tensors, changed("motion.noise", 1.0), ": motion: noise", "found 1.0", None),
         (tensors, changed("depth_factor", []), ": depth_factor", "found []", "float"),

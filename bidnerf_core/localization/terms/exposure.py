@@ -8,8 +8,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-ROUNDS = 3
-"""Rounds of iteratively reweighted least squares, the first of which is unweighted."""
 NEARLY_CLIPPED = 0.01
 """Distance from black or white, in [0, 1], within which an image's colours may be clipped."""
 
@@ -22,13 +20,14 @@ def clipped(seen: Float[Tensor, "*s"], measured: Float[Tensor, "#*s"]) -> Bool[T
     return ((measured > 1 - NEARLY_CLIPPED) & (seen >= 1)) | ((measured < NEARLY_CLIPPED) & (seen <= 0))
 
 
+# Rounds of iteratively reweighted least squares, the first of which is unweighted
 def fit_exposure(
     seen: Float[Tensor, "h n 3"],
     measured: Float[Tensor, "n 3"],
     weigh: Callable[[Float[Tensor, "h n 3"]], Float[Tensor, "h n 3"]],
     known: Float[Tensor, "#h n 1"],
     precision: tuple[float, float],
-    rounds: int = ROUNDS,
+    rounds: int = 3,
 ) -> tuple[Float[Tensor, "h 1 3"], Float[Tensor, "h 1 3"]]:
     """Return the gain and the offset of the model ``measured = gain * seen + offset``, by reweighted least squares.
 

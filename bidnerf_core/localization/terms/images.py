@@ -24,8 +24,6 @@ from bidnerf_core.mapping import Normal, P, States, SurfaceMap, cast
 
 CHUNK = 16384
 """Number of rays rendered at a time."""
-UNKNOWN_COST = 0.7
-"""Cost of a pixel for which the map renders nothing, relative to that of a pixel that disagrees."""
 INDEPENDENT = 60.0
 """Number of independent measurements in a small image."""
 
@@ -167,7 +165,8 @@ class Images:
         corrected = gain * seen + offset
         error = corrected.clamp(0, 1) - measured
         near = inlier(error)
-        cost = (sure * (1 - near) + (1 - sure) * UNKNOWN_COST)[..., 0].mean(-1)
+        # Cost of a pixel for which the map renders nothing, relative to that of a pixel that disagrees
+        cost = (sure * (1 - near) + (1 - sure) * 0.7)[..., 0].mean(-1)
         # Where the camera clips, the colour does not depend on the pose.
         inside = (corrected - 0.5).abs() < 0.5
         weight = inside * (sure * near.square() * (2 / scales.colour**2 / error.shape[1]))

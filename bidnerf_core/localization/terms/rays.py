@@ -27,10 +27,6 @@ ALONE = 10.0
 """Largest number of independent rays without other measurements, at a pose that may be far off."""
 FIELD_ERRORS = 10.0
 """Variance of the rays' gradients relative to that by their noise: neighbouring rays share the errors of the field."""
-GAIN_PRIOR = 0.001
-"""Precision of the gain's prior, relative to the number of rays. It matters only if everything in view has one colour."""
-MISS = 3.0
-"""Depth residual, in scales of the loss, of a ray that hits nothing: that of an outlier, but less than the whole distance."""
 OUTLIER = 3.0
 """Residual, in scales of the loss, beyond which a ray disagrees with the rendering."""
 
@@ -177,7 +173,9 @@ class Rays:
         """Return the measured distances of all rays from ``count`` states, and by how much a ray that hits nothing is off."""
         if self.depth_loss is None:
             return None, 0.0
-        return self.distance.float().repeat(count), MISS * self.depth_loss.scale
+        # Depth residual, in scales of the loss, of a ray that hits nothing: that of an outlier, but less than
+        # the whole distance
+        return self.distance.float().repeat(count), 3.0 * self.depth_loss.scale
 
     def _differences(
         self, seen: Float[Tensor, "h n c"]
@@ -195,7 +193,9 @@ class Rays:
         if not (self.exposure or always):
             return torch.ones_like(seen[:, :1]), torch.zeros_like(seen[:, :1])
         half = 2 * self.loss.scale
-        known, precision = self.coloured[None, :, None], GAIN_PRIOR * len(self)
+        # Precision of the gain's prior, relative to the number of rays. It matters only if everything in view
+        # has one colour.
+        known, precision = self.coloured[None, :, None], 0.001 * len(self)
         gain, offset = fit_exposure(
             seen, self.rgb, lambda off: 1 / (1 + (off / half).square()), known, (precision, 0.0)
         )

@@ -17,8 +17,6 @@ from bidnerf_core.localization.settings import DescentSettings, ReachSettings, r
 
 DIFFERENT = 0.02
 """Colour difference from the background, in [0, 1], above which a pixel shows matter."""
-LITTLE_BACKGROUND = 0.02
-"""Fraction of an image's pixels without matter below which preferring the other pixels is not worth its cost."""
 
 
 @dataclass(eq=False)
@@ -36,8 +34,10 @@ class SampledLoss:
         problem = self.problem
         self._field, self._bounds = problem.level(self.rays.level), problem.bounds
         # Preferring other pixels pays only if more than a few show the background.
+        # Fraction of an image's pixels without matter below which preferring the other pixels is not worth
+        # its cost
         shown = self.reach.candidates > 1 and any(
-            _share_of_background(view.frame, problem.bounds) > LITTLE_BACKGROUND for view in problem.views
+            _share_of_background(view.frame, problem.bounds) > 0.02 for view in problem.views
         )
         self._candidates = self.reach.candidates if shown else 1
 

@@ -31,19 +31,10 @@ POINTS = 500
 """Number of points that are compared."""
 INDEPENDENT = 10.0
 """Largest number of independent measurements among depths against the surface."""
-DENSE = 20
-"""Ratio of measured to compared points above which they are drawn with replacement, which takes far less time."""
-DISC = 1.5
-"""Radius of a surfel in cells: beyond it, a point does not lie on the surface."""
 COLOUR = 0.15
 """Norm of the colour difference (three channels, each in [0, 1]) at which a point's inlier weight is one half."""
 MOST_CHANGE = 0.2
 """Maximum change of a surfel's colour to which its gradient is extrapolated within the plane."""
-GAINED = 0.05
-"""Minimum increase of the colour inliers by an exposure, as a fraction of all points, for it to be applied.
-
-Blur also lowers contrast, but restoring that contrast only enlarges the differences.
-"""
 
 
 def sights_of(
@@ -94,7 +85,9 @@ class Surface:
                 shown = ~frame.hidden.cpu()[row, column]
                 row, column = row[shown], column[shown]
             most = -(-count // len(views))
-            if len(row) > DENSE * most:  # hardly any is drawn twice
+            # Ratio of measured to compared points above which they are drawn with replacement, which takes
+            # far less time
+            if len(row) > 20 * most:  # hardly any is drawn twice
                 drawn = torch.randint(len(row), (most,), generator=generator)
             else:
                 drawn = torch.randperm(len(row), generator=generator)[:most]
@@ -206,7 +199,9 @@ class Surface:
         rgb = ((self.rgb - offset[0]) / gain[0].clamp(min=0.1)).clamp(0, 1)
         changed = replace(self, rgb=rgb)
         gained = near * (changed._alike(surface - rgb) - self._alike(difference)) * self.coloured
-        return changed if float(gained.mean()) > GAINED else self  # host
+        # Minimum increase of the colour inliers by an exposure, as a fraction of all points, for it to be
+        # applied. Blur also lowers contrast, but restoring that contrast only enlarges the differences.
+        return changed if float(gained.mean()) > 0.05 else self  # host
 
     def _alike(self, difference: Float[Tensor, "h n 3"]) -> Float[Tensor, "h n"]:
         return inlier_weight(difference.double().square().sum(-1), COLOUR)
@@ -235,7 +230,8 @@ class Surface:
         normal = self.surface.surfels.normals[index].double()
         across = (offset * normal).sum(-1)
         along = offset - across[..., None] * normal
-        beyond = (along.norm(dim=-1) - DISC * self.surface.cell).clamp(min=0)
+        # Radius of a surfel in cells: beyond it, a point does not lie on the surface
+        beyond = (along.norm(dim=-1) - 1.5 * self.surface.cell).clamp(min=0)
         return across, across.square() + beyond.square(), normal, index, along, local, rays
 
     def _rows(self, states: States, normal: Tensor, local: Tensor, rays: Tensor) -> Float[Tensor, "h n P"]:

@@ -14,12 +14,8 @@ FLOW_WINDOW = (13, 13)
 """Size of the compared patches, pixels."""
 FLOW_STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
 """Maximum number of iterations on each level, and the step (pixels) below which they end."""
-RETURN = 0.7
-"""Maximum forward-backward error of a point, pixels."""
 LEAST_TEXTURE = 1e-3
 """Minimum eigenvalue of a patch's gradient matrix, as normalised by OpenCV; a blank wall with noise stays below it."""
-BRIGHTNESS = 0.02
-"""Relative change of an image's mean above which its brightness is matched first, since the flow assumes constant brightness."""
 
 PATCH, LEAST_CORRELATION = 4, 0.6
 """Half size (pixels) of the patches that ``alike`` compares, and their minimum correlation."""
@@ -48,7 +44,8 @@ def flow(
     )  # fmt: skip
     height, width = now.shape
     inside = ((there >= 0) & (there <= (width - 1, height - 1))).all(-1)
-    returned = np.linalg.norm(back - start, axis=-1) <= RETURN
+    # Maximum forward-backward error of a point, pixels
+    returned = np.linalg.norm(back - start, axis=-1) <= 0.7
     found = inside & returned & (seen[:, 0] > 0) & (seen_back[:, 0] > 0)
     return torch.from_numpy(there + FIRST_CENTRE).to(pixels), torch.from_numpy(found)
 
@@ -89,14 +86,11 @@ def _corner_based(pixels: Float[Tensor, "m 2"]) -> Float[np.ndarray, "m 2"]:
 
 def _as_bright_as(model: Grey, image: Grey) -> Grey:
     """Return ``image`` with about the mean and standard deviation of ``model``; unchanged if the means hardly differ."""
-    (mean, spread), (wanted, wanted_spread) = _moments(image), _moments(model)
-    if abs(wanted - mean) <= BRIGHTNESS * mean or spread < 1:
+    (mean, spread), (wanted, wanted_spread) = (np.ravel(cv2.meanStdDev(x)).tolist() for x in (image, model))
+    # Relative change of an image's mean above which its brightness is matched first, since the flow assumes
+    # constant brightness
+    if abs(wanted - mean) <= 0.02 * mean or spread < 1:
         return image
     gain = min(4.0, max(0.25, wanted_spread / spread))
     levels = (gain * (np.arange(256) - mean) + wanted).round().clip(0, 255).astype(np.uint8)
     return levels[image]
-
-
-def _moments(image: Grey) -> tuple[float, float]:
-    mean, spread = cv2.meanStdDev(image)
-    return float(mean[0, 0]), float(spread[0, 0])

@@ -15,7 +15,7 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import CORNERS_PER_INDEPENDENT, SE3, skew, update_between
 from bidnerf_core.localization.accept import Evidence, judge
 from bidnerf_core.localization.explanations import MOVE, SHARE_AS_MAP, SHARE_MOVING, STATED, TURN
-from bidnerf_core.localization.loop import ANGLE, CELLS, DEPTH_WIDTH, TOLERANCE
+from bidnerf_core.localization.loop import CELLS, DEPTH_WIDTH
 from bidnerf_core.localization.matching import (
     OBLIQUE,
     LandmarkMatcher,
@@ -24,12 +24,13 @@ from bidnerf_core.localization.matching import (
     Projected,
     log10_nfa,
 )
-from bidnerf_core.localization.posterior import Posterior
+from bidnerf_core.localization.posterior import TOLERANCE, Posterior, mass_within
 from bidnerf_core.localization.problem import SceneMap
 from bidnerf_core.localization.propose import LEAST_AGREEING, consensus
 from bidnerf_core.localization.query import Query
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.settings import LEAST_POINTS, TrackerConfig
+from bidnerf_core.localization.support import Support
 from bidnerf_core.localization.terms.rays import ALONE, Rays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.localization.tracking.flow import Grey
@@ -61,43 +62,12 @@ there are many; and after this number of frames. Fewer than the first number are
 """
 MOST_IN_VIEW = 4_000
 """Number of landmarks in view, those in most images, that are compared with keypoints regardless of where they project."""
-TIGHT = 1.5
-"""Radius of matching by projection around an accurate pose, in units of the inlier threshold."""
-WIDEST = 0.4
-"""Maximum search radius around the predicted landmarks, as a fraction of the image's diagonal."""
-PLAUSIBLE = 5.0
-"""Deviation of the scale of measured depth from that of the landmarks beyond which the depth is wrong, in standard deviations."""
-SCALE_NOISE = 0.01
-"""Relative standard deviation of that scale by a few landmarks."""
 LEAST_CORNERS, LEAST_SHARE, SIGNIFICANT_NFA = 20, 0.5, -6.0
 """Minimum number and fraction of the corners that agree on a motion, and maximum log10 of its number of false alarms."""
-FOLLOWS = 4.0
-"""Log odds that a pose is right if none of an image was rejected before it: one in fifty is wrong, far more than tracked sequences
-show.
-"""
 WIDER = 3.0, 1.0
 """Scales of the robust loss of measured points, in units of that which suits their residuals, of consecutive descents."""
 STEPS = 2
 """Maximum number of steps of such a descent, since the start is close."""
-VAGUE = 0.35
-"""Maximum uncertainty of a prediction that measured points may correct, as a fraction of the distance to the scene."""
-RAYS = 256
-"""Number of rays rendered for a frame in a map without landmarks."""
-COMMON = 0.5
-"""Fraction of the variance of a pose by depth or rendered colours that is common to consecutive frames."""
-WEAK = 0.1
-"""Ratio to the mean information of the three best directions below which the prediction is kept along a direction."""
-FORESEEN = 25.0
-"""Maximum squared Mahalanobis distance between a prediction and an accepted pose by depth or rendered colours."""
-JUDGED_CELLS = 4.0
-"""Distance from the surface at which a point counts half, in cells of the surface's grid."""
-ON_SURFACE, LIKE_SURFACE, LIKE_RENDERED = 0.85, 0.42, 0.93
-"""Minimum fractions of the measured points on the surface, of those that also have its colour, and of the rays with the rendered
-colours."""
-PRECISION = 0.03
-"""Maximum standard deviation of an accepted position, relative to the distance of the scene."""
-TYPICAL_ERRORS = 4.5
-"""Maximum standard deviation of a position without colours, in median errors of the map's own images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +102,9 @@ class Determined:
         back = torch.linalg.inv(at_middle)
         values, axes = torch.linalg.eigh((back.T @ found.hessian[0] @ back)[:6, :6])
         good = torch.eye(P, dtype=torch.float64)
-        good[:6, :6] = axes @ (axes * (values >= WEAK * values[3:].mean())).T
+        # Ratio to the mean information of the three best directions below which the prediction is kept along
+        # a direction
+        good[:6, :6] = axes @ (axes * (values >= 0.1 * values[3:].mean())).T
         kept = back @ good @ at_middle
         return Normal(found.cost, found.gradient @ kept, kept.T @ found.hessian @ kept)
 
@@ -208,7 +180,8 @@ class Measurer:
             seen = Projected(query, landmarks, States.known(T, still), within)
             return points_of(seen.matches(within)), seen
 
-        tight = TIGHT * query.threshold
+        # Radius of matching by projection around an accurate pose, in units of the inlier threshold
+        tight = 1.5 * query.threshold
         if radius > 2 * tight:
             # Matching by projection would compare a keypoint with the few landmarks nearest to it: compare it with all in view.
             if len(landmarks) < 2 or len(query.view) < 4:
@@ -304,7 +277,10 @@ class Measurer:
         ratio = ratio[depth > 0]
         if len(ratio) >= LEAST_AGREEING:
             scale = float(ratio.median())
-            if abs(scale - 1) > PLAUSIBLE * math.hypot(DEPTH_WIDTH * sensor.scale, SCALE_NOISE):
+            # Deviation of the scale of measured depth from that of the landmarks beyond which the depth is
+            # wrong, in standard deviations
+            # Relative standard deviation of that scale by a few landmarks
+            if abs(scale - 1) > 5.0 * math.hypot(DEPTH_WIDTH * sensor.scale, 0.01):
                 return None, 1 / scale
         view = View(frame, SE3.identity())
         return Surface.of([view], None, surface, state.frames, self.config.depth_points), 1.0
@@ -320,17 +296,16 @@ class Measurer:
             # It is estimated from few counts, hence at least a half.
             nfa = log10_nfa(fit.keypoints, count, min(0.5, max(0.5, fit.by_chance) / fit.keypoints))
             chance, recall = fit.by_chance, count / fit.keypoints
-        fused = Posterior(
-            fit.states, Normal(one, one, one), one, covariance[None], torch.zeros((1, 6)).double(), one, 0
-        )
         evidence = Evidence(
             log10_nfa=nfa, inliers=count, by_chance=chance, recall=recall,
             spread=len(cells(kept.pixels, fit.camera).unique()) / CELLS**2,
             noise_ratio=noise / self.landmarks.noise, precision=_position_deviation(covariance) / distance,
-            mass=fused.mass(distance, 0 * covariance, TOLERANCE, ANGLE, one > 0),
+            mass=mass_within(one, torch.zeros((1, 6)).double(), covariance[None], distance),
             other_place=0.0, credible=1.0, replaced=0.0, searched=True,
         )  # fmt: skip
-        verdict = judge(evidence, 0.0 if state.searchable else FOLLOWS)
+        # Log odds that a pose is right if none of an image was rejected before it: one in fifty is wrong, far
+        # more than tracked sequences show
+        verdict = judge(evidence, 0.0 if state.searchable else 4.0)
         if fit.is_recognised:
             kept = kept.well_spread(fit.camera, self.config.points)
             state = replace(state, sought=len(kept), age=0)
@@ -358,7 +333,9 @@ class Measurer:
         if points is None and (image is None or not has_field(self.scene.field)):
             return None
         off = math.sqrt(float((covariance.diagonal() * torch.tensor([1.0] * 3 + [reach**2] * 3)).sum() / 3))
-        if image is None and off > VAGUE * reach:
+        # Maximum uncertainty of a prediction that measured points may correct, as a fraction of the distance
+        # to the scene
+        if image is None and off > 0.35 * reach:
             why = "no colours were recorded, and the prediction is too uncertain for the shape"
             return Measurement(predicted, Verdict(Outcome.UNDETERMINED, why), 1.0, state)
         states = States.known(predicted.T_world_camera, torch.zeros(6, dtype=torch.float64))
@@ -366,11 +343,13 @@ class Measurer:
         hessian[0, :6, :6] = torch.linalg.inv(covariance)
         prediction = Quadratic(states, zero[:, 0], zero, hessian)
         if points is None:
-            rays = Rays.of([view], self.scene.field, self.scene.bounds, RAYS, state.frames)
+            # Number of rays rendered for a frame in a map without landmarks
+            rays = Rays.of([view], self.scene.field, self.scene.bounds, 256, state.frames)
             rays = replace(rays, independent=ALONE)
             for _ in WIDER:
                 states, normal = descend(states, [prediction, rays.fitted(states)], STEPS)
             share = float(rays.agreement(states))
+            measured = Support(new_inliers=share)
             words = f"{share:.0%} of the rays have the rendered colours"
         else:
             points = replace(points, colour_weight=float(image is not None))
@@ -382,41 +361,40 @@ class Measurer:
                 )
                 term = Determined(fitted) if image is None else fitted
                 states, normal = descend(states, [prediction, term], STEPS)
-            near, alike = replace(points, noise=JUDGED_CELLS / 2 * points.surface.cell).inliers(states)
+            # Distance from the surface at which a point counts half, in cells of the surface's grid
+            near, alike = replace(points, noise=2 * points.surface.cell).inliers(states)
             share, colours = float(near.mean()), float((near * alike).mean())
+            measured = Support(on_surface=share, colour_inliers=None if image is None else colours)
             words = f"{share:.0%} of the measured points lie on the surface"
         information = normal.hessian[0, :6, :6] - hessian[0, :6, :6]
         fused = torch.linalg.inv(normal.hessian[0, :6, :6])
-        kept, measured = torch.eye(6).double() - fused @ information, fused @ information @ fused
+        rest, own = torch.eye(6).double() - fused @ information, fused @ information @ fused
+        # Half of the variance of a pose by depth or rendered colours is common to consecutive frames.
         pose = PoseEstimate(
             states.T[0].polished(),
-            kept @ predicted.noise[:6, :6] @ kept.T + (1 - COMMON) * measured,
-            kept @ predicted.bias @ kept.T + COMMON * measured,
+            rest @ predicted.noise[:6, :6] @ rest.T + own / 2,
+            rest @ predicted.bias @ rest.T + own / 2,
         )
         moved = update_between(predicted.T_world_camera, pose.T_world_camera)
         motion = predicted.refined(pose)
         deviation = _position_deviation(motion.covariance)
         typical = 0.0 if self.landmarks is None else self.landmarks.trial.translation
         uncertain = f"{words}, but the position is uncertain by {deviation:.3g}"
-        bounds = [
-            (float(moved @ torch.linalg.solve(covariance, moved)) <= FORESEEN,
+        verdict = measured.verdict(words)
+        doubts = [
+            # A squared Mahalanobis distance between the prediction and the pose
+            (float(moved @ torch.linalg.solve(covariance, moved)) <= 25,
              Outcome.AMBIGUOUS, "the measurements fit a place that is inconsistent with the motion"),
-            (deviation <= PRECISION * reach, Outcome.IMPRECISE, uncertain),
+            (image is not None or state.clock.stamped,
+             Outcome.IMPRECISE, f"{words}, but without a time stamp the motion is unknown"),
+            (deviation <= TOLERANCE * reach, Outcome.IMPRECISE, uncertain),
+            # In median errors of the map's own images
+            (image is not None or not typical or deviation <= 4.5 * typical,
+             Outcome.IMPRECISE, f"{uncertain}, images by {typical:.3g}"),
         ]  # fmt: skip
-        if points is None:
-            bounds.insert(0, (share >= LIKE_RENDERED, Outcome.RENDERING_MISMATCH, f"only {words}"))
-        else:
-            bounds.insert(0, (share >= ON_SURFACE, Outcome.OFF_SURFACE, f"only {words}"))
-        if points is not None and image is not None:
-            why = f"only {colours:.0%} have the surface's colour"
-            bounds.insert(1, (colours >= LIKE_SURFACE, Outcome.COLOUR_MISMATCH, why))
-        elif image is None:
-            why = f"{words}, but without a time stamp the motion is unknown"
-            bounds.insert(2, (state.clock.stamped, Outcome.IMPRECISE, why))
-            known = not typical or deviation <= TYPICAL_ERRORS * typical
-            bounds.append((known, Outcome.IMPRECISE, f"{uncertain}, images by {typical:.3g}"))
-        broken = (Verdict(outcome, why) for passed, outcome, why in bounds if not passed)
-        return Measurement(motion, next(broken, Verdict(Outcome.CONVERGED, words)), 1 - share, state)
+        if verdict.accepted:
+            verdict = next((Verdict(outcome, why) for known, outcome, why in doubts if not known), verdict)
+        return Measurement(motion, verdict, 1 - share, state)
 
     def odometry(
         self, frame: Frame, corners: Points, motion: Motion, predicted: Motion, seconds: float
@@ -437,7 +415,8 @@ def search_radius(frame: Frame, predicted: Motion) -> float | None:
     """Return the radius (pixels) within which landmarks very likely project; None if that is most of the image."""
     camera = frame.intrinsics
     radius = INLIER * pixel_radius(predicted.covariance, camera.fx, predicted.reach)
-    return radius if radius <= WIDEST * math.hypot(camera.width, camera.height) else None
+    # Maximum search radius around the predicted landmarks, as a fraction of the image's diagonal
+    return radius if radius <= 0.4 * math.hypot(camera.width, camera.height) else None
 
 
 def shows_shape(frame: Frame) -> bool:

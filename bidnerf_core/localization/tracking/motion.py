@@ -55,14 +55,10 @@ briskly.
 """
 LONGEST_GAP = 0.6
 """Interval without frames, in seconds, after which the velocity is no longer used."""
-UNFORESEEN = 60.0
-"""Squared Mahalanobis distance of a measured pose from the prediction beyond which the prediction is discarded."""
 ADAPTED, LEAST_AGILITY, MOST_SURPRISE = 0.4, 0.1, 9.0
 """Fraction of the squared agility that each measured pose updates, the agility's lower limit, and the upper limit of the ratio of
 a squared innovation to its expected value.
 """
-KNOWN = 0.5
-"""Variance of a velocity, relative to that of an unknown one, below which innovations update the agility."""
 UNSTAMPED = 0.5
 """Relative standard deviation of an interval between frames without time stamps, as frames may be missing."""
 LEAST_SECONDS = 1e-3
@@ -176,7 +172,9 @@ class Motion:
             return self
         off = update_between(self.T_world_camera, measured.T_world_camera)
         spread = self.noise[:6, :6] + measured.noise
-        if float(off @ torch.linalg.solve(spread, off)) > UNFORESEEN:
+        # Squared Mahalanobis distance of a measured pose from the prediction beyond which the prediction is
+        # discarded
+        if float(off @ torch.linalg.solve(spread, off)) > 60.0:
             return Motion.at(measured, self.reach)
         return replace(self.corrected(measured), agility=self._observed_agility(off[:3], spread[:3, :3]))
 
@@ -187,7 +185,9 @@ class Motion:
         translation of a walking person, and measurements determine them well.
         """
         velocity = float(self.noise.diagonal()[6:9].mean()) / (self.reach * SPEED) ** 2
-        if velocity > KNOWN:
+        # Variance of a velocity, relative to that of an unknown one, below which innovations update the
+        # agility
+        if velocity > 0.5:
             return self.agility
         ratio = min(MOST_SURPRISE, float(off @ torch.linalg.solve(spread, off)) / 3)
         return min(1.0, max(LEAST_AGILITY, self.agility * math.sqrt(1 - ADAPTED + ADAPTED * ratio)))

@@ -57,13 +57,6 @@ class TrackerState:
     is_approximate: bool = False
     doubt: Float[Tensor, "6 6"] = _zeros(6, 6)  # covariance of the pose due to errors of the intrinsics
 
-    def __post_init__(self) -> None:
-        for name in ("frames", "lost", "searchable", "sought", "age", "misread"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name} is {getattr(self, name)}", expected="0 or more")
-        if self.clock.interval <= 0:
-            raise InputError("the interval is 0 or less", expected="a positive number")
-
     def corrected(self, frame: Frame) -> Frame:
         """Return a frame with the corrections of its camera; frames of the other kind are from another source."""
         if frame.focal_is_approximate != self.is_approximate or not bool(self.camera.any()):
@@ -102,26 +95,33 @@ def load_tracker_state(path: Path, key: str) -> TrackerState:
         raise InputError(f"belongs to map {found.get('map')!r}, the tracker's is {key!r}", where=path)
     state = from_plain(TrackerState, with_tensors(found.get("state"), tensors, str(path)), str(path))
     for name, value in tensors.items():
-        if not value.is_floating_point():
-            continue
         kind = torch.float32 if name == "points.pixels" else torch.float64
-        if value.dtype != kind or not bool(value.isfinite().all()):
-            raise InputError(f"{name} is not finite, or {value.dtype}", where=path, expected=str(kind))
-        if value.numel() and float(value.abs().max()) > LARGEST_LENGTH:
-            largest = f"at most {LARGEST_LENGTH:g}"
-            raise InputError(f"{name} is {float(value.abs().max()):g}", where=path, expected=largest)
+        sound = value.dtype == kind and bool(
+            (value.abs() <= LARGEST_LENGTH).all()
+        )  # false for what is not a number
+        if value.is_floating_point() and not sound:
+            largest = f"finite numbers up to {LARGEST_LENGTH:g}, {kind}"
+            raise InputError(f"{name} has others, or is {value.dtype}", where=path, expected=largest)
     points, motion = state.points, state.motion
-    if len({len(getattr(points, part.name)) for part in fields(points)}) > 1:
-        raise InputError("the points have different numbers of pixels, positions or landmarks", where=path)
-    if bool((points.deviations < 0).any()):
-        raise InputError("a deviation of the points is negative", where=path)
-    if motion is None:
-        return state
-    T = motion.T_world_camera
-    if T.rotation.dim() + T.translation.dim() != 3 or not bool(T.is_rigid().all()):
-        raise InputError("the pose of the motion is not rigid", where=path)
-    if any(bool((part.diagonal() < 0).any()) for part in (motion.noise, motion.bias)):
-        raise InputError("a variance of the motion is negative", where=path)
-    if not 0 < motion.reach <= LARGEST_LENGTH:
-        raise InputError(f"reach is {motion.reach}", where=path, expected="a positive distance")
+    counts = state.frames, state.lost, state.searchable, state.sought, state.age, state.misread
+    faults = {
+        "a number of frames or landmarks is negative": min(counts) < 0,
+        "the interval is not positive": state.clock.interval <= 0,
+        "the points have different numbers of pixels, positions or landmarks": len(
+            {len(getattr(points, part.name)) for part in fields(points)}
+        )
+        > 1,
+        "a deviation of the points is negative": bool((points.deviations < 0).any()),
+    }
+    if motion is not None:
+        T = motion.T_world_camera
+        is_one = T.rotation.dim() + T.translation.dim() == 3
+        variances = torch.cat([motion.noise.diagonal(), motion.bias.diagonal()])
+        faults |= {
+            "the pose of the motion is not rigid": not (is_one and bool(T.is_rigid())),
+            "a variance of the motion is negative": bool((variances < 0).any()),
+            "the reach is not positive": not 0 < motion.reach <= LARGEST_LENGTH,
+        }
+    for what in (what for what, is_so in faults.items() if is_so):
+        raise InputError(what, where=path, expected=expected)
     return state

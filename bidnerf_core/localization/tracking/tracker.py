@@ -14,10 +14,9 @@ import torch
 from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.auto import localization_of, unrecognized, within_risk
+from bidnerf_core.localization.auto import localize_by_landmarks, within_risk
 from bidnerf_core.localization.by_surface import is_blank
-from bidnerf_core.localization.localizer import Localizer, Start, map_with_distances, start_pose
-from bidnerf_core.localization.loop import Loop
+from bidnerf_core.localization.localizer import NO_DISTANCES, Localizer, Start, start_pose
 from bidnerf_core.localization.problem import SceneMap, origin_of, unit_of
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.settings import TrackerConfig
@@ -35,16 +34,8 @@ from bidnerf_core.mapping import grey_image, strongest
 
 METHOD = "track"
 """Method name of a tracker's poses."""
-KEYPOINTS = 600
-"""Number of keypoints of an image that are matched with landmarks."""
 START = 0.03, 0.1
 """Standard deviations of a start of unknown uncertainty: fraction of the scene's extent, and radians."""
-VELOCITY_KEPT = 0.6
-"""Fraction of the velocity kept with each lost frame."""
-FIRST_FULL_SEARCH = 4
-"""The number of lost frames after which the whole surface is searched, and again each time that number has doubled."""
-CORNERS_LEFT = 0.5
-"""Remaining fraction of the corners at which new ones are detected."""
 MISREAD = 5
 """Number of frames with implausible depth of which the user is warned."""
 
@@ -68,13 +59,17 @@ class Tracker:
                 expected="a Localizer; Localizer(map) makes one" if isinstance(localizer, SceneMap) else "a Localizer",
             )  # fmt: skip
         self.localizer, self.config = localizer, TrackerConfig() if config is None else config
-        self._scene = map_with_distances(localizer)
+        self._scene = localizer.scene
+        if not self._scene.has_distances:
+            found = f"tracking needs positions, but {NO_DISTANCES};"
+            raise InputError(found, expected="a map of photos from several places")
         self._state = TrackerState(Clock(None, self.config.frame_seconds))
         self._origin = origin_of(self._scene)
         self._start = None if start is None else start_pose(start).translated(-self._origin)
         matcher = localizer.matcher if localizer.matches_landmarks else None
         self._landmarks = None if matcher is None else matcher.landmarks
-        features = None if matcher is None else strongest(matcher.features, KEYPOINTS)
+        # Number of keypoints of an image that are matched with landmarks
+        features = None if matcher is None else strongest(matcher.features, 600)
         self._measure = Measurer(self._scene, self._landmarks, features, localizer.depth_sensor, self.config)
         surface, bounds = self._scene.surface, self._scene.bounds
         corners = torch.tensor([bounds.lower, bounds.upper])
@@ -172,8 +167,9 @@ class Tracker:
                     Measurement(vague, Verdict(Outcome.TOO_FEW_MATCHES, why), 1.0, state), vague
                 )
             return found, state
+        # Fraction of the velocity kept with each lost frame
         state = replace(
-            state, motion=replace(predicted, velocity=VELOCITY_KEPT * predicted.velocity),
+            state, motion=replace(predicted, velocity=0.6 * predicted.velocity),
             points=self._corners(frame, image, state.points, predicted.T_world_camera),
         )  # fmt: skip
         unseen = Verdict(Outcome.TOO_FEW_MATCHES, "no landmarks were recognised around the prediction")
@@ -230,7 +226,8 @@ class Tracker:
     def _corners(self, frame: Frame, image: Grey | None, points: Points, T_world_camera: SE3) -> Points:
         """Return the corners among ``points``, or new ones at the pose of this frame if they have become few."""
         points, count = points.fresh, self.config.points
-        if image is None or not frame.has_depth or len(points) >= CORNERS_LEFT * count:
+        # Remaining fraction of the corners at which new ones are detected
+        if image is None or not frame.has_depth or len(points) >= 0.5 * count:
             return points
         return Points.measured(frame, image, T_world_camera, count, self.localizer.depth_sensor.noise)
 
@@ -246,19 +243,17 @@ class Tracker:
         lost = max(state.searchable, min(state.lost, 1)) if begun else state.searchable
         if image is None or (not shows_shape(frame) and is_blank(frame)):
             return None
-        first = FIRST_FULL_SEARCH if self._landmarks is not None else 1
+        # The number of lost frames after which the whole surface is searched, and again each time that number
+        # has doubled
+        first = 4 if self._landmarks is not None else 1
         is_due = lost == 0 or (lost % first == 0 and (lost // first).bit_count() == 1)
         if self._landmarks is None and not is_due:
             return None
         T = None if predicted is None else predicted.T_world_camera
         problem = self.localizer.problem(frame, T if is_due else None)
         if self.localizer.matcher is not None and not is_due:
-            began, sensor = clocks.perf_counter(), self.localizer.depth_sensor
-            problem = replace(problem, sensor=sensor)
-            answer = Loop(problem.views, self.localizer.matcher, problem, seed=state.frames)()
-            found = unrecognized(problem) if answer is None else localization_of(problem, answer, began)
-            risk = self.localizer.shared.risk
-            return found if risk is None else within_risk(found, risk)
+            problem = replace(problem, sensor=self.localizer.depth_sensor)
+            return within_risk(localize_by_landmarks(problem, 0, state.frames), self.localizer.shared.risk)
         try:
             return self.localizer.solved(problem, state.frames)
         except InputError:
