@@ -17,13 +17,11 @@ from bidnerf_core.progress import check_cancelled
 
 WINDOW = 20
 """Steps over which the noisy loss of a few rays is averaged."""
-WARM_UP = 3
-"""Steps before the capture, which fill caches and load kernels, as a capture does not allow this."""
 Loss = Callable[[SE3], Tensor]
 RATE = 0.0125
 """Usual learning rate: of translations as a fraction of the distance to the pivot, of rotations in radians."""
-BETAS, EPSILON = (0.9, 0.999), 1e-8
-"""Decay rates of the moments, and the constant added to the root of the second (Kingma and Ba 2015, Alg. 1)."""
+BETAS = (0.9, 0.999)
+"""Decay rates of the moments (Kingma and Ba 2015, Alg. 1)."""
 
 
 class AdamSteps:
@@ -87,7 +85,7 @@ class AdamSteps:
         decays = constant(BETAS, self._updates)
         bias, bias_of_square = (1 - decays**self._updates).unbind()
         fade = constant((self._config.decay,), self._steps)[0] ** (self._steps / self._config.decay_steps)
-        root = self._square.sqrt() / bias_of_square.sqrt() + EPSILON
+        root = self._square.sqrt() / bias_of_square.sqrt() + 1e-8
         return -self._rate * fade / bias * (self._mean / root)
 
 
@@ -109,7 +107,9 @@ def follow_gradient(
         count = min(WINDOW, config.max_steps - first)
         with without_waiting():
             for step in range(count):
-                if generator is not None and first + step == WARM_UP:
+                # Steps before the capture, which fill caches and load kernels, as a capture does not allow
+                # this
+                if generator is not None and first + step == 3:
                     take = captured(steps, device, generator)
                 take()
         T, values, finite = steps.block()

@@ -28,9 +28,6 @@ from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.settings import AutoConfig
 from bidnerf_core.mapping import true_intrinsics
 
-FINAL = (Outcome.MISCALIBRATED, Outcome.MIRRORED, Outcome.AMBIGUOUS)
-"""Outcomes of a pose by landmarks that no other measurement can correct."""
-
 
 def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     """Find the pose by landmarks, or else on the surface, or else by descent from a start.
@@ -45,7 +42,10 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
         loop = Loop(problem.views, problem.matcher, problem, rays, seed)
     answer = None if loop is None else loop()
     found = None if answer is None else localization_of(problem, answer, began)
-    if found is None or not (found.converged or found.outcome in FINAL):
+    # Outcomes of a pose by landmarks that no other measurement can correct
+    if found is None or not (
+        found.converged or found.outcome in (Outcome.MISCALIBRATED, Outcome.MIRRORED, Outcome.AMBIGUOUS)
+    ):
         found = _on_surface(problem, config, seed, loop, found, began)
     is_blank = found.outcome is Outcome.UNDETERMINED
     if problem.matcher is None and problem.surface is not None and not (found.converged or is_blank):

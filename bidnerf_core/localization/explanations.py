@@ -46,11 +46,8 @@ OF_MAP = (
     ("map, about", 0.005, 0.005, 0.005, 0.001, 0.0, 0.4),
 )
 """Standard deviations about the camera of the map's images, as in ``STATED``, with shares of its odds."""
-ODDS_OF_MAP, ODDS_OF_OTHER = 0.5, 0.05
-"""Prior odds that the image is from the map's camera, if the stated one is similar but different, and if it differs much."""
 NEARLY = (0.002, 0.002, 0.002, 0.002, 0.001, 0.001)
 """Differences of two good calibrations of one camera."""
-SIMILAR = (0.16, 0.06, 0.06, 0.2, 0.02, 0.01)
 USUAL = ("exact", "right", "inexact", "nominal", "map", "map, about")
 """Explanations by which the stated camera or one of the map's is at least approximately right."""
 MOVING = " moving"
@@ -161,8 +158,9 @@ def explanations(
             rows.append((name, [0.0] * 6, (focal, centre, centre, k1, aspect, skew), share, credible))
         for c in known:
             if query.approximate or bool((c.abs() > nearly).any()):
-                similar = bool((c.abs() <= torch.tensor(SIMILAR)).all())
-                odds = ODDS_OF_MAP if similar else ODDS_OF_OTHER
+                similar = bool((c.abs() <= torch.tensor((0.16, 0.06, 0.06, 0.2, 0.02, 0.01))).all())
+                # Prior odds that the image is from the map's camera, if the stated one is similar but different, and if it differs much
+                odds = 0.5 if similar else 0.05
                 for name, focal, centre, k1, aspect, skew, share in OF_MAP:
                     deviations = (focal, centre, centre, k1, aspect, skew)
                     rows.append((name, c.tolist(), deviations, share * odds, True))

@@ -257,7 +257,7 @@ def _checked_seed(seed: Any) -> int:
 
 
 def _views(query: Any) -> list[View]:
-    views = (
+    views: list[Any] = (
         [query] if isinstance(query, Frame | View) else list(query) if isinstance(query, Sequence) else [None]
     )
     if len(views) == 1 and isinstance(views[0], Frame):

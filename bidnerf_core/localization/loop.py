@@ -69,12 +69,6 @@ RADII = (3.0, 1.5)
 """Radii of the rounds of matching by projection, in units of the inlier threshold."""
 HEAVY_TAILS = 1.7
 """Factor of the covariance by which the ellipsoid of a Gaussian's 95 % holds 95 % of the poses: errors have heavier tails."""
-AGREEING, MANY_MORE = 0.7, 1.3
-"""Fraction of the matches by descriptors that agree with a usual camera, from which no other is tried, and how many times more must agree
-with another.
-"""
-MANY_VISIBLE, CONTRADICTED = 200, 1.5
-"""Number of visible landmarks from which a pose can be contradicted, and multiple of the chance matches below which it is."""
 CELLS = 10
 """Number of rows and columns of the grid whose occupied cells measure how far matches spread over an image."""
 
@@ -305,14 +299,14 @@ class Loop:
         """
         query, found = mode.query, mode.by_descriptors
         agreeing = int(inliers(query, self.landmarks, found, best).sum())
-        if agreeing >= AGREEING * len(found):
+        if agreeing >= 0.7 * len(found):
             return best
         states = given.first(seed, 0, query.threshold / 2)
         state = states[(states.row == given.widest).nonzero()[:, 0]]
         term = self._term([replace(mode, matches=found)], best)
         state = run_on(self.device, graduate, state, term)
         more = int(inliers(query, self.landmarks, found, state).sum())
-        return state if more > MANY_MORE * agreeing else best
+        return state if more > 1.3 * agreeing else best
 
     def _rivals(
         self, nearest: Nearest, nfa: float, best: States
@@ -450,7 +444,8 @@ class Loop:
             verdict = Verdict(
                 Outcome.MIRRORED, f"the mirror image has {count} landmark inliers", verdict.confidence
             )
-        contradicted = seen.visible >= MANY_VISIBLE and count < CONTRADICTED * chance + LEAST_AGREEING
+        # Many landmarks are visible, and hardly more match than by chance.
+        contradicted = seen.visible >= 200 and count < 1.5 * chance + LEAST_AGREEING
         if (record := current_record()) is not None:
             record.add(f"refined on {count} landmarks", found.pose())
         return Answer(modes, found, given, term, covariance, distance, evidence, verdict, contradicted)

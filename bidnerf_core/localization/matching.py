@@ -33,12 +33,12 @@ from bidnerf_core.mapping import (
     squared_distances,
 )
 
-STRONGEST, LOOKED_UP = 700, 4
-"""Number of an image's keypoints that are matched by descriptors alone at first, and of landmarks looked up for each."""
+STRONGEST = 700
+"""Number of an image's keypoints that are matched by descriptors alone at first."""
 AMBIGUITY = 0.9
 """Largest ratio of the descriptor distances of the best and the second-best landmark (Lowe 2004)."""
-CANDIDATES, OCTAVES, OBLIQUE = 6, 1.0, math.radians(40)
-"""For matches by projection: landmarks compared with each keypoint, and limits of the differences in size and direction."""
+OCTAVES, OBLIQUE = 1.0, math.radians(40)
+"""For matches by projection: limits of the differences in size and direction."""
 
 
 class LandmarkMatcher:
@@ -228,7 +228,7 @@ class Nearest:
         first = torch.searchsorted(query.view, query.view)
         strongest = strongest if len(landmarks) else 0
         keypoint = (torch.arange(len(query.view)) - first < strongest).nonzero()[:, 0]
-        distance, index = matcher.nearest(query.keypoints.descriptors[keypoint], LOOKED_UP)
+        distance, index = matcher.nearest(query.keypoints.descriptors[keypoint], 4)
         position, size = landmarks.positions[index], landmarks.sizes[index]
         apart = (position - position[:, :1]).norm(dim=-1)
         same = apart <= 2 * torch.maximum(size, size[:, :1]) + 3 * landmarks.deviations[index].amax(-1)
@@ -310,7 +310,7 @@ class Projected:
                 continue
             observed = query.sights.image[own] * focal + shift
             _, found = tree.query(
-                observed.numpy(), CANDIDATES, distance_upper_bound=radius, workers=torch.get_num_threads()
+                observed.numpy(), 6, distance_upper_bound=radius, workers=torch.get_num_threads()
             )  # host
             found = torch.from_numpy(np.asarray(found, dtype=np.int64).reshape(len(own), -1))
             row, column = (found < len(index)).nonzero().unbind(-1)

@@ -63,10 +63,10 @@ from bidnerf_core.settings import Settings, from_flat
 class SharedSettings:
     """Settings of a method that trackers, collections of maps and the command line take into account as well."""
 
-    matches_landmarks: bool = True  # whether images are matched with the map's landmarks
-    depth_sensor: str = UNKNOWN_SENSOR  # name of the sensor that measured the depth
-    rays: int = 0  # number of rays that may be rendered to compare explanations of an image
-    risk: float | None = None  # tolerated fraction of wrong answers among the accepted ones
+    matches_landmarks: bool  # whether images are matched with the map's landmarks
+    depth_sensor: str  # name of the sensor that measured the depth
+    rays: int  # number of rays that may be rendered to compare explanations of an image
+    risk: float | None  # tolerated fraction of wrong answers among the accepted ones
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Method:
     presets: Mapping[str, Any] = field(default_factory=dict)  # alternatives to the default settings, by name
     uses_landmarks: bool = False  # whether the map's landmarks are prepared for it, as ``Problem.matcher``
     # returns those of its settings that matter elsewhere too
-    shared: Callable[[Any], SharedSettings] = lambda config: SharedSettings()
+    shared: Callable[[Any], SharedSettings] = lambda config: SharedSettings(True, UNKNOWN_SENSOR, 0, None)
     summary: str = field(kw_only=True)  # one line
 
     def settings(self, preset: str | None = None) -> Any:
@@ -150,9 +150,6 @@ def settings_of(method: str, values: dict[str, Any], where: str = "config", pres
 
 
 # First-order methods.
-
-PAPER_STEPS = AdamSettings(max_steps=1000, learning_rate=0.02, decay=0.8, decay_steps=100)
-"""The paper's number of steps, with iNeRF's decay. The paper does not give its learning rate; this one is provisional."""
 
 
 @dataclass(frozen=True)
@@ -224,8 +221,10 @@ def descended(
     )
 
 
+# The paper's number of steps, with iNeRF's decay. The paper does not give its learning rate; this one is
+# provisional.
 PAPER = BidConfig(
-    DescentSettings(level=0, pivot="camera"), PAPER_STEPS, depth=DepthSettings(depth_scale=0.1), reach=ReachSettings()
+    DescentSettings(level=0, pivot="camera"), AdamSettings(max_steps=1000, learning_rate=0.02, decay=0.8, decay_steps=100), depth=DepthSettings(depth_scale=0.1), reach=ReachSettings()
 )  # fmt: skip
 """The paper's settings, with updates in the camera's frame as in its Alg. 1."""
 BID = Method(

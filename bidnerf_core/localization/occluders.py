@@ -17,9 +17,6 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.settings import LEAST_POINTS
 from bidnerf_core.mapping import SurfaceMap, cast
 
-CONSIDERABLE, REST = 0.15, 0.05
-"""Minimum fraction of the measured pixels in an occluder, and in the rest."""
-
 
 @dataclass(frozen=True, eq=False)
 class Occluder:
@@ -61,11 +58,12 @@ def nearest_piece(problem: Problem) -> Occluder | None:
     label = connected_components(graph, directed=False)[1].reshape(depth.shape)
     counts = np.bincount(label[measured], minlength=1)
     total = counts.sum()
-    pieces = (counts >= max(LEAST_POINTS, CONSIDERABLE * total)).nonzero()[0]
+    # Neither the occluder nor the rest may be small.
+    pieces = (counts >= max(LEAST_POINTS, 0.15 * total)).nonzero()[0]
     if len(pieces) == 0:
         return None
     nearest = min(pieces, key=lambda piece: float(np.median(values[measured & (label == piece)])))
-    if total - counts[nearest] < max(LEAST_POINTS, REST * total):
+    if total - counts[nearest] < max(LEAST_POINTS, 0.05 * total):
         return None
     piece = torch.from_numpy(measured & (label == nearest))
     hidden, given = piece.to(view.frame.depth.device), view.frame.hidden

@@ -20,16 +20,14 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.problem import SceneMap, origin_of
 from bidnerf_core.localization.result import Localization
 
-SIDE = 240
-"""Longer side (pixels) of the photo and the rendering: each rendered pixel takes time."""
-
 
 def shown_in(scene: SceneMap, frame: Frame) -> Callable[[Localization], str]:
     """Return a function that shows an answer to a frame as an element of a page, and keeps only a small file of the photo.
 
     Answers may outlive the map, whose memory they do not hold: then, and where it cannot be rendered from the pose, it returns "".
     """
-    small, kept = frame.replace(depth=None).at_most(SIDE), weakref.ref(scene)
+    # Longer side (pixels) of the photo and the rendering: each rendered pixel takes time
+    small, kept = frame.replace(depth=None).at_most(240), weakref.ref(scene)
     stated, photo = (
         small.intrinsics,
         cv2.imencode(".png", np.ascontiguousarray(small.rgb_bytes.cpu().numpy()))[1],

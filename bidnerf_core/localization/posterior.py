@@ -13,9 +13,6 @@ from bidnerf_core.devices import run_on
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import CAMERA, Landmarks, Normal, P, Quadratic, States, log_evidence
 
-BY_SHARE = 10.0
-"""Log odds per factor e between the evidence for two places: it is not proportional to the number of matches, since the right
-place rarely has fewer than two thirds as many as another."""
 TOLERANCE, ANGLE = 0.03, 0.05
 """Within which the pose must be: relative to the distance of the scene, and radians."""
 
@@ -54,7 +51,9 @@ class Posterior:
         norm = torch.where(member, log[None], -torch.inf).logsumexp(-1)
         # Evidence below which places are not compared: a few chance matches are no evidence against even
         # fewer
-        log = log + (log_odds + BY_SHARE * by_mode.clamp(min=50.0).log() - norm)[states.mode]
+        # Log odds per factor e between the evidence for two places: it is not proportional to the number of
+        # matches, since the right place rarely has fewer than two thirds as many as another
+        log = log + (log_odds + 10.0 * by_mode.clamp(min=50.0).log() - norm)[states.mode]
         probability = log.nan_to_num(-torch.inf).softmax(0)
         best = int(probability.argmax())
         states, covariance = _true_cameras(states, normal, _robust_covariance(*information), scatter)

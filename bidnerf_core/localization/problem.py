@@ -98,14 +98,13 @@ class Problem:
     bounds: SceneBounds
     views: tuple[View, ...]
     start: SE3 | None  # guess at T_world_K; None if there is none
-    depth_rays: Observations | None = None  # from a lidar or similar, in the frame of the last camera
-    surface: SurfaceMap | None = None  # baked from the field
-    matcher: LandmarkMatcher | None = (
-        None  # of the map's landmarks, with a cache of the images' keypoints, see ``for_query``
-    )
+    depth_rays: Observations | None  # from a lidar or similar, in the frame of the last camera
+    surface: SurfaceMap | None  # baked from the field
+    # Of the map's landmarks, with a cache of the images' keypoints, see ``for_query``
+    matcher: LandmarkMatcher | None
     # Root mean square difference between the field's colours and its training images; None if unknown.
-    colour_noise: float | None = None
-    sensor: DepthSensorModel = UNKNOWN  # model of the sensor that measured the depth
+    colour_noise: float | None
+    sensor: DepthSensorModel  # model of the sensor that measured the depth
 
     def start_for(self, method: str) -> SE3:
         """Return the start. Raises ``InputError``, naming ``method``, if there is none."""
@@ -181,7 +180,7 @@ def rig(
             raise InputError(f"pose of {what} is not a rigid transform: {pose.matrix().tolist()}")
     return Problem(
         scene.field, scene.bounds, relative, None if start is None else start.to("cpu", torch.float64),
-        depth_rays, scene.surface, None if matcher is None else matcher.for_query(), scene.colour_noise,
+        depth_rays, scene.surface, None if matcher is None else matcher.for_query(), scene.colour_noise, UNKNOWN,
     )  # fmt: skip
 
 

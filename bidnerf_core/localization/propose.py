@@ -19,7 +19,6 @@ from bidnerf_core.mapping import LandmarkMap, States, project, rays_through
 
 CONVINCING = -20.0
 """Log10 of the number of false alarms below which no other camera is tried."""
-LEAST_DRAWS, MOST_DRAWS = 50, 5_000
 LEAST_AGREEING = 6
 """Least number of matches that agree on a pose."""
 
@@ -71,7 +70,7 @@ def consensus(
     ]
     options = {
         "max_reproj_error": query.threshold, "seed": 0,  "progressive_sampling": True,
-        "min_iterations": LEAST_DRAWS, "max_iterations": MOST_DRAWS, "max_prosac_iterations": MOST_DRAWS,
+        "min_iterations": 50, "max_iterations": 5_000, "max_prosac_iterations": 5_000,
     }  # fmt: skip
     found: list[SE3] = []
     of_view = [image.T_ref_camera for image in query.images]

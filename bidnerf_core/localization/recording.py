@@ -18,9 +18,6 @@ from bidnerf_core.geometry import SE3
 if TYPE_CHECKING:
     from bidnerf_core.localization.loop import Answer
 
-MOST_POSES = 400
-"""Maximum number of poses kept per step, the best ones."""
-
 
 @dataclass(frozen=True, eq=False)
 class RecordedStep:
@@ -46,7 +43,8 @@ class SearchRecord:
         compared = scores is not None
         if scores is None:
             scores = torch.arange(len(T.translation), dtype=torch.float64)
-        best = scores.argsort()[:MOST_POSES]
+        # Maximum number of poses kept per step, the best ones
+        best = scores.argsort()[:400]
         T, scores = moved((T[best], scores[best]), "cpu")
         self.steps.append(RecordedStep(caption, T, scores.double(), min(kept, len(best)), compared))
 

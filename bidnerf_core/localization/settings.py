@@ -41,19 +41,16 @@ class DepthLossSettings(Settings):
     # weight of the depth term; the photometric term has weight 1, and differences are in units of their scales
     depth_weight: NotNegative = 4.0
     depth_loss: RobustName = "huber"  # robust loss of depth differences
-    # depth difference, metres, at which outliers begin; None: 1.9 % of the scene's mean side
+    # depth difference, metres, at which outliers begin; None: 1.9 % of the scene's mean side, in first-order steps twice as much
     depth_scale: Positive | None = None
 
 
 @dataclass(frozen=True)
-class DepthSettings(Settings):
+class DepthSettings(DepthLossSettings):
     """Settings of the depth term of first-order steps, which applies where depth was measured."""
 
     # weight of the depth term, per square metre; the photometric term has weight 1
     depth_weight: NotNegative = 1.0
-    depth_loss: RobustName = "huber"  # robust loss of depth differences
-    # depth difference, metres, at which outliers begin; None: 3.8 % of the scene's mean side
-    depth_scale: Positive | None = None
     depth_residual: Annotated[str, OneOf(DEPTH_RESIDUALS), EXPERT] = "distance"  # how depths are compared
     # number of rays drawn from a sensor with rays of its own
     depth_rays: Annotated[int, Range(0, 10**7), EXPERT] = 512

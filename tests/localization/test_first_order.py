@@ -24,7 +24,6 @@ from bidnerf_core.localization import (
     DepthSettings,
     DescentSettings,
     InerfConfig,
-    Localizer,
     Outcome,
     Pivot,
     Problem,
@@ -291,7 +290,3 @@ def test_a_preset_can_be_changed_and_is_checked() -> None:
         settings_of("bid", {}, preset="papers")
     with refused(found="preset 'paper' is unknown, this method offers none"):
         METHODS["auto"].settings("paper")
-    world = FieldMap(BALL, BOX)
-    assert Localizer(world, "bid", preset="paper", warm_up=False).config == METHODS["bid"].settings("paper")
-    with refused(found="preset 'paper' and a BidConfig", expected="one"):
-        Localizer(world, "bid", METHODS["bid"].settings(), preset="paper")

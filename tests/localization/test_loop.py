@@ -8,7 +8,6 @@ outcome of an image without a right answer. The confidence, which was fitted to 
 from __future__ import annotations
 
 import functools
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -420,21 +419,6 @@ def test_an_image_that_shows_nothing_is_rejected_without_rendering(fault: str) -
     found = Localizer(scene, warm_up=False)(view)
     assert not found.converged
     assert found.reason
-
-
-def test_the_same_seed_gives_the_same_answer_in_any_thread() -> None:
-    localize = Localizer(with_landmarks(ground_landmarks()), config=QUICK, warm_up=False)
-    views = [ground_views("none", depth=True), ground_views("occluder:0.25"), ground_views("focal:0.95")]
-    expected = [localize(view, seed=3) for view in views]
-    torch.manual_seed(99)
-    with ThreadPoolExecutor(3) as pool:
-        again = list(pool.map(lambda view: localize(view, seed=3), views * 2))
-    for one, other in zip(expected * 2, again, strict=True):
-        assert torch.equal(one.T_world_camera.matrix(), other.T_world_camera.matrix())
-        assert one.covariance is not None
-        assert other.covariance is not None
-        assert torch.equal(one.covariance, other.covariance)
-        assert (one.outcome, one.reason) == (other.outcome, other.reason)
 
 
 def test_in_a_moved_world_the_answer_moves(monkeypatch: pytest.MonkeyPatch) -> None:

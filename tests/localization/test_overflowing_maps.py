@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization import Localizer, Outcome, Tracker
+from bidnerf_core.localization import Localizer, Tracker
 from bidnerf_core.mapping import surface_from_tensors, surface_tensors
 from bidnerf_core.testing import textured_map
 from flights import flight
@@ -33,13 +33,3 @@ def test_a_surface_of_overflowing_numbers_ends_no_tracking(part: str, value: flo
     tracker = Tracker(Localizer(scene, warm_up=False))
     answers = [tracker(frame, time) for time, frame, _ in flight()[:2]]
     assert all(answer.reason for answer in answers if not answer.converged)
-
-
-def test_landmarks_of_overflowing_positions_locate_nothing() -> None:
-    known = textured_map()
-    assert known.landmarks is not None
-    far = torch.full_like(known.landmarks.positions, 3e38)
-    scene = replace(known, landmarks=replace(known.landmarks, positions=far))
-    _, frame, _ = flight()[0]
-    found = Localizer(scene, warm_up=False)(replace(frame, depth=None))
-    assert found.outcome is Outcome.TOO_FEW_MATCHES

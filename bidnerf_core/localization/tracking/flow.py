@@ -17,8 +17,8 @@ FLOW_STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
 LEAST_TEXTURE = 1e-3
 """Minimum eigenvalue of a patch's gradient matrix, as normalised by OpenCV; a blank wall with noise stays below it."""
 
-PATCH, LEAST_CORRELATION = 4, 0.6
-"""Half size (pixels) of the patches that ``alike`` compares, and their minimum correlation."""
+PATCH = 4
+"""Half size (pixels) of the patches that ``alike`` compares."""
 
 Grey = UInt8[np.ndarray, "h w"]
 
@@ -59,7 +59,7 @@ def alike(
     """
     one, two = (_patches(image, place) for image, place in ((before, pixels), (now, there)))
     spread = np.sqrt((one**2).sum(-1) * (two**2).sum(-1)).clip(min=1e-6)
-    return torch.from_numpy((one * two).sum(-1) >= LEAST_CORRELATION * spread)
+    return torch.from_numpy((one * two).sum(-1) >= 0.6 * spread)
 
 
 def _patches(image: Grey, pixels: Float[Tensor, "m 2"]) -> Float[np.ndarray, "m p"]:

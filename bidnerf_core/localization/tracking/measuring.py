@@ -56,18 +56,12 @@ from bidnerf_core.mapping import (
     total,
 )
 
-ENOUGH_LANDMARKS, REFRESHED, MANY, REFRESH_FRAMES = 40, 0.5, 125, 20
-"""Landmarks are recognised anew if fewer than this number of tracked inliers, or than this fraction of those at first, are left, unless
-there are many; and after this number of frames. Fewer than the first number are not accepted unless the image confirms them.
-"""
+ENOUGH_LANDMARKS = 40
+"""Number of tracked inliers below which landmarks are recognised anew; fewer are not accepted unless the image confirms them."""
 MOST_IN_VIEW = 4_000
 """Number of landmarks in view, those in most images, that are compared with keypoints regardless of where they project."""
-LEAST_CORNERS, LEAST_SHARE, SIGNIFICANT_NFA = 20, 0.5, -6.0
-"""Minimum number and fraction of the corners that agree on a motion, and maximum log10 of its number of false alarms."""
-WIDER = 3.0, 1.0
-"""Scales of the robust loss of measured points, in units of that which suits their residuals, of consecutive descents."""
-STEPS = 2
-"""Maximum number of steps of such a descent, since the start is close."""
+LEAST_CORNERS, SIGNIFICANT_NFA = 20, -6.0
+"""Minimum number of the corners that agree on a motion, at least half of them, and maximum log10 of its number of false alarms."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,8 +128,9 @@ class Measurer:
         known, fit, tracked = state.points.landmarks, None, None
         if len(known) >= LEAST_AGREEING:
             fit = self._fit(frame, known, predicted.T_world_camera)
-            enough = max(ENOUGH_LANDMARKS, min(REFRESHED * state.sought, MANY))
-            if int(fit.is_inlier.sum()) >= enough and state.age < REFRESH_FRAMES:
+            # Recognised anew if fewer than half of those at first are left, unless there are many; and after some frames
+            enough = max(ENOUGH_LANDMARKS, min(0.5 * state.sought, 125))
+            if int(fit.is_inlier.sum()) >= enough and state.age < 20:
                 tracked = self._by_landmarks(frame, state, fit, predicted)
                 if tracked.verdict.accepted:
                     return tracked
@@ -346,21 +341,22 @@ class Measurer:
             # Number of rays rendered for a frame in a map without landmarks
             rays = Rays.of([view], self.scene.field, self.scene.bounds, 256, state.frames)
             rays = replace(rays, independent=ALONE)
-            for _ in WIDER:
-                states, normal = descend(states, [prediction, rays.fitted(states)], STEPS)
+            for _ in range(2):
+                states, normal = descend(states, [prediction, rays.fitted(states)], 2)
             share = float(rays.agreement(states))
             measured = Support(new_inliers=share)
             words = f"{share:.0%} of the rays have the rendered colours"
         else:
             points = replace(points, colour_weight=float(image is not None))
-            for wider in WIDER:
+            # Scales of the robust loss, in units of that which suits the residuals
+            for wider in (3.0, 1.0):
                 fitted = replace(points, noise=max(points.noise, off)).fitted_noise(states)
                 # The same information from a wider basin.
                 fitted = replace(
                     fitted, noise=wider * fitted.noise, independent=points.independent * wider**2
                 )
                 term = Determined(fitted) if image is None else fitted
-                states, normal = descend(states, [prediction, term], STEPS)
+                states, normal = descend(states, [prediction, term], 2)
             # Distance from the surface at which a point counts half, in cells of the surface's grid
             near, alike = replace(points, noise=2 * points.surface.cell).inliers(states)
             share, colours = float(near.mean()), float((near * alike).mean())
@@ -403,7 +399,7 @@ class Measurer:
         if len(corners) < LEAST_CORNERS:
             return None
         fit = Fit.of(corners, frame.intrinsics, predicted.T_world_camera, CORNERS_PER_INDEPENDENT)
-        few = fit.agreeing < max(LEAST_CORNERS, LEAST_SHARE * len(corners))
+        few = fit.agreeing < max(LEAST_CORNERS, 0.5 * len(corners))
         relative, singular = torch.linalg.inv_ex(fit.term(fit.states).hessian[0, :6, :6])
         if few or fit.log10_nfa > SIGNIFICANT_NFA or bool(singular):
             return None

@@ -47,18 +47,14 @@ class Clock:
         return Clock(time, seconds if seconds > 0 else self.interval), seconds
 
 
-SPEED, TURN_RATE = 1.0, 1.0
-"""Standard deviations of an unknown velocity, per second: reaches (distances to the visible scene), and radians."""
+SPEED = 1.0
+"""Standard deviation of an unknown velocity, per second: in reaches (distances to the visible scene), and in radians."""
 ACCELERATION, TURN_ACCELERATION = 2.0, 4.0
 """Standard deviations of the acceleration, per second squared: reaches, and radians. They suit a hand-held camera that is moved
 briskly.
 """
 LONGEST_GAP = 0.6
 """Interval without frames, in seconds, after which the velocity is no longer used."""
-ADAPTED, LEAST_AGILITY, MOST_SURPRISE = 0.4, 0.1, 9.0
-"""Fraction of the squared agility that each measured pose updates, the agility's lower limit, and the upper limit of the ratio of
-a squared innovation to its expected value.
-"""
 UNSTAMPED = 0.5
 """Relative standard deviation of an interval between frames without time stamps, as frames may be missing."""
 LEAST_SECONDS = 1e-3
@@ -96,7 +92,7 @@ class Motion:
         """Return a camera at a known pose with an unknown velocity."""
         noise = torch.zeros((12, 12), dtype=torch.float64)
         noise[:6, :6] = pose.noise
-        noise[6:, 6:] = _scaled(reach * SPEED, TURN_RATE)
+        noise[6:, 6:] = _scaled(reach * SPEED, SPEED)
         return Motion(pose.T_world_camera, torch.zeros(6, dtype=torch.float64), noise, pose.bias, reach)
 
     @property
@@ -189,8 +185,9 @@ class Motion:
         # agility
         if velocity > 0.5:
             return self.agility
-        ratio = min(MOST_SURPRISE, float(off @ torch.linalg.solve(spread, off)) / 3)
-        return min(1.0, max(LEAST_AGILITY, self.agility * math.sqrt(1 - ADAPTED + ADAPTED * ratio)))
+        # Each pose updates a fraction of the squared agility by the squared innovation, relative to what is expected.
+        ratio = min(9.0, float(off @ torch.linalg.solve(spread, off)) / 3)
+        return min(1.0, max(0.1, self.agility * math.sqrt(1 - 0.4 + 0.4 * ratio)))
 
     def moved(self, T_world_camera: SE3, relative: Float[Tensor, "6 6"], seconds: float) -> Motion:
         """Return the state ``seconds`` later, after a motion measured between the images themselves.

@@ -34,8 +34,6 @@ from bidnerf_core.mapping import grey_image, strongest
 
 METHOD = "track"
 """Method name of a tracker's poses."""
-START = 0.03, 0.1
-"""Standard deviations of a start of unknown uncertainty: fraction of the scene's extent, and radians."""
 MISREAD = 5
 """Number of frames with implausible depth of which the user is warned."""
 
@@ -181,7 +179,8 @@ class Tracker:
 
     def _at(self, frame: Frame, T: SE3, covariance: torch.Tensor | None) -> Motion:
         """Return a camera of unknown velocity at a pose, by default with the uncertainty of a start."""
-        deviation = torch.tensor([START[0] * self._extent] * 3 + [START[1]] * 3, dtype=torch.float64)
+        # A start is off by a fraction of the scene's extent, and by radians.
+        deviation = torch.tensor([0.03 * self._extent] * 3 + [0.1] * 3, dtype=torch.float64)
         zero = torch.zeros((6, 6), dtype=torch.float64)
         parts = (deviation.square().diag(), zero) if covariance is None else (covariance / 2, covariance / 2)
         return Motion.at(PoseEstimate(T, *parts), self._reach(frame))
