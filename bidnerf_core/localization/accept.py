@@ -57,9 +57,8 @@ class Bound(NamedTuple):
     outcome: Outcome
     reason: str  # with the value as ``{0}``, and the limit as ``{1}``
 
-    def keeps(self, value: float, limit: float | None = None) -> bool:
-        """Return whether a value keeps the bound, or another ``limit``; what is not a number does not."""
-        limit = self.limit if limit is None else limit
+    def keeps(self, value: float, limit: float) -> bool:
+        """Return whether a value keeps a ``limit``; what is not a number does not."""
         return value >= limit if self.is_least else value <= limit
 
 
@@ -84,7 +83,7 @@ def judge(evidence: Evidence, log_odds: float = 0.0) -> Verdict:
     confidence = model().probability(features(evidence), log_odds)
     for bound in LANDMARK_BOUNDS if evidence.searched else LANDMARK_BOUNDS[1:]:
         value = getattr(evidence, bound.measure)
-        if not bound.keeps(value):
+        if not bound.keeps(value, bound.limit):
             shown = 10.0 ** min(max(value, -300), 300) if bound.measure == "log10_nfa" else value
             return Verdict(bound.outcome, bound.reason.format(shown), confidence)
     share = f"{evidence.inliers} landmark inliers"

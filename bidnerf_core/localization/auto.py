@@ -80,22 +80,19 @@ def _on_surface(
     config = config if loop is None else replace(config, rounds=1)
     occluder = nearest_piece(problem)
     for given in (problem, *(() if occluder is None else (occluder.rest,))):
-        by_depth = localize_by_depth(given, surface, config, seed)
-        if by_depth is None:
+        found = localize_by_depth(given, surface, config, seed)
+        if found is None:
             break
-        found = by_depth
         if occluder is not None and given is not problem:
             # Minimum fraction of an occluder's points that must lie in front of the surface
             if not found.converged or occluder.share_in_front(surface, found.T_world_camera) < 0.9:
                 continue
-            hidden = (
-                f"without the nearest {occluder.share:.0%} of the measured points, which are on an occluder"
-            )
-            found = replace(found, reason=f"{found.reason}, {hidden}")
+            share = f"the nearest {occluder.share:.0%} of the measured points, which are on an occluder"
+            found = replace(found, reason=f"{found.reason}, without {share}")
         there = None if loop is None else loop.at(found.T_world_camera)
         if there is not None and there.verdict.accepted:
-            refined = localization_of(problem, there, began)
-            return replace(refined, reason=f"found on the surface; {refined.reason}")
+            found = localization_of(problem, there, began)
+            return replace(found, reason=f"found on the surface; {found.reason}")
         if there is not None and found.converged and there.contradicted:
             why = f"{there.evidence.inliers} landmarks match, {there.evidence.by_chance:.0f} by chance"
             found = found.rejected(Verdict(Outcome.TOO_FEW_MATCHES, why))
@@ -132,10 +129,10 @@ def localization_of(problem: Problem, answer: Answer, began: float) -> Localizat
         reason += ", with the motion of a rolling shutter"
     if (record := current_record()) is not None:
         record.answers.append(answer)
-    losses = torch.full((1 if problem.start is None else 2,), noise, dtype=torch.float64)
-    path = SE3.stack([T, T] if problem.start is None else [problem.start, T, T])
+    path = [T, T] if problem.start is None else [problem.start, T, T]
+    losses = torch.full((len(path) - 1,), noise, dtype=torch.float64)
     found = Localization.of(
-        replace(answer.verdict, reason=reason), path, losses, "auto", began, noise, answer.covariance, answer.evidence
+        replace(answer.verdict, reason=reason), SE3.stack(path), losses, "auto", began, noise, answer.covariance, answer.evidence
     )  # fmt: skip
     factor = 1.0 if camera is None else float(camera[0].exp())
     return replace(found, intrinsics=corrected, focal_factor=factor)
@@ -146,7 +143,7 @@ def unrecognized(problem: Problem) -> Localization:
     causes = "the image may show another place, or be too dark, too blurred or taken from too far away"
     why = Verdict(Outcome.TOO_FEW_MATCHES, f"too few landmarks were recognised: {causes}")
     path, none = (problem.start or SE3.identity())[None], torch.zeros(0, dtype=torch.float64)
-    return replace(Localization.of(why, path, none, "auto", 0.0, float("nan")), seconds=0.0)
+    return Localization.of(why, path, none, "auto", time.perf_counter(), float("nan"))
 
 
 def within_risk(found: Localization, risk: float | None) -> Localization:

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.nn.functional import pad
 
 from bidnerf_core.camera import exposure_times
 from bidnerf_core.errors import InputError
@@ -56,14 +57,13 @@ class LandmarkMatcher:
         self.landmarks = landmarks.to("cpu")
         _ = self.landmarks.cells
         self._descriptors = landmarks.descriptors
-        self._cells: _Cells | None = None
-        self._products: _Products | None = None
+        self._index: _Products | _Cells | None = None  # None: all are compared
         self._found_once: FoundOnce | None = None
         if self.device.type != "cpu":
-            self._products = _Products(landmarks.descriptors)
+            self._index = _Products(landmarks.descriptors)
         # The number of landmarks up to which the search is exhaustive, without cells
         elif len(landmarks) > 4_000:
-            self._cells = _Cells(landmarks.descriptors, seed)
+            self._index = _Cells(landmarks.descriptors, seed)
 
     @property
     def device(self) -> torch.device:
@@ -99,19 +99,15 @@ class LandmarkMatcher:
                 f"the map's descriptors have {channels} channels, those of the image {descriptors.shape[1]}; "
                 "use the detector with which the map was baked, or bake it again"
             )
-        # The number of keypoint-landmark pairs up to which comparing all of them is faster than searching
-        # cells
-        if self._cells is not None and len(descriptors) * len(self.landmarks) > 4_000_000:
-            return self._cells.nearest(descriptors, count)
-        distances = torch.full((len(descriptors), count), torch.inf)
-        index = torch.zeros(distances.shape, dtype=torch.long)
-        if len(self.landmarks):
-            if self._products is None:
-                found = _smallest(squared_distances(descriptors, self._descriptors), count)
-            else:
-                found = self._products.nearest(descriptors.to(self.device), count)
-            distances[:, : found[0].shape[1]], index[:, : found[0].shape[1]] = found
-        return distances, index
+        few = (
+            len(descriptors) * len(self.landmarks) <= 4_000_000
+        )  # pairs, which are compared faster than cells are searched
+        if self._index is None or (few and isinstance(self._index, _Cells)):
+            distance, landmark = _smallest(squared_distances(descriptors, self._descriptors), count)
+        else:
+            distance, landmark = self._index.nearest(descriptors.to(self.device), count)
+        missing = (0, count - distance.shape[1])
+        return pad(distance, missing, value=torch.inf), pad(landmark, missing)
 
 
 class _Products:
@@ -131,7 +127,7 @@ class _Products:
         """Return squared distances, which are exact, and indices of the nearest; on the CPU."""
         found, n = [], len(self._half)
         # Number of products of descriptors at a time on an accelerator, which bounds the memory
-        for part in descriptors.split(max(1, 2**26 // n)):
+        for part in descriptors.split(max(1, 2**26 // max(1, n))):
             alike = 2 * (self._unit(part) @ self._half.T).float() - self._squares
             # Number of further landmarks that are looked up by products in half precision, and then compared
             # exactly

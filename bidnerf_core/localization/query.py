@@ -44,24 +44,13 @@ class Query:
         T = SE3.stack([image.T_ref_camera.inverse() for image in images])[view]
         names = ("pixels", "sizes", "descriptors")
         joined = (torch.cat([getattr(image.keypoints, name) for image in images]) for name in names)
-        times = (
-            torch.cat([image.exposure_times for image in images])
-            if len(images) == 1
-            else torch.zeros(len(view)).double()
-        )
+        times = images[0].exposure_times if len(images) == 1 else torch.zeros(len(view)).double()
         rays = torch.cat([image.rays for image in images])[:, :2]
         focal = torch.tensor([image.focal for image in images], dtype=torch.float64)[view]
         last = images[-1].T_ref_camera.matrix()
         single = len(images) == 1 and torch.allclose(last, torch.eye(4, dtype=last.dtype), rtol=0, atol=1e-9)
         sights = Sights(rays, times, T.rotation, T.translation, single)
-        return Query(
-            images,
-            Keypoints(*joined),
-            view,
-            sights,
-            focal,
-            approximate,
-        )
+        return Query(images, Keypoints(*joined), view, sights, focal, approximate)
 
     @cached_property
     def mirrored(self) -> Query:

@@ -90,9 +90,11 @@ class Rays:
         if depth_rays is not None:
             # Such a ray is the central pixel of a camera of its own.
             some = depth_rays.drawn(count, generator, torch.float64, "cpu")
-            zero = torch.zeros_like(some.origins)
+            zero, z = torch.zeros_like(some.origins), some.directions
+            least = torch.nn.functional.one_hot(z.abs().argmin(-1), 3).to(z)
+            x = normalize(torch.linalg.cross(least, z), dim=-1)
             parts.append((
-                zero[:, :2], zero[:, 0], _looking_along(some.directions), some.origins, zero, zero[:, 0], some.distance,
+                zero[:, :2], zero[:, 0], torch.stack([x, torch.linalg.cross(z, x), z], -1), some.origins, zero, zero[:, 0], some.distance,
             ))  # fmt: skip
         image, times, R, t, rgb, coloured, depth = (torch.cat(part) for part in zip(*parts, strict=True))
         seen = Sights(image, times, R, t, single=len(views) == 1 and depth_rays is None)
@@ -312,10 +314,3 @@ def averaged(frame: Frame, size: int) -> Float[Tensor, "h w 3"]:
     covered = (small.shape[2] * size, small.shape[3] * size)
     smooth = interpolate(small, covered, mode="bilinear", align_corners=False)[..., :height, :width]
     return smooth[0].permute(1, 2, 0)
-
-
-def _looking_along(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
-    """Return rotations that take the z axis to unit ``directions``."""
-    least = torch.nn.functional.one_hot(directions.abs().argmin(-1), 3).to(directions)
-    x = normalize(torch.linalg.cross(least, directions), dim=-1)
-    return torch.stack([x, torch.linalg.cross(directions, x), directions], -1)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Generator, Tensor
 
 from bidnerf_core.devices import constant
-from bidnerf_core.fields import Objective, Observations, Rays, SceneBounds, masked_mean, render, widened
-from bidnerf_core.frames import DRAWERS, Frame, draw
+from bidnerf_core.fields import Objective, Observations, Rays, masked_mean, render, widened
+from bidnerf_core.frames import DRAWERS, draw
 from bidnerf_core.geometry import SE3, Robust
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.settings import DescentSettings, ReachSettings, rendered_depth_scale
@@ -33,13 +33,15 @@ class SampledLoss:
     def __post_init__(self) -> None:
         problem = self.problem
         self._field, self._bounds = problem.level(self.rays.level), problem.bounds
-        # Preferring other pixels pays only if more than a few show the background.
-        # Fraction of an image's pixels without matter below which preferring the other pixels is not worth
-        # its cost
-        shown = self.reach.candidates > 1 and any(
-            _share_of_background(view.frame, problem.bounds) > 0.02 for view in problem.views
-        )
-        self._candidates = self.reach.candidates if shown else 1
+        # Preferring other pixels pays only if more than a few, without measured depth, have the background's colour.
+        self._candidates = 1
+        for frame in (view.frame for view in problem.views) if self.reach.candidates > 1 else ():
+            background = constant(problem.bounds.background, frame.rgb)
+            plain = ((frame.rgb - background).abs() <= DIFFERENT).all(-1)
+            plain = plain if frame.depth is None else plain & (frame.depth <= 0)
+            plain = plain if frame.hidden is None else plain[~frame.hidden]
+            if float(plain.float().mean()) > 0.02:
+                self._candidates = self.reach.candidates
 
     def __call__(self, T_world_last: SE3) -> Float[Tensor, ""]:
         """Return the loss; differentiable in the pose of the last view's camera."""
@@ -48,7 +50,11 @@ class SampledLoss:
         pixels = draw(problem.views, many, DRAWERS[self.rays.pixels], generator, device=device)
         if self._candidates > 1:
             count = max(1, self.rays.rays // len(problem.views))
-            order = self._rank(pixels, here).sort(dim=-1, descending=True, stable=True).indices
+            # 2 or more for pixels that show matter in the image, and 1 for others whose rays may hit it in the map
+            background = constant(self._bounds.background, pixels.rgb)
+            shows = pixels.measured | ((pixels.rgb - background).abs().amax(-1) > DIFFERENT)
+            rank = 2 * shows.int() + self._field.sampler(self._rays(pixels, here)).valid.any(-1).int()
+            order = rank.sort(dim=-1, descending=True, stable=True).indices
             pixels = pixels.gathered(order[:, :count])
         found = self._loss(pixels, T_world_last)
         if problem.depth_rays is not None and self.objective.uses_depth and self.depth_rays > 0:
@@ -71,17 +77,3 @@ class SampledLoss:
     def _rays(self, observed: Observations, T_world_last: SE3) -> Rays:
         rays = observed.rays(T_world_last, self._bounds)
         return rays if self.rays.wide == 1 else widened(rays, self.rays.wide)
-
-    def _rank(self, pixels: Observations, T_world_last: SE3) -> Int[Tensor, "k p"]:
-        """Return 2 or more for pixels that show matter in the image, and 1 for others whose rays may hit it in the map."""
-        background = constant(self._bounds.background, pixels.rgb)
-        shows = pixels.measured | ((pixels.rgb - background).abs().amax(-1) > DIFFERENT)
-        valid = self._field.sampler(self._rays(pixels, T_world_last)).valid
-        return 2 * shows.int() + valid.any(-1).int()
-
-
-def _share_of_background(frame: Frame, bounds: SceneBounds) -> float:
-    """Return the fraction of the pixels with the background's colour and without measured depth."""
-    plain = ((frame.rgb - constant(bounds.background, frame.rgb)).abs() <= DIFFERENT).all(-1)
-    plain = plain if frame.depth is None else plain & (frame.depth <= 0)
-    return float((plain if frame.hidden is None else plain[~frame.hidden]).float().mean())

@@ -113,7 +113,10 @@ class Motion:
         transition = torch.eye(12, dtype=torch.float64)
         transition[:6, :6] = back
         transition[:6, 6:] = seconds * torch.eye(6, dtype=torch.float64)
-        noise = transition @ motion.noise @ transition.T + self._acceleration_noise(seconds)
+        apart = max(abs(seconds), LEAST_SECONDS)
+        spread = _scaled(self.agility * self.reach * ACCELERATION, TURN_ACCELERATION)
+        pairs = torch.tensor([[apart**4 / 4, apart**3 / 2], [apart**3 / 2, apart**2]])
+        noise = transition @ motion.noise @ transition.T + torch.kron(pairs.double(), spread)
         if not stamped:
             way, turn = (float(torch.linalg.vector_norm(part)) for part in step.split(3))
             noise[:6, :6] += _scaled(UNSTAMPED * way, UNSTAMPED * turn)
@@ -205,12 +208,6 @@ class Motion:
         return replace(
             self, T_world_camera=T_world_camera, velocity=step / seconds, noise=_symmetric(noise), bias=bias
         )
-
-    def _acceleration_noise(self, seconds: float) -> Float[Tensor, "12 12"]:
-        seconds = max(abs(seconds), LEAST_SECONDS)
-        spread = _scaled(self.agility * self.reach * ACCELERATION, TURN_ACCELERATION)
-        pairs = torch.tensor([[seconds**4 / 4, seconds**3 / 2], [seconds**3 / 2, seconds**2]])
-        return torch.kron(pairs.double(), spread)
 
 
 def pixel_radius(covariance: Float[Tensor, "6 6"], focal: float, distance: float) -> float:

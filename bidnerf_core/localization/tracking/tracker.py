@@ -128,10 +128,8 @@ class Tracker:
         if motion is None and self._start is not None:
             motion = self._at(frame, self._start, None)
             seconds = 0.0 if state.frames == 1 else seconds
-        predicted, how = (
-            None if motion is None else motion.predicted(seconds, state.clock.stamped),
-            "constant velocity",
-        )
+        predicted = None if motion is None else motion.predicted(seconds, state.clock.stamped)
+        how = "constant velocity"
         if motion is not None and predicted is not None:
             if image is not None:
                 before, points = state.image, Points.none()
@@ -170,20 +168,20 @@ class Tracker:
             state, motion=replace(predicted, velocity=0.6 * predicted.velocity),
             points=self._corners(frame, image, state.points, predicted.T_world_camera),
         )  # fmt: skip
-        unseen = Verdict(Outcome.TOO_FEW_MATCHES, "no landmarks were recognised around the prediction")
-        verdict = unseen if measured is None else measured.verdict
+        verdict = Verdict(Outcome.TOO_FEW_MATCHES, "no landmarks were recognised around the prediction")
+        verdict = verdict if measured is None else measured.verdict
         reason = f"lost for {amount(state.lost, 'frame')}, bridged by {how}: {verdict.reason}"
-        return self._answer(
-            Measurement(predicted, replace(verdict, reason=reason), 1.0, state), predicted
-        ), state
+        bridged = Measurement(predicted, replace(verdict, reason=reason), 1.0, state)
+        return self._answer(bridged, predicted), state
 
     def _at(self, frame: Frame, T: SE3, covariance: torch.Tensor | None) -> Motion:
         """Return a camera of unknown velocity at a pose, by default with the uncertainty of a start."""
         # A start is off by a fraction of the scene's extent, and by radians.
         deviation = torch.tensor([0.03 * self._extent] * 3 + [0.1] * 3, dtype=torch.float64)
-        zero = torch.zeros((6, 6), dtype=torch.float64)
-        parts = (deviation.square().diag(), zero) if covariance is None else (covariance / 2, covariance / 2)
-        return Motion.at(PoseEstimate(T, *parts), self._reach(frame))
+        noise, bias = (deviation.square().diag(), 0.0 * deviation.diag())
+        if covariance is not None:
+            noise = bias = covariance / 2
+        return Motion.at(PoseEstimate(T, noise, bias), self._reach(frame))
 
     def _answer(self, measured: Measurement, predicted: Motion) -> Localization:
         """Return the answer for a frame; its path leads from the prediction to the pose."""
