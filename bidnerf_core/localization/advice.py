@@ -36,10 +36,7 @@ ADVICE = {
         "The geometry fits, but the field renders something else.",
         "Check with `bidnerf render` whether the field is sharp, then whether the light has changed.",
     ),
-    Outcome.UNDETERMINED: Advice(
-        "The image does not fix all six degrees of freedom.",
-        "Add depth or views.",
-    ),
+    Outcome.UNDETERMINED: Advice("The image does not fix all six degrees of freedom.", "Add depth or views."),
     Outcome.NOT_SETTLED: Advice(
         "Newly drawn rays still ask for a step of more than 0.01.",
         "Localize again from the pose, or raise `--fine-steps` and `--fine-rays`.",
@@ -61,8 +58,7 @@ ADVICE = {
         "Turn mirroring off in the front camera, check the image reader for flipped rows, or flip the image.",
     ),
     Outcome.IMPRECISE: Advice(
-        "The position is too uncertain.",
-        "Add depth of the same image, or views with known relative poses.",
+        "The position is too uncertain.", "Add depth of the same image, or views with known relative poses."
     ),
     Outcome.UNCERTAIN: Advice(
         "The diagnostics together make a wrong pose too likely.",

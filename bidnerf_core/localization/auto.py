@@ -71,8 +71,8 @@ def _on_surface(
         why = "the map has no surface ('bidnerf bake' makes one)"
         if problem.start is None:
             raise InputError("method 'auto' then needs a start; give one", where=why)
-        found = bid(problem, BidConfig(), seed)
-        return replace(found, reason=f"{why}; {found.reason}")
+        descended = bid(problem, BidConfig(), seed)
+        return replace(descended, reason=f"{why}; {descended.reason}")
     # Matches of a usual image of the map from which an image without recognised landmarks shows something
     # else
     if surface is None or (loop is not None and loop.landmarks.usual_matches >= 150):

@@ -20,30 +20,30 @@ from bidnerf_core.mapping import LandmarkMap, N, States
 
 # fmt: off
 STATED = (
-    # log focal, centre, k1, log aspect, skew, probability, whether a pose under it counts as right
-    ("exact", 0.0005, 0.0005, 0.0005, 0.0005, 0.0, 0.40, True),  # of this very camera, as for the map's own images
-    ("right", 0.005, 0.005, 0.005, 0.001, 0.0, 0.25, True),  # well calibrated
-    ("inexact", 0.01, 0.01, 0.01, 0.001, 0.0, 0.27, True),  # of another unit of the model, or at another focus
-    ("wrong", 0.1, 0.02, 0.05, 0.001, 0.0, 0.05, True),
-    ("cropped", 0.01, 0.1, 0.01, 0.001, 0.0, 0.02, True),
-    ("bent", 0.01, 0.01, 0.3, 0.001, 0.0, 0.01, True),  # the lens was not stated
-    ("resized", 0.3, 0.15, 0.05, 0.001, 0.0, 0.003, False),
-    ("unlike", 0.3, 0.3, 0.1, 0.1, 0.1, 0.001, False),  # a photo of a picture, a stretched or a sheared image
+    # log focal, centre (u and v), k1, log aspect, skew, probability, whether a pose under it counts as right
+    ("exact", 0.0005, 0.0005, 0.0005, 0.0005, 0.0005, 0.0, 0.40, True),  # of this very camera, as for the map's own images
+    ("right", 0.005, 0.005, 0.005, 0.005, 0.001, 0.0, 0.25, True),  # well calibrated
+    ("inexact", 0.01, 0.01, 0.01, 0.01, 0.001, 0.0, 0.27, True),  # of another unit of the model, or at another focus
+    ("wrong", 0.1, 0.02, 0.02, 0.05, 0.001, 0.0, 0.05, True),
+    ("cropped", 0.01, 0.1, 0.1, 0.01, 0.001, 0.0, 0.02, True),
+    ("bent", 0.01, 0.01, 0.01, 0.3, 0.001, 0.0, 0.01, True),  # the lens was not stated
+    ("resized", 0.3, 0.15, 0.15, 0.05, 0.001, 0.0, 0.003, False),
+    ("unlike", 0.3, 0.3, 0.3, 0.1, 0.1, 0.1, 0.001, False),  # a photo of a picture, a stretched or a sheared image
 )
 """What may be true of a stated camera: standard deviations of its corrections (see ``NUISANCES``), and prior probabilities.
 
 The more an explanation frees, the rarer it is, and a pose is not trusted if only a camera that explains any warp of the image fits.
 """
 APPROXIMATE = (
-    ("nominal", 0.2, 0.01, 0.03, 0.001, 0.0, 0.96, True),
-    ("cropped", 0.2, 0.1, 0.03, 0.001, 0.0, 0.03, True),
-    ("unlike", 0.3, 0.3, 0.1, 0.1, 0.1, 0.01, False),
+    ("nominal", 0.2, 0.01, 0.01, 0.03, 0.001, 0.0, 0.96, True),
+    ("cropped", 0.2, 0.1, 0.1, 0.03, 0.001, 0.0, 0.03, True),
+    ("unlike", 0.3, 0.3, 0.3, 0.1, 0.1, 0.1, 0.01, False),
 )
 """What may be true of a camera whose focal length is stated to be approximate, in the columns of ``STATED``."""
 # fmt: on
 OF_MAP = (
-    ("map", 0.0005, 0.0005, 0.0005, 0.0005, 0.0, 0.6),
-    ("map, about", 0.005, 0.005, 0.005, 0.001, 0.0, 0.4),
+    ("map", 0.0005, 0.0005, 0.0005, 0.0005, 0.0005, 0.0, 0.6),
+    ("map, about", 0.005, 0.005, 0.005, 0.005, 0.001, 0.0, 0.4),
 )
 """Standard deviations about the camera of the map's images, as in ``STATED``, with shares of its odds."""
 NEARLY = (0.002, 0.002, 0.002, 0.002, 0.001, 0.001)
@@ -144,28 +144,26 @@ def explanations(
     Images of different cameras are only compared with their stated intrinsics.
     """
     # Of each: its name, the mean corrections of the camera and their deviations, its probability, and whether it is credible.
-    rows = list[tuple[str, list[float], tuple[float, ...], float, bool]]()
+    rows = list[tuple[str, list[float], list[float], float, bool]]()
     if query.has_one_camera:
         known = cameras_of_map(query, landmarks)
         nearly = torch.tensor(NEARLY, dtype=torch.float64)
         as_map = any(bool((c.abs() < nearly).all()) for c in known) and not query.approximate
-        for name, focal, centre, k1, aspect, skew, share, credible in (
-            APPROXIMATE if query.approximate else STATED
-        ):
-            # Factor of the probability of other than the stated intrinsics if those are the intrinsics of the
-            # map's images
-            share *= 0.1 if as_map and name != "exact" else 1
-            rows.append((name, [0.0] * 6, (focal, centre, centre, k1, aspect, skew), share, credible))
+        # Other than the stated intrinsics are less likely where those are the intrinsics of the map's images.
+        rows = [
+            (name, [0.0] * 6, deviation, share * (0.1 if as_map and name != "exact" else 1), credible)
+            for name, *deviation, share, credible in (APPROXIMATE if query.approximate else STATED)
+        ]
         for c in known:
             if query.approximate or bool((c.abs() > nearly).any()):
                 similar = bool((c.abs() <= torch.tensor((0.16, 0.06, 0.06, 0.2, 0.02, 0.01))).all())
                 # Prior odds that the image is from the map's camera, if the stated one is similar but different, and if it differs much
                 odds = 0.5 if similar else 0.05
-                for name, focal, centre, k1, aspect, skew, share in OF_MAP:
-                    deviations = (focal, centre, centre, k1, aspect, skew)
-                    rows.append((name, c.tolist(), deviations, share * odds, True))
+                rows += [
+                    (name, c.tolist(), deviation, share * odds, True) for name, *deviation, share in OF_MAP
+                ]
     else:
-        rows.append(("exact", [0.0] * 6, (0.0,) * 6, 1.0, True))
+        rows.append(("exact", [0.0] * 6, [0.0] * 6, 1.0, True))
     single = moving and len(query.images) == 1  # views of a rig may be from different times
     share_moving = max(SHARE_MOVING, SHARE_AS_MAP * landmarks.moving) if single else 0.0
     still, motion = [0.0] * 6, [MOVE * distance] * 3 + [TURN] * 3

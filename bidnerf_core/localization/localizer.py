@@ -26,12 +26,7 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.io import LARGEST_INTEGER
 from bidnerf_core.localization.matching import LandmarkMatcher
-from bidnerf_core.localization.methods import (
-    USUAL_METHOD,
-    find_method,
-    require_use_of_depth,
-    settings_of,
-)
+from bidnerf_core.localization.methods import USUAL_METHOD, find_method, require_use_of_depth, settings_of
 from bidnerf_core.localization.picture import shown_in
 from bidnerf_core.localization.problem import (
     Problem,

@@ -243,7 +243,7 @@ class Loop:
             return [], States.known(seed.T, seed.camera)
         if searched:
             first = first[0], self._warped(first[0], seed, given, first[1])
-        rivals = (self._mode(*place, given, True) for place in self._rivals(nearest, nfa, first[1]))
+        rivals = (self._mode(*rival, given, True) for rival in self._rivals(nearest, nfa, first[1]))
         both = [first, *(rival for rival in rivals if rival is not None)]
         modes, best = [mode for mode, _ in both], [state for _, state in both]
         seen: list[Projected | None] = [None] * len(modes)
@@ -356,8 +356,8 @@ class Loop:
         points, fused = None, list[str]()
         others: dict[str, float | None] = {}
         if problem is not None and problem.surface is not None and problem.has_depth:
-            place = "cpu" if problem.surface.device == self.device else None  # ``run_on`` sends them
-            points = Surface.of(problem.views, problem.depth_rays, problem.surface, self.seed, device=place)
+            where = "cpu" if problem.surface.device == self.device else None  # ``run_on`` sends them
+            points = Surface.of(problem.views, problem.depth_rays, problem.surface, self.seed, device=where)
         if points is not None:
             noise, near, _ = run_on(self.device, fit_noise, points, found.chosen)
             # Least fraction of the measured points on the surface; with fewer, depth is in another unit or of
@@ -374,8 +374,8 @@ class Loop:
         position = float(found.mixture()[:3, :3].trace().sqrt().nan_to_num(math.inf))
         blurred = float(landmarks.focal.max()) * position / landmarks.distance(found.chosen) > 0.6
         if problem is not None and self.rays and found.mode == 0 and blurred:
-            place = "cpu" if problem.device == self.device else None
-            rays = Rays.of(problem.views, problem.field, problem.bounds, self.rays, self.seed, device=place)
+            where = "cpu" if problem.device == self.device else None
+            rays = Rays.of(problem.views, problem.field, problem.bounds, self.rays, self.seed, device=where)
             fused.append("rendering")
             best = States.cat([found.chosen, best[1:]])
             minima, by_rays = run_on(self.device, fit_with_rays, best, terms, rays, given)

@@ -226,8 +226,8 @@ class Nearest:
         keypoint = (torch.arange(len(query.view)) - first < strongest).nonzero()[:, 0]
         distance, index = matcher.nearest(query.keypoints.descriptors[keypoint], 4)
         position, size = landmarks.positions[index], landmarks.sizes[index]
-        apart = (position - position[:, :1]).norm(dim=-1)
-        same = apart <= 2 * torch.maximum(size, size[:, :1]) + 3 * landmarks.deviations[index].amax(-1)
+        away = (position - position[:, :1]).norm(dim=-1)
+        same = away <= 2 * torch.maximum(size, size[:, :1]) + 3 * landmarks.deviations[index].amax(-1)
         other = torch.where(same, torch.inf, distance).amin(1)
         other = torch.where(other.isfinite(), other, distance[:, -1])
         return Nearest(
@@ -310,9 +310,9 @@ class Projected:
             )  # host
             found = torch.from_numpy(np.asarray(found, dtype=np.int64).reshape(len(own), -1))
             row, column = (found < len(index)).nonzero().unbind(-1)
-            place = found[row, column]
-            alike = (expected[place] / query.keypoints.sizes[own[row]]).log2().abs() <= OCTAVES
-            pairs.append(torch.stack([own[row], index[place]])[:, alike])
+            candidate = found[row, column]
+            alike = (expected[candidate] / query.keypoints.sizes[own[row]]).log2().abs() <= OCTAVES
+            pairs.append(torch.stack([own[row], index[candidate]])[:, alike])
         keypoint, landmark = torch.cat([torch.zeros((2, 0), dtype=torch.long), *pairs], 1)
         distance = paired_squared_distances(
             query.keypoints.descriptors, landmarks.descriptors, keypoint, landmark

@@ -231,10 +231,7 @@ BID = Method(
     bid,
     BidConfig,
     needs_start=True,
-    presets={
-        "paper": PAPER,
-        "paper-scene": replace(PAPER, descent=DescentSettings(level=0, pivot="scene")),
-    },
+    presets={"paper": PAPER, "paper-scene": replace(PAPER, descent=DescentSettings(level=0, pivot="scene"))},
     summary="Adam on colour and depth at the coarse level (BID-NeRF)",
 )
 INERF = Method(

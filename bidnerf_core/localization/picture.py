@@ -27,14 +27,14 @@ def shown_in(scene: SceneMap, frame: Frame) -> Callable[[Localization], str]:
     Answers may outlive the map, whose memory they do not hold: then, and where it cannot be rendered from the pose, it returns "".
     """
     # Longer side (pixels) of the photo and the rendering: each rendered pixel takes time
-    small, kept = frame.replace(depth=None).at_most(240), weakref.ref(scene)
+    small, reference = frame.replace(depth=None).at_most(240), weakref.ref(scene)
     stated, photo = (
         small.intrinsics,
         cv2.imencode(".png", np.ascontiguousarray(small.rgb_bytes.cpu().numpy()))[1],
     )
 
     def shown(found: Localization) -> str:
-        scene, camera = kept(), stated
+        scene, camera = reference(), stated
         if scene is None:
             return ""
         if found.intrinsics is not None:

@@ -75,24 +75,19 @@ def consensus(
     found: list[SE3] = []
     of_view = [image.T_ref_camera for image in query.images]
     data = [
-        ((flat[p] * focal[p, None]).numpy(), points[p].numpy(), _camera(float(focal[p[0]]))) for p in parts
+        ((flat[p] * focal[p, None]).numpy(), points[p].numpy(), pinhole(float(focal[p[0]]))) for p in parts
     ]  # host
     for part, (pixels, there, model) in zip(parts, data, strict=True):
         pose, _ = poselib.estimate_absolute_pose(pixels, there, model, options, {})
-        found.append(_transform(pose).inverse() @ of_view[int(view[part[0]])].inverse())
+        found.append(from_poselib(pose).inverse() @ of_view[int(view[part[0]])].inverse())
     if len(parts) > 1:
-        poses = []
-        for part in parts:
-            T = of_view[int(view[part[0]])].inverse()
-            pose = poselib.CameraPose()
-            pose.R, pose.t = T.rotation.numpy(), T.translation.numpy()
-            poses.append(pose)
+        poses = [to_poselib(of_view[int(view[part[0]])].inverse()) for part in parts]
         all_pixels, all_points, models = (list(x) for x in zip(*data, strict=True))
         generalized = options | {"progressive_sampling": False}
         pose, _ = poselib.estimate_generalized_absolute_pose(
             all_pixels, all_points, poses, models, generalized, {}
         )
-        found.append(_transform(pose).inverse())
+        found.append(from_poselib(pose).inverse())
     scored = [
         (T, inliers(query, landmarks, matches, States.known(T, camera))) for T in found if bool(T.is_rigid())
     ]
@@ -116,11 +111,19 @@ def inliers(
     return (off <= radius * query.threshold) & seen.front[0]
 
 
-def _camera(focal: float) -> dict[str, object]:
+def pinhole(focal: float) -> dict[str, object]:
     """Return poselib's description of a pinhole camera with its principal point at the origin."""
     return {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
 
 
-def _transform(pose: poselib.CameraPose) -> SE3:
+def to_poselib(T: SE3) -> poselib.CameraPose:
+    """Convert a pose T_camera_world on the CPU."""
+    pose = poselib.CameraPose()
+    pose.R, pose.t = T.rotation.numpy(), T.translation.numpy()
+    return pose
+
+
+def from_poselib(pose: poselib.CameraPose) -> SE3:
+    """Return T_camera_world."""
     rotation = torch.from_numpy(np.array(pose.R, dtype=np.float64))
     return SE3(rotation, torch.from_numpy(np.array(pose.t, dtype=np.float64).reshape(3)))

@@ -66,21 +66,21 @@ def halve(
         order = scores.argsort()
         # Twice the displacement of a rival, since poses are still on their way to a minimum.
         other = order[~same_pose(states.T[order[0]], states.T[order], middle, 2 * DISPLACEMENT)]
-        kept = order[: stage.keep]
+        passing = order[: stage.keep]
         if len(other):
             # Maximum number of other poses with which the best one is compared
             margin, rivals = float(scores[other[0]] - scores[order[0]]), states[other[:3]]
-            if stage.keep > 1 and not torch.isin(kept, other).any():
-                kept = torch.cat([kept[:-1], other[:1]])
+            if stage.keep > 1 and not torch.isin(passing, other).any():
+                passing = torch.cat([passing[:-1], other[:1]])
         if (record := current_record()) is not None:
             taken = f"after {stage.steps} steps from each" if stage.steps else "as they were drawn"
             record.add(
-                f"{amount(len(scores), 'pose')} {taken}; {len(kept)} kept", states.T, scores, len(kept)
+                f"{amount(len(scores), 'pose')} {taken}; {len(passing)} kept", states.T, scores, len(passing)
             )
         poses += [T[None] for T, _ in path[1:]] + ([states.T[None]] if path else [])
         losses += [cost for _, cost in path]
-        poses, losses = [T[:, kept] for T in poses], [values[kept] for values in losses]
-        states, scores = states[kept], scores[kept]
+        poses, losses = [T[:, passing] for T in poses], [values[passing] for values in losses]
+        states, scores = states[passing], scores[passing]
     path_losses = torch.stack([values[0] for values in losses]) if losses else scores[:0]
     path_poses = SE3.cat([T[:, 0] for T in poses])
     return moved(Proposals(states, scores, margin, rivals, before, path_poses, path_losses), "cpu")

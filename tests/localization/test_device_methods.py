@@ -28,12 +28,7 @@ SETTINGS = {
     "refine_rays": 64,
     "fused_rays": 64,
 }
-BY_COLOUR = {
-    "hypotheses": 8,
-    "rounds": 1,
-    "fine_steps": 2,
-    "fine_rays": 64,
-}
+BY_COLOUR = {"hypotheses": 8, "rounds": 1, "fine_steps": 2, "fine_rays": 64}
 
 
 def blobs() -> FieldMap:

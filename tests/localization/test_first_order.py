@@ -38,7 +38,6 @@ from bidnerf_core.localization import (
 
 # Inside: the length of a block of steps
 from bidnerf_core.localization.adam import RATE, WINDOW
-from bidnerf_core.localization.pivots import PivotName
 from bidnerf_core.scenes import GaussianBlobs
 from bidnerf_core.settings import to_flat
 from blob_images import BOUNDS, CAMERA, TRUTH
@@ -174,19 +173,6 @@ def test_a_step_that_is_not_finite_leaves_the_pose() -> None:
     _, _, finite = steps.block()
     assert torch.equal(steps.T.matrix(), SE3.identity().matrix())
     assert not finite[0]
-
-
-@pytest.mark.parametrize("name", ["camera", "world", "scene"])
-def test_a_linear_update_has_the_value_and_the_derivative_of_the_exact_one(
-    problem: Problem, name: PivotName
-) -> None:
-    about, zero = pivot(name, problem), torch.zeros(6, dtype=torch.float64)
-    exact, linear = (
-        lambda xi, move=move: move(TRUTH, xi).matrix() for move in (about.moved, about.moved_linearly)
-    )
-    torch.testing.assert_close(linear(zero), exact(zero))
-    derivatives = [torch.autograd.functional.jacobian(update, zero) for update in (linear, exact)]
-    torch.testing.assert_close(*derivatives)
 
 
 BACK = (0.0, 0.0, 0.0)

@@ -9,7 +9,6 @@ import math
 import pickle
 import re
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,12 +18,11 @@ import numpy as np
 import pytest
 import torch
 
-import baked
 import bidnerf_core as bn
 import tiny
 from bidnerf_core import Cancelled, InputError, Localization, Localizer, View
 from bidnerf_core.evaluation import perturb
-from bidnerf_core.geometry import SE3, pose_from_matrix
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import METHODS, AutoConfig, settings_of
 from bidnerf_core.progress import Progress, job_context
 from bidnerf_core.testing import DEVICE, Elsewhere, textured_map, training_views, unseen
@@ -36,7 +34,6 @@ from refusals import refused
 MAP = FieldMap(FIELD, BOUNDS)
 START = perturb(TRUTH, 0.1, 3.0, seed=2)
 FEW = settings_of("bid", {"rays": 64, "max_steps": 3, "level": None})
-QUICK = AutoConfig(points=500, hypotheses=64, rounds=1, refine_steps=0)
 
 
 @functools.cache
@@ -186,13 +183,6 @@ def test_a_bad_map_or_method_is_refused_when_the_localizer_is_made(
     assert caught.error.expected == expected
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_settings_are_the_methods_own_by_default(method: str) -> None:
-    made = Localizer(MAP, method)
-    assert made.config == METHODS[method].config_type()
-    assert made.method == method
-
-
 def test_a_dictionary_changes_the_settings_that_it_names() -> None:
     assert Localizer(MAP, "bid", {"rays": 64, "max_steps": 3, "level": None}, warm_up=False).config == FEW
     given = Localizer(MAP, "bid", {"rays": 64}, preset="paper", warm_up=False).config
@@ -207,27 +197,6 @@ def test_warming_up_changes_no_answer_and_no_random_state() -> None:
     assert torch.equal(torch.get_rng_state(), state)
     one, other = (made(FRAME, START).poses.matrix() for made in (cold, warm))
     assert torch.equal(one, other)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["auto", "bid"])
-def test_eight_threads_share_a_localizer(method: str) -> None:
-    """Neither the order of calls nor what else is being computed changes an answer."""
-    if method == "auto":
-        made = Localizer(FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), "auto", QUICK)
-        queries = [(view.frame, None) for view in baked.unseen()] * 2
-    else:
-        made, queries = localizer(), [(FRAME, perturb(TRUTH, 0.1, 3.0, seed=i)) for i in range(8)]
-
-    def answer(number: int) -> torch.Tensor:
-        frame, start = queries[number]
-        return made(frame, start, seed=number).poses.matrix()
-
-    alone = [answer(i) for i in range(8)]
-    with ThreadPoolExecutor(8) as pool:
-        together = list(pool.map(answer, range(8)))
-    for one, other in zip(alone, together, strict=True):
-        assert torch.equal(one, other)
 
 
 def test_many_queries_have_the_answers_of_each_alone_in_order() -> None:
@@ -277,19 +246,6 @@ def test_a_device_that_is_another_one_gets_a_copy_of_the_field() -> None:
     assert {p.device.type for p in field.parameters()} == {"cpu"}
     assert all(torch.equal(value, before[name]) for name, value in field.state_dict().items())
     assert Localizer(own, "bid", device="cpu", warm_up=False).scene is own
-
-
-def test_a_matrix_with_rounded_numbers_becomes_a_rigid_transform() -> None:
-    rounded = torch.tensor(np.round(START.matrix().numpy(), 6))
-    assert float((pose_from_matrix(rounded, "start").matrix() - START.matrix()).abs().max()) < 1e-5
-    assert bool(pose_from_matrix(rounded, "start").is_rigid())
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_the_name_of_what_is_wrong_opens_the_message() -> None:
-    with refused(expected=MATRIX) as caught:
-        pose_from_matrix(torch.eye(3), "pose.json")
-    assert str(caught.error).startswith("pose.json has shape (3, 3)")
 
 
 @pytest.mark.usefixtures("unchecked")

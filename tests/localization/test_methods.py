@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -166,21 +165,3 @@ def test_an_image_of_another_exposure() -> None:
     assert off(found.T_world_camera) < 0.03
     assert found.converged, found.reason
     assert not found_by("bid-lm", darker, start).converged
-
-
-SENSELESS = {
-    "auto": {"points": 10, "hypotheses": 0, "rounds": 1000},
-    "bid": {"stop_loss": math.nan, "colour_scale": 0.0, "rays": 0},
-    "inerf": {"stop_loss": -1.0, "converged_loss": math.inf, "colour_scale": 0.0, "rays": 0},
-    "bid-lm": {"poses": 0, "fine_rays": 6, "colour_scale": 0.0, "depth_scale": 0.0},
-    "inerf-lm": {"poses": 0, "spread_rotation": -1.0, "fine_rays": 6, "fine_steps": 0, "colour_scale": 0.0},
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("method", "name"), [(m, name) for m, given in SENSELESS.items() for name in given])
-def test_settings_that_make_no_sense_are_named(method: str, name: str) -> None:
-    value = SENSELESS[method][name]
-    where, found = ("config", f"{name} is") if math.isfinite(value) else (f"config: {name}", "found")
-    with refused(where=where, found=f"{found} {value}") as caught:
-        settings_of(method, {name: value})
-    assert caught.error.expected is not None

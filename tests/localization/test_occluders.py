@@ -153,11 +153,7 @@ def test_hidden_pixels_are_not_drawn(name: str) -> None:
 @pytest.mark.parametrize(
     ("hidden", "found", "expected"),
     [
-        (
-            torch.zeros((2, 3), dtype=torch.bool),
-            f"hidden is 3x2, but its camera expects {SIZE}x{SIZE}",
-            None,
-        ),
+        (torch.zeros((2, 3), dtype=torch.bool), f"hidden is 3x2, but its camera expects {SIZE}x{SIZE}", None),
         (torch.ones((SIZE, SIZE), dtype=torch.bool), "hidden is all true", "something visible"),
     ],
 )

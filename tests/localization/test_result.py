@@ -23,20 +23,9 @@ FOUND = Localization(
     covariance=torch.eye(6, dtype=torch.float64),
 )  # fmt: skip
 KEYS = [
-    "T_world_camera",
-    "converged",
-    "outcome",
-    "reason",
-    "steps",
-    "seconds",
-    "covariance",
-    "loss",
-    "method",
-    "focal_factor",
-    "intrinsics",
-    "confidence",
-    "unit",
-]
+    "T_world_camera", "converged", "outcome", "reason", "steps", "seconds", "covariance", "loss", "method",
+    "focal_factor", "intrinsics", "confidence", "unit",
+]  # fmt: skip
 
 
 def test_the_file_holds_the_answer_to_the_last_digit(tmp_path: Path) -> None:
@@ -58,13 +47,6 @@ def test_a_later_rejection_comes_with_its_own_confidence() -> None:
     assert (mirrored.outcome, mirrored.confidence) == (Outcome.MIRRORED, None)
     assert mirrored.reason == "the mirror image fits better; all is well"
     assert sure.rejected(Verdict(Outcome.UNCERTAIN, "too risky", 0.99)).plain()["confidence"] == 0.99
-
-
-def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
-    path = tmp_path / "pose.json"
-    path.write_text("x" * 10**5)
-    FOUND.save(str(path))
-    assert json.loads(path.read_text())["method"] == "bid"
 
 
 @pytest.mark.parametrize("loss", [math.nan, math.inf, -math.inf])

@@ -19,14 +19,7 @@ from bidnerf_core.evaluation import perturb
 from bidnerf_core.fields import RadianceField
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import (
-    ColourSettings,
-    DepthLossSettings,
-    Images,
-    RayTerms,
-    rig,
-    states_at,
-)
+from bidnerf_core.localization import ColourSettings, DepthLossSettings, Images, RayTerms, rig, states_at
 from bidnerf_core.localization.terms.images import Thumbnail, surface_renderer
 from bidnerf_core.mapping import SurfaceMap, Surfels, Term, cast, descend, trace
 from bidnerf_core.testing import DEVICE, DeviceFault, Elsewhere

@@ -81,9 +81,6 @@ class Surface:
             frame = view.frame
             depth = torch.zeros((0, 0)) if frame.depth is None else frame.depth.cpu()
             row, column = ((depth > 0) & depth.isfinite()).nonzero().unbind(-1)
-            if frame.hidden is not None and len(row):
-                shown = ~frame.hidden.cpu()[row, column]
-                row, column = row[shown], column[shown]
             most = -(-count // len(views))
             # Ratio of measured to compared points above which they are drawn with replacement, which takes
             # far less time

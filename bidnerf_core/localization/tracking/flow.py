@@ -57,7 +57,7 @@ def alike(
 
     The flow leaves patches of pure noise where its search started; these do not correlate.
     """
-    one, two = (_patches(image, place) for image, place in ((before, pixels), (now, there)))
+    one, two = (_patches(image, at) for image, at in ((before, pixels), (now, there)))
     spread = np.sqrt((one**2).sum(-1) * (two**2).sum(-1)).clip(min=1e-6)
     return torch.from_numpy((one * two).sum(-1) >= 0.6 * spread)
 
@@ -72,9 +72,9 @@ def _patches(image: Grey, pixels: Float[Tensor, "m 2"]) -> Float[np.ndarray, "m 
     return found - found.mean(-1, keepdims=True)
 
 
-def corners(image: Grey, count: int, apart: float) -> Float[Tensor, "n 2"]:
-    """Return up to ``count`` corners (u, v), at least ``apart`` pixels from each other (Shi and Tomasi 1994)."""
-    found: np.ndarray | None = cv2.goodFeaturesToTrack(image, count, 0.01, apart)
+def corners(image: Grey, count: int, distance: float) -> Float[Tensor, "n 2"]:
+    """Return up to ``count`` corners (u, v), at least ``distance`` pixels from each other (Shi and Tomasi 1994)."""
+    found: np.ndarray | None = cv2.goodFeaturesToTrack(image, count, 0.01, distance)
     if found is None:
         return torch.zeros((0, 2))
     return torch.from_numpy(found.reshape(-1, 2) + FIRST_CENTRE)

@@ -99,8 +99,8 @@ class Determined:
         # Ratio to the mean information of the three best directions below which the prediction is kept along
         # a direction
         good[:6, :6] = axes @ (axes * (values >= 0.1 * values[3:].mean())).T
-        kept = back @ good @ at_middle
-        return Normal(found.cost, found.gradient @ kept, kept.T @ found.hessian @ kept)
+        determined = back @ good @ at_middle
+        return Normal(found.cost, found.gradient @ determined, determined.T @ found.hessian @ determined)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,8 +232,7 @@ class Measurer:
         covariance = torch.linalg.inv_ex(normal.hessian[best])[0][:6, :6]
         here, doubt = states[best : best + 1], state.doubt
         if fit.is_recognised:
-            focal, centre, k1 = STATED[0][1:4]
-            exact = torch.tensor([focal, centre, centre, k1], dtype=torch.float64)
+            exact = torch.tensor(STATED[0][1:5], dtype=torch.float64)
             deviation[:, :4] = torch.hypot(exact, scatter)
             free = replace(here, deviation=deviation[1:])
             whole = Quadratic.of(total(free, terms) - prior(free), free)
@@ -283,8 +282,8 @@ class Measurer:
     def _judged(self, state: TrackerState, fit: Fit, motion: Motion, distance: float) -> Measurement:
         """Judge a pose by landmarks, after its fusion with the prediction."""
         assert self.landmarks is not None
-        covariance, kept, noise = motion.covariance, fit.points[fit.is_inlier], float(fit.states.noise)
-        count, one = len(kept), torch.ones(1, dtype=torch.float64)
+        covariance, inliers, noise = motion.covariance, fit.points[fit.is_inlier], float(fit.states.noise)
+        count, one = len(inliers), torch.ones(1, dtype=torch.float64)
         if fit.by_chance is None:
             nfa, chance, recall = fit.log10_nfa, 0.0, count / len(fit.points)
         else:
@@ -293,7 +292,7 @@ class Measurer:
             chance, recall = fit.by_chance, count / fit.keypoints
         evidence = Evidence(
             log10_nfa=nfa, inliers=count, by_chance=chance, recall=recall,
-            spread=len(cells(kept.pixels, fit.camera).unique()) / CELLS**2,
+            spread=len(cells(inliers.pixels, fit.camera).unique()) / CELLS**2,
             noise_ratio=noise / self.landmarks.noise, precision=_position_deviation(covariance) / distance,
             mass=mass_within(one, torch.zeros((1, 6)).double(), covariance[None], distance),
             other_place=0.0, credible=1.0, replaced=0.0, searched=True,
@@ -302,14 +301,14 @@ class Measurer:
         # more than tracked sequences show
         verdict = judge(evidence, 0.0 if state.searchable else 4.0)
         if fit.is_recognised:
-            kept = kept.well_spread(fit.camera, self.config.points)
-            state = replace(state, sought=len(kept), age=0)
+            inliers = inliers.well_spread(fit.camera, self.config.points)
+            state = replace(state, sought=len(inliers), age=0)
         elif verdict.accepted and not fit.is_accurate:
             verdict = Verdict(Outcome.AMBIGUOUS, f"{verdict.reason}, hardly better than by chance")
         elif verdict.accepted and count < ENOUGH_LANDMARKS:
             why = f"{verdict.reason}, but the image does not confirm these few tracked ones"
             verdict = Verdict(Outcome.TOO_FEW_MATCHES, why)
-        return Measurement(motion, verdict, noise, replace(state, points=kept))
+        return Measurement(motion, verdict, noise, replace(state, points=inliers))
 
     def _by_surface(
         self, frame: Frame, image: Grey | None, state: TrackerState, predicted: Motion

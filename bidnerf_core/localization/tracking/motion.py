@@ -106,25 +106,23 @@ class Motion:
         After a gap, the pose is unchanged, and its uncertainty grows with a camera's possible speed. Without a time stamp, the
         interval is an assumption, and the distance covered in it is uncertain in proportion.
         """
-        motion = self.at_rest() if abs(seconds) > LONGEST_GAP else self
+        motion = self
+        if abs(seconds) > LONGEST_GAP:  # the velocity is unknown
+            motion = Motion.at(PoseEstimate(self.T_world_camera, self.noise[:6, :6], self.bias), self.reach)
         step = motion.velocity * seconds
         T = retracted(motion.T_world_camera, step)
         back = _adjoint_of_inverse(step)
         transition = torch.eye(12, dtype=torch.float64)
         transition[:6, :6] = back
         transition[:6, 6:] = seconds * torch.eye(6, dtype=torch.float64)
-        apart = max(abs(seconds), LEAST_SECONDS)
+        elapsed = max(abs(seconds), LEAST_SECONDS)
         spread = _scaled(self.agility * self.reach * ACCELERATION, TURN_ACCELERATION)
-        pairs = torch.tensor([[apart**4 / 4, apart**3 / 2], [apart**3 / 2, apart**2]])
+        pairs = torch.tensor([[elapsed**4 / 4, elapsed**3 / 2], [elapsed**3 / 2, elapsed**2]])
         noise = transition @ motion.noise @ transition.T + torch.kron(pairs.double(), spread)
         if not stamped:
             way, turn = (float(torch.linalg.vector_norm(part)) for part in step.split(3))
             noise[:6, :6] += _scaled(UNSTAMPED * way, UNSTAMPED * turn)
         return replace(motion, T_world_camera=T, noise=_symmetric(noise), bias=back @ self.bias @ back.T)
-
-    def at_rest(self) -> Motion:
-        """Return the same pose with an unknown velocity."""
-        return Motion.at(PoseEstimate(self.T_world_camera, self.noise[:6, :6], self.bias), self.reach)
 
     def corrected(self, measured: PoseEstimate) -> Motion:
         """Return the state after fusing it with a measured pose.
@@ -135,10 +133,10 @@ class Motion:
         innovation = self.noise[:6, :6] + measured.noise
         gain = torch.linalg.solve(innovation, self.noise[:6]).T
         delta = gain @ off
-        kept = torch.eye(12, dtype=torch.float64)
-        kept[:, :6] -= gain
-        noise = kept @ self.noise @ kept.T + gain @ measured.noise @ gain.T  # Joseph's form stays positive
-        shared = kept[:6, :6] @ _root(self.bias) + gain[:6] @ _root(measured.bias)
+        rest = torch.eye(12, dtype=torch.float64)
+        rest[:, :6] -= gain
+        noise = rest @ self.noise @ rest.T + gain @ measured.noise @ gain.T  # Joseph's form stays positive
+        shared = rest[:6, :6] @ _root(self.bias) + gain[:6] @ _root(measured.bias)
         return Motion(
             retracted(self.T_world_camera, delta[:6]).polished(),
             self.velocity + delta[6:],

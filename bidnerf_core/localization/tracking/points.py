@@ -9,7 +9,6 @@ import math
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
-import numpy as np
 import poselib
 import torch
 from jaxtyping import Bool, Float, Int
@@ -21,6 +20,7 @@ from bidnerf_core.frames import Frame, visible_at
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.loop import CELLS
 from bidnerf_core.localization.matching import log10_nfa
+from bidnerf_core.localization.propose import from_poselib, pinhole, to_poselib
 from bidnerf_core.localization.query import THRESHOLD
 from bidnerf_core.localization.tracking.flow import Grey, alike, corners, flow
 from bidnerf_core.mapping import Landmarks, Sights, States, measured_depth, point_variance
@@ -123,17 +123,13 @@ class Fit:
     @staticmethod
     def of(points: Points, camera: Intrinsics, start: SE3, correlation: float) -> Fit:
         """Fit a pose near ``start`` to points of which ``correlation`` count as one."""
-        focal, inverse, count = (camera.fx * camera.fy) ** 0.5, start.inverse(), len(points)
+        focal, count = (camera.fx * camera.fy) ** 0.5, len(points)
         threshold = max(2.0, THRESHOLD * math.hypot(camera.width, camera.height))
         image = camera.unproject(points.pixels.double())[:, :2]
-        pose = poselib.CameraPose()
-        pose.R, pose.t = inverse.rotation.numpy(), inverse.translation.numpy()
-        model = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
         options = {"loss_type": "CAUCHY", "loss_scale": threshold / 2}
-        pose, _ = poselib.refine_absolute_pose(
-            (image * focal).numpy(), points.positions.numpy(), pose, model, options
-        )
-        T = SE3(torch.from_numpy(np.array(pose.R)), torch.from_numpy(np.array(pose.t)).flatten()).inverse()
+        known = points.positions.numpy(), to_poselib(start.inverse()), pinhole(focal)
+        pose, _ = poselib.refine_absolute_pose((image * focal).numpy(), *known, options)
+        T = from_poselib(pose).inverse()
         T = T.polished() if bool(T.is_rigid()) else start
         states = States.known(T, torch.zeros(6, dtype=torch.float64))
         zero, one = torch.zeros((1, count, 3), dtype=torch.float64), torch.ones(count, dtype=torch.float64)

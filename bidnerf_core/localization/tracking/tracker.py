@@ -236,8 +236,8 @@ class Tracker:
         By landmarks, each image is searched for. The search of the whole surface, which takes longer, runs at increasing intervals.
         A shape without an image fits many places.
         """
-        begun = state.motion is not None
-        lost = max(state.searchable, min(state.lost, 1)) if begun else state.searchable
+        has_begun = state.motion is not None
+        lost = max(state.searchable, min(state.lost, 1)) if has_begun else state.searchable
         if image is None or (not shows_shape(frame) and is_blank(frame)):
             return None
         # The number of lost frames after which the whole surface is searched, and again each time that number
