@@ -91,11 +91,6 @@ class Explanations:
         """The number of the explanation at rest that leaves the camera most freedom."""
         return int((self.deviation[:, :6].sum(-1) - self.deviation[:, 6:12].sum(-1)).argmax())
 
-    @property
-    def prior_of_all(self) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
-        """Mean and deviation of a prior that fixes nothing which any explanation frees."""
-        return self.deviation.new_zeros(N), self.deviation.amax(0)
-
     def first(self, seed: Seed, mode: int, noise: float) -> States:
         """Return the states with which the search begins: one of each kind of camera, and the stated one in motion.
 

@@ -125,7 +125,7 @@ class Localizer:
         """Localize independent queries, each as by a call, and yield the answers in their order.
 
         A query that cannot be localized at all gives its ``InputError`` in place of an answer. ``workers`` threads, each with a
-        stream of its own on a GPU, localize at the same time; by default as many as torch uses or, on a GPU, ``STREAMS``.
+        stream of its own on a GPU, localize at the same time; by default as many as torch uses or, on a GPU, 8.
         ``queries`` may be an iterator, from which they draw a few queries in advance. Raises ``InputError`` unless ``workers`` is
         positive, and ``Cancelled`` as usual.
         """

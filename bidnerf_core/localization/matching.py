@@ -45,7 +45,7 @@ OCTAVES, OBLIQUE = 1.0, math.radians(40)
 class LandmarkMatcher:
     """Finds the landmarks whose descriptors are nearest to those of keypoints.
 
-    Above ``EXHAUSTIVE`` landmarks, it uses an inverted file: k-means divides the landmarks into sqrt(n) cells (more in large
+    Above some thousand landmarks, it uses an inverted file: k-means divides the landmarks into sqrt(n) cells (more in large
     maps), and only the cells nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). Threads may share
     a matcher. It also prepares ``LandmarkMap.cells`` for guided matching.
 

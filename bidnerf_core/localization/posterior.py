@@ -26,7 +26,6 @@ class Posterior:
     probability: Float[Tensor, "h"]
     covariance: Float[Tensor, "h 6 6"]  # of the pose under each
     update: Float[Tensor, "h 6"]  # from the pose of the most probable explanation
-    by_mode: Float[Tensor, "g"]  # evidence for each mode, relative to outliers alone
     best: int
 
     @staticmethod
@@ -58,9 +57,7 @@ class Posterior:
         best = int(probability.argmax())
         states, covariance = _true_cameras(states, normal, _robust_covariance(*information), scatter)
         anchor = states.T[best]
-        return Posterior(
-            states, normal, probability, covariance, (anchor.inverse() @ states.T).log(), by_mode, best
-        )
+        return Posterior(states, normal, probability, covariance, (anchor.inverse() @ states.T).log(), best)
 
     @property
     def mode(self) -> int:

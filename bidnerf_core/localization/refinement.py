@@ -13,6 +13,7 @@ from bidnerf_core.localization.terms.rays import Rays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.mapping import (
     Landmarks,
+    N,
     Normal,
     Quadratic,
     States,
@@ -60,7 +61,8 @@ def fit(best: States, terms: Sequence[Term], given: Explanations, steps: int) ->
 
 
 def linearize(best: States, terms: Sequence[Term], given: Explanations) -> Quadratic:
-    free = best.under(*given.prior_of_all)
+    # A prior that fixes nothing which any explanation frees
+    free = best.under(given.deviation.new_zeros(N), given.deviation.amax(0))
     return Quadratic.of(total(free, terms) - prior(free), free)
 
 

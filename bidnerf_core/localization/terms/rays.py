@@ -214,10 +214,7 @@ class Rays:
             self.bounds.background,
             *self._distances(len(states)),
         )
-        seen, by_origin, by_direction = (
-            part.double().unflatten(0, (len(states), -1))
-            for part in (found.value, found.by_origin, found.by_direction)
-        )
+        seen, by_origin, by_direction = (part.double().unflatten(0, (len(states), -1)) for part in found)
         value, gain = self._differences(seen)
         R, sights = states.T.rotation, self.sights
         # In the rig's axes. Products of many rows by one matrix are faster than many of few rows.

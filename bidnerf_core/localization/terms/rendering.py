@@ -7,7 +7,7 @@ With features f_i of the samples (colours, distances), weights w_i and a backgro
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -29,13 +29,8 @@ LEAST_WEIGHT = 0.01
 """Rendering weight of a sample below which its derivatives are neglected: most samples lie in empty space."""
 
 
-@dataclass(frozen=True, eq=False)
-class Derivatives:
-    """Channels of r rendered rays, and their gradients."""
-
-    value: Float[Tensor, "r c"]
-    by_origin: Float[Tensor, "r c 3"]
-    by_direction: Float[Tensor, "r c 3"]
+Derivatives = tuple[Float[Tensor, "r c"], Float[Tensor, "r c 3"], Float[Tensor, "r c 3"]]
+"""Channels of r rendered rays, and their gradients by the rays' origins and by their directions."""
 
 
 def channels(rendering: Rendering, measured: Float[Tensor, "r"] | None, miss: float) -> Float[Tensor, "r c"]:
@@ -105,7 +100,7 @@ def differentiate(
             part.new_zeros(len(rays.near), *part.shape[1:]).index_add_(0, ray, part)
             for part in (by_position, by_direction)
         ]
-    return Derivatives(seen, *sums)
+    return seen, sums[0], sums[1]
 
 
 def _differentiate_hits(
@@ -123,4 +118,5 @@ def _differentiate_hits(
         else [torch.zeros_like(leaf) for leaf in leaves]
         for total in sums
     ]
-    return Derivatives(value.detach(), *(torch.stack(parts, 1) for parts in zip(*gradients, strict=True)))
+    by_origin, by_direction = (torch.stack(parts, 1) for parts in zip(*gradients, strict=True))
+    return value.detach(), by_origin, by_direction

@@ -154,13 +154,14 @@ class Tracker:
         state = replace(state, lost=state.lost + 1, searchable=state.searchable + searchable)
         if state.motion is None or predicted is None:
             if found is None:
-                why = "the beginning of the sequence has not been recognised yet"
+                why = Verdict(
+                    Outcome.TOO_FEW_MATCHES, "the beginning of the sequence has not been recognised yet"
+                )
                 T = SE3.identity() if self._start is None else self._start
                 deviation = torch.tensor([self._extent] * 3 + [math.pi] * 3, dtype=torch.float64)
-                zero = torch.zeros((6, 6), dtype=torch.float64)
-                vague = Motion.at(PoseEstimate(T, deviation.square().diag(), zero), self._extent)
-                found = self._answer(
-                    Measurement(vague, Verdict(Outcome.TOO_FEW_MATCHES, why), 1.0, state), vague
+                path, losses = SE3.stack([T, T]), torch.ones(1, dtype=torch.float64)
+                found = Localization.of(
+                    why, path, losses, METHOD, clocks.perf_counter(), 1.0, deviation.square().diag()
                 )
             return found, state
         # Fraction of the velocity kept with each lost frame
@@ -185,11 +186,17 @@ class Tracker:
 
     def _answer(self, measured: Measurement, predicted: Motion) -> Localization:
         """Return the answer for a frame; its path leads from the prediction to the pose."""
-        T, verdict = measured.motion.T_world_camera, measured.verdict
-        return Localization(
-            T, verdict.outcome, verdict.reason, 1, 0.0, measured.loss, METHOD, SE3.stack([predicted.T_world_camera, T]),
-            torch.tensor([measured.loss], dtype=torch.float64), measured.motion.covariance, confidence=verdict.confidence,
-        )  # fmt: skip
+        path = SE3.stack([predicted.T_world_camera, measured.motion.T_world_camera])
+        losses = torch.tensor([measured.loss], dtype=torch.float64)
+        return Localization.of(
+            measured.verdict,
+            path,
+            losses,
+            METHOD,
+            clocks.perf_counter(),
+            measured.loss,
+            measured.motion.covariance,
+        )
 
     def _after(self, frame: Frame, image: Grey | None, measured: Measurement) -> TrackerState:
         """Return the state after a frame whose pose was accepted."""
