@@ -135,21 +135,25 @@ def moved_from(
 
 def with_wrong_pose(cameras: Sequence[StoredCamera]) -> list[str]:
     """Return the names of cameras whose given or refined pose is not a rigid transform."""
-    return [
-        c.name
-        for c in cameras
-        for rows in {c.T_world_camera, c.given_T_world_camera or c.T_world_camera}
-        if len(rows) != 4 or not bool(_pose(rows).is_rigid())
-    ]
+    poses = [(c.name, rows) for c in cameras for rows in (c.T_world_camera, c.given_T_world_camera) if rows]
+    wrong = {name for name, rows in poses if len(rows) != 4}
+    if poses and not wrong:
+        rigid = _pose([rows for _, rows in poses]).is_rigid().tolist()
+        wrong = {name for (name, _), sound in zip(poses, rigid, strict=True) if not sound}
+    return [camera.name for camera in cameras if camera.name in wrong]
 
 
 def pose_updates(cameras: Sequence[StoredCamera]) -> list[Float[Tensor, "6"] | None]:
     """Return the right updates (translation in metres first) from given to refined poses; None for unchanged
     poses.
     """
+    if not cameras:
+        return []
+    given = _pose([camera.given_T_world_camera or camera.T_world_camera for camera in cameras])
+    updates = (given.inverse() @ poses_of(cameras)).log()
     return [
-        None if c.given_T_world_camera is None else (_pose(c.given_T_world_camera).inverse() @ c.pose).log()
-        for c in cameras
+        None if camera.given_T_world_camera is None else update
+        for camera, update in zip(cameras, updates, strict=True)
     ]
 
 

@@ -162,9 +162,9 @@ def _check_kinds(tensors: dict[str, Tensor], kinds: Kinds) -> None:
 def _check_range(tensors: dict[str, Tensor], name: str, least: float, most: float) -> None:
     value = tensors[name]
     if value.numel() and not (float(value.min()) >= least and float(value.max()) <= most):
-        raise ValueError(
-            f"{name} is {float(value.min()):g} to {float(value.max()):g}, expected {least:g} to {most:g}"
-        )
+        found = " to ".join(f"{float(end):g}" for end in torch.stack([value.min(), value.max()]).unique())
+        expected = "a positive number" if least == TINY else f"{least:g} to {most:g}"
+        raise ValueError(f"{name} is {found}, expected {expected}")
 
 
 def _check_unit_length(tensors: dict[str, Tensor], name: str) -> None:

@@ -137,24 +137,6 @@ def test_views_that_contradict_each_other_have_no_surface() -> None:
         measured(spoilt, agreement=3, cells=4_000_000)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"rays": 0},
-        {"measured": 0},
-        {"cells": 10},
-        {"megabytes": 0.0},
-        {"opacity": 1.0},
-        {"opacity": float("nan")},
-        {"agreement": 9},
-    ],
-)
-def test_settings_are_judged(wrong: dict[str, float]) -> None:
-    (name,) = wrong
-    with pytest.raises(InputError, match=f"{name} is"):
-        BakeConfig(**wrong)  # type: ignore[arg-type]
-
-
 SCENE = baked.one_solid(Box((0.6, 0.6, 0.6)), blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1))
 
 
@@ -242,17 +224,6 @@ def test_a_room_in_a_box_of_a_hundred_times_its_volume_takes_little_more_memory(
         taken[times] = surface_bytes(points, VoxelGrid.covering(box, 0.05))
     small, large = taken.values()
     assert small < large < 2 * small
-
-
-def test_a_hundred_rooms_stay_within_the_memory_that_is_allowed() -> None:
-    room = walls((6.0, 4.0, 3.0), 0.08)
-    rooms = [room + torch.tensor([6.0 * x, 4.0 * y, 0.0]) for x in range(10) for y in range(10)]
-    box = SceneBounds((0.0, 0.0, 0.0), (60.0, 40.0, 3.0), 0.0, 100.0)
-    alone = surface_bytes(room, VoxelGrid.covering(replace(box, upper=(6.0, 4.0, 3.0)), 0.1))
-    with pytest.warns(InputWarning, match="--megabytes"):
-        grid = chosen_grid(torch.cat(rooms), box, 0.1, 0.1, 20 * alone / 1e6)
-    assert surface_bytes(torch.cat(rooms), grid) <= 20 * alone
-    assert grid.cell < 0.4  # no coarser than needed
 
 
 def test_a_baked_surface_stays_within_its_memory() -> None:

@@ -97,12 +97,6 @@ def test_quantising_keeps_the_order_of_signed_descriptors(generator: torch.Gener
     torch.testing.assert_close(close, torch.cdist(exact, exact), atol=0.03, rtol=0)
 
 
-@pytest.mark.parametrize("options", [{"count": 0}, {"contrast": -0.1}, {"contrast": 1.0}])
-def test_useless_settings_are_refused(options: dict[str, float]) -> None:
-    with pytest.raises(InputError, match=next(iter(options))):
-        Sift(**options)  # type: ignore[arg-type]
-
-
 SOUND = Keypoints(torch.rand(5, 2), torch.ones(5), torch.zeros(5, 8, dtype=torch.uint8))
 UNUSABLE: list[tuple[Any, str]] = [
     (None, "returned a NoneType, expected Keypoints"),

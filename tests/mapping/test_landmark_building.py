@@ -141,12 +141,6 @@ def test_blank_images_are_refused(count: int) -> None:
         build_landmarks([View(blank, looking_in(0.1 * i)) for i in range(count)], Sift())
 
 
-@pytest.mark.parametrize("options", [{"neighbours": 0}, {"most": 0}, {"parallax": 0.0}, {"parallax": 90.0}])
-def test_useless_settings_are_refused(options: dict[str, float]) -> None:
-    with pytest.raises(InputError, match=next(iter(options))):
-        LandmarkConfig(**options)  # type: ignore[arg-type]
-
-
 def sightings(point: torch.Tensor, cameras: list[SE3], noise: float, trials: int, seed: int = 0) -> Sightings:
     """One point, seen ``trials`` times by all cameras; noise in pixels at a focal length of 300."""
     generator = torch.Generator().manual_seed(seed)

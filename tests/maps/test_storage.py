@@ -450,7 +450,7 @@ def test_a_damaged_part_is_named_and_can_be_made_anew(damage: str, name: str, tm
         (
             "landmarks",
             landmark_tensors(landmarks()) | {"noise": torch.tensor(-1.0).double()},
-            "noise is -1.0",
+            "noise is -1, expected a positive number",
         ),
         (
             "landmarks",
