@@ -136,17 +136,21 @@ def answer(localize: Callable[[], Localization], truth: View | None) -> Row:
     return errors_of(found, truth) | judged
 
 
-def within(row: Row, limits: str = RIGHT) -> bool:
+def within(row: Row, limits: str | tuple[float, float] = RIGHT) -> bool:
     """Return whether an answer is within the limits of its errors; an answer without a pose is not."""
-    metres, degrees = LIMITS[limits]
+    metres, degrees = LIMITS[limits] if isinstance(limits, str) else limits
     return row["translation"] is not None and row["translation"] < metres and row["rotation_deg"] < degrees
 
 
 def rates(rows: Sequence[Row]) -> dict[str, Any]:
     """Return the successes with Wilson's 95 % intervals, and the median errors, None where half have no answer."""
-    found: dict[str, Any] = {
-        name: asdict(success_rate(sum(within(row, name) for row in rows), len(rows))) for name in LIMITS
-    }
+    counts = {name: sum(within(row, name) for row in rows) for name in LIMITS}
+    return {name: asdict(success_rate(n, len(rows))) for name, n in counts.items()} | median_errors(rows)
+
+
+def median_errors(rows: Sequence[Row]) -> dict[str, float | None]:
+    """Return the median errors, None where half have no answer."""
+    found = {}
     for part in ("translation", "rotation_deg"):
         middle = statistics.median(float("inf") if row[part] is None else row[part] for row in rows)
         found[f"median_{part}"] = None if middle == float("inf") else middle

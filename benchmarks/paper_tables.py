@@ -22,7 +22,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,7 @@ from typing import Any
 
 import _lab
 
-from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
+from bidnerf_core.cli.progress import displayed, stopped_by_ctrl_c
 from bidnerf_core.errors import Cancelled
 from bidnerf_core.evaluation import (
     Group,
@@ -149,9 +149,12 @@ def run_part(trials: Sequence[Trial], path: Path, workers: int, minutes: float |
         return minutes is not None and time.monotonic() - began > 60 * minutes
 
     with ResultsFile(path) as file:
-        with suppress(Cancelled), ExitStack() as stack:
-            display, ctrl_c = stack.enter_context(Display()), stack.enter_context(stopped_by_ctrl_c())
-            stack.enter_context(job_context(display, lambda: ctrl_c() or late()))
+        with (
+            displayed(),
+            stopped_by_ctrl_c() as ctrl_c,
+            suppress(Cancelled),
+            job_context(cancel=lambda: ctrl_c() or late()),
+        ):
             run_trials(trials, file, workers=workers)
         done = [trial for trial in trials if trial in file]
         if not done or (len(done) < len(trials) and minutes is None):

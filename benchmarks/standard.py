@@ -23,7 +23,6 @@ indoors, and beyond 50 cm or 5 degrees in Cambridge, whose scenes are a hundred 
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -31,7 +30,20 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _lab import BOUND, RESULTS, Row, RowStore, answer, cpu_seconds, modes, one_thread, parser, record
+from _lab import (
+    BOUND,
+    RESULTS,
+    Row,
+    RowStore,
+    answer,
+    cpu_seconds,
+    median_errors,
+    modes,
+    one_thread,
+    parser,
+    record,
+    within,
+)
 
 from bidnerf_core import SE3, Intrinsics, Localizer, load_map
 from bidnerf_core.datasets import Capture, Shot, open_dataset
@@ -129,23 +141,11 @@ def spread(scene: Capture, split: str, every: int = 1, most: int | None = None) 
 
 def summary(rows: Sequence[Row], right: tuple[float, float]) -> dict[str, Any]:
     """Return the medians, shares and counts of some answers."""
-
-    def within(row: Row, limits: tuple[float, float]) -> bool:
-        return (
-            row["translation"] is not None
-            and row["translation"] < limits[0]
-            and row["rotation_deg"] < limits[1]
-        )
-
     accepted = [row for row in rows if row["converged"]]
     squared = [row["normalized_error_squared"] for row in accepted]
-    medians = {
-        part: statistics.median(float("inf") if row[part] is None else row[part] for row in rows)
-        for part in ("translation", "rotation_deg")
-    }
     return {
         "n": len(rows),
-        **{f"median_{part}": None if value == float("inf") else value for part, value in medians.items()},
+        **median_errors(rows),
         **{name: sum(within(row, limits) for row in rows) / len(rows) for name, limits in SHARES.items()},
         "accepted": len(accepted),
         "wrong_of_accepted": sum(not within(row, right) for row in accepted),

@@ -11,9 +11,9 @@ from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import TEST_IMAGES, Json, MethodOptions
 from bidnerf_core.cli.output import print_json, say, show
 from bidnerf_core.cli.parser import Flag, Option, Without
+from bidnerf_core.cli.progress import displayed
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
-from bidnerf_core.progress import Progress
 
 
 def run(
@@ -53,16 +53,13 @@ def run(
         )
     *maps, data = folders
     plan = replace(tried, size=() if size is None else (size,)).plan(method, images)
-
-    def count(progress: Progress) -> None:
-        say(f"{progress.done}/{progress.total}  {progress.text}")
-
     if out is None:
-        found = compare(maps, data, plan, progress=count)
+        with displayed():
+            found = compare(maps, data, plan)
     else:
         check_folder(out, folders)
-        with output_folder(out, overwrite):
-            found = compare(maps, data, plan, progress=count)
+        with output_folder(out, overwrite), displayed():
+            found = compare(maps, data, plan)
             found.save(out / "compare.json")
             try:
                 say(f"look at {comparison_figure(out, found).with_suffix('.png')}")

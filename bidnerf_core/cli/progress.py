@@ -24,7 +24,6 @@ from bidnerf_core.cli.output import console, say
 from bidnerf_core.errors import Cancelled
 from bidnerf_core.progress import Cancel, Progress, duration_text, job_context
 
-LINE_EVERY = 10.0  # seconds, if stderr is not a terminal
 STEP = "stopping after this step (Ctrl-C again: at once, back to the last checkpoint)"
 
 
@@ -38,14 +37,7 @@ class Display:
     def __init__(self) -> None:
         self._stage, self._first = "", 0
         self._began = self._spoke = time.monotonic()
-        self._bar: Bar | None = None
-
-    def __enter__(self) -> Display:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
+        self.bar: Bar | None = None
 
     def __call__(self, now: Progress) -> None:
         if now.stage != self._stage or not now.done:
@@ -54,11 +46,11 @@ class Display:
         each = elapsed / max(1, now.done - self._first)
         rate = f"{each:.1f} s each" if each >= 1 else f"{1 / each:.1f} per second" if each > 1e-6 else ""
         text = now.text or rate
-        if self._bar is not None:
-            self._bar.update(self._bar.task_ids[0], completed=now.done, total=now.total, text=text)
+        if self.bar is not None:
+            self.bar.update(self.bar.task_ids[0], completed=now.done, total=now.total, text=text)
             return
         last = now.done == now.total and (bool(now.text) or self._spoke > self._began)
-        if now.total > 1 and now.done and (last or time.monotonic() - self._spoke > LINE_EVERY):
+        if now.total > 1 and now.done and (last or time.monotonic() - self._spoke > 10):
             self._spoke = time.monotonic()
             counted = Progress(now.stage, now.done, now.total, now.unit, text)
             say(f"{counted}, {duration_text(each * (now.total - now.done))} left")
@@ -68,8 +60,8 @@ class Display:
         self._began = self._spoke = time.monotonic()
         if not console.is_terminal:
             return
-        if self._bar is not None:
-            self._bar.stop()
+        if self.bar is not None:
+            self.bar.stop()
         columns: tuple[ProgressColumn, ...] = (
             TextColumn(now.stage), BarColumn(), TextColumn("{task.completed}/{task.total} " + now.unit),
             TextColumn("{task.fields[text]}"), TextColumn("left"), TimeRemainingColumn(),
@@ -77,16 +69,21 @@ class Display:
         if now.total == 1:
             columns = (SpinnerColumn(), TextColumn(now.stage), TimeElapsedColumn())
         # Results on the same terminal appear above the bar.
-        self._bar = Bar(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty())
-        self._bar.add_task("", total=now.total, text="")
-        self._bar.start()
+        self.bar = Bar(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty())
+        self.bar.add_task("", total=now.total, text="")
+        self.bar.start()
 
 
 @contextlib.contextmanager
 def displayed() -> Iterator[None]:
     """Display the progress of the work in the context."""
-    with Display() as display, job_context(display):
-        yield
+    display = Display()
+    try:
+        with job_context(display):
+            yield
+    finally:
+        if display.bar is not None:
+            display.bar.stop()
 
 
 @contextlib.contextmanager

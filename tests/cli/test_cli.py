@@ -417,6 +417,10 @@ WRONG_USAGE = """
     evaluate {map} {data} --out {out} --method guess
     evaluate {map} {data} --out {out} --protocol guess
     evaluate {map} {data} --out {out} --size -1
+    evaluate {map} {data} --out {out} --size half
+    evaluate {map} {data} --out {out} --trials 999999999
+    evaluate {map} {data} --out {out} --shards 2 --shard 2
+    evaluate {map} {data} --out {out} --dask tcp://x:1 --workers 2
     evaluate {map} {data} --out {out} --protocol none --size 1
     compare {map} {data} --method guess
     compare {map} {data} --size 0.5:10

@@ -39,10 +39,8 @@ from bidnerf_core.evaluation.arcs import arc, mean_up, seen_middle
 from bidnerf_core.evaluation.results import as_line
 from bidnerf_core.geometry import look_at, turned_about
 from bidnerf_core.io import to_plain
-from bidnerf_core.localization import METHODS
 from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import closed_form_data, closed_form_map, orbit
-from bidnerf_core.settings import to_flat
 from refusals import refused
 
 QUICK = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--workers", "1"]
@@ -472,32 +470,6 @@ def test_ctrl_c_keeps_what_is_finished(
     assert len(read_results([tmp_path / "r.jsonl"])) == 2
     assert evaluate("--trials", 5, "--size", 0.3)[0] == 0
     assert [r.seed for r in read_results([tmp_path / "r.jsonl"])] == list(range(5))
-
-
-@pytest.mark.parametrize(
-    ("words", "status", "said"),
-    [
-        (["--size", "half"], 2, "--size is half, expected numbers"),
-        (["--trials", "999999999"], 2, "trials is 999999999, expected a whole number, 1 to"),
-        (["--shards", "2", "--shard", "2"], 2, "shard is 2"),
-        (["--protocol", "prallel"], 2, "did you mean 'parallel'"),
-        (["--dask", "tcp://x:1", "--workers", "2"], 2, "contradict"),
-    ],
-)
-def test_a_mistake_is_told_in_one_line(evaluate: Evaluate, words: list[str], status: int, said: str) -> None:
-    found, err = evaluate(*words)
-    assert (found, err.count("\n")) == (status, 1), err
-    assert said in err
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_every_method_has_its_settings_on_the_command_line(
-    method: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["evaluate", "--method", method, "--help-all"]) == 0
-    page = capsys.readouterr().out
-    names = [f"--{name.replace('_', '-')}" for name in to_flat(METHODS[method].config_type())]
-    assert sum(f"{name} " in page for name in names) > 3
 
 
 def _circle(count: int) -> list[tuple[float, float]]:

@@ -202,26 +202,15 @@ def test_the_command_prints_a_table_and_writes_what_it_says(
     maps: list[Path], data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folders = [str(maps[0]), str(data)]
-    options = [
-        "--method",
-        "bid",
-        "--trials",
-        "1",
-        "--rays",
-        "32",
-        "--max-steps",
-        "2",
-        "--out",
-        str(tmp_path / "out"),
-    ]
+    options = [*["--method", "bid", "--trials", "2", "--rays", "32", "--max-steps", "2", "--out"], str(tmp_path / "out")]
     assert main(["compare", *folders, *options]) == 0
     shown = capsys.readouterr()
     assert "short" in shown.out
     assert "ms a step" in shown.out
-    assert "1/1" in shown.err
-    assert shown.err.startswith("1 start in 1 map; a process for each begins\n")
+    assert "2/2 trials" in shown.err
+    assert shown.err.startswith("2 starts in 1 map; a process for each begins\n")
     kept = from_plain(Comparison, json.loads((tmp_path / "out" / "compare.json").read_text()), "compare.json")
-    assert [len(column) for column in kept.results] == [1]
+    assert [len(column) for column in kept.results] == [2]
     assert main(["compare", *folders, *options]) == 1  # what is there is not overwritten
     assert "not empty" in capsys.readouterr().err
 

