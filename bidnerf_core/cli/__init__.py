@@ -86,8 +86,11 @@ def _guarded(name: str, given: list[str]) -> int:
 
 
 def _dispatch(given: list[str]) -> int:
+    width = max(map(len, COMMANDS))
+    commands = "\n".join(f"  {name.ljust(width)}  {what}" for name, what in COMMANDS.items())
+    usage = f"usage: bidnerf COMMAND ...\n\n{commands}\n\n'bidnerf COMMAND --help' describes a command."
     if not given or given[0] in ("-h", "--help"):
-        print(_usage(), file=sys.stdout if given else sys.stderr)
+        print(usage, file=sys.stdout if given else sys.stderr)
         return DONE if given else WRONG_USAGE
     if given[0] == "--version":
         from importlib.metadata import version
@@ -96,9 +99,9 @@ def _dispatch(given: list[str]) -> int:
         return DONE
     if given[0] not in COMMANDS:
         unknown = f"no command {given[0]!r}{spelling_hint(given[0], COMMANDS)}"
-        return _failed("bidnerf", unknown, WRONG_USAGE, f"\n{_usage()}")
+        return _failed("bidnerf", unknown, WRONG_USAGE, f"\n{usage}")
     if any("\0" in word for word in given):
-        return _failed(f"bidnerf {given[0]}", "an argument holds a NUL character, expected text", WRONG_USAGE)
+        raise UsageError("an argument holds a NUL character", expected="text")
     from bidnerf_core.cli.parser import parse  # imported here, for the sake of a quick --version
 
     parse(given[0], importlib.import_module(f"bidnerf_core.cli.{given[0]}").run, given[1:])
@@ -175,13 +178,3 @@ def _discard(stream: TextIO) -> None:
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())
         os.close(null)
-
-
-def _usage() -> str:
-    width = max(map(len, COMMANDS))
-    lines = [f"  {name.ljust(width)}  {what}" for name, what in COMMANDS.items()]
-    return (
-        "usage: bidnerf COMMAND ...\n\n"
-        + "\n".join(lines)
-        + "\n\n'bidnerf COMMAND --help' describes a command."
-    )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+import importlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
@@ -32,22 +33,19 @@ Json: TypeAlias = Annotated[bool, FLAG, Option(None, "print JSON: one value on a
 Names: TypeAlias = tuple[str, ...]
 
 
-def _bake_settings(*_: Any) -> Any:
-    from bidnerf_core.mapping import BakeConfig
-
-    return BakeConfig()
-
-
-def _point_choice(*_: Any) -> Any:
-    from bidnerf_core.datasets import SparseChoice
-
-    return SparseChoice()
+def default_of(module: str, name: str) -> Callable[..., Any]:
+    """Return a function that imports a class of settings, and returns the default ones."""
+    return lambda *_: getattr(importlib.import_module(module), name)()
 
 
 BakeSettings: TypeAlias = Annotated[
-    Any, Settings(_bake_settings, "settings of the surface and the landmarks")
+    Any,
+    Settings(default_of("bidnerf_core.mapping", "BakeConfig"), "settings of the surface and the landmarks"),
 ]
-PointChoice: TypeAlias = Annotated[Any, Settings(_point_choice, "which points of a COLMAP model are used")]
+PointChoice: TypeAlias = Annotated[
+    Any,
+    Settings(default_of("bidnerf_core.datasets", "SparseChoice"), "which points of a COLMAP model are used"),
+]
 
 
 def _method_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from bidnerf_core.cli.folders import check_output
 from bidnerf_core.cli.interruptions import uninterrupted
-from bidnerf_core.cli.options import USUAL_METHOD, MapFolder
+from bidnerf_core.cli.options import USUAL_METHOD, MapFolder, default_of
 from bidnerf_core.cli.output import print_json, print_table, say
 from bidnerf_core.cli.parser import Flag, Option, Settings, Without
 from bidnerf_core.cli.progress import displayed
@@ -24,12 +24,6 @@ from bidnerf_core.settings import WholeNumbers
 if TYPE_CHECKING:
     from bidnerf_core.localization import Tracker
     from bidnerf_core.results import Answers, TrackingVideo
-
-
-def _tracker_settings(*_: Any) -> Any:
-    from bidnerf_core.localization import TrackerConfig
-
-    return TrackerConfig()
 
 
 @dataclass(frozen=True)
@@ -103,7 +97,9 @@ class TrackingOptions:
             "accepted as usual",
         ),
     ] = None
-    config: Annotated[Any, Settings(_tracker_settings, "settings of the tracker")] = None
+    config: Annotated[
+        Any, Settings(default_of("bidnerf_core.localization", "TrackerConfig"), "settings of the tracker")
+    ] = None
 
 
 def run(

@@ -7,7 +7,7 @@ import logging
 import os
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -248,7 +248,10 @@ def _rigs(plan: Plan, dataset: Capture, names: list[str], data: str) -> list[tup
         return [(name,) for name in visible]
     if isinstance(dataset, ClosedFormData):
         return [dataset.sequence(name, plan.images, plan.angle) for name in visible]
-    rigs = list(_sequences(plan, dataset, visible))
+    poses = {view.frame.name: view.T_ref_camera for view in dataset.views(plan.split)}
+    seen = list(poses)  # without those that masks hide altogether
+    arcs = (arc(list(poses.values()), seen.index(n), plan.images, plan.angle) for n in visible if n in poses)
+    rigs = [tuple(seen[place] for place in places) for places in arcs if places is not None]
     if not rigs:
         raise InputError(
             f"no frame of split {plan.split!r} ends a sequence of {plan.images} frames {plan.angle:g}"
@@ -256,14 +259,3 @@ def _rigs(plan: Plan, dataset: Capture, names: list[str], data: str) -> list[tup
             where=data,
         )
     return rigs
-
-
-def _sequences(plan: Plan, dataset: Capture, last: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """Yield the sequence around the object that ends with each frame of ``last``, where there is one."""
-    poses = {view.frame.name: view.T_ref_camera for view in dataset.views(plan.split)}
-    names = list(poses)  # without those that masks hide altogether
-    for name in last:
-        if name in poses:
-            places = arc(list(poses.values()), names.index(name), plan.images, plan.angle)
-            if places is not None:
-                yield tuple(names[place] for place in places)

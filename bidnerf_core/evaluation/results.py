@@ -33,7 +33,7 @@ from bidnerf_core.io import (
     to_plain,
     write_file,
 )
-from bidnerf_core.results import CRITERIA, Rate
+from bidnerf_core.results import CRITERIA
 
 LARGEST_FILE = 512 * 2**20
 """Bytes. A trial takes a few kilobytes, so this is enough for a hundred thousand trials."""
@@ -77,7 +77,10 @@ class ResultTable:
                 lines.append([row.start])
                 start = row.start
             known = row.statistics
-            rates = ["-" if success is None else _percent(success.rate) for success in known.success.values()]
+            rates = [
+                f"{100 * s.rate.rate:.0f} % ({100 * s.rate.low:.0f}-{100 * s.rate.high:.0f})" if s else "-"
+                for s in known.success.values()
+            ]
             error = "-"
             if known.translation is not None and known.rotation_deg is not None:
                 error = f"{known.translation:.3f} {symbol(known.unit)} {known.rotation_deg:6.2f} deg"
@@ -92,10 +95,6 @@ class ResultTable:
     def load(cls, *paths: str | Path) -> ResultTable:
         """Load the results in files, as ``read_results`` does."""
         return cls(tuple(read_results(map(Path, paths))))
-
-
-def _percent(rate: Rate) -> str:
-    return f"{100 * rate.rate:.0f} % ({100 * rate.low:.0f}-{100 * rate.high:.0f})"
 
 
 def aligned(lines: Sequence[Sequence[str]]) -> str:

@@ -88,7 +88,8 @@ def evaluate(
     and an importable main module, and finds registered names only if importing that module registers them. With one,
     everything runs in the calling thread.
 
-    Raises ``InputError`` for an evaluation that cannot be carried out, and ``Cancelled`` once ``cancel`` returns True and
+    Raises ``InputError`` for an evaluation that cannot be carried out, also if the method does not use the plan's depth points or
+    the views of some trial observe none, and ``Cancelled`` once ``cancel`` returns True and
     the running trials have ended.
     """
     in_memory = isinstance(scene, Map) or not isinstance(data, str | Path)
@@ -102,7 +103,15 @@ def evaluate(
     with job_context(progress, cancel):
         here = open_both(scene, data, plan)
         trials = planned(plan, name_of(scene), name_of(data), here[1])
-        _check_points(plan, trials, here, name_of(data))
+        if plan.depth_points is not None:
+            require_use_of_depth(plan.method)
+            points, rigs = opened_points(plan.depth_points, here[0]), dict.fromkeys(t.frames for t in trials)
+            blind = [rig[-1] for rig in rigs if not any(len(points.seen(name, plan.split)) for name in rig)]
+            if blind:
+                raise InputError(
+                    f"has no points for {len(blind)} of {len(rigs)} frames ({listed(blind)}); choose others with --frame",
+                    where=plan.depth_points,
+                )
         if repeated := repeated_frames(trials):
             log.info(repeated)
         with ResultsFile(None if out is None else Path(out)) as file:
@@ -228,20 +237,6 @@ def left_to_do(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None 
                     f"holds results of frame {trial.frame} made with other {what}; {advice}", where=file.path
                 )
     return [trial for trial in trials if trial not in file]
-
-
-def _check_points(plan: Plan, trials: Sequence[Trial], scene: Opened, data: str) -> None:
-    """Raise ``InputError`` if the method does not use the plan's depth points, or if the views of some trial observe none."""
-    if plan.depth_points is None:
-        return
-    require_use_of_depth(plan.method)
-    points, rigs = opened_points(plan.depth_points, scene[0]), dict.fromkeys(t.frames for t in trials)
-    blind = [rig[-1] for rig in rigs if not any(len(points.seen(name, plan.split)) for name in rig)]
-    if blind:
-        raise InputError(
-            f"has no points for {len(blind)} of {len(rigs)} frames ({listed(blind)}); choose others with --frame",
-            where=plan.depth_points,
-        )
 
 
 # Executors.

@@ -8,7 +8,7 @@ from functools import cache
 
 import torch
 from jaxtyping import Float
-from torch import Generator, Tensor
+from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import Rays, widened
@@ -62,7 +62,8 @@ def points(count: int, seed: int = 0) -> tuple[Float[Tensor, "n 3"], Float[Tenso
     """Return random positions within the box, and random unit directions."""
     generator = torch.Generator().manual_seed(seed)
     lower, size = torch.tensor(SCENE_BOUNDS.lower), torch.tensor(SCENE_BOUNDS.size)
-    return lower + size * torch.rand((count, 3), generator=generator), _directions(count, generator)
+    positions = lower + size * torch.rand((count, 3), generator=generator)
+    return positions, torch.nn.functional.normalize(torch.randn((count, 3), generator=generator), dim=-1)
 
 
 def awkward_points() -> dict[str, Float[Tensor, "n 3"]]:
@@ -104,7 +105,3 @@ def picked(rays: Rays, index: Tensor) -> Rays:
 def joined(parts: list[Rays]) -> Rays:
     names = ("origins", "directions", "near", "far")
     return Rays(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
-
-
-def _directions(count: int, generator: Generator) -> Float[Tensor, "n 3"]:
-    return torch.nn.functional.normalize(torch.randn((count, 3), generator=generator), dim=-1)

@@ -79,7 +79,12 @@ def vanished_thing(frame: Frame, share: float, generator: Generator) -> Frame:
     if empty is not None and empty.any():
         background = frame.rgb[empty].median(dim=0).values.expand_as(frame.rgb)
         return _pasted(frame, mask, background, torch.zeros_like(depth), torch.zeros_like(depth))
-    return _pasted(frame, mask, _inpainted(frame.rgb, mask), depth[rim].max().expand_as(depth))
+    # Continued from the surrounding colours (Telea 2004).
+    colours = (frame.rgb * 255).round().to(torch.uint8).contiguous().numpy()
+    filled = cv2.inpaint(colours, mask.to(torch.uint8).numpy(), RIM, cv2.INPAINT_TELEA)
+    return _pasted(
+        frame, mask, torch.from_numpy(filled).to(frame.rgb) / 255, depth[rim].max().expand_as(depth)
+    )
 
 
 def _textured_blob(
@@ -123,13 +128,6 @@ def _pasted(
     return pasted
 
 
-def _inpainted(rgb: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
-    """Inpaint ``mask`` from the surrounding colours (Telea 2004)."""
-    bytes_ = (rgb * 255).round().to(torch.uint8).contiguous().numpy()
-    filled = cv2.inpaint(bytes_, mask.to(torch.uint8).numpy(), RIM, cv2.INPAINT_TELEA)
-    return torch.from_numpy(filled).to(rgb) / 255
-
-
 def blob(height: int, width: int, share: float, generator: Generator) -> Bool[Tensor, "h w"]:
     """Return a mask of one irregular piece around a random place that covers exactly ``share`` of the image.
 
@@ -138,24 +136,18 @@ def blob(height: int, width: int, share: float, generator: Generator) -> Bool[Te
     centre = uniform_number(generator, 0.2, 0.8) * width, uniform_number(generator, 0.2, 0.8) * height
     down = torch.arange(height, dtype=torch.float32)[:, None] + 0.5 - centre[1]
     across = torch.arange(width, dtype=torch.float32)[None, :] + 0.5 - centre[0]
-    distance = torch.hypot(down, across) / _radius(torch.atan2(down, across), generator)
-    covered = round(share * height * width)
-    mask = torch.zeros(height * width, dtype=torch.bool)
-    mask[distance.flatten().argsort()[:covered]] = True
-    return mask.reshape(height, width)
-
-
-def _radius(angle: Float[Tensor, "h w"], generator: Generator) -> Float[Tensor, "h w"]:
-    """Return the radius of an irregular outline at ``angle`` (radians) around its centre.
-
-    Every point of the outline is visible from the centre, so that the blob is one piece.
-    """
+    # Every point of the irregular outline is visible from the centre, so that the blob is one piece.
+    angle = torch.atan2(down, across)
     waves = [
         uniform_number(generator, -0.35, 0.35)
         * torch.cos(n * angle + uniform_number(generator, 0, 2 * math.pi))
         for n in range(2, 6)  # periods around the outline
     ]
-    return torch.stack(waves).sum(0).exp()
+    distance = torch.hypot(down, across) / torch.stack(waves).sum(0).exp()
+    covered = round(share * height * width)
+    mask = torch.zeros(height * width, dtype=torch.bool)
+    mask[distance.flatten().argsort()[:covered]] = True
+    return mask.reshape(height, width)
 
 
 def texture(height: int, width: int, generator: Generator) -> Float[Tensor, "h w 3"]:
