@@ -21,7 +21,7 @@ from starlette.types import Scope
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import parse_json
 from bidnerf_core.service.jobs import Job
-from bidnerf_core.service.models import Health, Localization, MapFacts, Refused, checked
+from bidnerf_core.service.models import Localization, MapFacts, Refused, checked
 from bidnerf_core.service.pool import Lost, Pool
 from bidnerf_core.service.protocols import PROTOCOLS, ServiceProtocol
 from bidnerf_core.service.settings import ServiceLimits
@@ -90,7 +90,7 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
 
     @app.get(
         "/health",
-        response_model=Health,
+        response_model=dict[str, str | int],
         responses=errors(503),
         summary="Whether the service can answer; needs no token.",
     )

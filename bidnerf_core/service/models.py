@@ -167,14 +167,6 @@ class Problem(BaseModel):
     localization: Localization = Field(ABSENT)
 
 
-class Health(BaseModel):
-    """Whether the service can answer."""
-
-    status: Literal["ok"]
-    workers: int = Field(ge=0)
-    waiting: int = Field(ge=0)
-
-
 class MapFacts(BaseModel):
     """Facts about a map."""
 

@@ -6,7 +6,8 @@ A protocol's name is its path: the service answers it at ``/NAME``, and at ``/ma
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 from bidnerf_core.registry import Plugins, interface_defects
@@ -48,9 +49,11 @@ class ServiceProtocol(Protocol):
         """
 
 
-def _defects(value: Any) -> Iterator[str]:
-    attributes = ("summary", "request", "response", "media_type")
-    yield from interface_defects(value, attributes, {"answer": ("body", "scene", "localize")})
-
-
-PROTOCOLS: Plugins[ServiceProtocol] = Plugins("services", _defects)
+PROTOCOLS: Plugins[ServiceProtocol] = Plugins(
+    "services",
+    partial(
+        interface_defects,
+        attributes=("summary", "request", "response", "media_type"),
+        methods={"answer": ("body", "scene", "localize")},
+    ),
+)

@@ -175,11 +175,6 @@ async def _failure(request: Request, error: Exception) -> Response:
     if isinstance(error, Refused):
         return problem(error.status, error.detail, error.headers, **error.more)
     if isinstance(error, HTTPException):
-        path = getattr(request.scope.get("route"), "path", None)
-        if error.status_code == 405:  # of the methods of a path, each has a route, which knows only its own
-            same = [route for route in request.app.routes if route.path == path]
-            methods = sorted({method for route in same for method in route.methods})
-            return problem(405, error.detail, {"Allow": ", ".join(methods)})
         return problem(error.status_code, error.detail, error.headers)
     return problem(400, str(error))
 

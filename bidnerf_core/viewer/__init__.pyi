@@ -1,9 +1,9 @@
 from .answer import ShownAnswer as ShownAnswer
 from .app import LiveView as LiveView
+from .saving import MapView as MapView
 from .server import PORT as PORT
 from .server import serve_view as serve_view
 from .trajectories import shown_trajectory as shown_trajectory
-from .view import MapView as MapView
 from .view import page_of as page_of
 from .view import read_and_localized as read_and_localized
 from .view import shown_row as shown_row

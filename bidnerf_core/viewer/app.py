@@ -29,7 +29,6 @@ from bidnerf_core.errors import Cancelled, InputError
 from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.io import parse_json
 from bidnerf_core.localization import Localizer
-from bidnerf_core.maps import Map
 from bidnerf_core.progress import job_context
 from bidnerf_core.service import (
     Application,
@@ -49,8 +48,9 @@ from bidnerf_core.service import (
 from bidnerf_core.viewer.jobs import Jobs, Read
 from bidnerf_core.viewer.packing import Json, jpeg
 from bidnerf_core.viewer.rendering import field_image, quick_image
-from bidnerf_core.viewer.saving import PageState, page_html
+from bidnerf_core.viewer.saving import MapView
 from bidnerf_core.viewer.scene import shown_map, thumbnail_jpeg
+from bidnerf_core.viewer.view import map_of
 
 COOKIE = "bidnerf_token"
 LARGEST_RENDERING = 1024
@@ -71,14 +71,6 @@ class LiveView:
     trajectory: Json | None = None
     results: tuple[Json, ...] = ()
     camera: CameraSource | None = None
-
-    @property
-    def map(self) -> Map:
-        """The map. Raises ``InputError`` if the localizer has another kind of scene."""
-        scene = self.localizer.scene
-        if not isinstance(scene, Map):
-            raise InputError(f"the viewer shows a Map, got a {type(scene).__name__}")
-        return scene
 
 
 class VirtualCamera(BaseModel):
@@ -130,13 +122,13 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
     """
     limits = limits or ServiceLimits()
     scene, localizer, names = (
-        shown.map,
+        map_of(shown.localizer),
         shown.localizer,
         () if shown.source is None else tuple(shown.source.names),
     )
     usual = replace(shown.camera or CameraSource(), assumed=localizer.assumed_cameras)
     others = replace(usual, hfov=None)  # the page sends the field of view
-    state = PageState(
+    state = MapView(
         shown_map(scene, thumbnails=0), live=True, queries=names, trajectory=shown.trajectory, results=shown.results,
         hfov=usual.hfov, camera_given=others.is_given,
     )  # fmt: skip
@@ -161,7 +153,7 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
 
     @app.get("/", response_class=HTMLResponse, summary="The page.")
     async def page() -> Response:
-        return HTMLResponse(page_html(state), headers=PAGE_HEADERS)
+        return HTMLResponse(state.html(), headers=PAGE_HEADERS)
 
     @app.get("/health", summary="Whether the viewer is up; needs no token.")
     async def health() -> Response:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from bidnerf_core.datasets import Query, QuerySource
-from bidnerf_core.errors import InputError, amount
+from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import Localization, Localizer, SearchRecord, recorded
@@ -18,32 +16,9 @@ from bidnerf_core.maps import Map
 from bidnerf_core.results import BAD_INPUT
 from bidnerf_core.viewer.answer import ShownAnswer, shown_answer
 from bidnerf_core.viewer.packing import Json
-from bidnerf_core.viewer.saving import PageState, page_html, save_page
+from bidnerf_core.viewer.saving import MapView
 from bidnerf_core.viewer.scene import shown_map
 from bidnerf_core.viewer.trajectories import shown_trajectory
-
-HEIGHT = 620
-"""Height (pixels) of the page in a notebook."""
-
-
-@dataclass(frozen=True, eq=False)
-class MapView:
-    """The page of a map, which a notebook shows and ``save`` writes to a file."""
-
-    state: PageState
-
-    def __repr__(self) -> str:
-        """A one-line description, without the content of the page."""
-        return f"<MapView of {self.state.map['name']} with {amount(len(self.state.answers), 'localization')}>"
-
-    def _repr_html_(self) -> str:
-        """Return the page in an iframe, as notebooks show it."""
-        page = html.escape(page_html(self.state), quote=True)
-        return f'<iframe srcdoc="{page}" style="width:100%;height:{HEIGHT}px;border:0" sandbox="allow-scripts"></iframe>'
-
-    def save(self, path: str | Path) -> Path:
-        """Write the page to a file that opens without a server or a network. Raises ``InputError`` if it cannot be written."""
-        return save_page(self.state, path)
 
 
 def view(
@@ -60,11 +35,7 @@ def view(
     ``localization`` is localized here, and the page then shows the search too. ``scene`` is a map, or a localizer with settings
     of its own, and ``trajectory`` a file of poses. Raises ``InputError`` if it is neither.
     """
-    scene_map = scene.scene if isinstance(scene, Localizer) else scene
-    if not isinstance(scene_map, Map):
-        raise InputError(
-            f"scene is a {type(scene_map).__name__}", where="view", expected="a Map, such as load_map returns"
-        )
+    scene_map = map_of(scene)
     answers = list[ShownAnswer]()
     if localization is not None:
         name = "localization" if frame is None else frame.name
@@ -79,7 +50,17 @@ def view(
     path = (
         None if trajectory is None else shown_trajectory(Path(trajectory), scene_map.unit, scene_map.origin)
     )
-    return MapView(PageState(shown_map(scene_map), tuple(answers), title, trajectory=path))
+    return MapView(shown_map(scene_map), tuple(answers), title, trajectory=path)
+
+
+def map_of(scene: object) -> Map:
+    """Return a map, or that of a localizer. Raises ``InputError`` for anything else."""
+    found = scene.scene if isinstance(scene, Localizer) else scene
+    if not isinstance(found, Map):
+        raise InputError(
+            f"scene is a {type(found).__name__}", where="view", expected="a Map, such as load_map returns"
+        )
+    return found
 
 
 def localized(
@@ -116,7 +97,7 @@ def page_of(
     scene: Map, answers: Iterable[ShownAnswer], trajectory: Json | None = None, results: Iterable[Json] = (),
 ) -> MapView:  # fmt: skip
     """Build the viewer page of a map with answers, a trajectory and rows of results."""
-    return MapView(PageState(shown_map(scene), tuple(answers), trajectory=trajectory, results=tuple(results)))
+    return MapView(shown_map(scene), tuple(answers), trajectory=trajectory, results=tuple(results))
 
 
 def shown_row(row: Any) -> Json:

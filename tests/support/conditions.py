@@ -41,11 +41,6 @@ class CountedDetector:
         self.images.append(rgb)
         return self.detector(rgb)
 
-    @property
-    def most_often(self) -> int:
-        """How often the keypoints of one image were sought at most."""
-        return max((sum(torch.equal(a, b) for b in self.images) for a in self.images), default=0)
-
 
 def with_landmarks(landmarks: LandmarkMap | None, scene: MapWithLandmarks | None = None) -> MapWithLandmarks:
     """Return a map with these landmarks, by default of the ground."""

@@ -41,7 +41,7 @@ from bidnerf_core.viewer.explanations import EARLIER, HERE, contests
 from bidnerf_core.viewer.figures import MEASURES, acceptance_figures, bar
 from bidnerf_core.viewer.packing import packed_points
 from bidnerf_core.viewer.rendering import field_image, quick_image
-from bidnerf_core.viewer.saving import MODULES, PageState, page_html
+from bidnerf_core.viewer.saving import MODULES, MapView
 from bidnerf_core.viewer.scene import shown_map, towards
 from bidnerf_core.viewer.view import localized
 from commands import Run, assert_refused
@@ -324,8 +324,7 @@ def test_packed_points_are_exact_to_a_part_in_65535(generator: torch.Generator) 
 def test_the_page_holds_its_state_and_hostile_names_stay_text(
     room: Map, found: ShownAnswer, refused: ShownAnswer
 ) -> None:
-    state = PageState(shown_map(room, 2), (found, refused), title=viewed.HOSTILE)
-    page = page_html(state)
+    page = MapView(shown_map(room, 2), (found, refused), title=viewed.HOSTILE).html()
     assert viewed.HOSTILE not in page
     assert page.count("</script>") == 3  # of the state, of three.js and of the modules
     held = viewed.state_of(page)
@@ -335,7 +334,7 @@ def test_the_page_holds_its_state_and_hostile_names_stay_text(
 
 
 def test_the_page_asks_nobody_for_anything(room: Map, found: ShownAnswer) -> None:
-    page = page_html(PageState(shown_map(room, 0), (found,)))
+    page = MapView(shown_map(room, 0), (found,)).html()
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)
     assert policy is not None
     assert "default-src 'none'" in policy[1]

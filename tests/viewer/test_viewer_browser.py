@@ -28,7 +28,6 @@ from bidnerf_core.viewer import page_of, shown_trajectory
 
 # Inside: an answer whose descent is given, and the page as a saved file
 from bidnerf_core.viewer.answer import shown_answer
-from bidnerf_core.viewer.saving import save_page
 from bidnerf_core.viewer.view import localized
 from viewer_client import serving
 
@@ -108,7 +107,7 @@ def saved(room: Map, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ]
     page = page_of(room, answers, shown_trajectory(folder / "track.json"), rows)
     (folder / "notebook.html").write_text(f"<!doctype html><title>notebook</title>{page._repr_html_()}")
-    return save_page(page.state, folder / "page.html")
+    return page.save(folder / "page.html")
 
 
 @contextmanager
@@ -269,7 +268,7 @@ def test_a_descent_can_be_replayed(browser: Any, room: Map, tmp_path: Path) -> N
     found = Localizer(room)(viewed.query().views)
     poses, losses = SE3.stack([*viewed.walk(30), found.T_world_camera]), torch.linspace(0.5, 0.1, 30)
     answer = shown_answer(room, "descent", replace(found, poses=poses, losses=losses))
-    file = save_page(page_of(room, [answer]).state, tmp_path / "page.html")
+    file = page_of(room, [answer]).save(tmp_path / "page.html")
     with opened(browser, file.as_uri(), LAPTOP, offline=True) as page:
         page.locator("#step").fill("10")
         assert page.text_content("#caption") == "step 10 of 30: loss 0.362"

@@ -66,29 +66,8 @@ class Gaussians:
         )
 
 
-@dataclass(frozen=True)
-class Dropped:
-    """How many Gaussians of a file were left out, and why."""
-
-    not_finite: int = 0  # one of their numbers is NaN or infinite, or too large
-    without_rotation: int = 0  # their quaternion is zero
-    invisible: int = 0  # their opacity is below anything ever rendered
-
-    def __str__(self) -> str:
-        parts = [
-            f"{count:,} {what}"
-            for count, what in (
-                (self.not_finite, "with numbers that are not finite or too large"),
-                (self.without_rotation, "with a zero quaternion"),
-                (self.invisible, "that are transparent"),
-            )
-            if count
-        ]
-        return ", ".join(parts)
-
-
-def cleaned(found: Gaussians, where: str) -> tuple[Gaussians, Dropped]:
-    """Return the Gaussians that can be rendered, and how many were left out.
+def cleaned(found: Gaussians, where: str) -> tuple[Gaussians, str]:
+    """Return the Gaussians that can be rendered, and a text that says how many others were left out, empty if none were.
 
     Raises ``InputError``, whose message begins with ``where``, if none is left.
     """
@@ -100,13 +79,15 @@ def cleaned(found: Gaussians, where: str) -> tuple[Gaussians, Dropped]:
         )
     finite = _finite(found)
     turned = found.quaternions.abs().amax(-1) > 1e-12
-    visible = found.logits.sigmoid() >= LEAST_ALPHA
-    kept = finite & turned & visible
-    dropped = Dropped(
-        int((~finite).sum()), int((finite & ~turned).sum()), int((finite & turned & ~visible).sum())
-    )
+    kept = finite & turned & (found.logits.sigmoid() >= LEAST_ALPHA)
+    left = {
+        "with numbers that are not finite or too large": ~finite,
+        "with a zero quaternion": finite & ~turned,
+        "that are transparent": finite & turned & ~kept,
+    }
+    dropped = ", ".join(f"{int(rows.sum()):,} {what}" for what, rows in left.items() if bool(rows.any()))
     if not bool(kept.any()):
-        what = f": {dropped}" if len(found) else ""
+        what = f": {dropped}" if dropped else ""
         raise InputError(
             f"none of its {len(found):,} Gaussians can be rendered{what}",
             where=where,

@@ -93,7 +93,7 @@ def imported(
     field = GaussiansField(settings, bounds)
     field.assign(moved)
     facts = [f"{count:,} Gaussians, harmonics of degree {gaussians.degree}" + (f" ({of.name})" if of else "")]
-    if str(dropped):
+    if dropped:
         facts.append(f"left out {dropped}")
     if config.least_opacity:
         facts.append(f"left out {before - len(kept):,} with an opacity below {config.least_opacity:g}")

@@ -35,10 +35,7 @@ def file(tmp_path: Path, some: Some) -> Path:
     return path
 
 
-def test_a_file_becomes_a_map(
-    file: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("bidnerf_core.maps.viewpoints.PLACES", 40)
+def test_a_file_becomes_a_map(file: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO, "bidnerf"):
         scene = import_map(file, tmp_path / "MAP", bake=False)
     assert "400 Gaussians, harmonics of degree 1 (PLY of splats)" in caplog.text
@@ -50,9 +47,8 @@ def test_a_file_becomes_a_map(
     assert float(first.opacity.max()) > 0.9
 
 
-def test_a_map_in_another_world(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_in_another_world(file: Path) -> None:
     """Moved with the field, a camera sees the same, at distances that are scaled."""
-    monkeypatch.setattr("bidnerf_core.maps.viewpoints.PLACES", 40)
     T = SE3.exp(torch.tensor([1.0, -2, 0.5, 0.4, 1.1, -0.7], dtype=torch.float64))
     here = import_map(file, bake=False)
     there = import_map(file, bake=False, options=ImportOptions(scale=3.0, T_world_file=T))

@@ -16,8 +16,7 @@ from bidnerf_nerf_pytorch.importer import importer
 from checkpoints import SMALL, Writer, contents
 
 
-def test_a_checkpoint_is_recognised_and_imported(write: Writer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bidnerf_core.maps.viewpoints.PLACES", 4)
+def test_a_checkpoint_is_recognised_and_imported(write: Writer) -> None:
     assert importer_of(write())[0] == "nerf-pytorch"
     scene = import_map(write(), config={"near": 1.0, "background": "black"}, bake=False)
     assert scene.info.backend == "nerf-pytorch"

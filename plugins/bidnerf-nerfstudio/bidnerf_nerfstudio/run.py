@@ -12,11 +12,10 @@ from typing import Any
 
 import torch
 import yaml
-from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry import SE3, Similarity
+from bidnerf_core.geometry import SE3, Similarity, rigid_pose
 from bidnerf_core.io import Record, read_file, read_record, read_saved
 from bidnerf_nerfstudio.placement import after, inverse
 
@@ -27,10 +26,8 @@ LARGEST_CONFIG = 4 * 2**20
 """Bytes; a config has about ten thousand, and YAML is slow to parse."""
 STEP = re.compile(r"step-(\d+)\.ckpt")
 PREFIX = "_model."
-COLMAP = ((0.0, 1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0))
+COLMAP = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
 """nerfstudio's default for a missing ``applied_transform`` in data that it processed with COLMAP."""
-RIGID = 1e-3
-"""Largest entry of the product of a rotation and its transpose, minus the identity; nerfstudio uses single precision."""
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -125,7 +122,7 @@ class Run:
         scale = record.number("scale")
         if scale is None or not 1e-12 < scale < 1e12:
             raise record.error(f"scale is {scale}", expected="a number above 0")
-        found = Similarity(scale, _moved(record, _rows(record, "transform"), scale))
+        found = Similarity(scale, _moved(record, "transform", record.items("transform"), scale))
         if data is None:
             return found, (
                 "poses will be in the coordinates of the original data, before any applied_transform: the"
@@ -164,23 +161,11 @@ def _part(record: Record, key: str) -> Record:
     return Record(f"{record.where}: {key}", found)
 
 
-def _rows(record: Record, key: str) -> Float[Tensor, "3 4"]:
-    """Return a matrix with 3 (or 4) rows of 4 numbers."""
-    rows = record.items(key) or []
-    if not (len(rows) in (3, 4) and all(isinstance(row, list) and len(row) == 4 for row in rows)):
-        raise record.error(f"{key} is not readable", expected="3 rows of 4 numbers")
-    numbers = [[record.checked_number(value, key) for value in row] for row in rows[:3]]
-    return torch.tensor(numbers, dtype=torch.float64)
-
-
-def _moved(record: Record, rows: Float[Tensor, "3 4"], scale: float) -> SE3:
-    """Return the transform after scaling that is equivalent to one before it."""
-    rotation = rows[:, :3]
-    off = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().max()
-    if not (float(off) < RIGID and float(torch.linalg.det(rotation)) > 0):
-        raise record.error("transform is not a rigid transform", expected="a rotation and a translation")
-    u, _, vh = torch.linalg.svd(rotation)
-    return SE3(u @ vh, scale * rows[:, 3])
+def _moved(record: Record, key: str, rows: Any, scale: float) -> SE3:
+    """Return the transform after scaling that is equivalent to one before it, which has ``rows``."""
+    matrix = torch.tensor(record.matrix(key, rows), dtype=torch.float64)
+    T = rigid_pose(matrix, record.where, f"the rotation of {key}")
+    return SE3(T.rotation, scale * T.translation)
 
 
 def _applied(data: Path) -> Similarity | None:
@@ -190,8 +175,9 @@ def _applied(data: Path) -> Similarity | None:
         return None
     record = read_record(file)
     scale = record.number("applied_scale") or 1.0
-    if record.value("applied_transform") is not None:
-        return Similarity(scale, _moved(record, _rows(record, "applied_transform"), scale))
-    if (data / "colmap" / "sparse" / "0").exists():
-        return Similarity(scale, _moved(record, torch.tensor(COLMAP, dtype=torch.float64), scale))
+    rows = record.items("applied_transform")
+    if rows is None and (data / "colmap" / "sparse" / "0").exists():
+        rows = COLMAP
+    if rows is not None:
+        return Similarity(scale, _moved(record, "applied_transform", rows, scale))
     return None if scale == 1.0 else Similarity(scale, SE3.identity())

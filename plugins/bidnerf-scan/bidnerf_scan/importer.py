@@ -95,7 +95,7 @@ def imported(
     used = points if kept.faces is None else points[torch.from_numpy(kept.faces).unique()]
     _check_precision(used, where, config)
     facts = [_counts(scan) + (f" ({of.name})" if of else "")]
-    if str(dropped):
+    if dropped:
         facts.append(f"left out {dropped}")
     if not scan.has_colours:
         facts.append(

@@ -61,7 +61,16 @@ def mesh_of_surface(surface: SurfaceMap) -> Mesh:
     It ends where the surfels end. Raises ``InputError`` for a surface of too few surfels, and for one without keyframes.
     """
     distance = SignedDistance.of(surface)
-    return _marched(distance, distance.spacing)
+    cell, places, faces, count = distance.spacing, [], list[Int64[np.ndarray, "m 3"]](), 0
+    for found, corners in _blocks(distance, cell):
+        places.append(found)
+        faces.append(corners + count)
+        count += len(found)
+    if not places:
+        raise InputError("its surface has no place on whose two sides the distance differs in sign")
+    vertices, triangles = _joined(np.concatenate(places), np.concatenate(faces))
+    points = cell * vertices
+    return Mesh(points, *distance.shading(points), triangles, cell)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,21 +166,6 @@ def _facing(surface: SurfaceMap, start: int, end: int) -> Float64[Tensor, "n"]:
     along = torch.where(met.met, met.along, torch.inf).view(away.shape)
     in_sight = (cosine.abs() > GRAZING) & (along > away - 2 * surface.surfel_radius / cosine.abs())
     return torch.where(in_sight, cosine, 0).sum(-1)
-
-
-def _marched(distance: SignedDistance, cell: float) -> Mesh:
-    """Return the mesh of the zero level on a grid."""
-    places, faces, count = [], list[Int64[np.ndarray, "m 3"]](), 0
-    for found, corners in _blocks(distance, cell):
-        places.append(found)
-        faces.append(corners + count)
-        count += len(found)
-    if not places:
-        raise InputError("its surface has no place on whose two sides the distance differs in sign")
-    places, faces = _joined(np.concatenate(places), np.concatenate(faces))
-    points = cell * places
-    normals, rgb = distance.shading(points)
-    return Mesh(points, normals, rgb, faces, cell)
 
 
 def _blocks(

@@ -14,10 +14,6 @@ FARTHEST = 1e12
 """Coordinates beyond which a point counts as broken."""
 
 
-FEWEST = 3
-"""Number of points that define a plane."""
-
-
 @dataclass(frozen=True, eq=False)
 class Scan:
     """A point cloud (without faces) or a mesh, in the coordinates of its file."""
@@ -35,47 +31,26 @@ class Scan:
         return self.rgb is not None or bool(self.images)
 
 
-@dataclass
-class Dropped:
-    """How much of a scan was left out, and why."""
+def cleaned(scan: Scan, where: str) -> tuple[Scan, str]:
+    """Return the usable part of a scan, and a text that says what was left out, empty if nothing was.
 
-    not_finite: int = 0  # points whose coordinates are NaN or infinite
-    broken_faces: int = 0  # faces with corners that are left out or do not exist
-    flat_faces: int = 0  # faces without an area
-    repeated: int = 0  # duplicate points
-
-    def __str__(self) -> str:
-        parts = [
-            f"{count:,} {what}"
-            for count, what in (
-                (self.not_finite, "points with coordinates that are not finite"),
-                (self.broken_faces, "faces with corners that do not exist"),
-                (self.flat_faces, "faces without an area"),
-                (self.repeated, "duplicate points"),
-            )
-            if count
-        ]
-        return ", ".join(parts)
-
-
-def cleaned(scan: Scan, where: str) -> tuple[Scan, Dropped]:
-    """Return the usable part of a scan, and what was left out. Raises ``InputError`` if nothing is left."""
-    dropped = Dropped()
+    Raises ``InputError`` if nothing is left.
+    """
     if not len(scan.points):
         raise InputError("holds no points", where=where, expected="a mesh or a point cloud")
     good = np.asarray(np.all(np.isfinite(scan.points) & (np.abs(scan.points) < FARTHEST), axis=-1))
-    dropped.not_finite = int((~good).sum())
+    left = {"points with coordinates that are not finite": int((~good).sum())}
     rgb = None if scan.rgb is None else np.nan_to_num(scan.rgb, nan=0.5).clip(0, 1)
     if scan.faces is None:
         points, rgb = scan.points[good], None if rgb is None else rgb[good]
         if not len(points):
             raise InputError(f"none of its {len(good):,} points has finite coordinates", where=where)
         _, first = np.unique(points, axis=0, return_index=True)
-        dropped.repeated = len(points) - len(first)
+        left["duplicate points"] = len(points) - len(first)
         first.sort()
-        if len(first) < FEWEST:
+        if len(first) < 3:  # which define a plane
             raise InputError(f"{len(first)} distinct points", where=where, expected="at least three")
-        return Scan(points[first], None if rgb is None else rgb[first]), dropped
+        return Scan(points[first], None if rgb is None else rgb[first]), _listed(left)
     exists = np.asarray(np.all((scan.faces >= 0) & (scan.faces < len(scan.points)), axis=-1))
     whole = exists.copy()
     whole[exists] = good[scan.faces[exists]].all(-1)
@@ -85,7 +60,8 @@ def cleaned(scan: Scan, where: str) -> tuple[Scan, Dropped]:
     with np.errstate(invalid="ignore"):
         has_area = np.linalg.norm(np.cross(a, b), axis=-1) > 1e-7 * longest
     kept = whole & has_area
-    dropped.broken_faces, dropped.flat_faces = int((~whole).sum()), int((whole & ~has_area).sum())
+    left["faces with corners that do not exist"] = int((~whole).sum())
+    left["faces without an area"] = int((whole & ~has_area).sum())
     if not kept.any():
         raise InputError(f"none of its {len(kept):,} faces has three finite corners and an area", where=where)
     part = replace(
@@ -93,7 +69,24 @@ def cleaned(scan: Scan, where: str) -> tuple[Scan, Dropped]:
         uv=None if scan.uv is None else np.nan_to_num(scan.uv[kept]),
         image=None if scan.image is None else scan.image[kept],
     )  # fmt: skip
-    return part, dropped
+    return part, _listed(left)
+
+
+def _listed(counts: dict[str, int]) -> str:
+    return ", ".join(f"{count:,} {what}" for what, count in counts.items() if count)
+
+
+def colours_of(rows: NDArray, *names: tuple[str, str, str]) -> NDArray[np.float32] | None:
+    """Return the colours (n, 3) in [0, 1] of points with any of ``names``; None if they have none."""
+    found = next((three for three in names if set(three) <= set(rows.dtype.names or ())), None)
+    return None if found is None else in_unit_range(np.stack([rows[name] for name in found], axis=-1))
+
+
+def in_unit_range(rgb: NDArray) -> NDArray[np.float32]:
+    """Return colours in [0, 1]. Their type and the largest of them tell what they are fractions of: 1, 255, or 65535."""
+    largest = np.nanmax(rgb) if rgb.size else 0
+    whole = 65535 if largest > 255 else 255 if rgb.dtype.kind in "ui" or largest > 1.5 else 1
+    return rgb.astype(np.float32) / np.float32(whole)
 
 
 def joined(scans: Sequence[Scan]) -> Scan:

@@ -27,7 +27,6 @@ EYE = look_at([0.5, -3.0, 1.0], [0.0, 0.0, 0.0], (0.0, 0.0, 1.0))
 
 @pytest.fixture(autouse=True)
 def few_places(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bidnerf_core.maps.viewpoints.PLACES", 40)
     monkeypatch.setattr(import_module("bidnerf_scan.importer"), "SURFACE_POINTS", 6000)
 
 

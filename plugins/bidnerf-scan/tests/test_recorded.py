@@ -16,14 +16,11 @@ from bidnerf_core.results import pose_error
 from bidnerf_scan.pieces import thinned
 
 
-def test_frames_with_depth_are_found_by_the_shape_of_a_cloud(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_with_depth_are_found_by_the_shape_of_a_cloud(tmp_path: Path) -> None:
     """Their poses are right, and no wrong one is accepted; without colours, most are not accepted at all."""
     folder = os.environ.get("BIDNERF_DATA")
     if not folder:
         pytest.skip("needs BIDNERF_DATA")
-    monkeypatch.setattr("bidnerf_core.maps.viewpoints.PLACES", 100)
     dataset = open_dataset(Path(folder) / "room_living")
     names = dataset.frame_names("train")[::2]
     pixels = draw(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bidnerf_core.errors import InputError
-from bidnerf_scan.scan import Scan, joined
+from bidnerf_scan.scan import Scan, in_unit_range, joined
 
 MOST_POINTS, MOST_COPIES = 2 * 10**8, 16
 """Points over all nodes, and in proportion to those of the meshes: a small mesh may be placed by any number of nodes."""
@@ -62,7 +62,7 @@ def _placed(scene: Any, node: str) -> Scan:
     if geometry.visual.kind == "texture":
         return _textured(geometry.visual, points, faces)
     if geometry.visual.kind == "face":
-        rgb = np.asarray(geometry.visual.face_colors, np.float32)[:, :3] / np.float32(255)
+        rgb = in_unit_range(np.asarray(geometry.visual.face_colors)[:, :3])
         corners = np.arange(faces.size).reshape(faces.shape)
         return Scan(points[faces].reshape(-1, 3), rgb.repeat(3, axis=0), corners)
     return Scan(points, _vertex_colours(geometry, len(points)), faces)
@@ -73,7 +73,7 @@ def _vertex_colours(geometry: Any, count: int) -> NDArray[np.float32] | None:
     if visual is None or visual.kind != "vertex":
         return None
     colours = np.asarray(visual.vertex_colors)
-    return colours[:, :3].astype(np.float32) / np.float32(255) if len(colours) == count else None
+    return in_unit_range(colours[:, :3]) if len(colours) == count else None
 
 
 def _textured(visual: Any, points: NDArray[np.float64], faces: NDArray[np.int64]) -> Scan:
@@ -83,8 +83,7 @@ def _textured(visual: Any, points: NDArray[np.float64], faces: NDArray[np.int64]
     attributes = getattr(visual, "vertex_attributes", None)
     found = attributes.get("color") if attributes is not None else None
     if found is not None and len(found) == len(points):
-        own = np.asarray(found)[:, :3].astype(np.float32)
-        own = own / np.float32(255) if np.asarray(found).dtype.kind in "ui" else own
+        own = in_unit_range(np.asarray(found)[:, :3])
         rgb = own if rgb is None else rgb * own
     if image is None or visual.uv is None or len(visual.uv) != len(points):
         return Scan(points, rgb, faces)
@@ -100,9 +99,4 @@ def _material(material: Any) -> tuple[NDArray[np.uint8] | None, NDArray[np.float
     factor = getattr(material, "baseColorFactor", None)
     if factor is None and image is None:
         factor = getattr(material, "diffuse", None)
-    if factor is None:
-        return image, None
-    colour = np.asarray(factor, np.float64)[:3]
-    return image, (colour / np.float32(255) if np.asarray(factor).dtype.kind in "ui" else colour).astype(
-        np.float32
-    )
+    return image, None if factor is None else in_unit_range(np.asarray(factor)[:3])

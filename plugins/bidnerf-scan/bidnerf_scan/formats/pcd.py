@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import read_file
-from bidnerf_scan.scan import Scan
+from bidnerf_scan.scan import Scan, colours_of
 
 EXPECTED = "a PCD file"
 LARGEST = 4 * 2**30
@@ -57,15 +57,7 @@ def _colours(rows: NDArray) -> NDArray[np.float32] | None:
         return np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=-1).astype(
             np.float32
         ) / np.float32(255)
-    three = next((n for n in (("r", "g", "b"), ("red", "green", "blue")) if set(n) <= set(names)), None)
-    if three is None:
-        return None
-    rgb = np.stack([rows[name].astype(np.float32) for name in three], axis=-1)
-    return (
-        rgb / np.float32(255)
-        if rows.dtype[three[0]].kind in "ui" or (len(rgb) and np.nanmax(rgb) > 1.5)
-        else rgb
-    )
+    return colours_of(rows, ("r", "g", "b"), ("red", "green", "blue"))
 
 
 def _header(path: Path, data: bytes) -> _Header:

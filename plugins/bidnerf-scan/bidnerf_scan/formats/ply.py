@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import check_ply_size, read_ply, read_ply_header
 from bidnerf_scan.formats import by_trimesh
-from bidnerf_scan.scan import Scan
+from bidnerf_scan.scan import Scan, colours_of
 
 EXPECTED = "a PLY file of a mesh or of points"
 SPLATS = ({"opacity", "scale_0"}, {"packed_position"})
@@ -46,16 +45,4 @@ def read(path: Path) -> Scan:
     if rows is None:
         raise InputError("its vertices hold lists of numbers", where=path, expected=EXPECTED)
     points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=-1)
-    return Scan(points, _colours(rows))
-
-
-def _colours(rows: NDArray) -> NDArray[np.float32] | None:
-    names = rows.dtype.names or ()
-    found = next((three for three in COLOURS if set(three) <= set(names)), None)
-    if found is None:
-        return None
-    rgb = np.stack([rows[name].astype(np.float32) for name in found], axis=-1)
-    kind = rows.dtype[found[0]]
-    if kind.kind in "ui":
-        return rgb / np.float32(np.iinfo(kind).max)
-    return rgb / np.float32(255) if len(rgb) and np.nanmax(rgb) > 1.5 else rgb
+    return Scan(points, colours_of(rows, *COLOURS))

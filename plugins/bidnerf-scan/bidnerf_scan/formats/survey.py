@@ -8,7 +8,7 @@ import numpy as np
 
 from bidnerf_core.errors import InputError
 from bidnerf_scan.extras import library
-from bidnerf_scan.scan import Scan, joined
+from bidnerf_scan.scan import Scan, in_unit_range, joined
 
 
 def recognises_las(path: Path) -> bool:
@@ -39,7 +39,7 @@ def read_las(path: Path) -> Scan:
         points = np.stack([np.asarray(axis, np.float64) for axis in (rows.x, rows.y, rows.z)], axis=-1)
         if not {"red", "green", "blue"} <= set(rows.point_format.dimension_names):
             return Scan(points)
-        rgb = np.stack([np.asarray(c) for c in (rows.red, rows.green, rows.blue)], -1).astype(np.float32)
+        rgb = np.stack([np.asarray(c) for c in (rows.red, rows.green, rows.blue)], -1)
     except InputError:
         raise
     except Exception as error:  # laspy and its decompressors raise errors of many types
@@ -48,8 +48,7 @@ def read_las(path: Path) -> Scan:
         ) from error
     if not rgb.size or rgb.max() == 0:
         return Scan(points)  # the colour fields are unused
-    # The standard uses 16 bits; many programs write 8.
-    return Scan(points, rgb / np.float32(65535 if rgb.max() > 255 else 255))
+    return Scan(points, in_unit_range(rgb))  # the standard uses 16 bits; many programs write 8
 
 
 def read_e57(path: Path) -> Scan:
@@ -70,8 +69,7 @@ def read_e57(path: Path) -> Scan:
             points = np.stack([rows[f"cartesian{axis}"] for axis in "XYZ"], axis=-1).astype(np.float64)
             rgb = None
             if "colorRed" in rows:
-                rgb = np.stack([rows[f"color{c}"] for c in ("Red", "Green", "Blue")], -1).astype(np.float32)
-                rgb /= 255 if rgb.size and rgb.max() > 1 else 1
+                rgb = in_unit_range(np.stack([rows[f"color{c}"] for c in ("Red", "Green", "Blue")], -1))
             parts.append(Scan(points, rgb))
     except InputError:
         raise
