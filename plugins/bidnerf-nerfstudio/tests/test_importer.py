@@ -123,10 +123,10 @@ def test_a_run_without_its_transform(run_of: RunOf) -> None:
     assert "poses will be in training coordinates" in " ".join(found.found)
     assert torch.allclose(trained_of(found).apply(points()), points())
     for text, said in (
-        ('{"transform": [1], "scale": 1}', "expected 3 rows"),
-        ('{"transform": [[2,0,0,0],[0,1,0,0],[0,0,1,0]], "scale": 1}', "not a rigid transform"),
+        ('{"transform": [1], "scale": 1}', "is not 3x4 or 4x4"),
+        ('{"transform": [[2,0,0,0],[0,1,0,0],[0,0,1,0]], "scale": 1}', "expected a rigid transform"),
         ('{"transform": [[1,0,0,0],[0,1,0,0],[0,0,1,0]], "scale": 0}', "above 0"),
-        ('{"transform": [[1,0,0,0],[0,1,0,0],[0,0,-1,0]], "scale": 1}', "not a rigid transform"),
+        ('{"transform": [[1,0,0,0],[0,1,0,0],[0,0,-1,0]], "scale": 1}', "expected a rigid transform"),
         ("{", "not JSON"),
     ):
         (folder / "dataparser_transforms.json").write_text(text)
