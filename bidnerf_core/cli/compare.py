@@ -33,7 +33,7 @@ def run(
         Option("SIZE", "error of the start: e_t, or METRES:DEGREES for perturb", "the protocol's first"),
     ] = None,
     *,
-    tried: Annotated[TrialOptions, Without("size")],
+    starts: Annotated[TrialOptions, Without("size")],
     json: Json = False,
     overwrite: Annotated[Flag, Option(None, "replace the contents of --out")] = False,
     images: Annotated[DatasetOptions, Without("largest", "background")] = TEST_IMAGES,
@@ -52,7 +52,7 @@ def run(
             expected="the folders of one or more maps, then that of a dataset",
         )
     *maps, data = folders
-    plan = replace(tried, size=() if size is None else (size,)).plan(method, images)
+    plan = replace(starts, size=() if size is None else (size,)).plan(method, images)
     if out is None:
         with displayed():
             found = compare(maps, data, plan)

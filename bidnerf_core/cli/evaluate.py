@@ -42,13 +42,13 @@ class TrialOptions:
     seed: Annotated[int | None, Option("N", "seed of every random choice", "the protocol's")] = None
     frame: Annotated[Names, Option("NAME...", "try only these frames", "all of the split")] = ()
 
-    def plan(self, method: MethodOptions, reading: DatasetOptions, **more: Any) -> Plan:
+    def plan(self, method: MethodOptions, dataset: DatasetOptions, **more: Any) -> Plan:
         """Return the plan of the trials; ``more`` holds its other fields."""
         from bidnerf_core.evaluation import Plan
         from bidnerf_core.localization import find_method
 
-        registration = reading.registration
-        _ = reading.mask_folder  # rejects anything but a folder of masks
+        registration = dataset.registration
+        _ = dataset.mask_folder  # rejects anything but a folder of masks
         try:
             numbers = [[float(number) for number in size.split(":")] for size in self.size]
         except ValueError as error:
@@ -59,11 +59,11 @@ class TrialOptions:
             usual = "bid" if find_method(method.method).needs_start else "none"
             return Plan(
                 protocol=self.protocol or usual, sizes=numbers or None, method=method.method, config=method.config,
-                trials=self.trials, seed=self.seed, frames=self.frame or None, split=reading.split,
-                camera=None if reading.camera is None else str(reading.camera),
+                trials=self.trials, seed=self.seed, frames=self.frame or None, split=dataset.split,
+                camera=None if dataset.camera is None else str(dataset.camera),
                 register_depth=registration if registration in (None, False) else str(registration),
-                depth_unit=reading.depth_unit, masks=None if reading.masks is None else str(reading.masks),
-                mask_hides=reading.mask_hides, **more,
+                depth_unit=dataset.depth_unit, masks=None if dataset.masks is None else str(dataset.masks),
+                mask_hides=dataset.mask_hides, **more,
             )  # fmt: skip
 
 
@@ -116,7 +116,7 @@ def run(
         Option("[DATA]", "folder of a dataset, or demo:object, demo:room, demo:blobs", positional=True),
     ] = None,
     *,
-    tried: TrialOptions,
+    starts: TrialOptions,
     input: InputOptions,
     work: WorkOptions,
     images: Annotated[DatasetOptions, Without("largest", "background")] = TEST_IMAGES,
@@ -133,7 +133,7 @@ def run(
         raise UsageError(f"no DATA after map {map}; only closed-form maps have their own data")
     if work.dask is not None and work.workers is not None:
         raise UsageError("--workers and --dask contradict each other: a cluster has its own workers")
-    plan = tried.plan(
+    plan = starts.plan(
         method, images, images=input.sequence, angle=input.angle, device=work.device, depth=input.depth,
         depth_points=None if input.depth_points is None else str(input.depth_points), faults=input.fault,
         shard=work.shard, shards=work.shards,

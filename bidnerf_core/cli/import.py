@@ -62,7 +62,7 @@ def run(
             "DATA", "dataset whose photos, with poses in the world, provide the landmarks", "rendered images"
         ),
     ] = None,
-    written: MapOptions,
+    target: MapOptions,
     images: Annotated[
         DatasetOptions,
         Without("register_depth", "depth_unit", "masks", "mask_hides", "largest", "background"),
@@ -83,13 +83,13 @@ def run(
     from bidnerf_core.results import read_pose
 
     check_folder(out, (file, photos), may_be_map=True)
-    working_device(written.device)
+    working_device(target.device)
     pose = None
     if world.T_world_file is not None:
         with wrong_usage():
             pose = read_pose(world.T_world_file)
     options = ImportOptions(
-        images, written.landmark_features, written.device, written.overwrite, as_, world.scale, pose
+        images, target.landmark_features, target.device, target.overwrite, as_, world.scale, pose
     )
     with working():
-        import_map(file, out, config, photos=photos, bake=not written.no_bake, options=options)
+        import_map(file, out, config, photos=photos, bake=not target.no_bake, options=options)

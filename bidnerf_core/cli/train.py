@@ -100,7 +100,7 @@ def run(
     out: Annotated[Path, Option("MAP", "folder for the map")],
     *,
     training: TrainingOptions,
-    written: MapOptions,
+    target: MapOptions,
     given_poses: PoseOptions,
     sparse_depth: DepthPointsOptions,
     images: DatasetOptions,
@@ -125,10 +125,10 @@ def run(
     from bidnerf_core.maps import DESCRIPTION, OtherSettings, TrainOptions, resume, train
     from bidnerf_core.structure import lacks_poses
 
-    resumes, bake = training.resume or training.finish, not written.no_bake
-    if resumes and (written.overwrite or training.quick):
+    resumes, bake = training.resume or training.finish, not target.no_bake
+    if resumes and (target.overwrite or training.quick):
         continuing = "--resume" if training.resume else "--finish"
-        other = "--overwrite" if written.overwrite else "--quick"
+        other = "--overwrite" if target.overwrite else "--quick"
         raise UsageError(f"{continuing} continues a map, {other} starts a new one; expected only one of them")
     if training.finish and not bake:
         raise UsageError("--finish bakes the map, --no-bake does not; expected only one of them")
@@ -136,7 +136,7 @@ def run(
         with wrong_usage():
             background_colour(images.background)
     check_folder(out, (data,), may_be_map=True)
-    working_device(written.device)
+    working_device(target.device)
     photos = lacks_poses(data)
     if photos and (images.depth_unit is not None or images.register_depth is not None):
         raise UsageError(
@@ -149,10 +149,10 @@ def run(
     # What was interrupted during pose estimation resumes by itself.
     resumes = resumes and not (photos and not (out / DESCRIPTION).exists())
     if resumes:
-        info = _interrupted(out, training.backend, config, written, given_poses, images)
+        info = _interrupted(out, training.backend, config, target, given_poses, images)
         images = replace(images, background=images.background or info.bounds.background)
     options = TrainOptions(
-        images, written.landmark_features, written.device, written.overwrite, given_poses.refine_poses,
+        images, target.landmark_features, target.device, target.overwrite, given_poses.refine_poses,
         given_poses.trust_poses, sparse_depth.depth_points, sparse_depth.model_points, training.checkpoint_every,
     )  # fmt: skip
     with working():
@@ -166,7 +166,7 @@ def run(
 
 
 def _interrupted(
-    out: Path, backend: str | None, config: Any, written: MapOptions, given_poses: PoseOptions, images: DatasetOptions
+    out: Path, backend: str | None, config: Any, target: MapOptions, given_poses: PoseOptions, images: DatasetOptions
 ) -> MapInfo:  # fmt: skip
     """Return the description of the map to resume. Raises ``UsageError`` for options that differ from its own, since they
     would be ignored.
@@ -176,7 +176,7 @@ def _interrupted(
     from bidnerf_core.maps import interrupted, longest_side
     from bidnerf_core.settings import to_flat
 
-    info = interrupted(out, not written.no_bake)
+    info = interrupted(out, not target.no_bake)
     if backend not in (None, info.backend):
         raise UsageError(f"{out}: uses backend {info.backend!r}, cannot resume it with {backend!r}")
     kind: Any = load_backend(info.backend, str(out)).config_type
@@ -197,7 +197,7 @@ def _interrupted(
             )
     for option, value, usual, before in (
         ("--largest", images.largest, None, longest_side(info)),
-        ("--landmark-features", written.landmark_features, USUAL_FEATURES, info.landmark_features),
+        ("--landmark-features", target.landmark_features, USUAL_FEATURES, info.landmark_features),
     ):
         if value not in (usual, before):
             raise UsageError(f"{out}: was started with {option} {before}, got {value}; leave it out")
