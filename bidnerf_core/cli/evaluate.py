@@ -71,9 +71,7 @@ class TrialOptions:
 class InputOptions:
     """What the method receives."""
 
-    sequence: Annotated[
-        int, Option("K", "localize a sequence of K images around the object at once", name="images")
-    ] = 1
+    images: Annotated[int, Option("K", "localize a sequence of K images around the object at once")] = 1
     angle: Annotated[float, Option("DEGREES", "angle between neighbours of a sequence")] = 15.0
     depth: Annotated[bool, Option(None, "use measured depth if available")] = True
     depth_points: Annotated[
@@ -119,7 +117,7 @@ def run(
     starts: TrialOptions,
     input: InputOptions,
     work: WorkOptions,
-    images: Annotated[DatasetOptions, Without("largest", "background")] = TEST_IMAGES,
+    dataset: Annotated[DatasetOptions, Without("largest", "background")] = TEST_IMAGES,
     method: MethodOptions,
 ) -> None:
     """Localize many frames from perturbed starts, or from none, and write one JSON line per trial.
@@ -134,7 +132,7 @@ def run(
     if work.dask is not None and work.workers is not None:
         raise UsageError("--workers and --dask contradict each other: a cluster has its own workers")
     plan = starts.plan(
-        method, images, images=input.sequence, angle=input.angle, device=work.device, depth=input.depth,
+        method, dataset, images=input.images, angle=input.angle, device=work.device, depth=input.depth,
         depth_points=None if input.depth_points is None else str(input.depth_points), faults=input.fault,
         shard=work.shard, shards=work.shards,
     )  # fmt: skip

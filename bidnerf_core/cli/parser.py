@@ -47,7 +47,6 @@ class Option:
     help: str = ""
     default: str | None = None  # in words; None: the value itself; empty: it is not mentioned
     positional: bool = False
-    name: str | None = None  # if it is not the parameter's
 
 
 class Without(frozenset[str]):
@@ -98,7 +97,7 @@ class Parameter:
     @property
     def flag(self) -> str:
         """The option, such as --depth-unit."""
-        return f"--{self.option.name or self.name.rstrip('_').replace('_', '-')}"
+        return f"--{self.name.rstrip('_').replace('_', '-')}"
 
     @property
     def left_out(self) -> frozenset[str]:
