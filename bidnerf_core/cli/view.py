@@ -100,7 +100,8 @@ def run(
     camera = queries.camera.source(images, localizer.assumed_cameras)
     if query:
         source = queries.open(query, images, localizer.assumed_cameras, scene)
-        splits = source.names_by_split if isinstance(source, DatasetFrames) else {}
+        data = source.capture if isinstance(source, DatasetFrames) else None
+        splits = {} if data is None else {split: data.frame_names(split) for split in data.splits}
         camera = CameraSource() if isinstance(source, DatasetFrames) else camera
         for name in frame:
             if name not in source.names:

@@ -24,8 +24,6 @@ from bidnerf_core.localization import window as windowed
 log = logging.getLogger("bidnerf")
 
 AS_STORED = DatasetOptions()
-NAMED = 5
-"""Largest number of files named in a message."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +88,7 @@ class Queries:
         points: DepthPoints | None = None,
     ) -> None:
         self.capture, self._rigs, self._split, self._points = capture, rigs, split, points
-        self._remarks: set[str] = set()
+        self._remarks, self._without_depth = set[str](), set[str]()
 
     @property
     def names(self) -> Sequence[str]:
@@ -100,6 +98,8 @@ class Queries:
         """Read the query at index ``place``. Raises ``InputError`` if one of its files is missing or unusable."""
         if self._split is None:
             shot = self.capture.shots[place]
+            if shot.name in self._without_depth:
+                log.info("%s: no measured depth was given; colour only", shot.name)
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", InputWarning)
                 frame = self.capture[place].frame
@@ -152,11 +152,6 @@ class Photos(Queries):
         super().__init__(capture, [(name,) for name in capture.names], None, points)
         self._without_depth = {shot.name for shot in capture.shots if depth and shot.file not in depth}
 
-    def read(self, place: int) -> Query:
-        if (name := self.names[place]) in self._without_depth:
-            log.info("%s: no measured depth was given; colour only", name)
-        return super().read(place)
-
 
 class DatasetFrames(Queries):
     """Frames of a dataset as queries: one rig of ``names``, or each frame of a split with the ``window - 1`` before it."""
@@ -184,11 +179,6 @@ class DatasetFrames(Queries):
             rigs.append(rig)
         super().__init__(dataset, rigs, split, points)
 
-    @property
-    def names_by_split(self) -> dict[str, list[str]]:
-        """The names of the dataset's frames in each split."""
-        return {split: self.capture.frame_names(split) for split in self.capture.splits}
-
 
 def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]:
     """Return the image files among ``paths`` and in folders among them; other files there are logged.
@@ -207,8 +197,8 @@ def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]
         if not found:
             raise no_dataset(path)
         if others:
-            named = ", ".join(file.name for file in others[:NAMED])
-            more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
+            named = ", ".join(file.name for file in others[:5])
+            more = f" and {len(others) - 5} more" if len(others) > 5 else ""
             log.info("%s: skipped %s%s: not photos by their names", path, named, more)
         files += found
     return files

@@ -21,9 +21,6 @@ from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.io import from_plain, read_json
 
 ANCHOR = "anchor.json"
-FARTHEST = 1e6
-"""Metres above or below the ellipsoid."""
-IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -33,7 +30,7 @@ class Anchor:
     latitude: float
     longitude: float
     height: float
-    T_enu_world: tuple[tuple[float, ...], ...] = IDENTITY
+    T_enu_world: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))  # fmt: skip
     metres_per_unit: float = 1.0
     position_sigma: float = 0.0  # metres
     orientation_sigma: float = 0.0  # degrees
@@ -42,7 +39,7 @@ class Anchor:
         """Raise ``InputError`` for a place off the earth, a matrix that is not a pose, and numbers that are
         not positive.
         """
-        for name, most in (("latitude", 90.0), ("longitude", 180.0), ("height", FARTHEST)):
+        for name, most in (("latitude", 90.0), ("longitude", 180.0), ("height", 1e6)):
             if not abs(getattr(self, name)) <= most:
                 raise InputError(f"{name} is {getattr(self, name)}", expected=f"{-most:g} to {most:g}")
         self.pose  # noqa: B018 (it checks the matrix)

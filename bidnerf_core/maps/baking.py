@@ -32,8 +32,6 @@ from bidnerf_core.progress import counter
 
 log = logging.getLogger("bidnerf")
 
-NO_CAMERAS = "holds no cameras to render from; give a dataset of its views with --data"
-
 
 def bake_surface(
     info: MapInfo, field: RadianceField, views: Sequence[View], config: BakeConfig, where: str
@@ -48,7 +46,7 @@ def bake_surface(
     began = time.monotonic()
     cameras = cameras_of(info) or [(view.frame.intrinsics, view.T_ref_camera) for view in views]
     if not cameras:
-        raise InputError(NO_CAMERAS, where=where)
+        raise _no_cameras(where)
     measured = [view for view in views if view.frame.has_depth]
     if any(view.frame.has_dense_depth for view in measured):
         cameras = []
@@ -81,7 +79,7 @@ def bake_landmarks(
     source: LandmarkSource = "photos" if views else "rendered images"
     images = views or rendered_views(field, info.bounds, cameras_of(info))
     if not images:
-        raise InputError(NO_CAMERAS, where=where)
+        raise _no_cameras(where)
     if tracked is None:
         tracked = tracked_views(images, info.landmark_features)
     if views and not info.distances:
@@ -107,6 +105,10 @@ def bake_landmarks(
             f" {time.monotonic() - began:.1f} s"
         )
     return info, landmarks, tracked
+
+
+def _no_cameras(where: str) -> InputError:
+    return InputError("holds no cameras to render from; give a dataset of its views with --data", where=where)
 
 
 def with_tracks_in(info: MapInfo, landmarks: LandmarkMap, names: Sequence[str]) -> LandmarkMap:

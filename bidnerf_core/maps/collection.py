@@ -35,9 +35,6 @@ from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, cou
 
 log = logging.getLogger("bidnerf")
 
-KEPT = 6
-"""Number of maps from folders that stay in memory after use."""
-
 
 @dataclass(frozen=True, eq=False)
 class Placement:
@@ -138,7 +135,7 @@ class MapCollection:
             scene = self._maps[name]
             stored = scene if isinstance(scene, Map) else load_map(scene)
             self._localizers[name] = Localizer(stored, self.method, self.config, warm_up=False)
-            while len(self._localizers) > KEPT:
+            while len(self._localizers) > 6:  # maps that stay in memory after use
                 self._localizers.popitem(last=False)
         self._localizers.move_to_end(name)
         return self._localizers[name]

@@ -17,13 +17,10 @@ from bidnerf_core.io import from_plain, read_json
 from bidnerf_core.mapping import USUAL_FEATURES
 from bidnerf_core.maps.anchor import Anchor, load_anchor
 
-FORMAT = "bidnerf map"
 VERSION = 1
 DESCRIPTION = "map.json"
 PART_NAMES = ("weights", "training", "surface", "landmarks", "capture")
 """The keys that name files."""
-EXPECTED_PART = "a safetensors file, without which the map is incomplete"
-
 LandmarkSource = Literal["photos", "rendered images"]
 
 
@@ -74,7 +71,7 @@ class MapInfo:
     anchor: Anchor | None = None  # where on earth the map lies, if known
     colour_noise: float | None = None  # root mean square error of rendered colours on training images
     bidnerf: str = field(default_factory=lambda: version("bidnerf"))
-    format: str = FORMAT
+    format: str = "bidnerf map"
     version: int = VERSION
 
     @property
@@ -126,8 +123,8 @@ def load_info(folder: Path) -> MapInfo:
             f"no {DESCRIPTION} found", where=folder, expected="a map as written by 'bidnerf train'"
         )
     found = read_json(path, "the description of a map")
-    if not isinstance(found, dict) or found.get("format") != FORMAT:
-        raise InputError("not the description of a map", where=path, expected=f'"format": "{FORMAT}"')
+    if not isinstance(found, dict) or found.get("format") != "bidnerf map":
+        raise InputError("not the description of a map", where=path, expected='"format": "bidnerf map"')
     if found.get("version") != VERSION:
         newer = isinstance(found.get("version"), int) and found["version"] > VERSION
         advice = "it was written by a newer bidnerf; upgrade bidnerf" if newer else "retrain the map"

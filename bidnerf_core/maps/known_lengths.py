@@ -28,8 +28,6 @@ Position = Sequence[float] | Float[Tensor, "3"]
 Place = str | Position
 """A point of a map: its three coordinates, the name of one of its cameras, or ``NAME@U,V``, what that camera
 shows at a pixel."""
-LEAST_CAMERAS = 3
-"""Smallest number of cameras with known positions that gives a scale that can be checked."""
 
 
 @dataclass(frozen=True)
@@ -68,12 +66,12 @@ def factor_of_poses(scene: Map, known: Mapping[str, SE3 | Position]) -> ScaleFit
     found = {name: camera for name in known if (camera := _camera_of(scene, name)) is not None}
     if len({camera.name for camera in found.values()}) < len(found):
         raise InputError("two known poses belong to the same camera of the map", expected="one for each")
-    if len(found) < LEAST_CAMERAS:
+    if len(found) < 3:  # two give a scale that nothing checks
         cameras = scene.info.cameras
         example = f" such as {cameras[0].name!r}" if cameras else ""
         raise InputError(
             f"{len(found)} of {len(known)} known poses belong to cameras of the map",
-            expected=f"at least {LEAST_CAMERAS}, matched by name{example}",
+            expected=f"at least 3, matched by name{example}",
         )
     source = torch.stack([camera.pose.translation for camera in found.values()])
     target = torch.stack([_position(known[name]) for name in found])

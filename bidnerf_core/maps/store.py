@@ -44,18 +44,14 @@ from bidnerf_core.mapping import (
     surface_tensors,
 )
 from bidnerf_core.maps.anchor import ANCHOR
-from bidnerf_core.maps.description import DESCRIPTION, EXPECTED_PART, PART_NAMES, MapInfo, load_info
+from bidnerf_core.maps.description import DESCRIPTION, PART_NAMES, MapInfo, load_info
 from bidnerf_core.training import TrainingState
 
 PARTS = r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|(capture|anchor)-\d{8,}-[0-9a-f]{8}\.json)"
+EXPECTED_PART = "a safetensors file, without which the map is incomplete"
 BAKED = "a safetensors file, which 'bidnerf bake' can recreate"
 OURS = re.compile(rf"{PARTS}|\.({PARTS}|map\.json)\.[0-9a-f]{{8}}")
 """Names of the files that saving may leave behind, of earlier versions as well; other files are never removed."""
-ATTEMPTS = 5
-"""Number of times that a map is read while a training run replaces it between the reading of its description and of its parts.
-Checkpoints are seconds apart, so that each further failure takes a disk slower than that."""
-LARGEST_WEIGHT = 1e9
-"""Limit of a field's parameters, beyond which products would overflow in float32; trained ones stay far below it."""
 
 
 def write_parts(
@@ -130,7 +126,9 @@ def read_parts(
     They belong together even while a training run replaces the map. Raises ``InputError`` if one of them is damaged.
     """
     info = load_info(folder)
-    for _ in range(ATTEMPTS):
+    for _ in range(
+        5
+    ):  # checkpoints are seconds apart, so that each further failure takes a disk slower than that
         try:
             weights = read_tensors(folder / info.weights, EXPECTED_PART)
             if not baked:
@@ -213,10 +211,11 @@ def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path
         raise InputError(
             f"tensor {surplus[0]!r} is not part of the field that map.json describes", where=path
         )
+    largest = 1e9  # beyond which products would overflow in float32; trained ones stay far below it
     for name, _ in module.named_parameters():
-        if name in tensors and not bool((tensors[name].abs() <= LARGEST_WEIGHT).all()):
+        if name in tensors and not bool((tensors[name].abs() <= largest).all()):
             raise InputError(
-                f"tensor {name!r} holds NaN, infinity or numbers above {LARGEST_WEIGHT:g}",
+                f"tensor {name!r} holds NaN, infinity or numbers above {largest:g}",
                 where=path,
                 expected="trained weights",
             )

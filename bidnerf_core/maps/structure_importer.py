@@ -28,9 +28,6 @@ from bidnerf_core.mapping import Keypoints
 from bidnerf_core.maps.importers import ImportedField, Structure, bounds_about
 from bidnerf_core.settings import Settings
 
-LEAST_OBSERVED = 6
-"""Number of points from which an image adds to the landmarks: fewer do not even determine its own pose by consensus."""
-
 
 @dataclass(frozen=True)
 class StructureSettings(Settings):
@@ -82,8 +79,10 @@ class StructureImporter:
                 left_out.append(f"{image.name}: it has no keypoints in the file of them")
             elif not known and image.name not in files:
                 left_out.append(f"{image.name}: no such photo in {folder}")
-            elif int((observed[number] >= 0).sum()) < LEAST_OBSERVED:
-                left_out.append(f"{image.name}: it observes fewer than {LEAST_OBSERVED} points")
+            elif (
+                int((observed[number] >= 0).sum()) < 6
+            ):  # which do not even determine its own pose by consensus
+                left_out.append(f"{image.name}: it observes fewer than 6 points")
             else:
                 kept.append(number)
         if not kept:

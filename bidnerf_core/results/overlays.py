@@ -42,8 +42,10 @@ def overlay(
     frame = frame.over(scene.bounds.background)
     if isinstance(found, Localization):
         frame, found = found.frame_as_taken(frame), found.T_world_camera
-    begun = None if start is None else start_pose(start)
-    return Painter(scene, frame).overlay(begun, start_pose(found, "found"))
+    painter, pose = Painter(scene, frame), start_pose(found, "found")
+    if start is not None:
+        return comparison(painter.observed, painter.rendered(start_pose(start)), painter.rendered(pose))
+    return painter.row(painter.observed, "observed", pose, "rendered at the pose found")
 
 
 class Painter:
@@ -65,48 +67,35 @@ class Painter:
         """Return the photo blended with the rendering, with the edges of each."""
         return blend(self.observed, self.rendered(T_world_camera))
 
-    def overlay(self, start: SE3 | None, found: SE3) -> UInt8[np.ndarray, "H W 3"]:
-        """Return the photo and renderings as one picture: ``comparison`` if there is a start, otherwise ``row``."""
-        if start is not None:
-            return comparison(self.observed, self.rendered(start), self.rendered(found))
-        return self.row(self.observed, "observed", found, "rendered at the pose found")
-
     def row(
         self, left: Float[Tensor, "h w 3"], left_caption: str, found: SE3, caption: str
     ) -> UInt8[np.ndarray, "H W 3"]:
         """Return an image, the rendering at the pose found, and its blend with the photo, side by side."""
         rendered = self.rendered(found)
-        tiles: Sequence[tuple[object, str]] = (
-            (left, left_caption),
-            (rendered, caption),
-            (blend(self.observed, rendered), "edges: photo green, map pink"),
-        )
-        return np.concatenate([tile(image, text) for image, text in tiles], axis=1)  # type: ignore[arg-type]
+        blended = blend(self.observed, rendered)
+        return _grid([(left, left_caption), (rendered, caption), (blended, "edges: photo green, map pink")])
 
 
 def comparison(
-    observed: ArrayLike | Tensor,
-    start: ArrayLike | Tensor,
-    found: ArrayLike | Tensor,
-    captions: tuple[str, str, str] = ("observed", "rendered at the start", "rendered at the pose found"),
+    observed: ArrayLike | Tensor, start: ArrayLike | Tensor, found: ArrayLike | Tensor
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Return one picture of the observed image, the rendering at the start and the rendering at the pose found.
 
-    Below each image is its comparison with the observed one. Images (h w 3) are as for ``as_picture``.
+    Below each image is its comparison with the observed one. Images (h w 3) of one size are as for ``as_picture``.
     """
-    images = [as_picture(image, what) for image, what in zip((observed, start, found), captions, strict=True)]
-    require_same_size(images, captions)
-    below = [chequered(images[0], images[2]), blend(images[0], images[1]), blend(images[0], images[2])]
-    notes = [
-        "observed / found, chequered",
-        "edges: photo green, start pink",
-        "edges: photo green, map pink",
-    ]
-    rows = [
-        np.concatenate([tile(image, caption) for image, caption in zip(row, text, strict=True)], axis=1)
-        for row, text in ((images, captions), (below, notes))
-    ]
-    return np.concatenate(rows, axis=0)
+    return _grid(
+        [(observed, "observed"), (start, "rendered at the start"), (found, "rendered at the pose found")],
+        [
+            (chequered(observed, found), "observed / found, chequered"),
+            (blend(observed, start), "edges: photo green, start pink"),
+            (blend(observed, found), "edges: photo green, map pink"),
+        ],
+    )
+
+
+def _grid(*rows: Sequence[tuple[ArrayLike | Tensor, str]]) -> UInt8[np.ndarray, "H W 3"]:
+    """Return rows of images with their captions as one picture."""
+    return np.concatenate([np.concatenate([tile(*image) for image in row], axis=1) for row in rows], axis=0)
 
 
 def as_picture(image: ArrayLike | Tensor, what: str = "image") -> UInt8[np.ndarray, "h w 3"]:
@@ -125,7 +114,6 @@ def as_picture(image: ArrayLike | Tensor, what: str = "image") -> UInt8[np.ndarr
 def blend(observed: ArrayLike | Tensor, rendered: ArrayLike | Tensor) -> UInt8[np.ndarray, "h w 3"]:
     """Return the pale mean of two images, with the edges of each in its own colour; they coincide at the true pose."""
     a, b = as_picture(observed, "observed"), as_picture(rendered, "rendered")
-    require_same_size([a, b], ("observed", "rendered"))
     mixed = 0.55 * (a / 2 + b / 2) + 0.45 * 255
     for image, colour in ((b, (235, 0, 140)), (a, (0, 190, 110))):
         strength = 0.9 * edges(image)[..., None]
@@ -138,7 +126,6 @@ def chequered(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return a chequerboard of two images; contours continue across its squares at the true pose."""
     a, b = as_picture(first, "first"), as_picture(second, "second")
-    require_same_size([a, b], ("first", "second"))
     side = max(1, math.ceil(max(a.shape[:2]) / squares))
     rows, columns = np.indices(a.shape[:2]) // side
     return np.where(((rows + columns) % 2 == 0)[..., None], a, b)
@@ -171,13 +158,6 @@ def as_array(values: ArrayLike | Tensor) -> np.ndarray:
     return values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
 
 
-def require_same_size(images: Sequence[np.ndarray], names: Sequence[str]) -> None:
-    for image, name in zip(images, names, strict=True):
-        if image.shape != images[0].shape:
-            found, expected = (f"{x.shape[1]}x{x.shape[0]}" for x in (image, images[0]))
-            raise InputError(f"{name} is {found} pixels, but {names[0]} is {expected}:", expected="the same")
-
-
 def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float = 8.0) -> None:
     """Write a looping animation of images (h w 3) of the same size."""
     if not (math.isfinite(fps) and fps > 0):
@@ -185,7 +165,12 @@ def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float 
     pictures = [as_picture(frame, f"frame {i}") for i, frame in enumerate(frames)]
     if not pictures:
         raise InputError("the animation has no frames", where=path)
-    require_same_size(pictures, [f"frame {i}" for i in range(len(pictures))])
+    for number, shape in enumerate(picture.shape for picture in pictures):
+        if shape != pictures[0].shape:
+            found, expected = (f"{width}x{height}" for height, width, _ in (shape, pictures[0].shape))
+            raise InputError(
+                f"frame {number} is {found} pixels", where=path, expected=f"{expected} like the first"
+            )
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     import imageio.v3 as iio  # imported here, since few commands draw
 

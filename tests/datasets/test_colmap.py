@@ -15,15 +15,9 @@ import tiny
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.datasets import SparseChoice, SparsePoints, read_model
-from bidnerf_core.fields import Observations, SceneBounds, render, render_image
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import rig
-from bidnerf_core.results import pose_error
-from bidnerf_core.scenes import GaussianBlobs, demo_object, orbit
-from bidnerf_core.training import RayBank, Silent, ray_termination
-from bidnerf_hashgrid import backend as hashgrid
-from problems import FieldMap, localize
+from bidnerf_core.scenes import orbit
 from refusals import refused
 from sparse_model import Known
 
@@ -293,58 +287,6 @@ def test_of_points_at_one_pixel_the_nearest_is_seen(model: Path, scene: Known) -
 
 
 # What it is good for.
-
-FIELD = GaussianBlobs.random(density=400, samples=96)
-BOUNDS = SceneBounds((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5), 2.0, 6.5, (1.0, 1.0, 1.0))
-CAMERA = Intrinsics(32.0, 32.0, 15.0, 12.0, 30, 24)
-
-
-def photograph(number: int, T: SE3) -> View:
-    image = render_image(FIELD, CAMERA, T, BOUNDS)
-    depth = torch.where(image.opacity > 0.99, image.depth, 0)
-    return View(Frame(f"p{number}", image.rgb, CAMERA, depth), T)
-
-
-def test_a_pose_comes_closer_with_the_points_than_without(tmp_path: Path) -> None:
-    with torch.no_grad():
-        views = [photograph(i, T) for i, T in enumerate(orbit(4.0, 6, seed=1))]
-    what = sparse_model.known(views, [f"{v.frame.name}.jpg" for v in views], each=60, agree=0.004)
-    model = sparse_model.write(tmp_path, what)
-    sparse = SparsePoints(model, places(what)[3:], CHOICE)
-    config = {
-        "rays": 16, "depth_rays": 64, "max_steps": 25, "learning_rate": 0.03, "pivot": "camera", "level": None,
-    }  # fmt: skip
-
-    def error(view: View, rays: Observations | None, back: float) -> float:
-        start = view.T_ref_camera.retract(torch.tensor([0, 0, back, 0, 0, 0], dtype=torch.float64))
-        found = localize(rig(FieldMap(FIELD, BOUNDS), [view], start, rays), "bid", config)
-        return float(pose_error(found.T_world_camera, view.T_ref_camera).translation)
-
-    sought = [bare(view) for view in views[1:3]]
-    pairs = list(zip(sought, (-0.3, -0.3), strict=True))
-    with_points = [error(view, sparse.rays([view], "train"), back) for view, back in pairs]
-    without = [error(view, None, back) for view, back in pairs]
-    assert sum(with_points) < 0.6 * sum(without)
-
-
-def test_training_is_supervised_by_the_points(model: Path, scene: Known) -> None:
-    """Matter of pixels that no point tells of comes nearer to where it is, too."""
-    dense = scene.views
-    views = [opened(model, scene).onto(bare(view), "train") for view in dense]
-    bounds = demo_object().bounds
-    assert not any(view.frame.has_dense_depth for view in views)
-
-    def misplaced(weight: float) -> float:
-        config = tiny.config(steps=40, depth_weight=weight, carve=False)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)
-            field = hashgrid.build(config, bounds)
-            hashgrid.train(field, views, config, Silent())
-        batch = RayBank(dense, bounds).draw(3000, torch.Generator().manual_seed(1))
-        with torch.no_grad():
-            return float(ray_termination(render(field, batch.rays, batch.background), batch))
-
-    assert misplaced(1.0) < 0.9 * misplaced(0.0)
 
 
 def test_the_scene_is_bounded_by_points_where_there_is_nothing_better(model: Path, scene: Known) -> None:

@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from bidnerf_core.datasets import READERS, Capture, DatasetOptions, Reader, open_dataset
+from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames import Frame
 from refusals import refused
@@ -102,12 +102,6 @@ def test_colours_are_laid_over_the_background_where_there_is_alpha(
     torch.testing.assert_close(frame.rgb, over, atol=0.501 / 255, rtol=0)  # rounded to bytes
 
 
-@pytest.mark.parametrize("given", ["pink", (0.0, 0.0), (0.0, 0.0, 2.0), (0.0, 0.0, math.nan)])
-def test_other_backgrounds_are_refused(blender: Path, given: Any) -> None:
-    with refused(found=f"background is {given!r}", expected='"white", "black" or three numbers'):
-        open_dataset(blender, given)
-
-
 @pytest.mark.parametrize("channels", [1, 2, 3])
 def test_images_without_alpha_or_colour_get_three_channels(nerfstudio: Path, channels: int) -> None:
     iio.imwrite(nerfstudio / "images/r_0.png", random_pixels(0, channels))
@@ -118,11 +112,6 @@ def test_images_without_alpha_or_colour_get_three_channels(nerfstudio: Path, cha
     rgb = raw[..., :1] * raw[..., 1:] if channels == 2 else raw
     torch.testing.assert_close(frame.rgb, rgb.expand(H, W, 3), atol=0.501 / 255, rtol=0)  # rounded to bytes
     assert (frame.alpha is not None) == (channels == 2)
-
-
-def test_sixteen_bit_grey_is_scaled(nerfstudio: Path) -> None:
-    iio.imwrite(nerfstudio / "images/r_0.png", np.full((H, W), 65535, dtype=np.uint16))
-    assert first(nerfstudio).rgb.unique().tolist() == [1.0]
 
 
 def test_cmyk_becomes_rgb_and_is_not_taken_for_alpha(nerfstudio: Path) -> None:
@@ -155,16 +144,6 @@ def test_depth_is_in_metres_and_holes_are_zero(nerfstudio: Path) -> None:
             torch.testing.assert_close(views[name].frame.depth, expected)
     iio.imwrite(nerfstudio / "depth/r_0.png", np.zeros((H, W), dtype=np.uint16))
     assert not first(nerfstudio).has_depth
-
-
-@pytest.mark.parametrize("nothing", [math.nan, -1, math.inf, 1e10, float(np.finfo(np.float32).max), 65.535])
-def test_depth_from_an_array_and_values_that_stand_for_none(nerfstudio: Path, nothing: float) -> None:
-    edit_frame(nerfstudio / JSON, 0, depth_file_path="depth/r_0.npy", depth_unit_scale_factor=1)
-    array = np.linspace(0.5, 3, W * H).reshape(H, W)
-    array[0, :3] = nothing
-    np.save(nerfstudio / "depth/r_0.npy", array)
-    array[0, :3] = 0
-    torch.testing.assert_close(first(nerfstudio).depth, torch.from_numpy(array).float())
 
 
 # Cameras
@@ -244,13 +223,6 @@ def test_a_single_frame_is_in_both_splits(tmp_path: Path) -> None:
     assert alone.frame_names("train") == alone.frame_names("test") == ["r_0"]
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".jpeg", ".png"])
-def test_extensions_are_found(blender: Path, suffix: str) -> None:
-    (blender / "test/r_4.png").unlink()
-    iio.imwrite(blender / f"test/r_4{suffix}", random_pixels(4, 3))
-    assert first(blender).name == "r_4"
-
-
 def test_only_what_is_asked_for_is_read_and_in_that_order(blender: Path) -> None:
     (blender / "train/r_1.png").write_bytes(b"damaged")
     told = list[tuple[int, int]]()
@@ -271,31 +243,3 @@ def test_names_with_dots_and_twins(nerfstudio: Path) -> None:
     assert len(dataset.views("train")) == 4
     with refused(where=nerfstudio, found="frame '0.5' is ambiguous", expected="one of left_0.5, right_0.5"):
         dataset.views("train", ["0.5"])
-
-
-def test_another_reader_can_join(tmp_path: Path, blender: Path) -> None:
-    class Other(Reader):
-        expected = "magic.bin"
-
-        def recognises(self, path: Path) -> bool:
-            return (path / "magic.bin").exists()
-
-        def read(self, path: Path, options: DatasetOptions) -> Capture:
-            return open_dataset(blender)
-
-    (tmp_path / "magic.bin").touch()
-    assert open_dataset(tmp_path, readers=[*READERS.values(), Other()]).path == blender
-
-
-@pytest.mark.data
-@pytest.mark.parametrize("scene", ["blender_lego", "tum_fr1_xyz", "room_living"])
-def test_recorded_scenes_open(data_dir: Path, scene: str) -> None:
-    dataset = open_dataset(data_dir / scene)
-    assert dataset.splits == ("train", "test")
-    for split in dataset.splits:
-        name = dataset.frame_names(split)[-1]
-        view = dataset.views(split, [name])[0]
-        assert view.frame.name == name
-        assert view.T_ref_camera.is_rigid(1e-9)
-        assert view.frame.has_depth or scene == "blender_lego"
-    assert dataset.background == ((1, 1, 1) if scene == "blender_lego" else (0, 0, 0))

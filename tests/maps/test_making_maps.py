@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -355,26 +354,3 @@ def test_a_broken_detector_is_reported_before_the_field_is_trained(
         trained(tmp_path / "map", options=options, bake=BAKE)
     info = load_info(tmp_path / "map")
     assert (info.step, info.complete) == (0, False)
-
-
-def test_photos_to_map_to_pose_to_overlay(tmp_path: Path) -> None:
-    """A notebook: ten lines, from photos to a picture of the pose that was found."""
-    tiny.write_dataset(tmp_path / "capture")
-    script = """
-import bidnerf_core as bn
-from bidnerf_core.results import overlay, pose_error
-data = bn.open_dataset("capture")
-scene = bn.train(data, config=config, bake=False)
-print(scene.describe())
-view = data.views("test", ["t_0000"])[0]
-found = bn.Localizer(scene, "bid", {"max_steps": 3})(view.frame, view.T_ref_camera)
-print(found.outcome, pose_error(found.T_world_camera, view.T_ref_camera))
-picture = overlay(scene, view.frame, found)
-"""
-    assert len(script.strip().splitlines()) <= 12
-    names: dict[str, Any] = {"config": tiny.config(3)}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(tmp_path)
-        exec(script, names)
-    assert names["picture"].dtype == np.uint8
-    assert names["picture"].shape[-1] == 3

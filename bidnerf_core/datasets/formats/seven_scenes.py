@@ -70,7 +70,7 @@ def _read(path: Path, folders: dict[int, Path], options: DatasetOptions) -> Capt
     T_depth_colour = SE3.identity() if sensor is None else sensor.T_colour_depth.inverse()
     lists = {"train": path / "TrainSplit.txt", "test": path / "TestSplit.txt"}
     numbers = {
-        split: _listed(file, folders) for split, file in lists.items() if 0 not in folders and file.is_file()
+        split: _listed(file, folders) for split, file in lists.items() if -1 not in folders and file.is_file()
     }
     shots = list[Shot]()
     for number in dict.fromkeys(n for group in numbers.values() for n in group) or sorted(folders):
@@ -91,9 +91,9 @@ def _read(path: Path, folders: dict[int, Path], options: DatasetOptions) -> Capt
 
 
 def _find(path: Path) -> dict[int, Path]:
-    """Return the folders of the sequences by number; a folder that is one has number 0."""
+    """Return the folders of the sequences by number; that of a folder that is one is -1."""
     if images_of(path):
-        return {0: path}
+        return {-1: path}
     found = {child: SEQUENCE.fullmatch(child.name) for child in path.glob("seq*") if child.is_dir()}
     folders = {int(match[1]): child for child, match in found.items() if match}
     return folders if any(map(images_of, folders.values())) else {}
