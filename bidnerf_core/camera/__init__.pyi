@@ -9,12 +9,9 @@ from .files import read_text_cameras as read_text_cameras
 from .intrinsics import CameraBatch as CameraBatch
 from .intrinsics import Intrinsics as Intrinsics
 from .intrinsics import cameras_at_size as cameras_at_size
-from .intrinsics import centre_crop_cameras as centre_crop_cameras
 from .intrinsics import reduced_size as reduced_size
 from .intrinsics import same_aspect as same_aspect
-from .intrinsics import stretched_cameras as stretched_cameras
 from .lenses import MODELS as MODELS
-from .lenses import PANORAMA as PANORAMA
 from .lenses import PANORAMA_FACES as PANORAMA_FACES
 from .lenses import Camera as Camera
 from .lenses import CentralLens as CentralLens

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -306,57 +306,25 @@ CameraGroup = tuple[Intrinsics, ...]
 
 
 @lru_cache(maxsize=64)
-def cameras_at_size(cameras: CameraGroup, width: int, height: int) -> tuple[CameraGroup, ...]:
-    """Return the ``cameras`` whose images have the aspect ratio of another size, resized to it.
+def cameras_at_size(
+    cameras: CameraGroup, width: int, height: int, fit: Literal["whole", "cropped", "stretched"] = "whole"
+) -> tuple[CameraGroup, ...]:
+    """Return ``cameras`` resized to an image of another size, in groups of the same turn.
 
-    If there are none, cameras that match after a quarter turn are returned, in two groups: turned to one
-    side, and to the other. Empty if there are none of these either.
+    By default, only those are returned whose images have its aspect ratio, or else those that match after a quarter turn, in two groups:
+    turned to one side, and to the other; possibly none. With another ``fit``, all are returned, centre-cropped to the aspect ratio or
+    resized regardless of it; landscape cameras are turned to both sides for a portrait size, and vice versa.
     """
     size = (width, height)
-    same = tuple(c.resized(*size) for c in cameras if same_aspect((c.width, c.height), size))
-    turned = tuple(c for c in cameras if same_aspect((c.height, c.width), size))
-    return (
-        (same,)
-        if same
-        else tuple(tuple(c.resized(*size) for c in group) for group in _oriented(turned, *size))
-    )
-
-
-@lru_cache(maxsize=64)
-def centre_crop_cameras(cameras: CameraGroup, width: int, height: int) -> tuple[CameraGroup, ...]:
-    """Return all ``cameras``, centre-cropped to the aspect ratio of another size and resized to it.
-
-    Landscape cameras are turned to both sides for a portrait size, and vice versa.
-    """
-    size = (width, height)
-    return tuple(tuple(c.centre_crop(*size) for c in group) for group in _oriented(cameras, *size))
-
-
-@lru_cache(maxsize=64)
-def stretched_cameras(cameras: CameraGroup, width: int, height: int) -> tuple[CameraGroup, ...]:
-    """Return all ``cameras``, resized to another size regardless of their aspect ratio.
-
-    Landscape cameras are turned to both sides for a portrait size, and vice versa.
-    """
-    return tuple(
-        tuple(dict.fromkeys(camera.resized(width, height) for camera in group))
-        for group in _oriented(cameras, width, height)
-    )
-
-
-def median_camera(group: CameraGroup) -> Intrinsics:
-    """Return the camera with the (lower) median focal length."""
-    return sorted(group, key=lambda camera: camera.fx)[(len(group) - 1) // 2]
-
-
-def _oriented(cameras: CameraGroup, width: int, height: int) -> tuple[CameraGroup, ...]:
-    """Return the cameras in the landscape or portrait orientation of another size: one group, or two if any
-    had to be turned.
-    """
-    ways = [
-        (camera,) if (camera.width - camera.height) * (width - height) >= 0 else camera.quarter_turns()
-        for camera in cameras
-    ]
+    if fit == "whole":
+        same = tuple(c.resized(*size) for c in cameras if same_aspect((c.width, c.height), size))
+        if same:
+            return (same,)
+        cameras = tuple(c for c in cameras if same_aspect((c.height, c.width), size))
+    ways = [(c,) if (c.width - c.height) * (width - height) >= 0 else c.quarter_turns() for c in cameras]
     ways = list(filter(None, ways))
-    sides = max(map(len, ways), default=0)
-    return tuple(tuple(way[side % len(way)] for way in ways) for side in range(sides))
+    groups = [[way[side % len(way)] for way in ways] for side in range(max(map(len, ways), default=0))]
+    if fit == "stretched":
+        return tuple(tuple(dict.fromkeys(c.resized(*size) for c in group)) for group in groups)
+    change = Intrinsics.centre_crop if fit == "cropped" else Intrinsics.resized
+    return tuple(tuple(change(c, *size) for c in group) for group in groups)

@@ -16,8 +16,6 @@ from bidnerf_core.camera.files import read_camera
 from bidnerf_core.camera.intrinsics import (
     Intrinsics,
     cameras_at_size,
-    centre_crop_cameras,
-    median_camera,
     reduced_size,
     same_aspect,
 )
@@ -266,10 +264,10 @@ def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> FoundCamera | Non
     size = raster.upright_size
     exact = tuple(camera for camera in cameras if (camera.width, camera.height) == size)
     whole = cameras_at_size(exact or tuple(cameras), *size)
-    groups = whole or centre_crop_cameras(tuple(cameras), *size)
+    groups = whole or cameras_at_size(tuple(cameras), *size, "cropped")
     if not groups:
         return None
-    likely, *others = (median_camera(group) for group in groups)
+    likely, *others = (sorted(group, key=lambda c: c.fx)[(len(group) - 1) // 2] for group in groups)
     origin = f"camera unknown, assumed to be that of {'' if whole else 'centre crops of '}the map's images"
     if not others:
         return FoundCamera(likely, f"{origin}: {_focal(likely)}")

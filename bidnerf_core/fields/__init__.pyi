@@ -51,12 +51,10 @@ from .residuals import colour_term as colour_term
 from .residuals import coloured as coloured
 from .residuals import depth_residual as depth_residual
 from .residuals import depth_term as depth_term
-from .residuals import first_surface_residual as first_surface_residual
 from .residuals import free_space as free_space
 from .residuals import free_space_term as free_space_term
 from .residuals import masked_mean as masked_mean
 from .residuals import opacity_term as opacity_term
-from .residuals import truncated_depth_residual as truncated_depth_residual
 from .sampling import EVEN_SHARE as EVEN_SHARE
 from .sampling import LARGEST_THICKNESS as LARGEST_THICKNESS
 from .sampling import TAIL as TAIL
@@ -64,7 +62,6 @@ from .sampling import Concentrated as Concentrated
 from .sampling import HierarchicalField as HierarchicalField
 from .sampling import Importance as Importance
 from .sampling import OccupiedOnly as OccupiedOnly
-from .sampling import Resampled as Resampled
 from .sampling import ScaledField as ScaledField
 from .sampling import Stratified as Stratified
 from .sampling import gathered as gathered

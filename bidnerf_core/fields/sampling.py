@@ -74,17 +74,6 @@ class OccupiedOnly:
         return replace(samples, valid=samples.valid & self.occupancy.holds(rays.at(samples.middles)))
 
 
-@dataclass(frozen=True)
-class Resampled:
-    """A field with its sampler replaced by another."""
-
-    field: RadianceField
-    sampler: RaySampler
-
-    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        return self.field.query(positions, directions)
-
-
 OfRays = TypeVar("OfRays", Rays, RaySamples)
 
 

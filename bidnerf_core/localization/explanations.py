@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics, cameras_at_size, centre_crop_cameras, stretched_cameras
+from bidnerf_core.camera import Intrinsics, cameras_at_size
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.query import Query
 from bidnerf_core.mapping import LandmarkMap, N, States
@@ -190,8 +190,8 @@ def cameras_of_map(query: Query, landmarks: LandmarkMap) -> list[Float[Tensor, "
     size = stated.width, stated.height
     groups = cameras_at_size(landmarks.cameras, *size)
     if not groups:
-        groups = stretched_cameras(landmarks.cameras, *size)
-        groups += centre_crop_cameras(landmarks.cameras, *size) if query.approximate else ()
+        groups = cameras_at_size(landmarks.cameras, *size, "stretched")
+        groups += cameras_at_size(landmarks.cameras, *size, "cropped") if query.approximate else ()
     nearly = torch.tensor(NEARLY, dtype=torch.float64)
     for group in groups:
         cameras = sorted(group, key=lambda camera: camera.fx)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bidnerf_core import Intrinsics
-from bidnerf_core.camera import Orientation, stretched_cameras
+from bidnerf_core.camera import Orientation, cameras_at_size
 
 LANDSCAPE = Intrinsics(520.0, 521.0, 310.0, 245.0, 640, 480, (0.05, -0.01, 0.001, 0.002))
 TILTED = replace(LANDSCAPE, distortion=(0.0,) * 12 + (0.1, 0.0))
@@ -47,4 +47,4 @@ def test_a_centre_crop_touches_two_edges(width: int, height: int, scale: float) 
 
 def test_landscape_cameras_of_portrait_images_are_turned_to_either_side() -> None:
     one, other = LANDSCAPE.quarter_turns()
-    assert stretched_cameras((LANDSCAPE,), 480, 640) == ((one,), (other,))
+    assert cameras_at_size((LANDSCAPE,), 480, 640, "stretched") == ((one,), (other,))

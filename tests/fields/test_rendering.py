@@ -16,7 +16,6 @@ from bidnerf_core.fields import (
     RadianceField,
     Rays,
     RaySamples,
-    Resampled,
     SceneBounds,
     Stratified,
     inverse_transform,
@@ -30,6 +29,7 @@ from bidnerf_core.fields import (
 )
 from bidnerf_core.geometry import SE3
 from bidnerf_core.scenes import HomogeneousBall, closed_form_data, closed_form_map
+from resampled import Resampled
 
 BLUE = (0.1, 0.2, 0.9)
 

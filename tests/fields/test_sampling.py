@@ -17,7 +17,6 @@ from bidnerf_core.fields import (
     Rays,
     RaySampler,
     RaySamples,
-    Resampled,
     SceneBounds,
     Stratified,
     render,
@@ -25,6 +24,7 @@ from bidnerf_core.fields import (
 from bidnerf_core.scenes import GaussianBlobs, HomogeneousBall
 from bidnerf_core.testing import check_background, check_intervals, check_rays_alone, check_repeatable
 from bidnerf_hashgrid.occupancy import OccupancyGrid
+from resampled import Resampled
 from voxels import cell_centres
 
 BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.05, 8.0)

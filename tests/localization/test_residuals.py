@@ -16,11 +16,9 @@ from bidnerf_core.fields import (
     Rendering,
     SceneBounds,
     depth_residual,
-    first_surface_residual,
     free_space,
     masked_mean,
     render,
-    truncated_depth_residual,
 )
 from bidnerf_core.geometry import RobustName
 from bidnerf_core.localization import METHODS, BidConfig, ColourSettings, DepthSettings, objective_of
@@ -163,25 +161,25 @@ def test_a_truncated_depth_error_bears_a_silhouette() -> None:
     pixel = pixel_at(2.0)
     rendering = silhouette(0.9)
     assert float(depth_residual(rendering, pixel)) == pytest.approx(0.4)
-    assert float(truncated_depth_residual(rendering, pixel, 0.3)) == pytest.approx(0.03)
+    assert float(DEPTH_RESIDUALS["truncated"](rendering, pixel, 0.3)) == pytest.approx(0.03)
     passing = replace(rendering, weights=rendering.weights * 0, opacity=rendering.opacity * 0)
-    assert float(truncated_depth_residual(passing, pixel, 0.3)) == pytest.approx(0.3)
+    assert float(DEPTH_RESIDUALS["truncated"](passing, pixel, 0.3)) == pytest.approx(0.3)
     near = silhouette(1.0, 2.05)
-    assert float(truncated_depth_residual(near, pixel, 0.3)) == pytest.approx(0.05)
+    assert float(DEPTH_RESIDUALS["truncated"](near, pixel, 0.3)) == pytest.approx(0.05)
 
 
 def test_the_first_surface_is_compared_where_there_is_one() -> None:
     pixel = pixel_at(2.0)
-    assert float(first_surface_residual(silhouette(0.9, 2.05), pixel)) == pytest.approx(0.05)
-    assert float(first_surface_residual(silhouette(0.2), pixel)) == pytest.approx(
+    assert float(DEPTH_RESIDUALS["first-surface"](silhouette(0.9, 2.05), pixel)) == pytest.approx(0.05)
+    assert float(DEPTH_RESIDUALS["first-surface"](silhouette(0.2), pixel)) == pytest.approx(
         4.0
     )  # the first one is glass
     empty = replace(silhouette(0.9), opacity=torch.zeros(1, dtype=torch.float64))
-    assert float(first_surface_residual(empty, pixel)) == 0
+    assert float(DEPTH_RESIDUALS["first-surface"](empty, pixel)) == 0
     leaf = torch.tensor([[2.05, 6.0]], dtype=torch.float64).requires_grad_()
     samples = RaySamples(leaf, leaf, torch.ones(1, 2, dtype=torch.bool))
     rendering = replace(silhouette(0.9, 2.05), samples=samples)
-    (slope,) = torch.autograd.grad(first_surface_residual(rendering, pixel).sum(), leaf)
+    (slope,) = torch.autograd.grad(DEPTH_RESIDUALS["first-surface"](rendering, pixel).sum(), leaf)
     torch.testing.assert_close(slope, torch.tensor([[1.0, 0.0]], dtype=torch.float64))
 
 
