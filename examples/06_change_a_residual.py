@@ -18,11 +18,11 @@ from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import closed_form_data, closed_form_map
 
 
-def log_depth(rendering, observed, miss=None):
-    """Return the logarithm of rendered over measured distance; rays that meet little count as a miss."""
+def log_depth(rendering, observed):
+    """Return the logarithm of rendered over measured distance; rays that meet little count little."""
     met = rendering.opacity.clamp(min=1e-3)
     ratio = (rendering.distance / met).clamp(min=1e-3) / observed.distance.clamp(min=1e-3)
-    return rendering.opacity * torch.log(ratio) + (1 - rendering.opacity) * (miss or 0.0)
+    return rendering.opacity * torch.log(ratio)
 
 
 DEPTH_RESIDUALS["log-distance"] = log_depth

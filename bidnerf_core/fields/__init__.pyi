@@ -48,7 +48,6 @@ from .residuals import Objective as Objective
 from .residuals import Residual as Residual
 from .residuals import Term as Term
 from .residuals import colour_term as colour_term
-from .residuals import coloured as coloured
 from .residuals import depth_residual as depth_residual
 from .residuals import depth_term as depth_term
 from .residuals import free_space as free_space

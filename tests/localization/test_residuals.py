@@ -115,16 +115,8 @@ def test_weight_zero_uses_no_depth() -> None:
 SOME = torch.tensor([[2.0, 0.0, 0.0], [2.0, 2.0, 2.0]])
 
 
-def test_a_ray_that_meets_nothing_is_off_by_the_miss() -> None:
-    pixels = measured(torch.full((2, 3), 2.0))
-    torch.testing.assert_close(depth_residual(wall(2.4, 0.0), pixels, 0.3), torch.full((2, 3), 0.3))
-    torch.testing.assert_close(depth_residual(wall(2.4, 1.0), pixels, 0.3), torch.full((2, 3), 0.4))
-    torch.testing.assert_close(depth_residual(wall(2.4, 0.5), pixels, 0.3), torch.full((2, 3), 0.35))
-    torch.testing.assert_close(depth_residual(wall(2.4, 0.0), pixels), torch.full((2, 3), -2.0))
-
-
 def test_a_depth_residual_of_ones_own_is_named_by_a_setting(monkeypatch: pytest.MonkeyPatch) -> None:
-    def halved(rendering: Rendering, observed: Observations, miss: float | None = None) -> torch.Tensor:
+    def halved(rendering: Rendering, observed: Observations) -> torch.Tensor:
         return (rendering.distance - observed.distance) / 2
 
     monkeypatch.setitem(DEPTH_RESIDUALS, "halved", halved)
@@ -161,11 +153,11 @@ def test_a_truncated_depth_error_bears_a_silhouette() -> None:
     pixel = pixel_at(2.0)
     rendering = silhouette(0.9)
     assert float(depth_residual(rendering, pixel)) == pytest.approx(0.4)
-    assert float(DEPTH_RESIDUALS["truncated"](rendering, pixel, 0.3)) == pytest.approx(0.03)
+    assert float(DEPTH_RESIDUALS["truncated"](rendering, pixel)) == pytest.approx(0.03)
     passing = replace(rendering, weights=rendering.weights * 0, opacity=rendering.opacity * 0)
-    assert float(DEPTH_RESIDUALS["truncated"](passing, pixel, 0.3)) == pytest.approx(0.3)
+    assert float(DEPTH_RESIDUALS["truncated"](passing, pixel)) == pytest.approx(0.3)
     near = silhouette(1.0, 2.05)
-    assert float(DEPTH_RESIDUALS["truncated"](near, pixel, 0.3)) == pytest.approx(0.05)
+    assert float(DEPTH_RESIDUALS["truncated"](near, pixel)) == pytest.approx(0.05)
 
 
 def test_the_first_surface_is_compared_where_there_is_one() -> None:
