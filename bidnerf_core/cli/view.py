@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from bidnerf_core.cli.folders import check_output
 from bidnerf_core.cli.options import TEST_IMAGES, USUAL_METHOD, Device, Host, MapFolder, Method, Names, Port
@@ -22,7 +22,6 @@ from bidnerf_core.viewer import PORT
 if TYPE_CHECKING:
     from bidnerf_core.datasets import Query, QuerySource
     from bidnerf_core.localization import Localizer
-    from bidnerf_core.viewer import ShownAnswer
 
 
 @dataclass(frozen=True)
@@ -122,7 +121,7 @@ def run(
     show(f"look at {page.save}")
 
 
-def _localized(localizer: Localizer, source: QuerySource) -> tuple[ShownAnswer, ...]:
+def _localized(localizer: Localizer, source: QuerySource) -> tuple[dict[str, Any], ...]:
     """Localize all queries. Raises ``InputError`` if none of them can be read."""
     from bidnerf_core.results import BAD_INPUT
     from bidnerf_core.viewer import read_and_localized
@@ -133,11 +132,11 @@ def _localized(localizer: Localizer, source: QuerySource) -> tuple[ShownAnswer, 
         for place in range(total):
             answers.append(read_and_localized(localizer, source, place))
             count(place + 1, total)
-    unread = [answer for answer in answers if answer.outcome == BAD_INPUT]
+    unread = [answer for answer in answers if answer["outcome"] == BAD_INPUT]
     if unread and len(unread) == len(answers):
-        raise InputError(unread[0].reason)
+        raise InputError(unread[0]["reason"])
     for answer in unread:
-        say(f"{answer.name}: {answer.reason}")
+        say(f"{answer['name']}: {answer['reason']}")
     return tuple(answers)
 
 

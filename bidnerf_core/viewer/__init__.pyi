@@ -1,4 +1,3 @@
-from .answer import ShownAnswer as ShownAnswer
 from .app import LiveView as LiveView
 from .saving import MapView as MapView
 from .server import PORT as PORT

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -37,7 +37,7 @@ from bidnerf_core.viewer.explanations import (
     last_answer,
     probable_poses,
 )
-from bidnerf_core.viewer.figures import Figure, acceptance_figures
+from bidnerf_core.viewer.figures import acceptance_figures
 from bidnerf_core.viewer.packing import Json, drawing, packed, photograph
 from bidnerf_core.viewer.rendering import quick_image
 from bidnerf_core.viewer.scene import frustum, rows_of
@@ -52,44 +52,44 @@ TOO_NEAR, RIGHT, TOO_FAR = (0.70, 0.09, 0.17), (0.97, 0.97, 0.96), (0.13, 0.40, 
 """Colours for rendered depth that is smaller than, equal to and larger than the measured depth."""
 
 
-@dataclass(frozen=True)
-class ShownAnswer:
-    """A localization, or an image that could not be localized, as the page shows it."""
-
-    name: str
-    outcome: str
-    accepted: bool
-    reason: str
-    meaning: str = ""  # of the outcome, if the pose was rejected
-    advice: str = ""
-    method: str = ""
-    method_summary: str = ""
-    seconds: float = 0.0
-    loss: float | None = None
-    unit: str = "units"
-    confidence: float | None = None
-    pose: tuple[float, ...] | None = None  # T_world_camera, 16 numbers by rows; None if it is not finite
-    truth: tuple[float, ...] | None = None
-    error: tuple[float, float] | None = None  # of the position, and of the orientation in degrees
-    shape: Json | None = None
-    camera: str = ""  # whose intrinsics were taken
-    ellipsoid: Json | None = None
-    observed: Json | None = None
-    rendered: Json | None = None
-    depth: Json | None = None
-    steps: tuple[Json, ...] = ()
-    path: tuple[tuple[float, float, float], ...] = ()  # positions from the start to the pose found
-    matches: Json | None = None
-    figures: tuple[Figure, ...] = ()
-    contests: tuple[Json, ...] = ()
-    runner_up: Json | None = None
+def no_answer(name: str, outcome: str, reason: str) -> Json:
+    """Return an image that could not be localized as the page shows it, see ``shown_answer``."""
+    texts = dict.fromkeys(("meaning", "advice", "method", "method_summary", "camera"), "")
+    unknown = (
+        "loss",
+        "confidence",
+        "pose",
+        "truth",
+        "error",
+        "shape",
+        "ellipsoid",
+        "observed",
+        "rendered",
+        "depth",
+        "matches",
+        "runner_up",
+    )
+    lists = dict[str, tuple[Any, ...]].fromkeys(("steps", "path", "figures", "contests"), ())
+    found = {
+        "name": name,
+        "outcome": outcome,
+        "accepted": False,
+        "reason": reason,
+        "seconds": 0.0,
+        "unit": "units",
+    }
+    return texts | dict.fromkeys(unknown) | lists | found
 
 
 def shown_answer(
     scene: SceneMap, name: str, found: Localization, frame: Frame | None = None, record: SearchRecord | None = None,
     truth: SE3 | None = None, quick: bool = False,
-) -> ShownAnswer:  # fmt: skip
+) -> Json:  # fmt: skip
     """Return a localization as JSON values, with renderings if its ``frame`` is known.
+
+    ``pose`` and ``truth`` are the 16 numbers of T_world_camera by rows, None if they are not finite or known; ``error`` is that of the
+    position, and of the orientation in degrees; ``path`` has the positions from the start to the pose found; ``camera`` says whose
+    intrinsics were taken, and ``meaning`` and ``advice`` what a rejection means and what to try.
 
     ``record`` is that of its search, ``truth`` the true T_world_camera. A ``quick`` answer has renderings of the surface.
     Poses are shown in the map's own coordinates, see ``Map.origin``.
@@ -115,35 +115,35 @@ def shown_answer(
     with contextlib.suppress(PluginError):  # it is not installed here
         summary = METHODS.load(found.method).summary
     places = found.poses.translation.detach().cpu().double()
-    return ShownAnswer(
-        name=name,
-        outcome=str(found.outcome),
-        accepted=found.converged and finite,
-        reason=found.reason,
-        meaning="" if advice is None else advice.meaning,
-        advice="" if advice is None else advice.first,
-        method=found.method,
-        method_summary=summary,
-        seconds=found.seconds,
-        loss=_finite(found.loss),
-        unit=symbol(found.unit),
-        confidence=_finite(found.confidence),
-        pose=rows_of(T) if finite else None,
-        truth=None if truth is None else rows_of(truth),
-        error=None if error is None else (float(error.translation), float(error.rotation_deg)),
-        shape=None if frame is None else frustum(frame.intrinsics),
-        camera=camera,
-        ellipsoid=ellipsoid(T, found.covariance) if finite else None,
-        observed=observed,
-        rendered=rendered,
-        depth=depth,
-        steps=_steps(found, record),
-        path=tuple((x, y, z) for x, y, z in places[places.isfinite().all(-1)].tolist()),
-        matches=None if frame is None or answer is None or not finite else _matches(scene, found, answer),
-        figures=acceptance_figures(found, record),
-        contests=contests(found, record),
-        runner_up=other,
-    )
+    return {
+        "name": name,
+        "outcome": str(found.outcome),
+        "accepted": found.converged and finite,
+        "reason": found.reason,
+        "meaning": "" if advice is None else advice.meaning,
+        "advice": "" if advice is None else advice.first,
+        "method": found.method,
+        "method_summary": summary,
+        "seconds": found.seconds,
+        "loss": _finite(found.loss),
+        "unit": symbol(found.unit),
+        "confidence": _finite(found.confidence),
+        "pose": rows_of(T) if finite else None,
+        "truth": None if truth is None else rows_of(truth),
+        "error": None if error is None else (float(error.translation), float(error.rotation_deg)),
+        "shape": None if frame is None else frustum(frame.intrinsics),
+        "camera": camera,
+        "ellipsoid": ellipsoid(T, found.covariance) if finite else None,
+        "observed": observed,
+        "rendered": rendered,
+        "depth": depth,
+        "steps": _steps(found, record),
+        "path": tuple((x, y, z) for x, y, z in places[places.isfinite().all(-1)].tolist()),
+        "matches": None if frame is None or answer is None or not finite else _matches(scene, found, answer),
+        "figures": acceptance_figures(found, record),
+        "contests": contests(found, record),
+        "runner_up": other,
+    }
 
 
 def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> Json | None:

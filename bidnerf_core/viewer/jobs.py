@@ -16,7 +16,8 @@ from bidnerf_core.localization import Localizer, SearchRecord
 from bidnerf_core.progress import job_context
 from bidnerf_core.results import BAD_INPUT
 from bidnerf_core.service import Job, Queue
-from bidnerf_core.viewer.answer import ShownAnswer
+from bidnerf_core.viewer.answer import no_answer
+from bidnerf_core.viewer.packing import Json
 from bidnerf_core.viewer.view import localized
 
 log = logging.getLogger("bidnerf.viewer")
@@ -38,7 +39,7 @@ class ShownJob:
     name: str
     state: Literal["waiting", "searching", "rendering", "done"] = "waiting"
     record: SearchRecord | None = None
-    answer: ShownAnswer | None = None
+    answer: Json | None = None
 
     def plain(self, known: str) -> dict[str, Any]:
         """Return the state as JSON values, with the answer unless the client has already seen it in the ``known`` state."""
@@ -53,18 +54,16 @@ class ShownJob:
             query, start, seed = read()
             self.answer = localized(localizer, query, start, seed, self._follow)
         except Cancelled:
-            self.answer = ShownAnswer(self.name, "stopped", False, "the viewer was closed")
+            self.answer = no_answer(self.name, "stopped", "the viewer was closed")
         except InputError as error:
-            self.answer = ShownAnswer(self.name, BAD_INPUT, False, str(error))
+            self.answer = no_answer(self.name, BAD_INPUT, str(error))
         except Exception:  # third-party code may raise anything, with paths of this machine in it
             log.exception("internal error while localizing %s", self.name)
-            self.answer = ShownAnswer(
-                self.name, "fault", False, "internal error, which the viewer's log describes"
-            )
+            self.answer = no_answer(self.name, "fault", "internal error, which the viewer's log describes")
         finally:
             self.state = "done"
 
-    def _follow(self, record: SearchRecord, answer: ShownAnswer | None) -> None:
+    def _follow(self, record: SearchRecord, answer: Json | None) -> None:
         self.record, self.answer, self.state = record, answer, "rendering" if answer else "searching"
 
 

@@ -14,7 +14,6 @@ from pathlib import Path
 
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.io import to_plain, write_file
-from bidnerf_core.viewer.answer import ShownAnswer
 from bidnerf_core.viewer.packing import Json
 
 MODULES = ("data", "space", "compare", "panel", "table", "track", "live", "main")
@@ -30,7 +29,7 @@ class MapView:
     """The page of a map and of localizations in it, which a notebook shows and ``save`` writes to a file."""
 
     map: Json
-    answers: tuple[ShownAnswer, ...] = ()
+    answers: tuple[Json, ...] = ()
     title: str = ""
     live: bool = False  # whether a server answers
     queries: tuple[str, ...] = ()  # names of images that the server can localize

@@ -14,7 +14,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import Localization, Localizer, SearchRecord, recorded
 from bidnerf_core.maps import Map
 from bidnerf_core.results import BAD_INPUT
-from bidnerf_core.viewer.answer import ShownAnswer, shown_answer
+from bidnerf_core.viewer.answer import no_answer, shown_answer
 from bidnerf_core.viewer.packing import Json
 from bidnerf_core.viewer.saving import MapView
 from bidnerf_core.viewer.scene import shown_map
@@ -36,7 +36,7 @@ def view(
     of its own, and ``trajectory`` a file of poses. Raises ``InputError`` if it is neither.
     """
     scene_map = map_of(scene)
-    answers = list[ShownAnswer]()
+    answers = list[Json]()
     if localization is not None:
         name = "localization" if frame is None else frame.name
         answers.append(shown_answer(scene_map, name, localization, frame))
@@ -68,8 +68,8 @@ def localized(
     query: Query,
     start: SE3 | None = None,
     seed: int = 0,
-    follow: Callable[[SearchRecord, ShownAnswer | None], None] | None = None,
-) -> ShownAnswer:
+    follow: Callable[[SearchRecord, Json | None], None] | None = None,
+) -> Json:
     """Localize a query, and return the answer with a record of its search. Raises ``InputError`` for an unusable query.
 
     ``follow`` is called with the record of the search before it begins, and again with an answer whose pictures are of the surface,
@@ -85,16 +85,16 @@ def localized(
     return shown_answer(*known)
 
 
-def read_and_localized(localizer: Localizer, source: QuerySource, place: int) -> ShownAnswer:
+def read_and_localized(localizer: Localizer, source: QuerySource, place: int) -> Json:
     """Localize the query at index ``place`` of a source; if it cannot be used, the answer states why."""
     try:
         return localized(localizer, source.read(place))
     except InputError as error:
-        return ShownAnswer(source.names[place], BAD_INPUT, False, str(error))
+        return no_answer(source.names[place], BAD_INPUT, str(error))
 
 
 def page_of(
-    scene: Map, answers: Iterable[ShownAnswer], trajectory: Json | None = None, results: Iterable[Json] = (),
+    scene: Map, answers: Iterable[Json], trajectory: Json | None = None, results: Iterable[Json] = (),
 ) -> MapView:  # fmt: skip
     """Build the viewer page of a map with answers, a trajectory and rows of results."""
     return MapView(shown_map(scene), tuple(answers), trajectory=trajectory, results=tuple(results))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import subprocess
 import sys
 import tarfile
 import tomllib
@@ -14,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+
+from commands import quietly
 
 pytestmark = pytest.mark.slow
 
@@ -36,7 +37,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
     made = os.environ.get("BIDNERF_WHEELS")
     out = Path(made or tmp_path_factory.mktemp("dist"))
     if not made:
-        _quietly([sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(ROOT)])
+        quietly([sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(ROOT)])
     (sdist,), (wheel,) = out.glob("bidnerf-*.tar.gz"), out.glob("bidnerf-*.whl")
     return Built(sdist, wheel)
 
@@ -46,15 +47,8 @@ def installed(built: Built, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder into which the wheel was installed, not editable."""
     target = tmp_path_factory.mktemp("installed")
     pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "--no-compile"]
-    _quietly([*pip, "--target", str(target), str(built.wheel)])
+    quietly([*pip, "--target", str(target), str(built.wheel)])
     return target
-
-
-def _quietly(command: list[str], **options: object) -> str:
-    """Standard output of a command; what it said, where it fails."""
-    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, **options)  # type: ignore[call-overload]
-    assert done.returncode == 0, done.stdout + done.stderr
-    return str(done.stdout)
 
 
 def _python(installed: Path, *arguments: str) -> str:
@@ -64,7 +58,7 @@ def _python(installed: Path, *arguments: str) -> str:
     """
     dependencies = [entry for entry in sys.path if entry.endswith(("site-packages", "dist-packages"))]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(installed), *dependencies])}
-    return _quietly([sys.executable, "-S", *arguments], cwd=installed, env=environment)
+    return quietly([sys.executable, "-S", *arguments], cwd=installed, env=environment)
 
 
 def _inside(wheel: Path) -> set[str]:

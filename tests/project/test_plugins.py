@@ -7,12 +7,13 @@ import json
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
 import pytest
+
+from commands import quietly
 
 pytestmark = pytest.mark.slow
 
@@ -22,13 +23,6 @@ PLUGINS = sorted(file.parent for file in (ROOT / "plugins").glob("*/pyproject.to
 BUNDLED = {folder.name for folder in (ROOT / "backends").iterdir()}
 
 every_plugin = pytest.mark.parametrize("plugin", PLUGINS, ids=lambda plugin: plugin.name)
-
-
-def quietly(command: list[str], **options: object) -> str:
-    """Standard output of a command; what it said, where it fails."""
-    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, **options)  # type: ignore[call-overload]
-    assert done.returncode == 0, done.stdout + done.stderr
-    return str(done.stdout)
 
 
 def installed(sources: list[Path], target: Path) -> dict[str, str]:

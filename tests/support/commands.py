@@ -1,8 +1,9 @@
-"""Commands run in this process, and what they printed."""
+"""Commands run in this process or in one of their own, and what they printed."""
 
 from __future__ import annotations
 
 import json
+import subprocess
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
@@ -40,3 +41,10 @@ def strict(text: str) -> Any:
     assert text.count("\n") == 1
     assert text.endswith("\n")
     return json.loads(text, parse_constant=refuse)
+
+
+def quietly(command: list[str], **options: object) -> str:
+    """Standard output of a command; what it said, where it fails."""
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, **options)  # type: ignore[call-overload]
+    assert done.returncode == 0, done.stdout + done.stderr
+    return str(done.stdout)

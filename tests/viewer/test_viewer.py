@@ -8,6 +8,7 @@ import re
 from base64 import b64decode
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ from bidnerf_core.mapping import States
 from bidnerf_core.progress import job_context
 from bidnerf_core.results import PosedImage, write_poses
 from bidnerf_core.scenes import closed_form_map, orbit
-from bidnerf_core.viewer import ShownAnswer, shown_trajectory
+from bidnerf_core.viewer import shown_trajectory
 
 # Inside: what a page states of one answer is read from its parts, without a browser
 from bidnerf_core.viewer.answer import MOST_STEPS, depth_difference, ellipsoid, shown_answer
@@ -75,24 +76,24 @@ def record(recording: tuple[Localization, SearchRecord]) -> SearchRecord:
     return recording[1]
 
 
-def largest_error(shown: ShownAnswer) -> float:
+def largest_error(shown: dict[str, Any]) -> float:
     """The largest distance between a keypoint and its landmark's projection, of those that agree, by the image's size."""
-    assert shown.matches is not None
+    assert shown["matches"] is not None
     seen, there = (
         np.frombuffer(b64decode(part["base64"]), np.float32).reshape(-1, 2)
-        for part in (shown.matches["keypoints"], shown.matches["projections"])
+        for part in (shown["matches"]["keypoints"], shown["matches"]["projections"])
     )
-    agree = np.frombuffer(b64decode(shown.matches["accepted"]["base64"]), np.uint8) > 0
+    agree = np.frombuffer(b64decode(shown["matches"]["accepted"]["base64"]), np.uint8) > 0
     return float(np.abs(seen - there)[agree].max())
 
 
 @pytest.fixture(scope="module")
-def found(localizer: Localizer, query: Query) -> ShownAnswer:
+def found(localizer: Localizer, query: Query) -> dict[str, Any]:
     return localized(localizer, query)
 
 
 @pytest.fixture(scope="module")
-def refused(localizer: Localizer) -> ShownAnswer:
+def refused(localizer: Localizer) -> dict[str, Any]:
     return localized(localizer, viewed.query(viewed.HOSTILE, seed=5))
 
 
@@ -111,28 +112,27 @@ def test_a_trajectory_in_another_unit_than_the_map_is_remarked(
         caplog.clear()
 
 
-def test_an_accepted_pose_passes_its_figures(found: ShownAnswer) -> None:
-    assert found.accepted
-    assert found.error is not None
-    assert found.error[0] < 0.02
-    assert all(figure.passed is not False for figure in found.figures)
-    assert found.matches is not None
-    assert found.matches["agreeing"] > 100
+def test_an_accepted_pose_passes_its_figures(found: dict[str, Any]) -> None:
+    assert found["accepted"]
+    assert found["error"] is not None
+    assert found["error"][0] < 0.02
+    assert all(figure.passed is not False for figure in found["figures"])
+    assert found["matches"]["agreeing"] > 100
     assert largest_error(found) < 0.05
-    assert [step["caption"] for step in found.steps][-1] == "the pose found"
-    assert found.ellipsoid is not None
-    assert found.observed is not None
-    assert found.rendered is not None
-    assert found.depth is not None
+    assert [step["caption"] for step in found["steps"]][-1] == "the pose found"
+    assert found["ellipsoid"] is not None
+    assert found["observed"] is not None
+    assert found["rendered"] is not None
+    assert found["depth"] is not None
 
 
-def test_a_refused_pose_fails_a_figure_and_shows_its_search(refused: ShownAnswer) -> None:
-    assert not refused.accepted
-    assert any(figure.passed is False for figure in refused.figures)
+def test_a_refused_pose_fails_a_figure_and_shows_its_search(refused: dict[str, Any]) -> None:
+    assert not refused["accepted"]
+    assert any(figure.passed is False for figure in refused["figures"])
     assert (
-        max(len(step["scores"]) for step in refused.steps) > 50
+        max(len(step["scores"]) for step in refused["steps"]) > 50
     )  # the hypotheses of the search on the surface
-    assert refused.runner_up is not None
+    assert refused["runner_up"] is not None
 
 
 def test_every_part_of_the_evidence_is_a_figure() -> None:
@@ -158,11 +158,10 @@ def test_a_mirrored_photo_is_compared_with_its_mirror_image(localizer: Localizer
     """Its matches are drawn where the photo shows them."""
     mirrored = query.frame.replace(rgb=query.frame.rgb.flip(1), depth=None)
     shown = localized(localizer, Query("mirrored", (View(mirrored, SE3.identity()),)))
-    assert shown.outcome == Outcome.MIRRORED
-    assert "mirror image" in shown.contests[0]["question"]
-    assert shown.contests[0]["answers"][0]["name"] == "the mirror image"
-    assert shown.matches is not None
-    assert shown.matches["agreeing"] > 100
+    assert shown["outcome"] == Outcome.MIRRORED
+    assert "mirror image" in shown["contests"][0]["question"]
+    assert shown["contests"][0]["answers"][0]["name"] == "the mirror image"
+    assert shown["matches"]["agreeing"] > 100
     assert largest_error(shown) < 0.05
 
 
@@ -182,17 +181,19 @@ def test_another_place_is_a_contest_a_step_and_the_runner_up(
     modes = [*found.modes, replace(found.modes[0], name="another place")]
     doubtful = SearchRecord(record.steps, [replace(found, modes=modes, posterior=both)])
     shown = shown_answer(room, "a", answer, record=doubtful)
-    here, there = shown.contests[0]["answers"]
+    here, there = shown["contests"][0]["answers"]
     assert (here["name"], there["name"]) == (HERE, "a pose 2 m away")
     assert (here["probability"], there["probability"]) == (pytest.approx(0.75), pytest.approx(0.25))
-    assert shown.runner_up is not None
-    assert shown.runner_up["pose"] == there["pose"]
-    assert shown.runner_up["probability"] == pytest.approx(0.25)
-    assert shown.steps[-2]["scores"] == pytest.approx((-math.log(0.75), -math.log(0.25)))
+    assert shown["runner_up"] is not None
+    assert shown["runner_up"]["pose"] == there["pose"]
+    assert shown["runner_up"]["probability"] == pytest.approx(0.25)
+    assert shown["steps"][-2]["scores"] == pytest.approx((-math.log(0.75), -math.log(0.25)))
 
 
-def test_a_bar_is_beyond_its_middle_on_the_side_that_passes(found: ShownAnswer, refused: ShownAnswer) -> None:
-    figures = [figure for answer in (found, refused) for figure in answer.figures if figure.bar]
+def test_a_bar_is_beyond_its_middle_on_the_side_that_passes(
+    found: dict[str, Any], refused: dict[str, Any]
+) -> None:
+    figures = [figure for answer in (found, refused) for figure in answer["figures"] if figure.bar]
     assert {figure.passed for figure in figures} == {True, False}
     for figure in figures:
         assert figure.bar is not None
@@ -207,10 +208,12 @@ def test_a_bar_is_beyond_its_middle_on_the_side_that_passes(found: ShownAnswer, 
     assert bar(math.nan, 3.0, True) is None
 
 
-def test_a_refusal_says_what_to_try_and_a_method_what_it_is(found: ShownAnswer, refused: ShownAnswer) -> None:
-    assert found.advice == ""
-    assert refused.advice == ADVICE[Outcome(refused.outcome)].first
-    assert found.method_summary == METHODS["auto"].summary
+def test_a_refusal_says_what_to_try_and_a_method_what_it_is(
+    found: dict[str, Any], refused: dict[str, Any]
+) -> None:
+    assert found["advice"] == ""
+    assert refused["advice"] == ADVICE[Outcome(refused["outcome"])].first
+    assert found["method_summary"] == METHODS["auto"].summary
 
 
 def test_poses_are_shown_relative_to_the_origin_of_the_map(
@@ -221,8 +224,8 @@ def test_poses_are_shown_relative_to_the_origin_of_the_map(
     surveyed, far = replace(room, info=replace(room.info, origin=origin)), answer.translated(offset)
     shown = shown_answer(surveyed, query.name, far, truth=far.T_world_camera)
     local = answer.T_world_camera.matrix().flatten().tolist()
-    assert shown.pose == pytest.approx(local, abs=1e-6)
-    assert shown.truth == pytest.approx(local, abs=1e-6)
+    assert shown["pose"] == pytest.approx(local, abs=1e-6)
+    assert shown["truth"] == pytest.approx(local, abs=1e-6)
     assert "500,000" in dict(shown_map(surveyed, 0)["facts"])["origin"]
     write_poses(tmp_path / "path.txt", [PosedImage("a", 0, query.frame.intrinsics, far.T_world_camera)])
     drawn = shown_trajectory(tmp_path / "path.txt", origin=origin)["poses"]
@@ -240,7 +243,7 @@ def test_the_loss_of_a_descent_is_the_first_figure(answer: Localization) -> None
 
 def test_a_descent_is_shown_step_by_step_with_its_loss(room: Map, answer: Localization) -> None:
     T, losses = SE3.stack([*viewed.walk(500), answer.T_world_camera]), torch.linspace(0.5, 0.1, 500)
-    steps = shown_answer(room, "descent", replace(answer, poses=T, losses=losses)).steps
+    steps = shown_answer(room, "descent", replace(answer, poses=T, losses=losses))["steps"]
     assert len(steps) <= MOST_STEPS + 1
     assert [steps[0]["caption"], steps[-1]["caption"]] == ["step 0 of 500", HERE]
     assert [step["loss"] for step in steps] == sorted(
@@ -254,17 +257,19 @@ def test_an_earlier_pose_by_landmarks_is_told_from_the_pose_found(
 ) -> None:
     here = shown_answer(room, "here", answer, query.frame, record)
     assert (
-        {figure.pose for figure in here.figures} == {here.matches["pose"] if here.matches else None} == {""}
+        {figure.pose for figure in here["figures"]}
+        == {here["matches"]["pose"] if here["matches"] else None}
+        == {""}
     )
     away = replace(answer.T_world_camera, translation=answer.T_world_camera.translation + 1.0)
     given_up = replace(answer, T_world_camera=away, diagnostics=None, confidence=None)
     there = shown_answer(room, "there", given_up, query.frame, record)
     assert (
-        {figure.pose for figure in there.figures}
-        == {there.matches["pose"] if there.matches else None}
+        {figure.pose for figure in there["figures"]}
+        == {there["matches"]["pose"] if there["matches"] else None}
         == {EARLIER}
     )
-    assert EARLIER in next(each["remark"] for each in there.contests if not each["of_pose"])
+    assert EARLIER in next(each["remark"] for each in there["contests"] if not each["of_pose"])
 
 
 def test_a_localization_is_not_recorded_unless_asked_for(
@@ -322,7 +327,7 @@ def test_packed_points_are_exact_to_a_part_in_65535(generator: torch.Generator) 
 
 
 def test_the_page_holds_its_state_and_hostile_names_stay_text(
-    room: Map, found: ShownAnswer, refused: ShownAnswer
+    room: Map, found: dict[str, Any], refused: dict[str, Any]
 ) -> None:
     page = MapView(shown_map(room, 2), (found, refused), title=viewed.HOSTILE).html()
     assert viewed.HOSTILE not in page
@@ -333,7 +338,7 @@ def test_the_page_holds_its_state_and_hostile_names_stay_text(
     assert held["map"]["unit"] == "m"
 
 
-def test_the_page_asks_nobody_for_anything(room: Map, found: ShownAnswer) -> None:
+def test_the_page_asks_nobody_for_anything(room: Map, found: dict[str, Any]) -> None:
     page = MapView(shown_map(room, 0), (found,)).html()
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)
     assert policy is not None
@@ -365,9 +370,9 @@ def test_a_localization_of_an_earlier_run_is_shown_without_its_frame(
 ) -> None:
     answer.save(tmp_path / "pose.json")
     shown = shown_answer(room, "earlier", Localization.load(tmp_path / "pose.json"))
-    assert shown.accepted
-    assert shown.rendered is None
-    assert shown.figures[0].name == "confidence"
+    assert shown["accepted"]
+    assert shown["rendered"] is None
+    assert shown["figures"][0].name == "confidence"
 
 
 def test_what_is_no_map_is_refused() -> None:

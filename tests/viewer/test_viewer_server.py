@@ -170,7 +170,7 @@ def test_closing_ends_the_localization_at_work(room: Map, method: str) -> None:
     until(lambda: running.state == "done")
     assert time.monotonic() - began < 20  # of hours; a busy machine takes seconds to end a step
     assert running.answer is not None
-    assert (running.state, running.answer.outcome, waiting.state) == ("done", "stopped", "waiting")
+    assert (running.state, running.answer["outcome"], waiting.state) == ("done", "stopped", "waiting")
 
 
 def test_thumbnails_and_renderings_are_images_of_the_size_asked_for(client: Client) -> None:
