@@ -73,7 +73,7 @@ def _render_views(scene: Map, level: int | None, views: Sequence[View], out: Pat
         show(f"{view.frame.name}  {scores[-1]}")
         count(number + 1, len(views))
     errors = torch.cat([score.depth_errors for score in scores])
-    mean = RenderingScores(statistics.fmean(score.psnr for score in scores), errors)
+    mean = RenderingScores(statistics.fmean(score.psnr for score in scores), errors, scene.unit)
     error = "-" if mean.depth_error is None else f"{mean.depth_error:.4f}"
     show(
         f"mean of {len(scores)}: PSNR {mean.psnr:.2f} dB; median depth error over all pixels {error} {symbol(scene.unit)}"

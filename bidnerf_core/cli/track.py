@@ -206,7 +206,7 @@ def _follow(
 def _summarize(path: Answers, seconds: float, frame_seconds: float) -> None:
     """Print a summary of a recording."""
     print_table([""] * 2, path.summary(seconds))
-    if path.lost and path.without_times:
+    if path.lost and all(answer.time is None for answer in path.answers):
         say(
             f"the frames have no time stamps, so the first ones are assumed to be {frame_seconds:.3g} s apart; if they"
             " are farther apart, set --frame-seconds"

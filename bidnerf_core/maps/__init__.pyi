@@ -1,5 +1,4 @@
 from .anchor import Anchor as Anchor
-from .checkpoints import CHECKPOINT_SECONDS as CHECKPOINT_SECONDS
 from .checkpoints import Checkpoints as Checkpoints
 from .collection import MapCollection as MapCollection
 from .collection import Placement as Placement

@@ -16,8 +16,6 @@ from bidnerf_core.maps.store import write_parts
 from bidnerf_core.progress import Progress, current_job
 from bidnerf_core.training import TrainingState, TrainingStep
 
-CHECKPOINT_SECONDS = 60.0
-
 
 class Checkpoints:
     """The ``Report`` of a training run. States are saved to ``folder``, unless that is None; ``info``
@@ -32,7 +30,7 @@ class Checkpoints:
         info: MapInfo,
         folder: Path | None = None,
         state: TrainingState | None = None,
-        seconds: float = CHECKPOINT_SECONDS,
+        seconds: float = math.inf,
         landmarks: LandmarkMap | None = None,
     ) -> None:
         self.info, self.folder = info, folder

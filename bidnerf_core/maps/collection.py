@@ -47,7 +47,7 @@ class Placement:
         str, float
     ]  # all maps, most similar first: the cosine between pooled descriptors, -1 if a map has none
     asked: tuple[str, ...]  # maps in which the image was localized, in order
-    backend: str = ""  # of the map
+    backend: str  # of the map
 
     @property
     def converged(self) -> bool:

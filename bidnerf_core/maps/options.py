@@ -13,7 +13,6 @@ from bidnerf_core.datasets import DatasetOptions, SparseChoice
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import USUAL_FEATURES, find_features
-from bidnerf_core.maps.checkpoints import CHECKPOINT_SECONDS
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class TrainOptions(MapOptions):
     point_choice: SparseChoice = SparseChoice()
     """which of these points are used"""
 
-    checkpoint_seconds: float = CHECKPOINT_SECONDS
+    checkpoint_seconds: float = 60.0
     """time between checkpoints: the most work lost if the program is killed"""
 
     def __post_init__(self) -> None:

@@ -20,7 +20,7 @@ class RenderingScores:
 
     psnr: float  # dB
     depth_errors: Float[Tensor, "n"]  # absolute errors of planar z, at the pixels with measured depth
-    unit: LengthUnit = "units"  # of the depth
+    unit: LengthUnit  # of the depth
 
     @property
     def depth_error(self) -> float | None:

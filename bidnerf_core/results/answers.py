@@ -298,11 +298,6 @@ class Answers:
         """The first and the last index of each run of frames without an accepted pose."""
         return spans([not answer.accepted for answer in self.answers])
 
-    @property
-    def without_times(self) -> bool:
-        """Whether no frame has a time stamp."""
-        return all(answer.time is None for answer in self.answers)
-
     def errors(self) -> TrajectoryErrors | None:
         """Return the errors of the accepted poses whose truth is known, or None if there are none."""
         known = [(a.found.T_world_camera, a.truth) for a in self.accepted if a.truth is not None]
@@ -321,20 +316,6 @@ class Answers:
             if answer.truth is not None and answer.found.covariance is not None
         ]
         return sum(inside) / len(inside) if inside else None
-
-    def trained_on(self) -> int:
-        """Return the number of frames that are training images of the map, judging by names and true poses."""
-        info = getattr(self.scene, "info", None)
-        cameras = () if info is None else as_given(info.cameras)
-        given = {camera.name: camera.pose.translated(self._origin).matrix() for camera in cameras}
-        return sum(
-            answer.truth is not None
-            and answer.name in given
-            and torch.allclose(
-                given[answer.name], answer.truth.matrix(), rtol=0, atol=1e-4
-            )  # rounding in files
-            for answer in self.answers
-        )
 
     @property
     def _origin(self) -> Tensor:
@@ -384,7 +365,17 @@ class Answers:
                 rows.append(("RPE per frame", str(errors.rpe)))
         if (share := self.consistency()) is not None:
             rows.append(("inside 95 % bound", f"{share:.1%} (by the poses' covariances)"))
-        if seen := self.trained_on():
+        # Frames that are training images of the map, judging by names and true poses, up to rounding in files.
+        info = getattr(self.scene, "info", None)
+        cameras = () if info is None else as_given(info.cameras)
+        given = {camera.name: camera.pose.translated(self._origin).matrix() for camera in cameras}
+        seen = sum(
+            answer.truth is not None
+            and answer.name in given
+            and torch.allclose(given[answer.name], answer.truth.matrix(), rtol=0, atol=1e-4)
+            for answer in self.answers
+        )
+        if seen:
             no_test = "errors on training frames of the map are no test"
             rows.append(("trained on", f"{amount(seen, 'frame')}; {no_test}"))
         return [(name, text) for name, text in rows if text]

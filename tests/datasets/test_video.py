@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -15,7 +15,6 @@ import torch
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import Capture, TimedFrame, open_sequence
-from bidnerf_core.frames import Frame
 from photo_files import write_photo
 from refusals import refused
 
@@ -93,12 +92,6 @@ def test_an_assumed_camera_is_approximate(clip: Path) -> None:
         frame = next(iter(sequence)).frame
         assert frame.intrinsics == Intrinsics.from_focal(25, WIDTH, HEIGHT)
         assert frame.focal_is_approximate is approximate
-
-
-def test_an_iteration_may_end_early(clip: Path) -> None:
-    for timed in open_sequence(clip, focal=50):
-        assert timed.time == 0
-        break
 
 
 def test_times_of_a_varying_rate(tmp_path: Path) -> None:
@@ -216,15 +209,3 @@ def test_masks_of_a_video_are_named_after_its_frames(tmp_path: Path) -> None:
     assert hidden == [False, True, False]
     with refused(where=masks["other"], found="no mask in it matches any of 3 images", expected="found other"):
         open_sequence(video, camera=camera, masks=masks["other"])
-
-
-class Stream:
-    """A sequence that does not know the names of its frames beforehand."""
-
-    path = Path("stream")
-
-    def __len__(self) -> int:
-        return 1
-
-    def __iter__(self) -> Iterator[TimedFrame]:
-        yield TimedFrame(0.0, Frame("a", torch.zeros(8, 8, 3), Intrinsics.from_focal(9, 8, 8)))
