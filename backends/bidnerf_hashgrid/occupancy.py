@@ -130,10 +130,9 @@ class OccupancyGrid(nn.Module):
         device = rays.near.device
         if may_wait(device) or not fused.available(device) or count > MOST:
             return None
-        found = fused.sampled(
+        return fused.sampled(
             rays.flattened(), self.bounds, self.occupied, self.density, self.step, count, self._most, jitter
-        )
-        return found.unflattened(rays.near.shape)
+        ).unflattened(rays.near.shape)
 
     @property
     def _steps(self) -> int:
