@@ -59,11 +59,6 @@ class StoredCamera:
             given_T_world_camera=None if given is None else change(given),
         )
 
-    def posed(self, view: View) -> View:
-        """Return the view with this pose and motion."""
-        motion = None if self.motion is None else torch.tensor(self.motion, dtype=torch.float64)
-        return replace(view, T_ref_camera=self.pose, motion=motion)
-
 
 @dataclass(frozen=True)
 class MovedCamera:
@@ -208,7 +203,16 @@ def at_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -> l
     """
     known = {(c.name, c.given_T_world_camera): c for c in cameras if c.given_T_world_camera}
     found = [known.get((view.frame.name, _rows(view.T_ref_camera))) for view in views]
-    return [view if c is None else c.posed(view) for view, c in zip(views, found, strict=True)]
+    return [
+        view
+        if c is None
+        else replace(
+            view,
+            T_ref_camera=c.pose,
+            motion=None if c.motion is None else torch.tensor(c.motion, dtype=torch.float64),
+        )
+        for view, c in zip(views, found, strict=True)
+    ]
 
 
 def _rows(T: SE3) -> MatrixRows:

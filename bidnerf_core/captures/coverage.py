@@ -127,9 +127,8 @@ def shows_distances(views: Sequence[View], tracked: TrackedViews | None) -> bool
         return False
     if tracked is None or not tracked.matched.count:
         return True
-    if _median(_cones_deg(tracked.matched)) >= DEFAULT_LANDMARKS.parallax:
-        return True
-    return len(tracked.triangulated(DEFAULT_LANDMARKS)[1]) >= 50
+    angle = _median(_cones_deg(tracked.matched))
+    return angle >= DEFAULT_LANDMARKS.parallax or len(tracked.triangulated(DEFAULT_LANDMARKS)[1]) >= 50
 
 
 def _cones_deg(seen: TrackedKeypoints) -> Float[Tensor, "n"]:

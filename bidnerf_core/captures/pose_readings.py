@@ -181,18 +181,19 @@ def _of_orders(count: int) -> Iterator[Reading]:
         return SE3(T.rotation[index], T.translation[index] + unknown[:, None])
 
     shifts = {1: "the next image", -1: "the image before", 2: "the image after next", -2: "the image before the previous one"}  # fmt: skip
-    orders = [(f"each is that of {words}", range(-by, count - by)) for by, words in shifts.items()]
+    orders = list[tuple[str, Sequence[int]]](
+        (f"each is that of {words}", range(-by, count - by)) for by, words in shifts.items()
+    )
     orders.append(("they are in the reverse order of the images", range(count)[::-1]))
-    for clause, order in [*orders, *_text_orders(count)]:
-        yield from _in_file_axes(clause, "reassign the poses to the images", partial(understand, order=order))
-
-
-def _text_orders(count: int) -> Iterator[tuple[str, Sequence[int]]]:
     for first in (0, 1):
-        order = sorted(range(count), key=lambda i: str(i + first))
-        inverse = sorted(range(count), key=order.__getitem__)
-        yield "they are in text order (1, 10, 11, 2), while the images are in numeric order", inverse
-        yield "they are in numeric order, while the images are in text order (1, 10, 11, 2)", order
+        texts = [str(i + first) for i in range(count)]
+        by_text = sorted(range(count), key=texts.__getitem__)
+        inverse = sorted(range(count), key=by_text.__getitem__)
+        text, numeric = "in text order (1, 10, 11, 2)", "in numeric order"
+        orders.append((f"they are {text}, while the images are {numeric}", inverse))
+        orders.append((f"they are {numeric}, while the images are {text}", by_text))
+    for clause, order in orders:
+        yield from _in_file_axes(clause, "reassign the poses to the images", partial(understand, order=order))
 
 
 def _in_file_axes(clause: str, remedy: str, understand: Understand) -> Iterator[Reading]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from bidnerf_core.captures.pose_conventions import matched_pair
-from bidnerf_core.captures.report import PhotoProblem, PhotoRecord
+from bidnerf_core.captures.report import PhotoProblem
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
@@ -73,18 +73,6 @@ class Relocation:
             return None
         about_axis = abs(float(self.update[5])) >= 0.9 * angle  # the optical axis
         return "turned" if about_axis and math.degrees(angle) >= 60 else "badly posed"
-
-    def onto(self, record: PhotoRecord) -> PhotoRecord:
-        """Return the record with the error of its given pose filled in; a mirrored photo's pose cannot be
-        compared.
-        """
-        if self.mirrored:
-            return record
-        translation, rotation = (float(torch.linalg.vector_norm(part)) for part in self.update.split(3))
-        return replace(
-            record, pose_translation=translation, pose_rotation_deg=math.degrees(rotation),
-            pose_deviations=self.deviations,
-        )  # fmt: skip
 
 
 def suspects(seen: TrackedKeypoints, links: csr_array) -> list[int]:

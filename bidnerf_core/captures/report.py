@@ -102,9 +102,3 @@ class CaptureReport:
     def with_problem(self, *problems: PhotoProblem) -> list[PhotoRecord]:
         """Return the photos that have any of the problems, in capture order."""
         return [photo for photo in self.photos if set(photo.problems) & set(problems)]
-
-    @property
-    def groups(self) -> list[list[PhotoRecord]]:
-        """The groups of linked photos, the largest first."""
-        count = max((photo.group for photo in self.photos), default=-1) + 1
-        return [[photo for photo in self.photos if photo.group == number] for number in range(count)]

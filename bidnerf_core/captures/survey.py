@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -77,7 +79,15 @@ def surveyed(
             float(sharpness[i]), float(exposure[i]), float(overexposed[i]), float(underexposed[i]),
             len(image.keypoints), int(count[i]), int(links.indptr[i + 1] - links.indptr[i]), int(group[i]), problems=(*problems,),
         )  # fmt: skip
-        photos.append(found.onto(record) if found else record)
+        if found and not found.mirrored:  # a mirrored photo's pose cannot be compared
+            metres, radians = torch.linalg.vector_norm(found.update.view(2, 3), dim=-1).tolist()
+            record = replace(
+                record,
+                pose_translation=metres,
+                pose_rotation_deg=math.degrees(radians),
+                pose_deviations=found.deviations,
+            )
+        photos.append(record)
     wrong = {"mirrored", "turned", "badly posed", "apart"}
     sound = [v for v, photo in zip(views, photos, strict=True) if not wrong & set(photo.problems)] or views
     covered = coverage(sound, tracked.matched, seen, positions, config.parallax, up)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -61,23 +61,23 @@ class ClosedFormData(Capture):
         listed = super().select(split)
         if names is None:
             return listed
-        by_name = {shot.name: shot for shot in listed}
-        return [self._turned(by_name, name) for name in names]
+        by_name, found = {shot.name: shot for shot in listed}, list[Shot]()
+        up, middle = (torch.tensor(v, dtype=torch.float64) for v in ((0.0, 0.0, 1.0), self.middle))
+        for name in names:
+            own, _, angle = name.partition("@")
+            if own not in by_name or (angle and re.fullmatch(r"-?\d+(?:\.\d+)?", angle) is None):
+                first, *_, last = by_name
+                expected = f"{first} to {last} or a name such as {first}@15"
+                raise InputError(f"no frame {name!r}", where=self.path, expected=expected)
+            pose = by_name[own].T_world_camera
+            assert pose is not None
+            turned = turned_about(pose, middle, up, float(angle or 0))
+            found.append(replace(by_name[own], T_world_camera=turned, name=name))
+        return found
 
     def sequence(self, name: str, count: int, angle: float) -> tuple[str, ...]:
         """Return the names of ``count`` frames, ``angle`` degrees apart, ending with frame ``name``."""
         return (*(f"{name}@{k * angle:g}" for k in range(count - 1, 0, -1)), name)
-
-    def _turned(self, by_name: Mapping[str, Shot], name: str) -> Shot:
-        own, _, angle = name.partition("@")
-        if own not in by_name or (angle and re.fullmatch(r"-?\d+(?:\.\d+)?", angle) is None):
-            first, *_, last = by_name
-            expected = f"{first} to {last} or a name such as {first}@15"
-            raise InputError(f"no frame {name!r}", where=self.path, expected=expected)
-        pose, up = by_name[own].T_world_camera, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-        assert pose is not None
-        turned = turned_about(pose, torch.tensor(self.middle, dtype=torch.float64), up, float(angle or 0))
-        return replace(by_name[own], T_world_camera=turned, name=name)
 
 
 def is_closed_form(name: str) -> bool:

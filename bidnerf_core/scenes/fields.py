@@ -8,9 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.fields import FieldValues, Rays, RaySampler, Stratified
+from bidnerf_core.fields import FieldValues, RaySampler, Stratified
 from bidnerf_core.geometry import SE3
-from bidnerf_core.scenes.primitives import Sphere
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +50,7 @@ class GaussianBlobs:
 
 @dataclass(frozen=True, eq=False)
 class HomogeneousBall:
-    """Constant density and colour within a sphere, whose opacity is known: 1 - exp(-density * chord)."""
+    """Constant density and colour within a sphere, whose opacity is 1 - exp(-density * chord)."""
 
     radius: float  # metres
     density: float  # per metre
@@ -63,18 +62,3 @@ class HomogeneousBall:
         distance = torch.linalg.vector_norm(positions - positions.new_tensor(self.centre), dim=-1)
         density = torch.where(distance <= self.radius, positions.new_tensor(self.density), 0)
         return FieldValues(density, positions.new_tensor(self.rgb).expand(positions.shape))
-
-    def chord(self, rays: Rays) -> tuple[Float[Tensor, "*r"], Float[Tensor, "*r"]]:
-        """Return the distances (metres) at which each ray enters and leaves the ball in [near, far]; equal if it misses."""
-        origins, directions = torch.broadcast_tensors(rays.origins, rays.directions)
-        starts = (origins - origins.new_tensor(self.centre)).reshape(-1, 3).T
-        enter, leave = Sphere(self.radius).interval(starts, directions.reshape(-1, 3).T)
-        enter = torch.maximum(enter.reshape(rays.near.shape), rays.near)
-        enter = torch.where(enter.isfinite(), enter, rays.near)
-        leave = torch.minimum(leave.reshape(rays.near.shape), rays.far)
-        return enter, torch.maximum(enter, leave)
-
-    def opacity(self, rays: Rays) -> Float[Tensor, "*r"]:
-        """Return the exact opacity of each ray (Beer-Lambert)."""
-        enter, leave = self.chord(rays)
-        return -torch.expm1(-self.density * (leave - enter))
