@@ -94,7 +94,7 @@ def test_a_baked_map_needs_no_start(sharp: Path, folder: Path, bidnerf: Run) -> 
     stored = load_map(folder)
     surface = stored.surface
     assert surface is not None
-    cells, size = len(surface.index.entries), round(surface.bytes / 2**20, 1)
+    cells, size = len(surface.index.entries), round(surface.mebibytes, 1)
     assert facts["surface"] == {"cell": surface.cell, "cells": cells, "MiB": size}
     assert all(said in err for said in (f"{cells} cells", f"{size} MiB", f"side of {surface.cell:.3g}"))
     assert stored.colour_noise is not None
