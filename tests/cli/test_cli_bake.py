@@ -257,7 +257,7 @@ def test_landmarks_of_photos_are_built_once_for_training_and_baking(monkeypatch:
         monkeypatch.setattr(f"bidnerf_core.{part}.tracked_views", tracked)
     monkeypatch.setattr("bidnerf_core.maps.map.bake_surface", lambda *_: None)
     watched = SimpleNamespace(summary="", config_type=HashGridConfig, build=hashgrid.build, train=trained)
-    monkeypatch.setattr("bidnerf_core.maps.training.load_backend", lambda name: watched)
+    monkeypatch.setattr("bidnerf_core.maps.training.load_backend", lambda *_: watched)
     stored = train(
         photos, config=tiny.config(4), options=TrainOptions(images=DatasetOptions(background=tiny.BACKGROUND))
     )
