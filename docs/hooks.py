@@ -23,7 +23,7 @@ from mkdocs.structure.files import File, Files
 
 import bidnerf_core
 from bidnerf_core.localization import METHODS
-from bidnerf_core.settings import Above, OneOf, Range, is_expert
+from bidnerf_core.settings import EXPERT, Above, OneOf, Range
 
 SETTINGS = re.compile(r"^<!-- settings of ([a-z-]+) -->$", re.MULTILINE)
 NAMES = "<!-- names of bidnerf_core -->"
@@ -93,7 +93,7 @@ def _rows(settings: Any, inside_expert: bool = False) -> typing.Iterator[str]:
     comments, hints = field_comments(kind), typing.get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
-        expert = inside_expert or is_expert(kind, field.name)
+        expert = inside_expert or EXPERT in getattr(hints[field.name], "__metadata__", ())
         if dataclasses.is_dataclass(value):
             yield from _rows(value, expert)
             continue
