@@ -73,8 +73,7 @@ def _on_surface(
             raise InputError("method 'auto' then needs a start; give one", where=why)
         descended = bid(problem, BidConfig(), seed)
         return replace(descended, reason=f"{why}; {descended.reason}")
-    # Matches of a usual image of the map from which an image without recognised landmarks shows something
-    # else
+    # Where images of the map usually have so many matches, one without recognised landmarks shows something else.
     if surface is None or (loop is not None and loop.landmarks.usual_matches >= 150):
         return best or unrecognized(problem)
     config = config if loop is None else replace(config, rounds=1)

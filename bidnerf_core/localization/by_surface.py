@@ -66,15 +66,14 @@ def localize_by_depth(
     if points is None:
         return None
     middle = points.points.median(0).values.cpu()
-    found: Proposals | None = None
+    found: Proposals
     for number in range(config.rounds):
         again = by_depth(problem, points, config.hypotheses, seed + number)
-        found = again if found is None or again.scores[0] < found.scores[0] else found
+        found = again if number == 0 or again.scores[0] < found.scores[0] else found
         best, exposed = _exposed(points, found.states[:1], middle)
         evidence = _evidence(exposed, best, found.margin)
         if evidence.verdict("").accepted:
             break
-    assert found is not None
     score = _score(exposed)
     finest = replace(exposed, noise=surface.cell, colour_weight=1.0)
     refined, path, losses = finest.fitted_noise(best), found.path, found.losses

@@ -48,7 +48,6 @@ from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.terms.rays import FIELD_ERRORS, Rays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.mapping import (
-    MOTION,
     Features,
     LandmarkMap,
     Landmarks,
@@ -112,11 +111,6 @@ class Answer:
     def explanation(self) -> str:
         """The name of the most probable explanation."""
         return self.explanations.names[int(self.posterior.states.row[self.posterior.best])]
-
-    @property
-    def motion(self) -> Float[Tensor, "6"]:
-        """The motion during the readout, from the first row to the last."""
-        return self.posterior.states.nuisances[self.posterior.best, MOTION]
 
     @property
     def camera(self) -> Float[Tensor, "6"] | None:

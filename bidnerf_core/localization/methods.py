@@ -221,12 +221,16 @@ def descended(
     )
 
 
-# The paper's number of steps, with iNeRF's decay. The paper does not give its learning rate; this one is
-# provisional.
 PAPER = BidConfig(
-    DescentSettings(level=0, pivot="camera"), AdamSettings(max_steps=1000, learning_rate=0.02, decay=0.8, decay_steps=100), depth=DepthSettings(depth_scale=0.1), reach=ReachSettings()
-)  # fmt: skip
-"""The paper's settings, with updates in the camera's frame as in its Alg. 1."""
+    DescentSettings(level=0, pivot="camera"),
+    AdamSettings(max_steps=1000, learning_rate=0.02, decay=0.8, decay_steps=100),
+    depth=DepthSettings(depth_scale=0.1),
+    reach=ReachSettings(),
+)
+"""The paper's settings, with updates in the camera's frame as in its Alg. 1, and iNeRF's decay.
+
+The paper does not give its learning rate; this one is provisional.
+"""
 BID = Method(
     bid,
     BidConfig,

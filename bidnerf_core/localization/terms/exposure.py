@@ -20,7 +20,6 @@ def clipped(seen: Float[Tensor, "*s"], measured: Float[Tensor, "#*s"]) -> Bool[T
     return ((measured > 1 - NEARLY_CLIPPED) & (seen >= 1)) | ((measured < NEARLY_CLIPPED) & (seen <= 0))
 
 
-# Rounds of iteratively reweighted least squares, the first of which is unweighted
 def fit_exposure(
     seen: Float[Tensor, "h n 3"],
     measured: Float[Tensor, "n 3"],
@@ -33,7 +32,7 @@ def fit_exposure(
 
     ``weigh`` returns the weights of differences, at most 1; ``known`` (0 to 1) multiplies them. ``precision`` is that of
     Gaussian priors of the gain about 1 and the offset about 0, in the unit of the weights: it matters where the colours do
-    not suffice, as in a channel that is constant over the image.
+    not suffice, as in a channel that is constant over the image. The first of the ``rounds`` is unweighted.
     """
     weight = known.expand_as(seen)
     gain, offset = torch.ones_like(seen[:, :1]), torch.zeros_like(seen[:, :1])

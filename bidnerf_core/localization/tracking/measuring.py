@@ -122,32 +122,31 @@ class Measurer:
         The landmarks that were tracked to this frame are used as long as they are enough; otherwise, landmarks are recognised
         around their pose or the prediction.
         """
-        if self.landmarks is None or image is None:
+        landmarks = self.landmarks
+        if landmarks is None or image is None:
             return self._by_surface(frame, image, state, predicted)
         state = replace(state, age=state.age + 1)
         known, fit, tracked = state.points.landmarks, None, None
         if len(known) >= LEAST_AGREEING:
-            fit = self._fit(frame, known, predicted.T_world_camera)
+            correlation = landmarks.correlation_of(len(known))
+            fit = Fit.of(known, frame.intrinsics, predicted.T_world_camera, correlation)
             # Recognised anew if fewer than half of those at first are left, unless there are many; and after some frames
             enough = max(ENOUGH_LANDMARKS, min(0.5 * state.sought, 125))
             if int(fit.is_inlier.sum()) >= enough and state.age < 20:
-                tracked = self._by_landmarks(frame, state, fit, predicted)
+                tracked = self._by_landmarks(landmarks, frame, state, fit, predicted)
                 if tracked.verdict.accepted:
                     return tracked
-        seen = self._recognised(frame, predicted, fit)
-        found = None if seen is None else self._by_landmarks(frame, state, seen, predicted)
+        seen = self._recognised(landmarks, frame, predicted, fit)
+        found = None if seen is None else self._by_landmarks(landmarks, frame, state, seen, predicted)
         if fit is None or (found is not None and found.verdict.accepted):
             return found
-        tracked = self._by_landmarks(frame, state, fit, predicted) if tracked is None else tracked
+        tracked = tracked or self._by_landmarks(landmarks, frame, state, fit, predicted)
         return found if found is not None and not tracked.verdict.accepted else tracked
 
-    def _fit(self, frame: Frame, points: Points, start: SE3) -> Fit:
-        assert self.landmarks is not None
-        return Fit.of(points, frame.intrinsics, start, self.landmarks.correlation_of(len(points)))
-
-    def _recognised(self, frame: Frame, predicted: Motion, tracked: Fit | None) -> Fit | None:
+    def _recognised(
+        self, known: LandmarkMap, frame: Frame, predicted: Motion, tracked: Fit | None
+    ) -> Fit | None:
         """Fit a pose to landmarks recognised around the pose of the tracked ones, or else around the prediction."""
-        assert self.landmarks is not None
         assert self.features is not None
         camera, T = frame.intrinsics, predicted.T_world_camera
         radius = search_radius(frame, predicted)
@@ -157,11 +156,11 @@ class Measurer:
             return None
         # Slopes of 0.5 times the size would have no margin.
         size = torch.tensor([camera.width / camera.fx, camera.height / camera.fy])
-        number, _ = self.landmarks.in_view(T, 0.6 * size, OBLIQUE)
+        number, _ = known.in_view(T, 0.6 * size, OBLIQUE)
         if len(number) > MOST_IN_VIEW:
-            order = self.landmarks.views[number].argsort(descending=True, stable=True)
+            order = known.views[number].argsort(descending=True, stable=True)
             number = number[order[:MOST_IN_VIEW].sort().values]
-        query, landmarks = Query.of([View(frame, SE3.identity())], self.features), self.landmarks[number]
+        query, landmarks = Query.of([View(frame, SE3.identity())], self.features), known[number]
         still = torch.zeros(6, dtype=torch.float64)
 
         def points_of(matches: Matches) -> Points:
@@ -193,21 +192,23 @@ class Measurer:
             points, _ = near(max(tight, min(radius, 2 * tight)))
             if len(points) < LEAST_AGREEING:
                 return None
-            T = self._fit(frame, points, T).states.T[0]
+            T = Fit.of(points, camera, T, known.correlation_of(len(points))).states.T[0]
         points, seen = near(tight)
         if len(points) < LEAST_AGREEING:
             return None
         chance = len(seen.matches(tight, 4 * tight))
-        return replace(self._fit(frame, points, T), keypoints=len(query.view), by_chance=chance)
+        fit = Fit.of(points, camera, T, known.correlation_of(len(points)))
+        return replace(fit, keypoints=len(query.view), by_chance=chance)
 
-    def _by_landmarks(self, frame: Frame, state: TrackerState, fit: Fit, predicted: Motion) -> Measurement:
+    def _by_landmarks(
+        self, landmarks: LandmarkMap, frame: Frame, state: TrackerState, fit: Fit, predicted: Motion
+    ) -> Measurement:
         """Fuse landmarks with measured depth, and both with the prediction; then judge the pose.
 
         Whether the camera moved during the readout, and the effect of its intrinsics and of correlated errors, are determined in
         frames in which landmarks are recognised, and change little until the next one.
         """
-        landmarks, points = self.landmarks, fit.points
-        assert landmarks is not None
+        points = fit.points
         distance = float((points.positions - fit.states.T.translation).norm(dim=-1).median())
         scatter = landmarks.calibration_scatter.double()
         moving = max(SHARE_MOVING, SHARE_AS_MAP * landmarks.moving)
@@ -256,7 +257,7 @@ class Measurer:
             state = replace(state, misread=state.misread + 1, depth_factor=factor)
         words = "" if depth is None else ", fused with depth"
         words = words if factor == 1 else f", without depth: it is {factor:.3g} times that of the landmarks"
-        found = self._judged(state, replace(fit, states=here), motion, distance)
+        found = self._judged(landmarks, state, replace(fit, states=here), motion, distance)
         return replace(found, verdict=replace(found.verdict, reason=found.verdict.reason + words))
 
     def _depth(
@@ -271,17 +272,16 @@ class Measurer:
         ratio = ratio[depth > 0]
         if len(ratio) >= LEAST_AGREEING:
             scale = float(ratio.median())
-            # Deviation of the scale of measured depth from that of the landmarks beyond which the depth is
-            # wrong, in standard deviations
-            # Relative standard deviation of that scale by a few landmarks
+            # Depth is wrong if its scale deviates from that of a few landmarks, known to a hundredth, by five deviations.
             if abs(scale - 1) > 5.0 * math.hypot(DEPTH_WIDTH * sensor.scale, 0.01):
                 return None, 1 / scale
         view = View(frame, SE3.identity())
         return Surface.of([view], None, surface, state.frames, self.config.depth_points), 1.0
 
-    def _judged(self, state: TrackerState, fit: Fit, motion: Motion, distance: float) -> Measurement:
+    def _judged(
+        self, landmarks: LandmarkMap, state: TrackerState, fit: Fit, motion: Motion, distance: float
+    ) -> Measurement:
         """Judge a pose by landmarks, after its fusion with the prediction."""
-        assert self.landmarks is not None
         covariance, inliers, noise = motion.covariance, fit.points[fit.is_inlier], float(fit.states.noise)
         count, one = len(inliers), torch.ones(1, dtype=torch.float64)
         if fit.by_chance is None:
@@ -293,7 +293,7 @@ class Measurer:
         evidence = Evidence(
             log10_nfa=nfa, inliers=count, by_chance=chance, recall=recall,
             spread=len(cells(inliers.pixels, fit.camera).unique()) / CELLS**2,
-            noise_ratio=noise / self.landmarks.noise, precision=_position_deviation(covariance) / distance,
+            noise_ratio=noise / landmarks.noise, precision=_position_deviation(covariance) / distance,
             mass=mass_within(one, torch.zeros((1, 6)).double(), covariance[None], distance),
             other_place=0.0, credible=1.0, replaced=0.0, searched=True,
         )  # fmt: skip
@@ -319,11 +319,8 @@ class Measurer:
         """
         surface, view = self.scene.surface, View(frame, SE3.identity())
         reach, covariance = predicted.reach, predicted.covariance
-        points = (
-            None
-            if surface is None
-            else Surface.of([view], None, surface, state.frames, self.config.depth_points)
-        )
+        count = self.config.depth_points
+        points = None if surface is None else Surface.of([view], None, surface, state.frames, count)
         if points is None and (image is None or not has_field(self.scene.field)):
             return None
         off = math.sqrt(float((covariance.diagonal() * torch.tensor([1.0] * 3 + [reach**2] * 3)).sum() / 3))
