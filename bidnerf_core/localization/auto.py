@@ -18,10 +18,9 @@ from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.fields import has_field
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Evidence, least_confidence
-from bidnerf_core.localization.by_surface import localize_by_depth, localize_by_images
+from bidnerf_core.localization.by_surface import localize_by_depth, localize_by_images, nearest_piece
 from bidnerf_core.localization.loop import Answer, Loop
 from bidnerf_core.localization.methods import BidConfig, Method, SharedSettings, bid
-from bidnerf_core.localization.occluders import nearest_piece
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.recording import current_record
 from bidnerf_core.localization.result import Localization, Outcome, Verdict

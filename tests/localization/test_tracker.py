@@ -22,10 +22,10 @@ from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import read_tensors_and_metadata
 from bidnerf_core.localization import AutoConfig, TrackerConfig
+from bidnerf_core.localization.tracking.motion import Clock
 
 # Inside: flow, and the parts of a state that only rare sequences fill
-from bidnerf_core.localization.tracking.flow import alike
-from bidnerf_core.localization.tracking.motion import Clock
+from bidnerf_core.localization.tracking.points import alike
 from bidnerf_core.localization.tracking.state import TrackerState, correction_of
 from bidnerf_core.results import normalized_error_squared, pose_error
 from bidnerf_core.testing import CAMERA, textured_map, view

@@ -33,9 +33,8 @@ from bidnerf_core.localization.settings import LEAST_POINTS, TrackerConfig
 from bidnerf_core.localization.support import Support
 from bidnerf_core.localization.terms.rays import ALONE, Rays
 from bidnerf_core.localization.terms.surface import Surface
-from bidnerf_core.localization.tracking.flow import Grey
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
-from bidnerf_core.localization.tracking.points import INLIER, Fit, Points, cells
+from bidnerf_core.localization.tracking.points import INLIER, Fit, Grey, Points, cells
 from bidnerf_core.localization.tracking.state import TrackerState
 from bidnerf_core.mapping import (
     DEPTH,

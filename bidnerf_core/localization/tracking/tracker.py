@@ -20,10 +20,9 @@ from bidnerf_core.localization.localizer import NO_DISTANCES, Localizer, Start, 
 from bidnerf_core.localization.problem import SceneMap, origin_of, unit_of
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.settings import TrackerConfig
-from bidnerf_core.localization.tracking.flow import Grey
 from bidnerf_core.localization.tracking.measuring import Measurement, Measurer, search_radius, shows_shape
 from bidnerf_core.localization.tracking.motion import Clock, Motion, PoseEstimate
-from bidnerf_core.localization.tracking.points import Points
+from bidnerf_core.localization.tracking.points import Grey, Points
 from bidnerf_core.localization.tracking.state import (
     TrackerState,
     correction_of,
