@@ -30,8 +30,6 @@ CAMERAS = ("focal", "hfov", "camera")
 """The ways to state the camera of a photo."""
 ABSENT: Any = None
 """The default of values that may be left out, but not be null."""
-DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-"""A number as a program writes it; Python's ``float`` takes digits of every script and underscores too."""
 
 
 class Refused(Exception):
@@ -63,7 +61,8 @@ class Upload:
 
 
 def _decimal(value: Any) -> Any:
-    if isinstance(value, str) and not DECIMAL.fullmatch(value):
+    """Return a number as a program writes it; Python's ``float`` takes digits of every script and underscores too."""
+    if isinstance(value, str) and not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", value, re.ASCII):
         raise PydanticCustomError("number", "a number")
     return value
 

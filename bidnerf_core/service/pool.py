@@ -28,8 +28,6 @@ from bidnerf_core.service.jobs import Job, Queue
 from bidnerf_core.service.metrics import Metrics
 from bidnerf_core.service.settings import ServiceLimits
 
-ATTEMPTS = 3
-"""Number of workers that a request may crash before it is answered with an error."""
 FORK_SECONDS = 60.0
 """Time for a new worker to report; on an accelerator it copies the maps first."""
 PAUSE = 1.0
@@ -161,10 +159,10 @@ class Pool:
                     self._busy.discard(number)
 
     def _answered(self, job: Job, number: int) -> dict[str, Any] | None:
-        """Return a worker's answer to a job; None if the job was stopped. Raises ``Lost``."""
+        """Return a worker's answer to a job; None if the job was stopped. Raises ``Lost`` if three workers died of it."""
         self.metrics.waited.observe(job.waited or 0.0)
         os.makedirs(tempfile.gettempdir(), exist_ok=True)  # something may have removed it
-        while job.attempts < ATTEMPTS and (worker := self._workers.get(number)) is not None:
+        while job.attempts < 3 and (worker := self._workers.get(number)) is not None:
             if worker.ended:  # since it was last looked at, and not by this job
                 self._replace(number, "ended")
                 continue

@@ -30,8 +30,6 @@ IDLE_SECONDS = 15
 """Time for which a connection may be idle between two requests."""
 CONNECTIONS = 256
 """Open connections; a further one ends that which has been without a request for the longest."""
-GRACE = 10
-"""Seconds for running requests when the service shuts down."""
 NEEDS = "the service needs the extra 'serve' (pip install 'bidnerf[serve]')"
 
 
@@ -121,7 +119,7 @@ def run_app(
     port: int,
     ready: Callable[[str], Any],
     stop: threading.Event | None = None,
-    grace: int = GRACE,
+    grace: int = 10,
 ) -> None:
     """Run an application on a port until the process is interrupted, or ``stop`` is set; ``ready`` is called with its address.
 

@@ -42,14 +42,8 @@ from bidnerf_core.viewer.packing import Json, drawing, packed, photograph
 from bidnerf_core.viewer.rendering import quick_image
 from bidnerf_core.viewer.scene import frustum, rows_of
 
-PICTURE_SIDE, RUNNER_UP_SIDE = 320, 240
-"""Longer sides (pixels) of a photo and its rendering, and of the runner-up and its rendering; rendering takes time."""
 MOST_MATCHES, MOST_STEPS = 600, 200
 """Maximum numbers of matches and of steps of a descent that are shown; more are subsampled at a regular stride."""
-SIGMAS = 2.0
-"""Semi-axes of the ellipsoid of the position, in standard deviations."""
-TOO_NEAR, RIGHT, TOO_FAR = (0.70, 0.09, 0.17), (0.97, 0.97, 0.96), (0.13, 0.40, 0.67)
-"""Colours for rendered depth that is smaller than, equal to and larger than the measured depth."""
 
 
 def no_answer(name: str, outcome: str, reason: str) -> Json:
@@ -104,7 +98,7 @@ def shown_answer(
         if found.intrinsics is not None:
             camera = f"intrinsics taken or estimated by the localization, focal length times {found.focal_factor:.3f}"
         frame = found.frame_as_taken(frame)
-        small = frame.intrinsics.at_most(PICTURE_SIDE)
+        small = frame.intrinsics.at_most(320)  # pixels; rendering takes time
         observed = photograph(reduced(frame.rgb, small.width, small.height))
         if finite:
             rendered, depth = _compared(scene, small, T, frame, quick)
@@ -147,7 +141,7 @@ def shown_answer(
 
 
 def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> Json | None:
-    """Return the ellipsoid of ``SIGMAS`` standard deviations of a pose's position; None if its covariance is unknown or not finite.
+    """Return the ellipsoid of two standard deviations of a pose's position; None if its covariance is unknown or not finite.
 
     ``axes`` are its semi-axes in the world, 9 numbers: an axis a row, the longest first, with their ``lengths``; ``rotation_deg``
     the standard deviations about the camera's x, y and z axes.
@@ -156,7 +150,7 @@ def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> J
         return None
     turn, covariance = T_world_camera.rotation.double().cpu(), covariance.detach().cpu().double()
     variances, axes = torch.linalg.eigh(turn @ covariance[:3, :3] @ turn.mT)
-    lengths = (SIGMAS * variances.clamp(min=0).sqrt()).flip(0)
+    lengths = (2 * variances.clamp(min=0).sqrt()).flip(0)
     return {
         "axes": (axes.flip(1) * lengths).mT.flatten().tolist(), "lengths": lengths.tolist(),
         "rotation_deg": torch.rad2deg(covariance.diagonal()[3:].clamp(min=0).sqrt()).tolist(),
@@ -179,7 +173,8 @@ def depth_difference(image: RenderedImage, frame: Frame) -> Json | None:
     most = max(float(off.abs().quantile(0.95)), 1e-9)
     share = torch.zeros_like(measured)
     share[known] = (off / most).clamp(-1, 1)
-    near, middle, far = (torch.tensor(colour) for colour in (TOO_NEAR, RIGHT, TOO_FAR))
+    # red where the rendered depth is smaller than the measured one, nearly white where equal, blue where larger
+    near, middle, far = torch.tensor([(0.70, 0.09, 0.17), (0.97, 0.97, 0.96), (0.13, 0.40, 0.67)])
     towards = torch.where((share > 0)[..., None], far, near)
     rgb = middle + share.abs()[..., None] * (towards - middle)
     pixels = torch.cat([rgb, known[..., None].float()], dim=-1)
@@ -294,5 +289,5 @@ def _rendered(scene: SceneMap, T: SE3, reason: str, frame: Frame | None, quick: 
     """Return another pose; its ``probability`` against the pose found alone is known if they were compared."""
     picture = None
     if frame is not None:
-        picture, _ = _compared(scene, frame.intrinsics.at_most(RUNNER_UP_SIDE), T, frame, quick)
+        picture, _ = _compared(scene, frame.intrinsics.at_most(240), T, frame, quick)
     return {"reason": reason, "pose": rows_of(T), "rendered": picture, "probability": None}

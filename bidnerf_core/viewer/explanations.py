@@ -20,8 +20,6 @@ from bidnerf_core.results import pose_error
 from bidnerf_core.viewer.packing import Json
 from bidnerf_core.viewer.scene import rows_of
 
-LEAST_SHOWN = 0.001
-"""Minimum probability of an explanation that is listed."""
 CAMERAS = {
     "exact": "given camera",
     "right": "given camera (well calibrated)",
@@ -109,7 +107,7 @@ def _of_cameras(found: Localization, answer: Answer) -> Json:
         camera = names[row].removesuffix(MOVING)
         name = CAMERAS.get(camera, camera) + (", with rolling shutter" if names[row].endswith(MOVING) else "")
         shown[name] = shown.get(name, 0.0) + probability
-    likely = [each for each in sorted(shown.items(), key=lambda each: -each[1]) if each[1] >= LEAST_SHOWN]
+    likely = [each for each in sorted(shown.items(), key=lambda each: -each[1]) if each[1] >= 0.001]
     pose = earlier(found, answer)
     return _contest("Whose camera took it?", likely, f"Weighed at {pose}." if pose else "", of_pose=False)
 

@@ -24,8 +24,6 @@ log = logging.getLogger("bidnerf.viewer")
 
 PLACES = 10
 """Maximum number of photos that are uploading, waiting or being localized."""
-KEPT = 64
-"""Maximum number of localizations whose answers are kept."""
 
 Read = Callable[[], tuple[Query, SE3 | None, int]]
 """Reads what is to be localized: a query, a start, and the seed of the search."""
@@ -81,7 +79,7 @@ class Jobs:
         """Queue a localization of what ``read`` returns, for a job of the queue."""
         shown = self.shown[job.id] = ShownJob(job.id, job.name)
         done = [each.id for each in self.shown.values() if each.state == "done"]
-        for old in done[: max(0, len(self.shown) - KEPT)]:
+        for old in done[: max(0, len(self.shown) - 64)]:  # the answers of so many localizations are kept
             del self.shown[old]
         self.queue.put(job, read)
         return shown

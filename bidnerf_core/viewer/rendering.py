@@ -14,9 +14,6 @@ from bidnerf_core.fields import has_field, render_image
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import SceneMap, picture_at, surface_renderer
 
-PIXELS_AT_A_TIME = 4096
-"""Number of pixels between two checks whether a rendering is still wanted, see ``job_context``."""
-
 
 def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
     """Render the colours of the field, in [0, 1], from a camera, which may be farther away or nearer than those of the images.
@@ -35,7 +32,8 @@ def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Flo
     bounds = replace(bounds, far=max(bounds.far, distance + beyond))
     if not has_field(scene.field):
         return picture_at(scene, camera, T_world_camera)
-    return render_image(scene.field, camera, T_world_camera, bounds, PIXELS_AT_A_TIME).rgb
+    # so many pixels at a time, between which it is checked whether the rendering is still wanted, see ``job_context``
+    return render_image(scene.field, camera, T_world_camera, bounds, 4096).rgb
 
 
 @torch.no_grad()

@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from bidnerf_core.viewer.app import LiveView
 
 PORT = 8010
-GRACE = 1
-"""Time (seconds) that requests in progress are given when the viewer is stopped."""
 NEEDS = "the live viewer needs the extra 'viewer' (pip install 'bidnerf[viewer]'); --save writes a page without it"
 
 
@@ -40,4 +38,4 @@ def serve_view(
         if ready is not None:
             ready(address if token is None else f"{address}/?token={token}")
 
-    run_app(viewer_app(shown, token, limits), host, port, announce, stop, grace=GRACE)
+    run_app(viewer_app(shown, token, limits), host, port, announce, stop, grace=1)

@@ -20,9 +20,6 @@ from bidnerf_core.viewer.packing import Json, packed
 
 log = logging.getLogger("bidnerf")
 
-MOST_POSES = 20_000
-"""Maximum number of poses that are shown; longer trajectories are subsampled at a regular stride."""
-
 
 def shown_trajectory(
     path: Path, unit: LengthUnit | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)
@@ -47,7 +44,7 @@ def shown_trajectory(
         ]
     if not found:
         raise InputError("holds no pose", where=path, expected="those of a trajectory")
-    some = found[:: max(1, math.ceil(len(found) / MOST_POSES))]
+    some = found[:: max(1, math.ceil(len(found) / 20_000))]  # as many as a page draws smoothly
     T, frames, times, sigmas, outcomes, _ = zip(*some, strict=True)
     other = {each[-1] for each in found} - {unit, None}
     if unit is not None and other:
