@@ -24,8 +24,6 @@ NEIGHBOURS = 6
 """Neighbours of a surfel whose mean distance is the spacing of the surfels there: as many as in a hexagonal tiling."""
 WIDTH = 0.6
 """Standard deviation of a disc in its plane, in units of that spacing: between two discs, an opacity above 0.9 is left."""
-THICKNESS = 0.1
-"""Standard deviation across the plane, in units of the spacing."""
 WIDEST = 4.0
 """Spacing of a lone surfel that still counts, in units of the median."""
 OPACITY = 0.95
@@ -67,7 +65,8 @@ def gaussians_of_surface(surface: SurfaceMap) -> Gaussians:
     normals = torch.where(surfels.normals[:, 2:] < 0, -surfels.normals, surfels.normals)
     x, y, z = normals.unbind(-1)
     turns = torch.stack([1 + z, -y, x, torch.zeros_like(z)], dim=-1)  # take the third axis to the normal
-    scales = spacing[:, None] * torch.tensor([WIDTH, WIDTH, THICKNESS])
+    # standard deviation across the plane, in units of the spacing
+    scales = spacing[:, None] * torch.tensor([WIDTH, WIDTH, 0.1])
     return Gaussians(
         surfels.positions,
         scales.log(),

@@ -16,9 +16,6 @@ from bidnerf_gaussians.gaussians import COEFFICIENTS, Gaussians
 from bidnerf_gaussians.quaternions import matrices, turned_back
 from bidnerf_gaussians.spherical_harmonics import colours
 
-LEAST_EXTENT = 2.0
-"""Minimum extent of a Gaussian's box in standard deviations, so that ``query`` finds nearly all of its density."""
-
 
 @dataclass(frozen=True)
 class FieldConfig:
@@ -68,7 +65,9 @@ class GaussiansField(PieceField):
         opacity = self.logits.sigmoid()
         seen = opacity >= LEAST_ALPHA
         # alpha falls to the least opacity at this many standard deviations
-        extent = (2 * (opacity / LEAST_ALPHA).clamp(min=1).log()).sqrt().clamp(min=LEAST_EXTENT)
+        # minimum extent of a Gaussian's box in standard deviations, so that ``query`` finds nearly all of its
+        # density
+        extent = (2 * (opacity / LEAST_ALPHA).clamp(min=1).log()).sqrt().clamp(min=2.0)
         turns = matrices(torch.nn.functional.normalize(self.quaternions, dim=-1))
         spread = (turns.square() * (2 * self.log_scales).exp()[:, None]).sum(-1).sqrt()
         self.rebuild(self.means, extent[:, None] * spread, seen)

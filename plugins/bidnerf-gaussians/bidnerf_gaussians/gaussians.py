@@ -17,8 +17,6 @@ COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}
 """Number of spherical harmonics up to each degree."""
 LARGEST = 1e12
 """Scene units: largest coordinate and size of a Gaussian."""
-LARGEST_LOGIT = 14.0
-"""Logit of an opacity at which alpha is practically 1 in single precision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +96,7 @@ def cleaned(found: Gaussians, where: str) -> tuple[Gaussians, str]:
         few.means.float(),
         few.log_scales.float(),
         torch.nn.functional.normalize(few.quaternions.float(), dim=-1),
-        few.logits.float().clamp(max=LARGEST_LOGIT),
+        few.logits.float().clamp(max=14.0),  # where alpha is practically 1 in single precision
         few.harmonics.float(),
     ), dropped
 

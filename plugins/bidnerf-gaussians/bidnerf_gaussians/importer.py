@@ -23,10 +23,6 @@ from bidnerf_gaussians.recipe import GaussiansConfig
 
 DILATION = 0.3
 """Square pixels that the original 3DGS code adds to the covariance of each Gaussian in an image."""
-OPAQUE = 0.3
-"""Opacity from which a Gaussian counts as matter in measuring the extent of a scene."""
-FEWEST = 100
-"""Number of opaque Gaussians below which all Gaussians count."""
 UP = (0.0, -1.0, 0.0)
 
 
@@ -86,8 +82,10 @@ def imported(
     T = placement.T_target_source
     moved = kept.similar(placement.scale, T.rotation, T.translation)
     moved = with_dilation(moved, config.pixel_angle, cameras)
-    opaque = moved.means[moved.opacities > OPAQUE]
-    points = opaque if len(opaque) >= FEWEST else moved.means
+    # opacity from which a Gaussian counts as matter in measuring the extent of a scene
+    opaque = moved.means[moved.opacities > 0.3]
+    # number of opaque Gaussians below which all Gaussians count
+    points = opaque if len(opaque) >= 100 else moved.means
     bounds = bounds_about(points, config.background)
     settings = GaussiansConfig(gaussians=len(moved), degree=moved.degree, by_means=config.by_means, steps=1)
     field = GaussiansField(settings, bounds)

@@ -18,8 +18,6 @@ from bidnerf_gaussians.field import GaussiansField
 from bidnerf_gaussians.gaussians import Gaussians
 from bidnerf_gaussians.spherical_harmonics import C0
 
-CELLS = 96
-"""Cells along each side of the grid in which silhouettes are carved."""
 OPACITY = 0.1
 """Initial opacity of a Gaussian, as in the original 3DGS code; larger on measured points."""
 MEASURED_OPACITY = 0.5
@@ -105,7 +103,8 @@ def _anywhere(
     within = torch.rand((count, 3), generator=generator)
     if bounds.contracted:
         return lower + size * (within * 2 - 0.5)
-    grid = VoxelGrid.cube(bounds, CELLS)
+    # cells along each side of the grid in which silhouettes are carved
+    grid = VoxelGrid.cube(bounds, 96)
     held = occupied_voxels(views, grid)
     cells = (held & ~_surrounded(held)).nonzero()
     if not len(cells):

@@ -10,11 +10,6 @@ from torch import Generator
 from bidnerf_gaussians.field import GaussiansField
 from bidnerf_gaussians.quaternions import matrices
 
-MOST_MOVED = 0.05
-"""Largest fraction of the Gaussians moved at once."""
-NARROWED = 1.6
-"""Factor by which the two Gaussians that replace one are narrower, as in the original 3DGS code."""
-
 
 @torch.no_grad()
 def relocate(field: GaussiansField, least_opacity: float, generator: Generator) -> int:
@@ -26,7 +21,8 @@ def relocate(field: GaussiansField, least_opacity: float, generator: Generator) 
     """
     opacity = field.logits.sigmoid().cpu()
     dead = (opacity < least_opacity).nonzero()[:, 0]
-    dead = dead[torch.randperm(len(dead), generator=generator)[: int(MOST_MOVED * len(opacity))]]
+    # largest fraction of the Gaussians moved at once
+    dead = dead[torch.randperm(len(dead), generator=generator)[: int(0.05 * len(opacity))]]
     area = torch.exp(field.log_scales.cpu().sort(dim=-1).values[:, 1:].sum(-1))
     weight = torch.where(opacity < least_opacity, 0, opacity * area).double()
     alive = int((weight > 0).sum())
@@ -41,7 +37,8 @@ def relocate(field: GaussiansField, least_opacity: float, generator: Generator) 
     offset = (turn @ (field.log_scales[chosen].exp() * offsets)[..., None])[..., 0] / 2
     share = 1 - (1 - field.logits[chosen].sigmoid()).clamp(min=1e-6).sqrt()
     logit = share.clamp(least_opacity, 1 - 1e-6).logit()
-    middle, width = field.means[chosen], field.log_scales[chosen] - math.log(NARROWED)
+    # factor by which the two Gaussians that replace one are narrower, as in the original 3DGS code
+    middle, width = field.means[chosen], field.log_scales[chosen] - math.log(1.6)
     turns, harmonics = field.quaternions[chosen], field.harmonics[chosen]
     for index, place in ((chosen, middle + offset), (dead, middle - offset)):
         field.means[index], field.log_scales[index], field.logits[index] = place, width, logit

@@ -21,10 +21,6 @@ SEMI_MAJOR = 6378137.0
 """Metres (NGA.STND.0036, table 3.1)."""
 FLATTENING = 1 / 298.257223563
 ECCENTRICITY_SQUARED = FLATTENING * (2 - FLATTENING)
-FARTHEST = 1e6
-"""Metres above or below the ellipsoid."""
-ITERATIONS = 6
-"""Steps of Bowring's iteration: near the ellipsoid, each gains three digits or more."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +33,8 @@ class Geodetic:
 
     def __post_init__(self) -> None:
         """Raise ``InputError`` for coordinates that no place near the earth has."""
-        bounds = (("latitude", 90.0), ("longitude", 180.0), ("height", FARTHEST))
+        # metres above or below the ellipsoid
+        bounds = (("latitude", 90.0), ("longitude", 180.0), ("height", 1e6))
         for name, most in bounds:
             value = getattr(self, name)
             if not abs(value) <= most:
@@ -78,7 +75,8 @@ def geodetic(ecef: Float[Tensor, "3"]) -> Geodetic:
     reduced = math.atan2(z, (1 - FLATTENING) * from_axis)
     polar, second = SEMI_MAJOR * (1 - FLATTENING), ECCENTRICITY_SQUARED / (1 - ECCENTRICITY_SQUARED)
     latitude = 0.0
-    for _ in range(ITERATIONS):
+    # steps of Bowring's iteration: near the ellipsoid, each gains three digits or more
+    for _ in range(6):
         latitude = math.atan2(
             z + second * polar * math.sin(reduced) ** 3,
             from_axis - ECCENTRICITY_SQUARED * SEMI_MAJOR * math.cos(reduced) ** 3,

@@ -21,12 +21,8 @@ from bidnerf_nerfstudio.nerfacto import PlacedSampler
 from bidnerf_nerfstudio.networks import HashConfig
 from bidnerf_nerfstudio.radiance import PlacedRadiance, RadianceConfig
 
-FADE = 0.95
-"""Decay factor of all cells' peaks per update."""
 OCCUPIED = 0.01
 """Optical thickness of a step above which a cell is occupied, or the mean of all cells if that is less."""
-EVERY = 16
-"""Number of training steps between updates."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +85,8 @@ class OccupancyLevels(nn.Module):
             points = ((corner + jitter) * (2 / resolution) - 1) * 2**level
             places = points * constant(self.half, points) + constant(self.centre, points)
             found = field.radiance.density(places.reshape(-1, 3)).reshape(corner.shape[:3])
-            self.peak[level] = torch.maximum(FADE * self.peak[level], field.config.step * found)
+            # decay factor of all cells' peaks per update
+            self.peak[level] = torch.maximum(0.95 * self.peak[level], field.config.step * found)
         self.cells.copy_(self.peak > self.peak.mean().clamp(max=OCCUPIED))
 
 
@@ -169,7 +166,8 @@ def train(field: NgpField, views: Sequence[View], config: NgpConfig, report: Rep
     supervision = Supervision(views, field.bounds, config, device_of(field))
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
-        if step and step % EVERY == 0:
+        # number of training steps between updates
+        if step and step % 16 == 0:
             field.grid.look(field, generator)
         return supervision.step(field, config.rays_per_step, generator)
 

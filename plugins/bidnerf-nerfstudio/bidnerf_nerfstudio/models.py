@@ -15,9 +15,6 @@ from bidnerf_nerfstudio.networks import HashConfig
 from bidnerf_nerfstudio.vanilla import DIRECTION, POSITION, VanillaConfig, reordered
 from bidnerf_nerfstudio.weights import Weights, layer_names, mean_code
 
-HALF_OF_BLENDER = 1.5
-"""Half the side of the box that nerfstudio assumes for Blender scenes."""
-
 
 @dataclass(frozen=True, eq=False)
 class Read:
@@ -157,6 +154,7 @@ def vanilla(weights: Weights, model: Record, parser: Record) -> Read:
                 state[name] = reordered(state[name], count, weights)
     half = parser.number("scene_scale")
     if half is None:
-        half = HALF_OF_BLENDER
+        # half the side of the box that nerfstudio assumes for Blender scenes
+        half = 1.5
     told = f"coarse and fine network of {settings.layers} layers of {settings.width}"
     return Read(settings, state, (-half, -half, -half, half, half, half), False, told)

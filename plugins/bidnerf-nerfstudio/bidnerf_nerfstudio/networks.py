@@ -18,10 +18,6 @@ from bidnerf_core.settings import Count, Layers, Range, Settings
 
 PRIMES = (1, 2654435761, 805459861)
 """Factors of the coordinates in the hash (Müller et al. 2022, eq. 4)."""
-LARGEST_LOG_DENSITY = 15.0
-"""Limit of the exponent of densities: matter of that density is opaque within a thousandth of any relevant length."""
-FIRST_TABLE = 1e-3
-"""Largest entry of an untrained table."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +57,8 @@ class HashEncoding(nn.Module):
             torch.floor(config.base_resolution * growth ** torch.arange(count)).tolist()
         )
         table = torch.rand(self.size * count, config.features) * 2 - 1
-        self.table = nn.Parameter(table * FIRST_TABLE)
+        # largest entry of an untrained table
+        self.table = nn.Parameter(table * 1e-3)
 
     def forward(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n w"]:
         """Return the features of each level after those of the level before."""
@@ -140,4 +137,6 @@ def unit_cube(
 
 def density_of(raw: Float[Tensor, "p"], factor: float) -> Float[Tensor, "p"]:
     """Return the density (per training unit) for raw outputs: ``factor`` times their exponential."""
-    return factor * raw.clamp(max=LARGEST_LOG_DENSITY).exp()
+    # limit of the exponent of densities: matter of that density is opaque within a thousandth of any relevant
+    # length
+    return factor * raw.clamp(max=15.0).exp()

@@ -22,8 +22,6 @@ from bidnerf_nerfstudio.placement import after, inverse
 CONFIG = "config.yml"
 TRANSFORMS = "dataparser_transforms.json"
 EXPECTED = "the folder of a nerfstudio run, with config.yml and nerfstudio_models/step-*.ckpt"
-LARGEST_CONFIG = 4 * 2**20
-"""Bytes; a config has about ten thousand, and YAML is slow to parse."""
 STEP = re.compile(r"step-(\d+)\.ckpt")
 PREFIX = "_model."
 COLMAP = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
@@ -141,7 +139,8 @@ def read_run(path: Path) -> Run:
     file = folder / CONFIG
     if not file.is_file():
         raise InputError(f"no {CONFIG}", where=path, expected=EXPECTED)
-    if file.stat().st_size > LARGEST_CONFIG:
+    # bytes; a config has about ten thousand, and YAML is slow to parse
+    if file.stat().st_size > 4 * 2**20:
         raise InputError(f"has {file.stat().st_size:,} bytes", where=file, expected="a config of nerfstudio")
     text = read_file(file, "a config of nerfstudio").decode("utf-8", "replace")
     try:

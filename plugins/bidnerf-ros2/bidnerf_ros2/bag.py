@@ -34,8 +34,6 @@ IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO = "sensor_msgs/msg/CameraInfo"
 WAITING = 30
 """Number of images that may wait for their depth, which is recorded with a delay."""
-FASTEST = 0.02
-"""Seconds by which the times of an image and its depth may always differ."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +91,8 @@ class Bag:
         self, time: float, image: Any, depths: deque[tuple[float, Any]]
     ) -> tuple[Any, Any | None]:
         nearest = min(depths, key=lambda depth: abs(depth[0] - time), default=None)
-        close = nearest is not None and abs(nearest[0] - time) <= max(FASTEST, self._topics.interval / 2)
+        # seconds by which the times of an image and its depth may always differ
+        close = nearest is not None and abs(nearest[0] - time) <= max(0.02, self._topics.interval / 2)
         return image, nearest[1] if nearest is not None and close else None
 
     def __getstate__(self) -> dict[str, Any]:

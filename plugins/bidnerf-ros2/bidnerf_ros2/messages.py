@@ -26,8 +26,6 @@ COLOURS = {
 DEPTHS = {"16UC1": (np.uint16, 0.001), "mono16": (np.uint16, 0.001), "32FC1": (np.float32, 1.0)}
 """Type, and metres per step (REP 118)."""
 BYTES = {"rgba8": 4, "bgra8": 4, "rgb8": 3, "bgr8": 3}
-LARGEST = 100_000_000
-"""Pixels of an image."""
 COMPRESSED_DEPTH = struct.Struct("<iff")
 """The header of ``compressed_depth_image_transport``: a format, and the two parameters of its inverse-depth
 quantization."""
@@ -114,7 +112,8 @@ def _raster(message: Any, kind: np.dtype, channels: int) -> np.ndarray:
     """Return rows of pixels without the padding at their ends."""
     width, height, step = int(message.width), int(message.height), int(message.step)
     row, data = width * channels * kind.itemsize, np.asarray(bytearray(message.data), np.uint8)
-    if not (0 < width * height <= LARGEST and row <= step and len(data) >= step * (height - 1) + row):
+    # pixels of an image
+    if not (0 < width * height <= 100_000_000 and row <= step and len(data) >= step * (height - 1) + row):
         raise InputError(
             f"an image of {width}x{height} in rows of {step} bytes has {len(data)} bytes",
             expected=step * height,

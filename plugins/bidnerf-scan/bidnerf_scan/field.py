@@ -14,13 +14,6 @@ from bidnerf_core.fields import LARGEST_ALPHA, Meeting, PieceField, SceneBounds
 from bidnerf_core.settings import NotNegative, Range
 from bidnerf_scan.pieces import Pieces
 
-ROUNDING = 2e-6
-"""Relative error of a position on a ray in single precision: triangles extend beyond their edges by it."""
-FLATTEST = 1e-6
-"""Sine of the angle between a ray and a plane below which they do not meet."""
-THICKNESS = 0.005
-"""Thickness of a surface when rays are sampled, in units of the scene's side."""
-
 
 @dataclass(frozen=True)
 class FieldConfig:
@@ -85,7 +78,8 @@ class ScanField(PieceField):
     @property
     def reach(self) -> float:  # type: ignore[override]
         """Metres over which density is spread in front of and behind a surface."""
-        return self.config.thickness or THICKNESS * self.bounds.side
+        # thickness of a surface when rays are sampled, in units of the scene's side
+        return self.config.thickness or 0.005 * self.bounds.side
 
     @torch.no_grad()
     def refit(self) -> None:
@@ -123,7 +117,8 @@ class ScanField(PieceField):
         area = torch.linalg.vector_norm(normal, dim=-1).clamp(min=1e-30)
         unit = normal / area[:, None]
         slope = (unit * directions).sum(-1)
-        meets = slope.abs() > FLATTEST
+        # sine of the angle between a ray and a plane below which they do not meet
+        meets = slope.abs() > 1e-6
         away = corner - origins
         distance = (away * unit).sum(-1) / torch.where(meets, slope, 1)
         place = distance[:, None] * directions - away
@@ -132,7 +127,8 @@ class ScanField(PieceField):
         radius = u.square() + v.square()
         faded = (1 - radius).clamp(min=0).square()
         longest = torch.linalg.vector_norm(torch.maximum(first.abs(), second.abs()), dim=-1)
-        slack = 1e-5 + (ROUNDING * torch.linalg.vector_norm(away, dim=-1) * longest / area).clamp(max=0.1)
+        # relative error of a position on a ray in single precision: triangles extend beyond their edges by it
+        slack = 1e-5 + (2e-6 * torch.linalg.vector_norm(away, dim=-1) * longest / area).clamp(max=0.1)
         inside = ((u > -slack) & (v > -slack) & (u + v < 1 + slack)).to(faded)
         share = torch.where(is_round, faded, inside.detach())
         alpha = (logits.sigmoid() * share).clamp(max=LARGEST_ALPHA)

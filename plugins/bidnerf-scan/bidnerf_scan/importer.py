@@ -32,19 +32,11 @@ UPS = {
     "-z": (0, 0, -1),
 }
 Up = Literal["format", "+x", "-x", "+y", "-y", "+z", "-z"]
-FINEST = 2.0**-22
-"""Relative rounding of a coordinate in single precision, with some margin."""
-COARSEST = 2e-4
-"""Rounding of coordinates, in units of the scene's longest side, beyond which a scan must be moved to the origin."""
 SURFACE_POINTS = 300_000
 """Number of points sampled uniformly on a mesh, which form its surface and determine its extent."""
 TRIED = 4000
 """Number of rays used to distinguish a solid object from a room."""
-FEWEST_BETWEEN = 0.02
-"""Fraction of the places in the box that must have matter on two opposite sides."""
 MOSTLY = 0.9
-HARDLY_CLIPPED = 1.5
-"""Ratio of the sides of the boxes around all and around nearly all points up to which the box contains all."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +150,8 @@ def is_solid(field: ScanField) -> bool:
         normal = torch.linalg.cross(field.first[index], field.second[index])
         backs.append((normal * way).sum(-1) > 0)
     between = valid[:, 0] & other[:, 0]  # something is hit either way
-    if float(between.float().mean()) < FEWEST_BETWEEN:
+    # fraction of the places in the box that must have matter on two opposite sides
+    if float(between.float().mean()) < 0.02:
         return False
     both = (backs[0] & backs[1])[between].float().mean()
     neither = (~backs[0] & ~backs[1])[between].float().mean()
@@ -182,8 +175,11 @@ def _check_precision(points: Float[Tensor, "n 3"], where: str, config: ScanSetti
         float((points.quantile(0.9, dim=0) - points.quantile(0.1, dim=0)).max()) if len(points) < 2**24 else 0
     )
     side = side or float((points.amax(0) - points.amin(0)).max())
-    rounding = FINEST * float(middle.abs().max())
-    if rounding > COARSEST * side:
+    # relative rounding of a coordinate in single precision, with some margin
+    rounding = 2.0**-22 * float(middle.abs().max())
+    # rounding of coordinates, in units of the scene's longest side, beyond which a scan must be moved to the
+    # origin
+    if rounding > 2e-4 * side:
         x, y, z = (round(o + float(m)) for o, m in zip(config.origin, middle, strict=True))
         raise InputError(
             f"its coordinates are around ({x}, {y}, {z}), which single precision resolves only to"
@@ -218,7 +214,8 @@ def _bounds(
     """Return bounds that contain all points, unless a few of them are far away."""
     found = bounds_about(points, background, footprint)
     lower, upper = points.amin(0).double(), points.amax(0).double()
-    if found.contracted or float((upper - lower).max()) > HARDLY_CLIPPED * found.side:
+    # ratio of the sides of the boxes around all and around nearly all points up to which the box contains all
+    if found.contracted or float((upper - lower).max()) > 1.5 * found.side:
         return found
     pad = 0.01 * float((upper - lower).max())
     low = torch.minimum(lower - pad, torch.tensor(found.lower, dtype=torch.float64)).tolist()

@@ -28,14 +28,6 @@ SPACED = 4
 """Number of neighbours of a surfel whose mean distance is the spacing there: as many as in a square tiling."""
 WIDTH = 1.0
 """Standard deviation of the weights over the distance, in units of the spacing."""
-REACH = 1.0
-"""Distance from a surfel up to which the mesh extends, in units of the spacing."""
-SIGHTS = 8
-"""Number of keyframes, those nearest to a surfel, from which it may be in sight."""
-GRAZING = 0.3
-"""Cosine of the angle between a ray and a surfel's normal below which the ray does not tell the surfel's sides apart."""
-SPREADING = 20
-"""Number of times that the surfels' votes on the side of the cameras spread to their neighbours."""
 BLOCK = 16
 """Cells along the side of a block."""
 LEAST = 4e-3
@@ -135,7 +127,8 @@ def facing_cameras(surface: SurfaceMap, near: Int64[Tensor, "n k"]) -> Float64[T
     vote = torch.cat([_facing(surface, start, start + AT_ONCE) for start in range(0, len(normals), AT_ONCE)])
     alike = (normals[near] * normals[:, None]).sum(-1)
     own = vote = (alike * vote[near]).median(-1).values  # without those of rays through a gap of the surface
-    for _ in range(SPREADING):
+    # number of times that the surfels' votes on the side of the cameras spread to their neighbours
+    for _ in range(20):
         vote = own + (alike * vote[near]).mean(-1)
     vote = vote.sign()
     unknown = vote == 0
@@ -155,7 +148,8 @@ def _facing(surface: SurfaceMap, start: int, end: int) -> Float64[Tensor, "n"]:
     if not len(cameras):
         raise InputError("a surface without keyframes, which tell its outside; 'bidnerf bake' stores some")
     positions = surface.surfels.positions[start:end].double()
-    count = min(SIGHTS, len(cameras))
+    # number of keyframes, those nearest to a surfel, from which it may be in sight
+    count = min(8, len(cameras))
     _, near = cKDTree(cameras.numpy()).query(positions.numpy(), k=range(1, count + 1))
     origins = cameras[torch.from_numpy(near)]
     away = torch.linalg.vector_norm(positions[:, None] - origins, dim=-1).clamp(min=1e-12)
@@ -164,7 +158,9 @@ def _facing(surface: SurfaceMap, start: int, end: int) -> Float64[Tensor, "n"]:
     met = cast(surface, origins.float().reshape(-1, 3), directions.float().reshape(-1, 3))
     # a ray hits a surfel within its radius, and the earlier, the more it grazes the surface
     along = torch.where(met.met, met.along, torch.inf).view(away.shape)
-    in_sight = (cosine.abs() > GRAZING) & (along > away - 2 * surface.surfel_radius / cosine.abs())
+    # cosine of the angle between a ray and a surfel's normal below which the ray does not tell the surfel's
+    # sides apart
+    in_sight = (cosine.abs() > 0.3) & (along > away - 2 * surface.surfel_radius / cosine.abs())
     return torch.where(in_sight, cosine, 0).sum(-1)
 
 
@@ -173,7 +169,8 @@ def _blocks(
 ) -> Iterator[tuple[Float64[np.ndarray, "n 3"], Int64[np.ndarray, "m 3"]]]:
     """Yield the vertices, in units of cells, and the faces of each block with some."""
     measure = library("skimage.measure", "making a mesh of a surface", "mesh")
-    reach = REACH * distance.spacing + math.sqrt(3) * cell
+    # the mesh extends up to the spacing from a surfel
+    reach = distance.spacing + math.sqrt(3) * cell
     box = reach * np.array(np.meshgrid(*3 * [[-1, 1]])).reshape(3, -1).T
     side = BLOCK * cell
     found = [np.floor((distance.tree.data + corner) / side).astype(np.int64) for corner in box]

@@ -19,8 +19,6 @@ SPACED = 8
 """Neighbour whose distance measures the spacing of points."""
 WIDER = 1.3
 """Radius of a disc in units of that distance: discs overlap enough that a surface of random points is opaque."""
-WIDEST = 4.0
-"""Largest radius of a disc, in units of the median radius; beyond it, a point is isolated."""
 OPAQUE = 8.0
 """Logit of the opacity of a triangle."""
 DISC_OPACITY = 3.0
@@ -101,7 +99,8 @@ def cloud_pieces(points: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"] | None)
     ]
     first, second, colours = (torch.cat([part[i] for part in parts]) for i in range(3))
     radius = torch.linalg.vector_norm(first, dim=-1)
-    shrunk = (WIDEST * radius.median() / radius.clamp(min=1e-30)).clamp(max=1)
+    # largest radius of a disc, in units of the median radius; beyond it, a point is isolated
+    shrunk = (4.0 * radius.median() / radius.clamp(min=1e-30)).clamp(max=1)
     first, second = first * shrunk[:, None], second * shrunk[:, None]
     colours = torch.cat([colours[:, :1], colours[:, 1:] * shrunk[:, None, None]], dim=1)
     return Pieces(

@@ -18,10 +18,6 @@ from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionC
 from bidnerf_scan.field import FieldConfig, ScanField
 from bidnerf_scan.pieces import Pieces, cloud_pieces, thinned
 
-DRAWN = 8
-"""Number of pixels with measured depth drawn for each disc."""
-FEWEST = 100
-"""Number of measured points below which discs are placed anywhere."""
 OPACITY = 0.1
 """Initial opacity of a disc that is placed anywhere."""
 
@@ -72,8 +68,10 @@ def train(field: ScanField, views: Sequence[View], config: ScanConfig, report: R
 def first_pieces(field: ScanField, views: Sequence[View], generator: Generator) -> Pieces:
     """Return as many discs as the field has: on measured depth if there is some, else anywhere."""
     count = len(field.corner)
-    points, rgb = _measured(views, field.bounds, DRAWN * count, generator)
-    if len(points) < FEWEST:
+    # number of pixels with measured depth drawn for each disc
+    points, rgb = _measured(views, field.bounds, 8 * count, generator)
+    # number of measured points below which discs are placed anywhere
+    if len(points) < 100:
         lower, size = torch.tensor(field.bounds.lower), torch.tensor(field.bounds.size)
         return _anywhere(field, lower + size * torch.rand((count, 3), generator=generator), generator)
     points, colours = thinned(points, rgb, count)

@@ -10,9 +10,6 @@ from numpy.typing import NDArray
 
 from bidnerf_core.errors import InputError
 
-FARTHEST = 1e12
-"""Coordinates beyond which a point counts as broken."""
-
 
 @dataclass(frozen=True, eq=False)
 class Scan:
@@ -38,7 +35,8 @@ def cleaned(scan: Scan, where: str) -> tuple[Scan, str]:
     """
     if not len(scan.points):
         raise InputError("holds no points", where=where, expected="a mesh or a point cloud")
-    good = np.asarray(np.all(np.isfinite(scan.points) & (np.abs(scan.points) < FARTHEST), axis=-1))
+    # coordinates beyond which a point counts as broken
+    good = np.asarray(np.all(np.isfinite(scan.points) & (np.abs(scan.points) < 1e12), axis=-1))
     left = {"points with coordinates that are not finite": int((~good).sum())}
     rgb = None if scan.rgb is None else np.nan_to_num(scan.rgb, nan=0.5).clip(0, 1)
     if scan.faces is None:

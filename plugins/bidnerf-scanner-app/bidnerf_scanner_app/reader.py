@@ -47,8 +47,6 @@ LARGEST_SIDE = 640
 POSE, INTRINSICS, PROJECTION = "cameraPoseARFrame", "intrinsics", "projectionMatrix"
 PHOTO = re.compile(r"frame_(\d+)\.jpe?g", re.IGNORECASE)
 DEPTH = re.compile(r"depth_(\d+)\.png")
-OTHER_SIZE = 0.01
-"""Relative difference of the focal lengths of ``intrinsics`` and ``projectionMatrix`` that indicates another image size."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -164,7 +162,9 @@ def scanner_camera(record: Record, width: int, height: int) -> Intrinsics:
     if record.items(PROJECTION) is not None:
         # u = (1 + x_ndc) w / 2 with x_ndc = P00 x / -z - P02, and likewise v, which points down
         projection = _numbers(record, PROJECTION, 16)
-        if abs(projection[0] * width / 2 / fx - 1) > OTHER_SIZE:
+        # relative difference of the focal lengths of ``intrinsics`` and ``projectionMatrix`` that indicates
+        # another image size
+        if abs(projection[0] * width / 2 / fx - 1) > 0.01:
             raise _other_size(record, width, height)
         centre = (width / 2 * (1 - projection[2]), height / 2 * (1 + projection[6]))
     if not (width / 4 < centre[0] < width * 3 / 4 and height / 4 < centre[1] < height * 3 / 4):

@@ -25,12 +25,8 @@ JSON, BINARY = 0x4E4F534A, 0x004E4942
 """The kinds of chunks of a .glb file."""
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-LARGEST_HEADER = 1 << 20
-"""Number of bytes of a file that are searched for the name of the extension."""
 MOST_COPIES = 16
 """Nodes that show each mesh, on average: a file of any size could place a mesh any number of times."""
-UNEVEN = 1e-3
-"""Relative difference between a node's scales along its axes up to which they count as equal."""
 
 
 def recognises(path: Path) -> bool:
@@ -38,7 +34,8 @@ def recognises(path: Path) -> bool:
     if path.suffix.lower() not in (".glb", ".gltf") or not path.is_file():
         return False
     with path.open("rb") as file:
-        return EXTENSION.encode() in file.read(LARGEST_HEADER)
+        # number of bytes of a file that are searched for the name of the extension
+        return EXTENSION.encode() in file.read(1 << 20)
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +216,8 @@ def _placed(gaussians: Gaussians, matrix: np.ndarray, path: Path) -> Gaussians:
     """Return the Gaussians with a node's transform applied. Raises ``InputError`` if it stretches or mirrors them."""
     scales = np.linalg.norm(matrix[:3, :3], axis=0)
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    if not scale > 0 or float(np.ptp(scales)) > UNEVEN * scale:
+    # relative difference between a node's scales along its axes up to which they count as equal
+    if not scale > 0 or float(np.ptp(scales)) > 1e-3 * scale:
         raise InputError(
             "a node stretches or mirrors its Gaussians", where=path, expected="one scale for all axes"
         )

@@ -27,8 +27,6 @@ HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fraction b
 HEADER_4 = struct.Struct("<4sIIBBBBI12x")  # ..., number of streams, offset of their sizes
 EXPECTED = "an .spz file"
 COLOUR_SCALE = 0.15
-WRITTEN = 3
-"""The version written: the newest one that the standard library can compress."""
 FLIP = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
 """Rotation from the axes of the file (x right, y up, z back) to x right, y down, z forward."""
 ORIGIN = torch.zeros(3)
@@ -211,7 +209,8 @@ def write(path: Path, gaussians: Gaussians) -> None:
         (found.log_scales.numpy() + 10) * 16, _packed(found.quaternions.numpy()), harmonics[:, 1:] * 128 + 128,
     )  # fmt: skip
     body = b"".join(np.clip(np.round(part), 0, 255).astype(np.uint8).tobytes() for part in sections)
-    header = HEADER.pack(MAGIC, WRITTEN, len(found), found.degree, bits, 0, 0)
+    # the version written: the newest one that the standard library can compress
+    header = HEADER.pack(MAGIC, 3, len(found), found.degree, bits, 0, 0)
     stream = zlib.compressobj(wbits=31)
     write_file(path, stream.compress(header + body) + stream.flush())
 

@@ -14,13 +14,7 @@ from bidnerf_core.io import read_file
 from bidnerf_scan.scan import Scan, colours_of
 
 EXPECTED = "a PCD file"
-LARGEST = 4 * 2**30
-"""Largest file, in bytes, that is read."""
 LARGEST_HEADER = 64 * 1024
-SMALLEST_NUMBER = 2
-"""Bytes per number in a text file, including the separator."""
-LARGEST_RATIO = 300
-"""Upper bound on the bytes that one byte of LZF can represent."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +32,8 @@ def recognises(path: Path) -> bool:
 
 def read(path: Path) -> Scan:
     """Read the points of a PCD file. The pose of its sensor (VIEWPOINT) is ignored, since points are in the world."""
-    data = read_file(path, EXPECTED, LARGEST)
+    # largest file, in bytes, that is read
+    data = read_file(path, EXPECTED, 4 * 2**30)
     header = _header(path, data)
     rows = _rows(path, header, memoryview(data)[header.length :])
     names = header.kind.names or ()
@@ -98,7 +93,8 @@ def _rows(path: Path, header: _Header, data: memoryview) -> NDArray:
     """Return the points as a structured array. Counts are checked against the data before memory is allocated."""
     size = header.count * header.kind.itemsize
     if header.encoding == "ascii":
-        _require(path, header, _width(header) * SMALLEST_NUMBER * header.count, len(data) + 1)
+        # bytes per number in a text file, including the separator
+        _require(path, header, _width(header) * 2 * header.count, len(data) + 1)
         return _text_rows(path, header, bytes(data))
     if header.encoding == "binary":
         _require(path, header, size, len(data))
@@ -109,7 +105,8 @@ def _rows(path: Path, header: _Header, data: memoryview) -> NDArray:
         _require(path, header, size, 0)
     packed, whole = (int(n) for n in np.frombuffer(data[:8], "<u4"))
     _require(path, header, packed, len(data) - 8)
-    _require(path, header, size, min(whole, LARGEST_RATIO * packed))
+    # upper bound on the bytes that one byte of LZF can represent
+    _require(path, header, size, min(whole, 300 * packed))
     columns = _decompressed(path, bytes(data[8 : 8 + packed]), whole)
     rows, at = np.zeros(header.count, header.kind), 0
     for name in header.kind.names or ():  # field by field, each for all points
