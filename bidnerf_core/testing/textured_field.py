@@ -22,13 +22,19 @@ POSES = orbit(1.7, 3, elevation=(50.0, 70.0), seed=5)
 """Poses (T_world_camera) that no training image has."""
 
 
+@dataclass(init=False, eq=False)  # its tensors are fields, which go to a device with it
 class TexturedGround:
     """A ground of height ``h(x, y)`` whose colours are sums of random waves; infinitely differentiable."""
 
+    sampler: RaySampler
+    waves: Float[Tensor, "2 w"]  # radians per metre
+    phases: Float[Tensor, "w"]
+    weights: Float[Tensor, "w 3"]
+
     def __init__(self, seed: int = 0) -> None:
-        self.sampler: RaySampler = Stratified(64)
+        self.sampler = Stratified(64)
         generator = torch.Generator().manual_seed(seed)
-        self.waves = 18 * torch.randn((2, 24), generator=generator)  # radians per metre
+        self.waves = 18 * torch.randn((2, 24), generator=generator)
         self.phases = 6.3 * torch.rand(24, generator=generator)
         self.weights = 0.3 * torch.randn((24, 3), generator=generator)
 
