@@ -63,7 +63,7 @@ class WholeNumbers(Range):
         return super().__contains__(value) and float(cast(float, value)).is_integer()
 
     def __str__(self) -> str:
-        return f"a whole number, {super().__str__()}"
+        return f"a whole number, {super().__str__().removeprefix('a number ')}"
 
 
 def _written(limit: float) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, Union
 
 from bidnerf_core.errors import InputError, UsageError
+from bidnerf_core.settings import WholeNumbers
 
 if TYPE_CHECKING:
     from bidnerf_core.camera import Camera, CameraSource
@@ -50,7 +51,7 @@ class DatasetOptions:
     mask_hides: Annotated[Literal["black", "white"], "COLOUR"] = "black"
     """colour in --masks that is ignored: black or white"""
 
-    largest: Annotated[int | None, "PX"] = None
+    largest: Annotated[int | None, WholeNumbers(1), "PX"] = None
     """longer side to which larger images are downscaled"""
 
     background: Annotated[Background | None, "COLOUR"] = None

@@ -135,6 +135,9 @@ class Plan(Setup, Settings):
         Settings.__post_init__(self)
         for name in ("faults", "frames", "sizes"):
             refuse_text(name, getattr(self, name))
+        for name in ("trials", "seed", "images", "shard", "shards"):  # generators and ranges take no 2.0
+            if type(getattr(self, name)) not in (int, type(None)):
+                raise InputError(f"{name} is {getattr(self, name)!r}", expected="a whole number")
         if not 0 <= self.shard < self.shards:
             raise InputError(f"shard is {self.shard}", expected=f"0 to {self.shards - 1}")
         twice = [name for name, count in Counter(self.frames or ()).items() if count > 1]

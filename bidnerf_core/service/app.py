@@ -131,7 +131,7 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
                 map = request.path_params.get("map", request.query_params.get("map"))
                 if map is None and len(names) > 1:
                     raise InputError("several maps are served", expected=f"map as one of {', '.join(names)}")
-                task = {"map": await known(map or names[0]), "protocol": name, "body": body}
+                task = {"map": await known(names[0] if map is None else map), "protocol": name, "body": body}
                 answer = await _answer(request, job, task)
             accepts = protocol.media_type.partition(";")[0] in request.headers.get("accept", "")
             return JSONResponse(answer, media_type=protocol.media_type if accepts else "application/json")

@@ -193,7 +193,11 @@ class Pool:
                         self._load()
                     self._workers[number] = self._fork()
                     return
-                except LOST:  # InputError is one of them
+                except InputError:
+                    # A worker's own, such as too little memory on its accelerator: other maps would not help it. The process of
+                    # maps that cannot be served ends, which is noticed when it is to fork.
+                    pass
+                except LOST:
                     self._end_maps()
                     self.metrics.restarts.labels(reason="maps").inc()
             time.sleep(PAUSE)

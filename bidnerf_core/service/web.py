@@ -175,7 +175,12 @@ async def _failure(request: Request, error: Exception) -> Response:
     if isinstance(error, Refused):
         return problem(error.status, error.detail, error.headers, **error.more)
     if isinstance(error, HTTPException):
-        return problem(error.status_code, error.detail, error.headers)
+        headers = error.headers
+        if error.status_code == 405:  # of the methods of a path, each has a route, which knows only its own
+            path = request.scope["route"].path
+            same = (route for route in request.app.routes if route.path == path)
+            headers = {"Allow": ", ".join(sorted({method for route in same for method in route.methods}))}
+        return problem(error.status_code, error.detail, headers)
     return problem(400, str(error))
 
 

@@ -33,7 +33,8 @@ def view(
 
     With the ``frame`` that was localized, the page compares it with the map as rendered from the pose. A frame without a
     ``localization`` is localized here, and the page then shows the search too. ``scene`` is a map, or a localizer with settings
-    of its own, and ``trajectory`` a file of poses. Raises ``InputError`` if it is neither.
+    of its own, and ``trajectory`` a file of poses. Raises ``InputError`` if it is neither,
+    and for a frame that cannot be localized at all.
     """
     scene_map = map_of(scene)
     answers = list[Json]()

@@ -385,6 +385,7 @@ WRONG_USAGE = """
     train {data} --out {out} --steps 0
     train {data} --out {out} --learning-rate nan
     train {data} --out {out} --checkpoint-every -1
+    train {data} --out {out} --largest 0
     train {data} --out {out} --frobnicate
     train {data} --out {out} --backend adanerf --threshold inf
     train {data} --out {out} --depth-weight inf

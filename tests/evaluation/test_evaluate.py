@@ -329,6 +329,8 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
         ({"workers": 2}, "workers is 2", "1: other processes read the map"),
         ({"trials": 0}, "trials is 0", "a whole number, 1 to 100,000"),
         ({"trials": 2.5}, "trials is 2.5", "a whole number, 1 to 100,000"),
+        ({"trials": 2.0}, "trials is 2.0", "a whole number"),
+        ({"images": True}, "images is True", "a whole number"),
         ({"scene": BLOBS, "workers": 0}, "workers is 0", "1 or more"),
         ({"scene": BLOBS, "workers": -1}, "workers is -1", "1 or more"),
         ({"seed": -1}, "seed is -1", "a whole number, 0 to 2,147,483,647"),

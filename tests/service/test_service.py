@@ -19,6 +19,7 @@ from base64 import b64encode
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -285,6 +286,9 @@ def test_a_registered_protocol_is_answered(service: Service, place: Place) -> No
     assert service.post("/echo", json.dumps(asked).encode()).json["detail"].startswith("several maps")
     assert "no 'photo'" in service.post("/maps/map/echo", b"{}").json["detail"]
     assert service.get("/maps/map/echo").json == {"status": "running"}
+    assert service.post("/echo?map=", json.dumps(asked).encode()).status == 404
+    refused = service.get("/echo", "PUT")
+    assert (refused.status, refused.headers["allow"]) == (405, "GET, POST")
 
 
 def test_names_are_text_and_never_files(service: Service, place: Place) -> None:
@@ -460,6 +464,24 @@ def test_a_process_with_the_maps_that_does_not_answer_is_replaced(
         monkeypatch.setattr("bidnerf_core.service.pool.FORK_SECONDS", 60.0)
         assert request(service, place).result(150).status == 200
     assert not maps.is_running()
+
+
+def test_maps_are_kept_while_a_worker_cannot_begin(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An accelerator whose memory is full now is no reason to load the maps again."""
+    pool, tried, held = Pool({"maps": {}}, LIMITS), list[int](), object()
+    worker = SimpleNamespace(ended=False, pid=1)
+
+    def fork() -> Any:
+        tried.append(len(tried))
+        if len(tried) < 3:
+            raise InputError("out of memory")
+        return worker
+
+    monkeypatch.setattr(pool, "_maps", held)
+    monkeypatch.setattr(pool, "_fork", fork)
+    monkeypatch.setattr("bidnerf_core.service.pool.PAUSE", 0.0)
+    pool._replace(0, "ended")
+    assert (tried, pool._maps, pool.alive) == ([0, 1, 2], held, [1])
 
 
 def test_a_temporary_folder_that_is_removed_is_made_anew(service: Service, place: Place) -> None:

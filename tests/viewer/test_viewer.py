@@ -375,7 +375,9 @@ def test_a_localization_of_an_earlier_run_is_shown_without_its_frame(
     assert shown["figures"][0].name == "confidence"
 
 
-def test_what_is_no_map_is_refused() -> None:
+def test_what_is_no_map_or_cannot_be_localized_is_refused(room: Map, query: Query) -> None:
+    with pytest.raises(InputError, match="start"):
+        view(Localizer(room, "bid", warm_up=False), frame=query.frame)
     with pytest.raises(InputError, match="expected a Map"):
         view("room")  # type: ignore[arg-type]
 
