@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
+from bidnerf_core import datasets, mapping  # which load what is used of them
 from bidnerf_core.cli.parser import FLAG, Option, Settings
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
@@ -33,18 +33,13 @@ Json: TypeAlias = Annotated[bool, FLAG, Option(None, "print JSON: one value on a
 Names: TypeAlias = tuple[str, ...]
 
 
-def default_of(module: str, name: str) -> Callable[..., Any]:
-    """Return a function that imports a class of settings, and returns the default ones."""
-    return lambda *_: getattr(importlib.import_module(module), name)()
-
-
 BakeSettings: TypeAlias = Annotated[
     Any,
-    Settings(default_of("bidnerf_core.mapping", "BakeConfig"), "settings of the surface and the landmarks"),
+    Settings(lambda *_: mapping.BakeConfig(), "settings of the surface and the landmarks"),
 ]
 PointChoice: TypeAlias = Annotated[
     Any,
-    Settings(default_of("bidnerf_core.datasets", "SparseChoice"), "which points of a COLMAP model are used"),
+    Settings(lambda *_: datasets.SparseChoice(), "which points of a COLMAP model are used"),
 ]
 
 

@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from bidnerf_core import localization  # which loads what is used of it
 from bidnerf_core.cli.folders import check_output
 from bidnerf_core.cli.interruptions import uninterrupted
-from bidnerf_core.cli.options import USUAL_METHOD, MapFolder, default_of
+from bidnerf_core.cli.options import USUAL_METHOD, MapFolder
 from bidnerf_core.cli.output import print_json, print_table, say
 from bidnerf_core.cli.parser import Flag, Option, Settings, Without
 from bidnerf_core.cli.progress import displayed
@@ -97,9 +98,9 @@ class TrackingOptions:
             "accepted as usual",
         ),
     ] = None
-    config: Annotated[
-        Any, Settings(default_of("bidnerf_core.localization", "TrackerConfig"), "settings of the tracker")
-    ] = None
+    config: Annotated[Any, Settings(lambda *_: localization.TrackerConfig(), "settings of the tracker")] = (
+        None
+    )
 
 
 def run(
