@@ -21,7 +21,7 @@ COMMANDS = {
     "plugins": "list everything registered by name: backends, readers, methods and others",
     "poses": "find the poses of photos or video frames without poses",
     "train": "build a map from a dataset, or from photos without poses",
-    "import": "build a map from a field trained elsewhere: splats, a checkpoint",
+    "import": "build a map from a COLMAP model, or a field trained elsewhere: splats, a checkpoint",
     "bake": "add to a map what localization without a start needs, as train does",
     "info": "describe a map",
     "extend": "add photos of the same scene to a map",

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from bidnerf_core.cli.folders import check_output
 from bidnerf_core.cli.options import Json, MapFolder
-from bidnerf_core.cli.output import print_json, show
+from bidnerf_core.cli.output import print_json, say, show
 from bidnerf_core.cli.parser import Option
 from bidnerf_core.errors import InputError
 
@@ -37,6 +37,7 @@ def run(
         seen_by = None if scene.landmarks is None else scene.landmarks.views
         points = None if scene.landmarks is None else scene.landmarks.positions
         draw_capture(scene.capture, points, seen_by, draw, scene.unit)
+        say(f"{draw}: written")
     if json:
         print_json(summary.plain())
         return

@@ -15,7 +15,6 @@ import torch
 
 from bidnerf_core.depth import find_depth_sensor
 from bidnerf_core.errors import InputError, enumeration
-from bidnerf_core.fields import has_field
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Evidence, least_confidence
 from bidnerf_core.localization.by_surface import localize_by_depth, localize_by_images, nearest_piece
@@ -37,8 +36,7 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     problem = replace(problem, sensor=find_depth_sensor(config.depth_sensor))
     loop = None
     if problem.matcher is not None and config.landmarks:
-        rays = config.fused_rays if has_field(problem.field) else 0
-        loop = Loop(problem.views, problem.matcher, problem, rays, seed)
+        loop = Loop(problem.views, problem.matcher, problem, config.fused_rays, seed)
     answer = None if loop is None else loop()
     found = None if answer is None else localization_of(problem, answer, began)
     # Outcomes of a pose by landmarks that no other measurement can correct

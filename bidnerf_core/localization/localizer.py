@@ -22,7 +22,7 @@ from bidnerf_core.depth import DepthSensorModel, find_depth_sensor
 from bidnerf_core.devices import constant, set_threads_here, threads_at_most, wait_for
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import Observations, device_of, has_field, render
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.frames import Frame, View, photos_in
 from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.io import LARGEST_INTEGER
 from bidnerf_core.localization.matching import LandmarkMatcher
@@ -118,7 +118,7 @@ class Localizer:
 
     def many(
         self,
-        queries: Iterable[Frame | View | Sequence[View] | str | Path],
+        queries: Iterable[Frame | View | Sequence[View] | str | Path] | str | Path,
         seed: int = 0,
         workers: int | None = None,
     ) -> Iterator[Localization | InputError]:
@@ -126,9 +126,14 @@ class Localizer:
 
         A query that cannot be localized at all gives its ``InputError`` in place of an answer. ``workers`` threads, each with a
         stream of its own on a GPU, localize at the same time; by default as many as torch uses or, on a GPU, 8.
-        ``queries`` may be an iterator, from which they draw a few queries in advance. Raises ``InputError`` unless ``workers`` is
-        positive, and ``Cancelled`` as usual.
+        ``queries`` may be an iterator, from which they draw a few queries in advance, or a folder of photos. Raises ``InputError`` unless
+        ``workers`` is positive, and for a folder without photos, and ``Cancelled`` as usual.
         """
+        if isinstance(queries, str | Path):
+            photos, _ = photos_in(queries)
+            if not photos:
+                raise InputError("contains no photos", where=queries)
+            queries = photos
         device = device_of(self.scene.field)
         # Number of queries that share an accelerator, which computes for some while the host detects
         # keypoints of others
@@ -265,7 +270,7 @@ def _views(query: Any) -> list[View]:
         )
     raise InputError(
         f"query is a {type(query).__name__}",
-        expected="a Frame (Frame.open reads a file, Frame.from_numpy takes an array), a View, or a list of views",
+        expected="the file of a photo, a Frame (Frame.from_numpy takes an array), a View, or a list of views",
     )
 
 

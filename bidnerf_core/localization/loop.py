@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.devices import run_on
+from bidnerf_core.fields import has_field
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Evidence, judge
@@ -129,15 +130,16 @@ class Loop:
     ) -> None:  # fmt: skip
         """Detect keypoints of ``views``, whose poses are relative to the last one.
 
-        Without a ``problem``, only landmarks are used. ``rays`` is the number that may be rendered, 0 for none. ``features`` detects
-        the keypoints, by default the map's detector. ``moving`` is whether the camera may have moved during the readout.
+        Without a ``problem``, only landmarks are used. ``rays`` is the number that may be rendered if the map has a field, 0 for none.
+        ``features`` detects the keypoints, by default the map's detector. ``moving`` is whether the camera may have moved during the readout.
         """
         self.matcher, self.problem, self.seed, self.moving = matcher, problem, seed, moving
         self.landmarks: LandmarkMap = matcher.landmarks
         self.query = Query.of(views, features or matcher.features)
         noise = None if problem is None else problem.colour_noise
         # Colour noise of a field on its training images above which its rays add nothing to the landmarks
-        self.rays = rays if problem is not None and (noise is None or noise <= 0.04) else 0
+        shows = problem is not None and has_field(problem.field) and (noise is None or noise <= 0.04)
+        self.rays = rays if shows else 0
         places = {matcher.device} if problem is None else {matcher.device, problem.device}
         self.device = places.pop() if len(places) == 1 else torch.device("cpu")
         self._nearest: dict[int, Nearest] = {}

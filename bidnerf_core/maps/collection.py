@@ -93,7 +93,7 @@ class MapCollection:
 
         ``asked`` is the largest number of maps that are tried, the most similar ones first, and ``localizers`` are existing ones by the
         names of their maps. Raises ``InputError`` if there is no map, or
-        two have the same name, and ``Cancelled`` once ``cancel`` returns True.
+        the same one twice, and ``Cancelled`` once ``cancel`` returns True.
         """
         if asked < 1:
             raise InputError(f"asked is {asked}", expected="1 or more")
@@ -112,7 +112,7 @@ class MapCollection:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the maps: those of their folders."""
+        """The names of the maps: those of their folders, with as many of the folders around them as tell them apart."""
         return tuple(self._maps)
 
     def __len__(self) -> int:
@@ -220,23 +220,28 @@ def maps_in(folder: Path) -> list[Path]:
 
 
 def _named(maps: Sequence[Map | str | Path] | Mapping[str, Map]) -> Mapping[str, Map | Path]:
+    """Return maps by the last part of their paths, or by as many of the last ones as tell them apart."""
     if isinstance(maps, Mapping):
         return maps
-    found: dict[str, Map | Path] = {}
+    placed, found = list[tuple[tuple[str, ...], Map | Path]](), dict[str, Map | Path]()
     for given in maps:
         scenes: list[Map | Path] = [given] if isinstance(given, Map) else [*maps_in(Path(given))]
         if not scenes:
             raise InputError("no map in it", where=given, expected="a map or a folder of maps")
         for scene in scenes:
             folder = scene.folder if isinstance(scene, Map) else scene
-            name = "map" if folder is None else folder.resolve().name
-            if isinstance(scene, Map) and folder is None:
-                name = scene.info.data or name
-            if name in found:
-                raise InputError(f"two maps are named {name!r}", expected="folders with different names")
-            found[name] = scene
-    if not found:
+            data = scene.info.data if isinstance(scene, Map) else ""
+            placed.append(((data or "map",) if folder is None else folder.resolve().parts, scene))
+    if not placed:
         raise InputError("no maps", expected="at least one")
+    for parts, scene in placed:
+        alike = [others for others, _ in placed if others[-1] == parts[-1]]
+        counts = (
+            n for n in range(1, len(parts) + 2) if [others[-n:] for others in alike].count(parts[-n:]) == 1
+        )
+        if (count := next(counts, None)) is None:
+            raise InputError(f"two maps are named {parts[-1]!r}", expected="each map once")
+        found[Path(*parts[-count:]).as_posix()] = scene
     return found
 
 

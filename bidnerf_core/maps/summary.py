@@ -157,6 +157,7 @@ class MapSummary:
         bounds, beyond = self.bounds, "more" if self.bounds.contracted else "nothing"
         box = f"a box of {' x '.join(f'{side:.3g}' for side in bounds.size)} from {_shown(bounds.lower)}, {beyond} beyond it"
         box += f"; seen from {bounds.near:.3g} to {bounds.far:.3g}"
+        unknown = {"distances": "unknown, since all images were taken from one place"}
         origin = {"origin": f"{_shown(self.origin)}, to which positions are relative"}
         return {
             "map": f"{place}, written by bidnerf {self.bidnerf}",
@@ -165,7 +166,7 @@ class MapSummary:
             "field": field,
             "scene": f"{box} away; background {_shown(bounds.background)}",
             **(origin if any(self.origin) else {}),
-            "distances": "known" if self.distances else "unknown, since all images were taken from one place",
+            **({} if self.distances else unknown),
             "frame": frame,
             "surface": surface,
             "landmarks": str(self.landmarks or "none; 'bidnerf bake MAP --data DATA' builds them"),

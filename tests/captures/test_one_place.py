@@ -113,6 +113,7 @@ def test_training_goes_on_and_says_so(tmp_path: Path, caplog: pytest.LogCaptureF
     assert caplog.text.count("from one place and do not determine distances") == 1
     assert not load_info(tmp_path / "still").distances
     assert not load_map(tmp_path / "still").has_distances
+    assert "distances:   unknown, since" in str(load_map(tmp_path / "still").describe())
     moved = [
         replace(v, T_ref_camera=SE3(v.T_ref_camera.rotation, v.T_ref_camera.translation + i))
         for i, v in enumerate(photos)

@@ -617,6 +617,7 @@ def test_info_describes_a_map(bidnerf: Run, shared: Path) -> None:
         "landmarks:   none; 'bidnerf bake MAP --data DATA'", "levels 3", "nothing beyond it",
     ):  # fmt: skip
         assert part in shown
+    assert "distances" not in shown  # which are known
 
 
 def test_render_refuses_names_whose_files_would_collide(

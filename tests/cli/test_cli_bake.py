@@ -116,8 +116,9 @@ def test_a_baked_map_needs_no_start(sharp: Path, folder: Path, bidnerf: Run) -> 
     # Baking the photos has left a record of them.
     (line,) = [line for line in err.splitlines() if "24 photos, " in line and "horizon" in line]
     assert len(facts["capture"]["photos"]) == 24
-    status, out, _ = bidnerf("info", folder, "--draw", folder.parent / "capture.png")
+    status, out, err = bidnerf("info", folder, "--draw", folder.parent / "capture.png")
     assert (status, line in out) == (0, True)
+    assert "capture.png: written" in err
     assert (folder.parent / "capture.png").read_bytes().startswith(b"\x89PNG")
     assert_refused(bidnerf("info", folder, "--draw", folder.parent / "capture.jpg"), 1, "PNG")
 

@@ -125,7 +125,7 @@ MIRRORED[:3, 0] *= -1
 ROW, MATRIX, POSE = "[0, 0, 0, 1]", "a 4x4 matrix T_world_camera", "an SE3 or a 4x4 matrix"
 RIGID, VIEWS = "an orthonormal rotation of determinant 1", "views: View(frame, T_ref_camera)"
 TRANSPOSE = f"{ROW}; its last column is, so the matrix is column-major: transpose it"
-QUERY = "a Frame (Frame.open reads a file, Frame.from_numpy takes an array), a View, or a list of views"
+QUERY = "the file of a photo, a Frame (Frame.from_numpy takes an array), a View, or a list of views"
 FOLDER, TAKES = "a Map, or the folder of one", "method 'bid' takes a BidConfig or a dictionary"
 
 
@@ -223,6 +223,18 @@ def test_many_queries_have_the_answers_of_each_alone_in_order() -> None:
         else:
             assert isinstance(answer, Localization)
             assert torch.equal(answer.poses.matrix(), made(query, seed=3).poses.matrix())
+
+
+def test_a_folder_of_photos_is_many_queries(tmp_path: Path) -> None:
+    for name in ("10.png", "2.png"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((8, 8, 3), np.uint8))
+    for folder in (tmp_path, str(tmp_path)):
+        assert [Path(error.where).name for error in localizer().many(folder)] == ["2.png", "10.png"]
+    with refused(where="asks", found="no such folder"):
+        localizer().many("asks")
+    (tmp_path / "empty").mkdir()
+    with refused(where=tmp_path / "empty", found="contains no photos"):
+        localizer().many(tmp_path / "empty")
 
 
 def test_many_queries_can_be_cancelled_and_need_workers() -> None:

@@ -16,6 +16,7 @@ import bidnerf_core as bn
 # Inside: the share of landmarks in view, and a worker of the service without its processes
 import bidnerf_core.maps.collection as collections_module
 from bidnerf_core.captures import stored_cameras
+from bidnerf_core.fields import NoField
 from bidnerf_core.mapping import BakeConfig, bake, build_landmarks
 from bidnerf_core.mapping.landmarks.vocabulary import visible
 from bidnerf_core.maps import Map, MapInfo, maps_in
@@ -87,6 +88,15 @@ def test_transparent_pixels_show_the_background_of_the_map(grounds: list[Map], t
     assert float(bn.Localizer(grounds[0], warm_up=False).problem(white).views[0].frame.rgb[-1, -1].min()) == 1
 
 
+def test_a_map_without_a_field_is_found_by_its_landmarks(grounds: list[Map]) -> None:
+    """As one imported from COLMAP, among maps with fields."""
+    alone = Map(replace(grounds[1].info, data="alone"), NoField(), None, grounds[1].landmarks)
+    found = bn.MapCollection([grounds[0], alone])(photo(SEEDS[1]).frame)
+    assert (found.map, found.converged) == ("alone", True)
+    rival = bn.MapCollection([grounds[1], alone])(photo(SEEDS[1]).frame)
+    assert {rival.map, rival.rival} == {"ground4", "alone"}
+
+
 @pytest.mark.slow
 def test_the_service_finds_the_map_of_a_photo(grounds: list[Map], tmp_path: Path) -> None:
     """Under the names by which the maps are served, and with the localizers that serve them."""
@@ -137,11 +147,28 @@ def test_maps_without_landmarks_come_last(grounds: list[Map]) -> None:
 def test_what_is_no_map_is_refused(grounds: list[Map], tmp_path: Path) -> None:
     with refused(where=tmp_path, found="no map in it", expected="a map or a folder of maps"):
         bn.MapCollection(tmp_path)
-    with refused(found="two maps are named 'ground0'", expected="different names"):
+    with refused(found="two maps are named 'ground0'", expected="each map once"):
         bn.MapCollection([grounds[0], grounds[0]])
     with refused(found="no map 'x'", expected="one of ground0"):
         bn.MapCollection(grounds[:1]).localizer("x")
     assert maps_in(tmp_path / "none") == []
+
+
+def test_folders_of_one_name_are_told_apart_by_those_around_them(
+    grounds: list[Map], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(collections_module, "load_info", lambda _: grounds[0].info)
+    monkeypatch.setattr(collections_module, "load_landmarks", lambda *_: None)
+    folders = [tmp_path / name for name in ("A/day/MAP", "B/day/MAP", "B/night/MAP", "B/other")]
+    for folder in folders:
+        folder.mkdir(parents=True)
+        (folder / "map.json").write_text("{}")
+    named = {"A/day/MAP", "B/day/MAP", "night/MAP", "other", "ground0"}
+    assert set(bn.MapCollection([*folders, grounds[0]]).names) == named
+    memory = replace(grounds[0], info=replace(grounds[0].info, data="other"))
+    assert bn.MapCollection([folders[-1], memory]).names == ("B/other", "other")
+    with refused(found="two maps are named 'MAP'", expected="each map once"):
+        bn.MapCollection([folders[0], folders[1], folders[0]])
 
 
 def test_the_command(
