@@ -144,12 +144,12 @@ def list_plugins(group: str) -> list[PluginInfo]:
 def _declared(group: str) -> tuple[PluginInfo, ...]:
     """Return what installed distributions declare in a group. Of several versions of one, the first on ``sys.path`` counts."""
     infos = list[PluginInfo]()
-    for p in _points(f"bidnerf.{group}"):
+    for p, source in _points(f"bidnerf.{group}"):
         try:
             names = p.load() if p.name == TABLE else [p.name]
         except Exception as error:
             raise PluginError(f"{p.value}: the table cannot be imported ({_described(error)})") from error
-        infos += [PluginInfo(group, name, p.value, *_name_version_summary(p.dist)) for name in names]
+        infos += [PluginInfo(group, name, p.value, *source) for name in names]
     found = []
     for info in infos:
         rivals = [x for x in infos if x.name == info.name and x is not info]
@@ -161,17 +161,22 @@ def _declared(group: str) -> tuple[PluginInfo, ...]:
     return tuple(found)
 
 
-def _points(group: str) -> Sequence[EntryPoint]:
-    """Return the entry points of a group. A package whose metadata is malformed is left out with a warning."""
+def _points(group: str) -> list[tuple[EntryPoint, tuple[str, str, str]]]:
+    """Return the entry points of a group, each with the name, version and summary of its distribution.
+
+    A package whose metadata is malformed is left out with a warning.
+    """
     with contextlib.suppress(Exception):  # one such package stops this look-up of all
-        return list(entry_points(group=group))
-    found = dict[str, Sequence[EntryPoint]]()
+        return [(point, _name_version_summary(point.dist)) for point in entry_points(group=group)]
+    found = dict[str, list[tuple[EntryPoint, tuple[str, str, str]]]]()
     for dist in distributions():
         try:
-            found.setdefault(dist.name, list(dist.entry_points.select(group=group)))
+            source = _name_version_summary(dist)
+            found.setdefault(source[0], [(p, source) for p in dist.entry_points.select(group=group)])
         except Exception as error:
+            where = getattr(dist, "_path", "an installed package")  # its name may be what cannot be read
             warnings.warn(
-                f"the plugins of {dist.name} are left out, since its metadata cannot be read ({_described(error)});"
+                f"the plugins of {where} are left out, since its metadata cannot be read ({_described(error)});"
                 " reinstall or remove it",
                 InputWarning,
                 stacklevel=2,

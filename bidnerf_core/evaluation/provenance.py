@@ -115,5 +115,6 @@ def script_command() -> str:
         return str(path.relative_to(root)) if path.is_relative_to(root) else path.name
 
     # Words such as ``--out=PATH`` and ``MAP:DATA`` hold paths, too.
-    words = ("".join(map(shortened, re.split(r"([=:])", word))) for word in sys.argv)
-    return shlex.join(words if Path(sys.argv[0]).name == "bidnerf" else ["python", *words])
+    words = ["".join(map(shortened, re.split(r"([=:])", word))) for word in sys.argv]
+    is_ours = Path(words[0]).stem == "bidnerf"  # wherever it is installed
+    return shlex.join(["bidnerf", *words[1:]] if is_ours else ["python", *words])

@@ -303,7 +303,9 @@ def test_results_come_in_the_order_of_the_plan(tmp_path: Path) -> None:
 def test_more_trials_and_other_methods_go_into_the_same_file(
     tmp_path: Path, evaluate: Evaluate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["/usr/bin/bidnerf", "evaluate", BLOBS])
+    monkeypatch.setattr(
+        sys, "argv", [str(Path(__file__).parents[2] / ".venv/bin/bidnerf"), "evaluate", BLOBS]
+    )
     assert evaluate("--trials", 2, "--size", 0.3)[0] == 0
     before = (tmp_path / "r.jsonl").read_bytes()
     status, err = evaluate("--trials", 3, "--size", 0.3)

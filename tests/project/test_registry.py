@@ -330,10 +330,14 @@ def test_of_two_versions_the_first_on_the_path_wins_as_for_import(
     assert listed("mist") == []  # which only the hidden version has
 
 
-def test_a_package_with_malformed_metadata_is_left_out_with_a_warning(site: Site) -> None:
-    site.metadata("unrelated", "1.0", "[console_scripts]\nnonsense\n")
+@pytest.mark.parametrize("file", ["entry_points.txt", "METADATA"])
+def test_a_package_with_malformed_metadata_is_left_out_with_a_warning(site: Site, file: str) -> None:
+    points = "[bidnerf.backends]\nbroken = unrelated:backend\n"
+    (site.metadata("unrelated", "1.0", points) / file).write_bytes(
+        b"[bidnerf.backends]\nnonsense\nName: \xff\n"
+    )
     site.backend()
-    with pytest.warns(InputWarning, match="plugins of unrelated are left out"):
+    with pytest.warns(InputWarning, match=r"plugins of .*unrelated-1.0.dist-info are left out"):
         assert isinstance(load_backend("fog"), Backend)
     assert listed("hashgrid")[0].is_bundled
 
