@@ -76,7 +76,7 @@ class Picture(Protocol):
 class DepthFile:
     """The depth image of a shot: ``read`` returns it in metres; it is registered to the image from ``sensor``, if given."""
 
-    path: Path | str  # for messages
+    path: Path | str  # for messages; a ``Path`` is a file, without which there is no depth
     read: Callable[[], DepthImage]
     sensor: DepthCamera | None = None
 
@@ -486,7 +486,7 @@ def with_files(capture: Capture) -> list[Shot]:
         return set(gone)
 
     gone = missing("image", [shot.image for shot in capture.shots])
-    shots = [shot for shot in capture.shots if shot.image not in gone]
+    shots = [shot for shot in capture.shots if shot.file not in gone]
     gone = missing("mask", [mask.path for shot in shots for mask in shot.masks])
     gone |= missing("depth image", [shot.depth.path for shot in shots if shot.depth is not None])
     return [

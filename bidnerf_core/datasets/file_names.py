@@ -7,6 +7,7 @@ path from another machine. The file is found anyway if the name is unambiguous.
 from __future__ import annotations
 
 from collections import Counter
+from itertools import chain
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from bidnerf_core.io import HEIF_SUFFIXES, IMAGE_SUFFIXES, is_file
@@ -46,7 +47,7 @@ class FileNames:
                 for parts in tails
                 for ending in endings
             )
-            for file in (*exact, *like):
+            for file in chain(exact, like):
                 if is_file(file):
                     return file
         return None

@@ -94,8 +94,10 @@ def place_of(scene: Map, place: Place) -> Float[Tensor, "3"]:
         return camera.pose.translation + origin_of(scene)
     name, at, pixel = place.rpartition("@")
     try:
-        numbers = [number for word in pixel.split(",") if math.isfinite(number := float(word))]
+        numbers = [float(word) for word in pixel.split(",")]
     except ValueError:
+        numbers = []
+    if not all(map(math.isfinite, numbers)):
         numbers = []
     if at and len(numbers) == 2 and (camera := _camera_of(scene, name)) is not None:
         return _seen_at(scene, camera, numbers[0], numbers[1]) + origin_of(scene)

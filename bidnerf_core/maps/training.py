@@ -94,10 +94,13 @@ def train(
     working_device(options.device)  # rejected before anything is read
     place, known = None if out is None else Path(out), None
     if place is not None and not options.overwrite:
+        there = None
         with contextlib.suppress(InputError):
-            info = load_info(place)
-            # complete without a field, as an imported map may be
-            known = load_map(place) if info.complete and not info.step else None
+            there = load_info(place)
+        if (
+            there is not None and there.complete and not there.step
+        ):  # without a field, as an imported map may be
+            known = load_map(place)
     with (
         job_context(progress, cancel),
         finished_parts(place),

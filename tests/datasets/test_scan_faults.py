@@ -63,6 +63,12 @@ def zero_pose(root: Path) -> None:
     )
 
 
+def missing_and_uncalibrated(root: Path) -> None:
+    (root / "images/IMG_2.png").unlink()
+    file = root / "cameras.xml"
+    file.write_text(file.read_text().replace('sensor_id="0" label="IMG_2"', 'sensor_id="1" label="IMG_2"'))
+
+
 INCOMPLETE: dict[str, tuple[Callable[[Path], object], int, list[int], list[int], list[str]]] = {
     # What happens to six frames; how many a sequence has then, which of them have no pose and no depth; the remarks.
     "record3d, unpacked": (lost_pose, 5, [2], [1], [
@@ -87,6 +93,7 @@ INCOMPLETE: dict[str, tuple[Callable[[Path], object], int, list[int], list[int],
     ]),
     "kitti": (unlinked("image_2/000001.png"), 5, [], [*range(5)], ["1 of 6 images are missing, first: number 1"]),
     "euroc": (unlinked("cam0/data/*.png"), 5, [], [*range(5)], ["1 of 6 images is missing and left out"]),
+    "metashape": (missing_and_uncalibrated, 5, [], [*range(5)], ["1 of 6 images is missing and left out, first: IMG_2"]),
     "colmap": (lambda root: (root / "images/r_2.png").rename(root / "images/r_9.png"), 5, [], [*range(5)], [
         "1 of 6 images is missing and left out, first: images/r_2.png",
         "1 of 6 photos are not registered in the model and are left out, first: r_9.png",

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 import torch
 
-# Inside: a limit of size that small images reach
+# Inside: a limit of size that small images reach, and pictures that are no files
 from bidnerf_core.datasets import (
     READERS,
+    Capture,
     DatasetFrames,
     DatasetOptions,
+    Shot,
     find_reader,
     lidar,
     open_dataset,
     open_sequence,
 )
+from bidnerf_core.datasets.capture import with_files
+from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.maps import read_views
 from bidnerf_core.testing import ReaderContract, training_views
@@ -170,6 +175,29 @@ def test_photos_of_phone_apps_have_the_size_that_is_asked_for(
         assert {max(frame.rgb.shape[:2]) for frame in frames} == {side}
         found, expected = frames[0].intrinsics, whole.scaled(side / max(whole.width, whole.height))
         torch.testing.assert_close(found.matrix(), expected.matrix(), atol=1e-4, rtol=0)
+
+
+def test_a_damaged_photo_of_a_known_size_prevents_no_others(tmp_path: Path) -> None:
+    """Headers are read only where cameras have no size."""
+    folder = LAYOUTS["polycam"].write(tmp_path, small_views(4))
+    next(folder.rglob("corrected_images/*.jpg")).write_bytes(b"damaged")
+    dataset = open_dataset(folder)
+    with pytest.raises(InputError):
+        read_all(folder)
+    assert len(dataset.names) == 4
+
+
+def test_pictures_need_no_hash(tmp_path: Path) -> None:
+    @dataclass
+    class Plain:
+        size: tuple[int, int] = (8, 6)
+
+        def pixels(self) -> torch.Tensor:
+            return torch.zeros(6, 8, 3, dtype=torch.uint8)
+
+    shots = [Shot(image=Plain(), stem="a"), Shot(image=tmp_path / "b.png"), Shot(image=Plain(), stem="c")]
+    (tmp_path / "b.png").touch()
+    assert len(with_files(Capture(tmp_path, shots))) == 3
 
 
 @pytest.mark.parametrize(

@@ -105,6 +105,7 @@ UNUSABLE: list[tuple[Any, str]] = [
         replace(SOUND, descriptors=SOUND.descriptors[:3]),
         r"float32 \[5\] and torch.uint8 \[3, 8\], expected tensors",
     ),
+    (replace(SOUND, descriptors=SOUND.descriptors[:, 0]), r"torch.uint8 \[5\], expected tensors"),
     (replace(SOUND, descriptors=SOUND.descriptors.float()), "and torch.float32 .*, expected tensors"),
     (replace(SOUND, pixels=SOUND.pixels * torch.nan), "outside the image of 40x30 pixels"),
     (replace(SOUND, pixels=SOUND.pixels + 40), "outside the image of 40x30 pixels"),

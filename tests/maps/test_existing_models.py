@@ -274,6 +274,16 @@ def test_training_adds_a_field_and_keeps_landmarks_and_cameras(
         bn.train(original.folder, out=tmp_path / "map", config=tiny.config(20))
 
 
+def test_damaged_landmarks_are_named_before_a_field_is_added(
+    original: Model, imported: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(imported, tmp_path / "map")
+    (file,) = (tmp_path / "map").glob("landmarks-*")
+    file.write_bytes(file.read_bytes()[:100])
+    with refused(where=file):
+        bn.train(original.folder, out=tmp_path / "map", config=tiny.config(20))
+
+
 # Training in parts.
 
 

@@ -80,6 +80,7 @@ def test_a_known_length_gives_the_factor(ground: Map) -> None:
     for bad, found, instead in (
         ("nobody", "no place 'nobody' in the map: none of its 3 cameras", "a name such as 'c0'"),
         ("1,2", "no place '1,2' in the map: none of its 3 cameras", "coordinates X,Y,Z"),
+        ("1,2,3,nan", "no place '1,2,3,nan' in the map: none of its 3 cameras", "coordinates X,Y,Z"),
         ("1,2,nan", "no place '1,2,nan' in the map: none of its 3 cameras", "coordinates X,Y,Z"),
         ("c0@1", f"no place 'c0@1' in the map: it has no camera of 'c0'; {held_out}", "NAME@U,V"),
         ("c7.png", f"no place 'c7.png' in the map: it has no camera of 'c7.png'; {held_out}", "such as 'c0'"),

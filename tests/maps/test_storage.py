@@ -105,6 +105,22 @@ def described(folder: Path, **changes: Any) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
+def test_backends_are_imported_where_tensors_have_values(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Shapes are checked on a device without values, on which the constants of a module would have none."""
+    devices = list[str]()
+
+    def load(name: str, wanted_by: str = "") -> Any:
+        devices.append(torch.zeros(1).device.type)
+        return load_backend(name, wanted_by)
+
+    monkeypatch.setattr("bidnerf_core.maps.map.load_backend", load)
+    write_parts(tmp_path, info(), state())
+    load_map(tmp_path)
+    assert devices[0] == "cpu"
+
+
 @pytest.mark.parametrize("complete", [True, False])
 def test_what_is_saved_is_what_is_loaded(complete: bool, tmp_path: Path) -> None:
     saved = write_parts(tmp_path / "a" / "map", info(complete=complete), state())

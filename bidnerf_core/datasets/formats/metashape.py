@@ -22,7 +22,7 @@ from bidnerf_core.datasets.reader import DatasetOptions, Format
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import SE3, rigid_pose
-from bidnerf_core.io import open_binary, read_file
+from bidnerf_core.io import is_file, open_binary, read_file
 
 
 def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
@@ -42,14 +42,17 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     shots = list[Shot]()
     for label in sorted(cameras, key=natural_order):
         transform, sensor = cameras[label].find("transform"), sensors.get(cameras[label].get("sensor_id"))
-        where, pose = f"{file}: camera {label}", None
+        where, pose, image = f"{file}: camera {label}", None, names.path(label, IMAGE_ENDINGS)
+        if not is_file(image):  # its sensor may never have been calibrated
+            shots.append(Shot(image=image))
+            continue
         if sensor is None:
             raise InputError("has no calibrated sensor", where=where, expected="the id of one")
         if transform is not None:
             matrix = torch.tensor(_numbers(transform, where, 16), dtype=torch.float64).reshape(4, 4)
             pose = rigid_pose(matrix[:3], where)
             pose = SE3(pose.rotation, pose.translation * scale)
-        shots.append(Shot(image=names.path(label, IMAGE_ENDINGS), camera=sensor, T_world_camera=pose))
+        shots.append(Shot(image=image, camera=sensor, T_world_camera=pose))
     return Capture(
         path, shots, options.colour, unit=None if metric is None else "metres", pose_file=file,
         poses_expected="a transform of each aligned camera", unposed="they are not aligned",

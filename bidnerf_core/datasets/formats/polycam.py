@@ -54,14 +54,16 @@ def _read(path: Path, cameras: Path, options: DatasetOptions) -> Capture:
             raise record.error(
                 "is incomplete", expected="fx, fy, cx, cy, and t_00 to t_23, the rows of the camera's pose"
             )
-        header = read_header(photo)  # since newer exports store no size
-        size = record.size("width") or header.width, record.size("height") or header.height
+        width, height = record.size("width"), record.size("height")
+        if width is None or height is None:  # as in newer exports
+            header = read_header(photo)
+            width, height = width or header.width, height or header.height
         depth, confidence = (cameras.parent / kind / f"{time}.png" for kind in ("depth", "confidence"))
         measured = partial(read, depth, confidence if is_file(confidence) else None)
         shots.append(
             Shot(
                 image=photo,
-                camera=camera_of(str(description), lens, size),
+                camera=camera_of(str(description), lens, (width, height)),
                 T_world_camera=pose_of_rows(record, "t_00 to t_23", rows),
                 time=int(time) / 1_000_000 if time.isdecimal() else None,
                 depth=DepthFile(depth, measured) if has_depth else None,

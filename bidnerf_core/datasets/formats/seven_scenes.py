@@ -92,11 +92,11 @@ def _read(path: Path, folders: dict[int, Path], options: DatasetOptions) -> Capt
 
 def _find(path: Path) -> dict[int, Path]:
     """Return the folders of the sequences by number; that of a folder that is one is -1."""
-    if images_of(path):
-        return {-1: path}
     found = {child: SEQUENCE.fullmatch(child.name) for child in path.glob("seq*") if child.is_dir()}
     folders = {int(match[1]): child for child, match in found.items() if match}
-    return folders if any(map(images_of, folders.values())) else {}
+    if any(map(images_of, folders.values())):
+        return folders
+    return {-1: path} if images_of(path) else {}
 
 
 def images_of(folder: Path) -> list[Path]:

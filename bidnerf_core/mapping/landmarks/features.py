@@ -135,7 +135,7 @@ def detected(features: Features, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
     if not fits or [list(p.shape) for p in parts] != [
         [n := len(parts[2]), 2],
         [n],
-        [n, *parts[2].shape[1:2]],
+        [n, parts[2].shape[-1]],
     ]:
         raise PluginError(
             f"pixels, sizes and descriptors are {enumeration(kinds)}",
