@@ -72,17 +72,17 @@ def colmap_project(path: Path) -> tuple[Path, Path, list[ModelImage], dict[int, 
 
     Raises ``InputError`` if the model is damaged or has no registered image.
     """
-    model, others = _largest(path, colmap_models(path)), list[Path]()
-    for _ in range(2):
-        images, cameras = read_posed_images(model)
-        folder, files = _image_folder(path, model, images)
-        others = _models_at(folder.parent / "sparse") if files else []
-        if not others or model.resolve() in [each.resolve() for each in others]:
-            break
+    model = _largest(path, colmap_models(path))
+    images, cameras = read_posed_images(model)
+    folder, files = _image_folder(path, model, images)
+    others = _models_at(folder.parent / "sparse") if files else []
+    if others and model.resolve() not in [each.resolve() for each in others]:
         # such as dense/0, whose images are undistorted, while those of sparse/0 lie elsewhere
         text = f"{folder.relative_to(path)} has a model of its own, which is used instead of {model.relative_to(path)}"
         remark(path, text)
         model = _largest(path, others)
+        images, cameras = read_posed_images(model)
+        folder, files = _image_folder(path, model, images)
     if not images:
         raise InputError("has no registered image", where=model, expected="at least one")
     images.sort(key=lambda image: natural_order(str(posix_name(image.name))))
