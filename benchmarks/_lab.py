@@ -210,9 +210,11 @@ class RowStore:
 
     @staticmethod
     def parse(content: bytes) -> dict[str, Any]:
-        """Return the rows of all complete lines, by the JSON of their keys."""
-        lines = map(json.loads, content.split(b"\n")[:-1])
-        return {line["key"]: line["row"] for line in lines}
+        """Return the rows of all complete lines, by the JSON of their keys. Raises ``ValueError`` for a file of something else."""
+        *lines, last = content.split(b"\n")
+        if not b'{"key": '.startswith(last[:8]):  # a row that a kill has cut begins as all do
+            raise ValueError("no file of rows")
+        return {line["key"]: line["row"] for line in map(json.loads, lines)}
 
     def __enter__(self) -> Self:
         self.path.parent.mkdir(parents=True, exist_ok=True)

@@ -158,7 +158,9 @@ class Protocol:
         """Raise ``InputError`` for a size with the wrong number of values, or with one that is out of range."""
         most = [180.0 if "deg" in unit else 1e6 for unit in self.units]
         if len(size) != len(self.units) or not all(0 <= x <= m for x, m in zip(size, most, strict=True)):
-            expected = " : ".join(self.units) or "none, since it has no sizes"
+            expected = (
+                " : ".join(self.units) or "none, since this protocol has no sizes, as bid and others have"
+            )
             limits = f", 0 to {' : '.join(f'{m:g}' for m in most)}" if most else ""
             raise InputError(
                 f"size is {':'.join(f'{x:g}' for x in size) or 'missing'}", expected=f"{expected}{limits}"

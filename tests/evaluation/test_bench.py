@@ -108,7 +108,11 @@ def test_shards_share_all_trials_between_them(shards: int) -> None:
 @pytest.mark.parametrize(
     ("change", "found", "expected"),
     [
-        ({"protocol": "inerf", "sizes": [0.5]}, "size is 0.5", "none, since it has no sizes"),
+        (
+            {"protocol": "inerf", "sizes": [0.5]},
+            "size is 0.5",
+            "none, since this protocol has no sizes, as bid and others have",
+        ),
         ({"frames": ["nope"]}, "split 'test': no frame 'nope'", None),
         ({"split": "train"}, "no split 'train'", "test"),
         ({"protocol": "parallel", "frames": ["0000"]}, "'parallel' defines its own frames", "all frames"),
