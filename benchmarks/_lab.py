@@ -149,7 +149,7 @@ def rates(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def median_errors(rows: Sequence[Row]) -> dict[str, float | None]:
-    """Return the median errors, None where half have no answer."""
+    """Return the median errors of translation and rotation, None where half of the rows have no answer."""
     found = {}
     for part in ("translation", "rotation_deg"):
         middle = statistics.median(float("inf") if row[part] is None else row[part] for row in rows)
@@ -247,8 +247,9 @@ class RowStore:
 
 
 def record(name: str, results: dict[str, Any], seed: int = 0, folder: Path = RESULTS) -> Path:
-    """Write a summary with its provenance, in five digits, and say where. Rows of single answers do not belong into it.
+    """Write a summary with its provenance, rounded to five digits, print its path and return it.
 
+    Rows of single answers do not belong in it.
     Raises ``ValueError`` if ``results`` contain values that strict JSON cannot represent.
     """
     threads, path = torch.get_num_threads(), folder / f"{name}.json"
@@ -263,7 +264,7 @@ def record(name: str, results: dict[str, Any], seed: int = 0, folder: Path = RES
 
 
 def _in_lines(value: Any, indent: str = "") -> str:
-    """Return a value as JSON, with each object or list on one line if it fits into 120 columns."""
+    """Return a value as JSON, with each object or list on one line if it fits in 120 columns."""
     line = json.dumps(value, allow_nan=False)
     if len(indent) + len(line) <= 120 or not value or not isinstance(value, (dict, list, tuple)):
         return line

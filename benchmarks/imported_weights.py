@@ -59,9 +59,8 @@ def coloured(depth: torch.Tensor) -> np.ndarray:
     known = np.isfinite(array) & (array > 0)
     low, high = np.percentile(array[known], (1, 99)) if known.any() else (0.0, 1.0)
     share = ((np.where(known, array, low) - low) / max(high - low, 1e-9)).clip(0, 1)
-    levels = (
-        (255 * (0.96 - 0.9 * share)).round().astype(np.uint8)
-    )  # the ends of the colour map are nearly black
+    # The ends of the colour map are nearly black.
+    levels = (255 * (0.96 - 0.9 * share)).round().astype(np.uint8)
     turbo = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[..., ::-1]  # to RGB
     return np.where(known[..., None], turbo, np.array((38, 38, 42), np.uint8))
 

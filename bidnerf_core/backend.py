@@ -99,7 +99,7 @@ class UpgradingField(Protocol):
 
 
 def quick_config(backend: Backend) -> Any:
-    """Return the config by which a backend trains small and simple scenes in about a minute, as ``bidnerf demo`` does.
+    """Return the config with which a backend trains a small and simple scene in about a minute, as in ``bidnerf demo``.
 
     It is what the backend's optional method ``quick_config`` returns, or else its default config.
     """

@@ -130,7 +130,7 @@ def captured(
                 f"operations are launched one by one, since a step cannot be captured: {why}", stacklevel=2
             )
             return step
-        finally:  # equal lists are told apart: two may be empty
+        finally:  # by identity, since two empty lists are equal
             _notes[:] = [notes for notes in _notes if notes is not constants]
 
     def replay(read: list[Tensor] = constants) -> None:  # keeps alive what the graph reads
@@ -232,9 +232,9 @@ class _Remote:
             source.copy_(tensor)
         self._received.copy_(self._sent, non_blocking=True)
         with without_waiting():
-            if self._calls == 1:  # the first call, of a rare shape perhaps, fills caches
-                # What a thread uses first, such as its handles of linear algebra, is not created during a capture, and
-                # another thread may have made the first call.
+            if self._calls == 1:  # the first call, of a rare shape perhaps, loads kernels and fills caches
+                # A thread cannot create during a capture what it uses for the first time, such as its handles of
+                # linear algebra, and another thread may have made the first call.
                 launched = self._step
                 launched()
                 self._step = captured(launched, self._lane.device, memory=self._lane.memory)

@@ -166,7 +166,7 @@ def _points(group: str) -> list[tuple[EntryPoint, tuple[str, str, str]]]:
 
     A package whose metadata is malformed is left out with a warning.
     """
-    with contextlib.suppress(Exception):  # one such package stops this look-up of all
+    with contextlib.suppress(Exception):  # one such package makes the look-up fail for all
         return [(point, _name_version_summary(point.dist)) for point in entry_points(group=group)]
     found = dict[str, list[tuple[EntryPoint, tuple[str, str, str]]]]()
     for dist in distributions():

@@ -65,7 +65,7 @@ def gaussians_of_surface(surface: SurfaceMap) -> Gaussians:
     normals = torch.where(surfels.normals[:, 2:] < 0, -surfels.normals, surfels.normals)
     x, y, z = normals.unbind(-1)
     turns = torch.stack([1 + z, -y, x, torch.zeros_like(z)], dim=-1)  # take the third axis to the normal
-    # standard deviation across the plane, in units of the spacing
+    # Across the plane, the standard deviation is a tenth of the spacing.
     scales = spacing[:, None] * torch.tensor([WIDTH, WIDTH, 0.1])
     return Gaussians(
         surfels.positions,

@@ -64,9 +64,8 @@ class GaussiansField(PieceField):
         """Rebuild the tree after the Gaussians have moved."""
         opacity = self.logits.sigmoid()
         seen = opacity >= LEAST_ALPHA
-        # alpha falls to the least opacity at this many standard deviations
-        # minimum extent of a Gaussian's box in standard deviations, so that ``query`` finds nearly all of its
-        # density
+        # Alpha falls to the least opacity at this many standard deviations. A box extends over at least two,
+        # so that ``query`` finds nearly all of a Gaussian's density.
         extent = (2 * (opacity / LEAST_ALPHA).clamp(min=1).log()).sqrt().clamp(min=2.0)
         turns = matrices(torch.nn.functional.normalize(self.quaternions, dim=-1))
         spread = (turns.square() * (2 * self.log_scales).exp()[:, None]).sum(-1).sqrt()

@@ -65,7 +65,7 @@ class Gaussians:
 
 
 def cleaned(found: Gaussians, where: str) -> tuple[Gaussians, str]:
-    """Return the Gaussians that can be rendered, and a text that says how many others were left out, empty if none were.
+    """Return the Gaussians that can be rendered, and a text on those left out, which is empty if there are none.
 
     Raises ``InputError``, whose message begins with ``where``, if none is left.
     """

@@ -82,9 +82,8 @@ def imported(
     T = placement.T_target_source
     moved = kept.similar(placement.scale, T.rotation, T.translation)
     moved = with_dilation(moved, config.pixel_angle, cameras)
-    # opacity from which a Gaussian counts as matter in measuring the extent of a scene
+    # Only opaque Gaussians count as matter in measuring the extent of the scene, unless there are too few.
     opaque = moved.means[moved.opacities > 0.3]
-    # number of opaque Gaussians below which all Gaussians count
     points = opaque if len(opaque) >= 100 else moved.means
     bounds = bounds_about(points, config.background)
     settings = GaussiansConfig(gaussians=len(moved), degree=moved.degree, by_means=config.by_means, steps=1)

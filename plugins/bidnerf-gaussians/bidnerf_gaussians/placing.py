@@ -103,8 +103,7 @@ def _anywhere(
     within = torch.rand((count, 3), generator=generator)
     if bounds.contracted:
         return lower + size * (within * 2 - 0.5)
-    # cells along each side of the grid in which silhouettes are carved
-    grid = VoxelGrid.cube(bounds, 96)
+    grid = VoxelGrid.cube(bounds, 96)  # in which silhouettes are carved
     held = occupied_voxels(views, grid)
     cells = (held & ~_surrounded(held)).nonzero()
     if not len(cells):

@@ -21,7 +21,7 @@ def relocate(field: GaussiansField, least_opacity: float, generator: Generator) 
     """
     opacity = field.logits.sigmoid().cpu()
     dead = (opacity < least_opacity).nonzero()[:, 0]
-    # largest fraction of the Gaussians moved at once
+    # At most a twentieth of the Gaussians is moved at once.
     dead = dead[torch.randperm(len(dead), generator=generator)[: int(0.05 * len(opacity))]]
     area = torch.exp(field.log_scales.cpu().sort(dim=-1).values[:, 1:].sum(-1))
     weight = torch.where(opacity < least_opacity, 0, opacity * area).double()
@@ -37,7 +37,7 @@ def relocate(field: GaussiansField, least_opacity: float, generator: Generator) 
     offset = (turn @ (field.log_scales[chosen].exp() * offsets)[..., None])[..., 0] / 2
     share = 1 - (1 - field.logits[chosen].sigmoid()).clamp(min=1e-6).sqrt()
     logit = share.clamp(least_opacity, 1 - 1e-6).logit()
-    # factor by which the two Gaussians that replace one are narrower, as in the original 3DGS code
+    # The two Gaussians that replace one are narrower by a factor of 1.6, as in the original 3DGS code.
     middle, width = field.means[chosen], field.log_scales[chosen] - math.log(1.6)
     turns, harmonics = field.quaternions[chosen], field.harmonics[chosen]
     for index, place in ((chosen, middle + offset), (dead, middle - offset)):

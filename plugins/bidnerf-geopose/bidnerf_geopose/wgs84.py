@@ -33,8 +33,7 @@ class Geodetic:
 
     def __post_init__(self) -> None:
         """Raise ``InputError`` for coordinates that no place near the earth has."""
-        # metres above or below the ellipsoid
-        bounds = (("latitude", 90.0), ("longitude", 180.0), ("height", 1e6))
+        bounds = (("latitude", 90.0), ("longitude", 180.0), ("height", 1e6))  # degrees, and metres
         for name, most in bounds:
             value = getattr(self, name)
             if not abs(value) <= most:
@@ -75,8 +74,7 @@ def geodetic(ecef: Float[Tensor, "3"]) -> Geodetic:
     reduced = math.atan2(z, (1 - FLATTENING) * from_axis)
     polar, second = SEMI_MAJOR * (1 - FLATTENING), ECCENTRICITY_SQUARED / (1 - ECCENTRICITY_SQUARED)
     latitude = 0.0
-    # steps of Bowring's iteration: near the ellipsoid, each gains three digits or more
-    for _ in range(6):
+    for _ in range(6):  # near the ellipsoid, each step gains three digits or more
         latitude = math.atan2(
             z + second * polar * math.sin(reduced) ** 3,
             from_axis - ECCENTRICITY_SQUARED * SEMI_MAJOR * math.cos(reduced) ** 3,

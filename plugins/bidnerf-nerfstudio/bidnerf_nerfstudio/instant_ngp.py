@@ -85,7 +85,7 @@ class OccupancyLevels(nn.Module):
             points = ((corner + jitter) * (2 / resolution) - 1) * 2**level
             places = points * constant(self.half, points) + constant(self.centre, points)
             found = field.radiance.density(places.reshape(-1, 3)).reshape(corner.shape[:3])
-            # decay factor of all cells' peaks per update
+            # Each update lets the peaks of all cells decay by 5 %.
             self.peak[level] = torch.maximum(0.95 * self.peak[level], field.config.step * found)
         self.cells.copy_(self.peak > self.peak.mean().clamp(max=OCCUPIED))
 
@@ -166,8 +166,7 @@ def train(field: NgpField, views: Sequence[View], config: NgpConfig, report: Rep
     supervision = Supervision(views, field.bounds, config, device_of(field))
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
-        # number of training steps between updates
-        if step and step % 16 == 0:
+        if step and step % 16 == 0:  # the grid is updated every 16 steps
             field.grid.look(field, generator)
         return supervision.step(field, config.rays_per_step, generator)
 

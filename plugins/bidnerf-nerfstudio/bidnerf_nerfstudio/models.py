@@ -154,7 +154,6 @@ def vanilla(weights: Weights, model: Record, parser: Record) -> Read:
                 state[name] = reordered(state[name], count, weights)
     half = parser.number("scene_scale")
     if half is None:
-        # half the side of the box that nerfstudio assumes for Blender scenes
-        half = 1.5
+        half = 1.5  # of the side of the box that nerfstudio assumes for Blender scenes
     told = f"coarse and fine network of {settings.layers} layers of {settings.width}"
     return Read(settings, state, (-half, -half, -half, half, half, half), False, told)

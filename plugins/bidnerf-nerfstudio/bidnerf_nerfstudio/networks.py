@@ -57,8 +57,7 @@ class HashEncoding(nn.Module):
             torch.floor(config.base_resolution * growth ** torch.arange(count)).tolist()
         )
         table = torch.rand(self.size * count, config.features) * 2 - 1
-        # largest entry of an untrained table
-        self.table = nn.Parameter(table * 1e-3)
+        self.table = nn.Parameter(table * 1e-3)  # the largest entry of an untrained table
 
     def forward(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n w"]:
         """Return the features of each level after those of the level before."""
@@ -137,6 +136,5 @@ def unit_cube(
 
 def density_of(raw: Float[Tensor, "p"], factor: float) -> Float[Tensor, "p"]:
     """Return the density (per training unit) for raw outputs: ``factor`` times their exponential."""
-    # limit of the exponent of densities: matter of that density is opaque within a thousandth of any relevant
-    # length
+    # Matter of a density of exp(15) is opaque within a thousandth of any relevant length.
     return factor * raw.clamp(max=15.0).exp()

@@ -139,7 +139,7 @@ def read_run(path: Path) -> Run:
     file = folder / CONFIG
     if not file.is_file():
         raise InputError(f"no {CONFIG}", where=path, expected=EXPECTED)
-    # bytes; a config has about ten thousand, and YAML is slow to parse
+    # A config has about ten thousand bytes, and YAML is slow to parse.
     if file.stat().st_size > 4 * 2**20:
         raise InputError(f"has {file.stat().st_size:,} bytes", where=file, expected="a config of nerfstudio")
     text = read_file(file, "a config of nerfstudio").decode("utf-8", "replace")
@@ -161,7 +161,7 @@ def _part(record: Record, key: str) -> Record:
 
 
 def _moved(record: Record, key: str, rows: Any, scale: float) -> SE3:
-    """Return the transform after scaling that is equivalent to one before it, which has ``rows``."""
+    """Return the transform that has the same effect after scaling as that of ``rows`` has before it."""
     matrix = torch.tensor(record.matrix(key, rows), dtype=torch.float64)
     T = rigid_pose(matrix, record.where, f"the rotation of {key}")
     return SE3(T.rotation, scale * T.translation)

@@ -91,7 +91,7 @@ class Bag:
         self, time: float, image: Any, depths: deque[tuple[float, Any]]
     ) -> tuple[Any, Any | None]:
         nearest = min(depths, key=lambda depth: abs(depth[0] - time), default=None)
-        # seconds by which the times of an image and its depth may always differ
+        # The times of an image and its depth may always differ by 20 ms.
         close = nearest is not None and abs(nearest[0] - time) <= max(0.02, self._topics.interval / 2)
         return image, nearest[1] if nearest is not None and close else None
 

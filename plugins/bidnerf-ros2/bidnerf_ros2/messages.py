@@ -112,7 +112,7 @@ def _raster(message: Any, kind: np.dtype, channels: int) -> np.ndarray:
     """Return rows of pixels without the padding at their ends."""
     width, height, step = int(message.width), int(message.height), int(message.step)
     row, data = width * channels * kind.itemsize, np.asarray(bytearray(message.data), np.uint8)
-    # pixels of an image
+    # An image has at most a hundred million pixels.
     if not (0 < width * height <= 100_000_000 and row <= step and len(data) >= step * (height - 1) + row):
         raise InputError(
             f"an image of {width}x{height} in rows of {step} bytes has {len(data)} bytes",

@@ -78,7 +78,7 @@ class ScanField(PieceField):
     @property
     def reach(self) -> float:  # type: ignore[override]
         """Metres over which density is spread in front of and behind a surface."""
-        # thickness of a surface when rays are sampled, in units of the scene's side
+        # By default, the thickness is proportional to the scene's side.
         return self.config.thickness or 0.005 * self.bounds.side
 
     @torch.no_grad()
@@ -117,8 +117,7 @@ class ScanField(PieceField):
         area = torch.linalg.vector_norm(normal, dim=-1).clamp(min=1e-30)
         unit = normal / area[:, None]
         slope = (unit * directions).sum(-1)
-        # sine of the angle between a ray and a plane below which they do not meet
-        meets = slope.abs() > 1e-6
+        meets = slope.abs() > 1e-6  # the sine of the angle between the ray and the plane
         away = corner - origins
         distance = (away * unit).sum(-1) / torch.where(meets, slope, 1)
         place = distance[:, None] * directions - away
@@ -127,7 +126,7 @@ class ScanField(PieceField):
         radius = u.square() + v.square()
         faded = (1 - radius).clamp(min=0).square()
         longest = torch.linalg.vector_norm(torch.maximum(first.abs(), second.abs()), dim=-1)
-        # relative error of a position on a ray in single precision: triangles extend beyond their edges by it
+        # Triangles extend beyond their edges by the relative error of a position on a ray in single precision.
         slack = 1e-5 + (2e-6 * torch.linalg.vector_norm(away, dim=-1) * longest / area).clamp(max=0.1)
         inside = ((u > -slack) & (v > -slack) & (u + v < 1 + slack)).to(faded)
         share = torch.where(is_round, faded, inside.detach())

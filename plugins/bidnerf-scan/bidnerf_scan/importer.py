@@ -150,7 +150,7 @@ def is_solid(field: ScanField) -> bool:
         normal = torch.linalg.cross(field.first[index], field.second[index])
         backs.append((normal * way).sum(-1) > 0)
     between = valid[:, 0] & other[:, 0]  # something is hit either way
-    # fraction of the places in the box that must have matter on two opposite sides
+    # Matter on two opposite sides of too few places in the box says nothing.
     if float(between.float().mean()) < 0.02:
         return False
     both = (backs[0] & backs[1])[between].float().mean()
@@ -175,10 +175,9 @@ def _check_precision(points: Float[Tensor, "n 3"], where: str, config: ScanSetti
         float((points.quantile(0.9, dim=0) - points.quantile(0.1, dim=0)).max()) if len(points) < 2**24 else 0
     )
     side = side or float((points.amax(0) - points.amin(0)).max())
-    # relative rounding of a coordinate in single precision, with some margin
+    # A coordinate in single precision is rounded relatively by less than this, with some margin. Where that is
+    # too coarse for the scene's longest side, the scan must be moved to the origin.
     rounding = 2.0**-22 * float(middle.abs().max())
-    # rounding of coordinates, in units of the scene's longest side, beyond which a scan must be moved to the
-    # origin
     if rounding > 2e-4 * side:
         x, y, z = (round(o + float(m)) for o, m in zip(config.origin, middle, strict=True))
         raise InputError(
@@ -214,7 +213,7 @@ def _bounds(
     """Return bounds that contain all points, unless a few of them are far away."""
     found = bounds_about(points, background, footprint)
     lower, upper = points.amin(0).double(), points.amax(0).double()
-    # ratio of the sides of the boxes around all and around nearly all points up to which the box contains all
+    # The box contains all points unless that makes it larger by half than a box around nearly all of them.
     if found.contracted or float((upper - lower).max()) > 1.5 * found.side:
         return found
     pad = 0.01 * float((upper - lower).max())

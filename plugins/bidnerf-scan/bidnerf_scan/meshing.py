@@ -127,8 +127,7 @@ def facing_cameras(surface: SurfaceMap, near: Int64[Tensor, "n k"]) -> Float64[T
     vote = torch.cat([_facing(surface, start, start + AT_ONCE) for start in range(0, len(normals), AT_ONCE)])
     alike = (normals[near] * normals[:, None]).sum(-1)
     own = vote = (alike * vote[near]).median(-1).values  # without those of rays through a gap of the surface
-    # number of times that the surfels' votes on the side of the cameras spread to their neighbours
-    for _ in range(20):
+    for _ in range(20):  # the votes on the side of the cameras spread to the neighbours
         vote = own + (alike * vote[near]).mean(-1)
     vote = vote.sign()
     unknown = vote == 0
@@ -148,7 +147,7 @@ def _facing(surface: SurfaceMap, start: int, end: int) -> Float64[Tensor, "n"]:
     if not len(cameras):
         raise InputError("a surface without keyframes, which tell its outside; 'bidnerf bake' stores some")
     positions = surface.surfels.positions[start:end].double()
-    # number of keyframes, those nearest to a surfel, from which it may be in sight
+    # A surfel is looked for from the nearest keyframes only.
     count = min(8, len(cameras))
     _, near = cKDTree(cameras.numpy()).query(positions.numpy(), k=range(1, count + 1))
     origins = cameras[torch.from_numpy(near)]
@@ -156,10 +155,9 @@ def _facing(surface: SurfaceMap, start: int, end: int) -> Float64[Tensor, "n"]:
     directions = (positions[:, None] - origins) / away[..., None]
     cosine = -(directions * surface.surfels.normals[start:end, None]).sum(-1)
     met = cast(surface, origins.float().reshape(-1, 3), directions.float().reshape(-1, 3))
-    # a ray hits a surfel within its radius, and the earlier, the more it grazes the surface
+    # A ray hits a surfel within its radius, and the earlier, the more it grazes the surface.
     along = torch.where(met.met, met.along, torch.inf).view(away.shape)
-    # cosine of the angle between a ray and a surfel's normal below which the ray does not tell the surfel's
-    # sides apart
+    # A ray that meets a surfel at too small an angle to its plane does not tell the surfel's sides apart.
     in_sight = (cosine.abs() > 0.3) & (along > away - 2 * surface.surfel_radius / cosine.abs())
     return torch.where(in_sight, cosine, 0).sum(-1)
 
@@ -169,7 +167,7 @@ def _blocks(
 ) -> Iterator[tuple[Float64[np.ndarray, "n 3"], Int64[np.ndarray, "m 3"]]]:
     """Yield the vertices, in units of cells, and the faces of each block with some."""
     measure = library("skimage.measure", "making a mesh of a surface", "mesh")
-    # the mesh extends up to the spacing from a surfel
+    # The mesh extends as far beyond a surfel as the surfels are apart.
     reach = distance.spacing + math.sqrt(3) * cell
     box = reach * np.array(np.meshgrid(*3 * [[-1, 1]])).reshape(3, -1).T
     side = BLOCK * cell

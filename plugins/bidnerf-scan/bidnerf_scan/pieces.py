@@ -88,7 +88,8 @@ def cloud_pieces(points: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"] | None)
     """Return a disc around each point (metres, world), in the plane fitted to its neighbours and as wide as
     their distances.
 
-    The colours of its neighbours give that of a disc, as a linear function within its plane (Park et al. 2017, eq. 10).    There must be three points at least.
+    The colours of its neighbours give that of a disc, as a linear function within its plane (Park et al. 2017,
+    eq. 10). There must be three points at least.
     """
     places = points.double().numpy()
     tree = cKDTree(places)
@@ -99,7 +100,7 @@ def cloud_pieces(points: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"] | None)
     ]
     first, second, colours = (torch.cat([part[i] for part in parts]) for i in range(3))
     radius = torch.linalg.vector_norm(first, dim=-1)
-    # largest radius of a disc, in units of the median radius; beyond it, a point is isolated
+    # A point whose disc would be wider than four times the median is isolated.
     shrunk = (4.0 * radius.median() / radius.clamp(min=1e-30)).clamp(max=1)
     first, second = first * shrunk[:, None], second * shrunk[:, None]
     colours = torch.cat([colours[:, :1], colours[:, 1:] * shrunk[:, None, None]], dim=1)

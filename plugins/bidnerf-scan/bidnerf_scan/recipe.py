@@ -68,10 +68,8 @@ def train(field: ScanField, views: Sequence[View], config: ScanConfig, report: R
 def first_pieces(field: ScanField, views: Sequence[View], generator: Generator) -> Pieces:
     """Return as many discs as the field has: on measured depth if there is some, else anywhere."""
     count = len(field.corner)
-    # number of pixels with measured depth drawn for each disc
-    points, rgb = _measured(views, field.bounds, 8 * count, generator)
-    # number of measured points below which discs are placed anywhere
-    if len(points) < 100:
+    points, rgb = _measured(views, field.bounds, 8 * count, generator)  # eight pixels for each disc
+    if len(points) < 100:  # too few, so that discs are placed anywhere
         lower, size = torch.tensor(field.bounds.lower), torch.tensor(field.bounds.size)
         return _anywhere(field, lower + size * torch.rand((count, 3), generator=generator), generator)
     points, colours = thinned(points, rgb, count)

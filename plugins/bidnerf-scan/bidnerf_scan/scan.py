@@ -31,11 +31,11 @@ class Scan:
 def cleaned(scan: Scan, where: str) -> tuple[Scan, str]:
     """Return the usable part of a scan, and a text that says what was left out, empty if nothing was.
 
-    Raises ``InputError`` if nothing is left.
+    Raises ``InputError``, whose message begins with ``where``, if nothing is left.
     """
     if not len(scan.points):
         raise InputError("holds no points", where=where, expected="a mesh or a point cloud")
-    # coordinates beyond which a point counts as broken
+    # A point with larger coordinates counts as broken.
     good = np.asarray(np.all(np.isfinite(scan.points) & (np.abs(scan.points) < 1e12), axis=-1))
     left = {"points with coordinates that are not finite": int((~good).sum())}
     rgb = None if scan.rgb is None else np.nan_to_num(scan.rgb, nan=0.5).clip(0, 1)
@@ -81,7 +81,7 @@ def colours_of(rows: NDArray, *names: tuple[str, str, str]) -> NDArray[np.float3
 
 
 def in_unit_range(rgb: NDArray) -> NDArray[np.float32]:
-    """Return colours in [0, 1]. Their type and the largest of them tell what they are fractions of: 1, 255, or 65535."""
+    """Return colours in [0, 1]; their type and largest value tell whether they are in units of 1, 255 or 65535."""
     largest = np.nanmax(rgb) if rgb.size else 0
     whole = 65535 if largest > 255 else 255 if rgb.dtype.kind in "ui" or largest > 1.5 else 1
     return rgb.astype(np.float32) / np.float32(whole)

@@ -162,8 +162,7 @@ def scanner_camera(record: Record, width: int, height: int) -> Intrinsics:
     if record.items(PROJECTION) is not None:
         # u = (1 + x_ndc) w / 2 with x_ndc = P00 x / -z - P02, and likewise v, which points down
         projection = _numbers(record, PROJECTION, 16)
-        # relative difference of the focal lengths of ``intrinsics`` and ``projectionMatrix`` that indicates
-        # another image size
+        # Unless the focal lengths of ``intrinsics`` and ``projectionMatrix`` agree, they are for different sizes.
         if abs(projection[0] * width / 2 / fx - 1) > 0.01:
             raise _other_size(record, width, height)
         centre = (width / 2 * (1 - projection[2]), height / 2 * (1 + projection[6]))

@@ -34,7 +34,7 @@ def recognises(path: Path) -> bool:
     if path.suffix.lower() not in (".glb", ".gltf") or not path.is_file():
         return False
     with path.open("rb") as file:
-        # number of bytes of a file that are searched for the name of the extension
+        # Only the first megabyte is searched for the name of the extension.
         return EXTENSION.encode() in file.read(1 << 20)
 
 
@@ -216,7 +216,7 @@ def _placed(gaussians: Gaussians, matrix: np.ndarray, path: Path) -> Gaussians:
     """Return the Gaussians with a node's transform applied. Raises ``InputError`` if it stretches or mirrors them."""
     scales = np.linalg.norm(matrix[:3, :3], axis=0)
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    # relative difference between a node's scales along its axes up to which they count as equal
+    # Scales along a node's axes count as equal up to a relative difference of a thousandth.
     if not scale > 0 or float(np.ptp(scales)) > 1e-3 * scale:
         raise InputError(
             "a node stretches or mirrors its Gaussians", where=path, expected="one scale for all axes"

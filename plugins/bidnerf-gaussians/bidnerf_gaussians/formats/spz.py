@@ -209,7 +209,7 @@ def write(path: Path, gaussians: Gaussians) -> None:
         (found.log_scales.numpy() + 10) * 16, _packed(found.quaternions.numpy()), harmonics[:, 1:] * 128 + 128,
     )  # fmt: skip
     body = b"".join(np.clip(np.round(part), 0, 255).astype(np.uint8).tobytes() for part in sections)
-    # the version written: the newest one that the standard library can compress
+    # Version 3 is the newest one that the standard library can compress.
     header = HEADER.pack(MAGIC, 3, len(found), found.degree, bits, 0, 0)
     stream = zlib.compressobj(wbits=31)
     write_file(path, stream.compress(header + body) + stream.flush())

@@ -32,8 +32,7 @@ def recognises(path: Path) -> bool:
 
 def read(path: Path) -> Scan:
     """Read the points of a PCD file. The pose of its sensor (VIEWPOINT) is ignored, since points are in the world."""
-    # largest file, in bytes, that is read
-    data = read_file(path, EXPECTED, 4 * 2**30)
+    data = read_file(path, EXPECTED, 4 * 2**30)  # bytes at most
     header = _header(path, data)
     rows = _rows(path, header, memoryview(data)[header.length :])
     names = header.kind.names or ()
@@ -93,7 +92,7 @@ def _rows(path: Path, header: _Header, data: memoryview) -> NDArray:
     """Return the points as a structured array. Counts are checked against the data before memory is allocated."""
     size = header.count * header.kind.itemsize
     if header.encoding == "ascii":
-        # bytes per number in a text file, including the separator
+        # A number takes at least two bytes of text, including the separator.
         _require(path, header, _width(header) * 2 * header.count, len(data) + 1)
         return _text_rows(path, header, bytes(data))
     if header.encoding == "binary":
@@ -105,7 +104,7 @@ def _rows(path: Path, header: _Header, data: memoryview) -> NDArray:
         _require(path, header, size, 0)
     packed, whole = (int(n) for n in np.frombuffer(data[:8], "<u4"))
     _require(path, header, packed, len(data) - 8)
-    # upper bound on the bytes that one byte of LZF can represent
+    # One byte of LZF represents at most 300 bytes.
     _require(path, header, size, min(whole, 300 * packed))
     columns = _decompressed(path, bytes(data[8 : 8 + packed]), whole)
     rows, at = np.zeros(header.count, header.kind), 0
