@@ -361,9 +361,9 @@ class Capture:
         """Read the frames ``names``, in that order, or the whole split; no other image is opened.
 
         When reading a whole split, frames that a mask hides entirely are left out. Images with more than ``limit``
-        pixels along the longer side are downscaled to that, where the user asked for nothing else. ``progress`` is called
-        with (frames read, frames requested) after each frame. Raises
-        ``InputError`` for an unknown split or frame, and for a file that is missing or invalid.
+        pixels along the longer side are downscaled to that, where the user asked for nothing else. ``progress`` is
+        called with (frames read, frames requested) after each frame. Raises ``InputError`` for an unknown split or
+        frame, and for a file that is missing or invalid.
         """
         shots, views = self.select(split, names), list[View]()
         for done, shot in enumerate(shots, start=1):
@@ -418,10 +418,11 @@ def _named(shots: Sequence[Shot], one_split: bool = False) -> list[Shot]:
 def hold_out(
     shots: Sequence[Shot], where: Callable[[Shot], bool] = lambda shot: True, rate: float = math.inf
 ) -> list[Shot]:
-    """Return the shots in splits: of those with a pose, every eighth (the first, the ninth ...) is "test", the others "train".
+    """Return the shots in splits: every eighth with a pose (the first, the ninth ...) is "test", the others "train".
 
-    A single one is in both splits. Shots of which ``where`` is false are in no split, nor are those beyond ``rate`` per
-    second, if all have a time, in their order. Times may be 5 ms early, as rounded ones are.
+    A single one is in both splits. Shots for which ``where`` is false are in no split. If all shots have a time, in
+    chronological order, nor are those beyond ``rate`` per second, where times may be early by 5 ms as a result of
+    rounding.
     """
     chosen, due = set[int](), -math.inf
     if any(shot.time is None for shot in shots):
@@ -470,8 +471,9 @@ def remark(where: Path | str, text: str) -> None:
 
 
 def with_files(capture: Capture) -> list[Shot]:
-    """Return the shots whose image files exist, without masks and depth images that do not; remarks count what is missing.
+    """Return the shots whose image files exist, without masks and depth images that do not exist.
 
+    Remarks count what is missing.
     Raises ``InputError`` if all images are missing, or all masks.
     """
 

@@ -42,8 +42,8 @@ class SparsePoints:
     """The points of the model in ``folder``, scaled with the training cameras ``places`` (frame name,
     T_world_camera).
 
-    Its unit is ``metres`` long according to ``cameras`` of these, whose median distance from those of the model is ``misfit``,
-    relative to their spread.
+    The unit of the model is ``metres`` long, as found from ``cameras`` training cameras. ``misfit`` is the median
+    distance of these from the model's, relative to their spread.
 
     Raises ``InputError`` if the folder holds no valid model, and if its cameras are not the training cameras.
     """
@@ -75,7 +75,7 @@ class SparsePoints:
         there, here = (torch.stack([pair[i].double().cpu() for pair in known]) for i in (0, 1))
         try:
             off = torch.linalg.vector_norm(fit_similarity(there, here).apply(there) - here, dim=-1)
-            # Once more without outliers: cameras off by several medians, but never by hardly anything.
+            # A second fit leaves out cameras that are off by several medians, but none that is off by hardly anything.
             fits = off <= max(3 * float(off.median()), 0.01 * spread(here))
             there, here, self.cameras = there[fits], here[fits], int(fits.sum())
             fit = fit_similarity(there, here)
@@ -84,7 +84,8 @@ class SparsePoints:
         except InputError as error:
             where = f"{folder}: the unit cannot be estimated from the training cameras"
             raise InputError(error, where=where) from error
-        if self.misfit > 0.2:  # a hand-held camera that moved by decimetres reaches 0.03
+        # More indicates a different scene; a hand-held camera that moved by decimetres reaches 0.03.
+        if self.misfit > 0.2:
             raise InputError(
                 f"its cameras are {self.misfit:.0%} of their spread away from the training cameras",
                 where=folder,

@@ -137,7 +137,7 @@ def _binary_camera(file: _Bytes) -> tuple[int, Camera]:
 
 
 def read_colmap_depth(path: Path) -> DepthImage:
-    """Read a depth map, in units of the model. Raises ``InputError`` for other or truncated files."""
+    """Read a depth map, in units of the model. Raises ``InputError`` for a truncated file or one of another kind."""
     content = read_file(path, "a COLMAP depth map")
     *sizes, numbers = content.split(b"&", 3)
     if len(sizes) != 3 or not all(size.isdigit() and len(size) < 10 for size in sizes):
@@ -181,7 +181,7 @@ class _Bytes:
         return len(self._content) - self._place
 
     def skip(self, size: int) -> int:
-        """Go on by ``size`` bytes, and return where they began. Raises ``InputError`` if there are fewer."""
+        """Skip ``size`` bytes, and return where they began. Raises ``InputError`` if there are fewer."""
         if size > self.left:
             length = len(self._content)
             raise InputError(

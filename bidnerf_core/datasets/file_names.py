@@ -21,7 +21,10 @@ def posix_name(name: str) -> PurePosixPath:
 
 
 class FileNames:
-    """The files below a folder, or else below others, found by the names in a metadata file; each folder is listed at most once."""
+    """The files below a folder, or else below others, found by the names in a metadata file.
+
+    Each folder is listed at most once.
+    """
 
     def __init__(self, folder: Path, *others: Path) -> None:
         self._folders = [each for each in (folder, *others) if each == folder or each.is_dir()]
@@ -36,7 +39,7 @@ class FileNames:
         relative one if it may be relative to a folder elsewhere because files were ``moved``.
         """
         name = posix_name(str(name))
-        # The parts of a relative name; of an absolute or moved one, those below each of its folders, longest first.
+        # Of a relative name, all parts are looked for; of an absolute or moved one, the last ones too, most first.
         is_absolute = name.is_absolute() or bool(name.parts and name.parts[0].endswith(":"))
         last = len(name.parts) if is_absolute or moved else min(1, len(name.parts))
         tails = [name.parts[first:] for first in range(int(is_absolute), last)]
@@ -57,7 +60,7 @@ class FileNames:
         return self.find(name, endings, moved) or self._folders[0] / posix_name(str(name))
 
     def _ignoring_case(self, place: Path, parts: tuple[str, ...]) -> Path:
-        """Return the path of ``parts`` below a folder, as the names in each folder are spelled, if only one is spelled so."""
+        """Return the path of ``parts`` below a folder, each spelled as in its folder unless that is ambiguous."""
         for part in parts:
             if place not in self._listed:
                 try:

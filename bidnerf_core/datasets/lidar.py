@@ -34,7 +34,7 @@ HIGH_CONFIDENCE = 2
 FRAMES_PER_SECOND = 5.0
 """Largest frame rate of a dataset."""
 UP = (0.0, 1.0, 0.0)
-"""ARKit aligns its world with gravity."""
+"""The upward direction of ARKit's world, which is aligned with gravity."""
 
 
 class LidarDepth:
@@ -59,8 +59,9 @@ class LidarDepth:
     def sure(
         self, measured: DepthImage, confidence: Integer[np.ndarray, "h w"] | None, where: str
     ) -> DepthImage:
-        """Return the depth whose confidence, if there is any, is high, and within the range of the lidar, 5 m according to
-        Apple; 0 elsewhere.
+        """Return the depth where its confidence, if known, is high, and 0 elsewhere.
+
+        Depth beyond 5 m, the range of the lidar according to Apple, is 0 as well.
 
         Raises ``InputError``, whose message begins with ``where``, for a confidence of another size or with
         values above the high one.
@@ -94,8 +95,7 @@ class LidarDepth:
 
 
 def pose_of_numbers(where: str, numbers: Sequence[float], opengl: bool) -> SE3 | None:
-    """Return ``T_world_camera`` (OpenCV axes) from a position and a quaternion x y z w, or None if they hold
-    no pose.
+    """Return ``T_world_camera`` (OpenCV axes) from a position and a quaternion x y z w, or None if they hold no pose.
 
     The camera axes are OpenGL's or OpenCV's. Raises ``InputError`` for a quaternion whose length is not 1.
     """

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 def unique_names(paths: Sequence[tuple[str, ...]]) -> list[str]:
     """Return a name for each path (folders, then stem): its stem, prefixed with just enough folders to make it unique.
 
-    Names that are still the same, such as those of a/b.png and a_b.png, end in "-2" and so on.
+    Names that are still the same, such as those of a/b.png and a_b.png, get the endings "-2" and so on.
     """
     names = [path[-1] for path in paths]
     for depth in range(2, max(map(len, paths), default=0) + 1):

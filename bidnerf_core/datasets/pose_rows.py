@@ -25,10 +25,11 @@ def camera_of(
     lens: Sequence[float] = (),
     first_centre: float = 0.5,
 ) -> Intrinsics:
-    """Return the camera of fx, fy, cx, cy (pixels), of images of this size (width, height), with OpenCV's distortion, if any.
+    """Return the camera with fx, fy, cx, cy (pixels) of images of ``size`` (width, height), with OpenCV's distortion, if any.
 
-    Where the upper left pixel's centre is (0, 0), half a pixel, the ``first_centre``, is added to the principal point. Raises
-    ``InputError``, whose message begins with ``where``, for numbers that no camera has.
+    ``first_centre`` is added to the principal point: half a pixel if the centre of the upper left pixel is (0, 0) in the
+    source, 0 if it is (0.5, 0.5). Raises ``InputError``, whose message begins with ``where``, for numbers that no
+    camera has.
     """
     fx, fy, cx, cy = numbers
     try:
@@ -71,8 +72,9 @@ def _from_opengl(record: Record, key: str, rows: list[list[float]]) -> SE3:
 
 
 def read_pose_matrix(path: Path) -> SE3 | None:
-    """Read ``T_world_camera`` (metres, OpenCV axes, float64) from a text file with one 4x4 matrix; None if there is no file,
-    or tracking failed, as numbers that are not finite record.
+    """Read ``T_world_camera`` (metres, OpenCV axes, float64) from a text file with one 4x4 matrix.
+
+    Returns None if there is no file, or if it holds numbers that are not finite, since tracking failed.
 
     Raises ``InputError``, which names the offending line.
     """

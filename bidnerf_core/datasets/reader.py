@@ -88,7 +88,7 @@ def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
         who = f"reader {type(reader).__name__} returned a {type(found).__name__}"
         raise InputError(who, where=path, expected="a Capture")
     shots = with_files(found)
-    farthest = 1e10  # from the centre of the Earth, and in millimetres, its surface is at 6.4e9
+    farthest = 1e10  # even in millimetres from the centre of the Earth, its surface is at 6.4e9
     for shot in shots:
         pose = shot.T_world_camera
         if pose is not None and not pose.translation.abs().max() < farthest:
@@ -196,7 +196,7 @@ class Format(Generic[Found]):
 
     expected: str
     find: Callable[[Path], Found | None]
-    """Returns what identifies the format in a folder, such as its metadata file; nothing if there is none."""
+    """Returns what identifies the format in a folder, such as its metadata file; a false value without it."""
     load: Callable[[Path, Found, DatasetOptions], Capture]
     accepts: Collection[OpenQuestion] = ()
     suffixes: Collection[str] = ()
@@ -310,7 +310,7 @@ def _without_dataset(folder: Path, readers: Sequence[Reader] | None) -> InputErr
 
 
 def _reader_of(folder: Path, readers: Sequence[Reader] | None) -> Reader | None:
-    """Return the one of ``readers``, by default of all, that recognizes a folder."""
+    """Return the first of ``readers``, by default of all, that recognizes a folder, or None."""
     if readers is None:
         return find_reader(folder)
     return next((each for each in readers if may_hold(each, folder) and each.recognises(folder)), None)

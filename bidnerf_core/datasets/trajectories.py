@@ -1,4 +1,4 @@
-"""Rows with time stamps, as in the TUM RGB-D benchmark, and tables; trajectories, and their poses interpolated in time.
+"""Rows with time stamps, as in the TUM RGB-D benchmark, tables, and trajectories with poses interpolated in time.
 
 A row is ``timestamp value value ...``, separated by spaces or commas; ``#`` begins a comment, empty lines are
 skipped, and Windows line endings are allowed. Rows may be in any order. A truncated last row, as left by an
@@ -87,7 +87,7 @@ def read_table(path: Path, expected: str, columns: str, needed: set[str]) -> lis
 def _complete(
     path: Path, rows: Sequence[tuple[Row, list[str]]], count: int, columns: str
 ) -> Sequence[tuple[Row, list[str]]]:
-    """Return rows, with their words, of at least ``count`` of these; a truncated last one is left out with a remark."""
+    """Return rows of at least ``count`` words with their words; a truncated last one is left out with a remark."""
     if not rows:
         raise InputError("has no rows", where=path, expected=f"lines of {columns}")
     last, words = rows[-1]
@@ -107,8 +107,8 @@ def _words(row: Row) -> list[str]:
 def _timed_rows(rows: Sequence[Row], path: Path, columns: str, nanoseconds: bool = False) -> list[TimedRow]:
     """Return rows that begin with a time stamp, followed by ``columns``, in chronological order.
 
-    Integer times are nanoseconds if ``nanoseconds`` is set, or if they are too large for seconds. Raises ``InputError`` for a
-    row with too few entries or without a finite time, and if there is none.
+    Integer times are nanoseconds if ``nanoseconds`` is set, or if they are too large for seconds. Raises ``InputError``
+    for a row with too few entries or without a finite time, and if there is no row.
     """
     timed = list[TimedRow]()
     columns = f"timestamp {columns}"
@@ -129,8 +129,8 @@ def _timed_rows(rows: Sequence[Row], path: Path, columns: str, nanoseconds: bool
 def read_timed_files(path: Path) -> list[TimedRow]:
     """Read a list of files with their time stamps, in chronological order.
 
-    Raises ``InputError`` if it is missing, not text, too large or empty, and for rows without a file name, without a finite
-    time, or with that of another.
+    Raises ``InputError`` if it is missing, not text, too large or empty, and for a row without a file name, without a
+    finite time, or with the time of another row.
     """
     rows = _timed_rows(read_rows(path, "a list of time stamps", "timestamp filename"), path, "filename")
     for row, following in pairwise(rows):
@@ -232,7 +232,7 @@ def pose_numbers(where: str, numbers: Sequence[float], order: str = "xyzw") -> l
     quaternion, length = dict(zip(order, numbers[3:], strict=True)), math.hypot(*numbers[3:])
     if length == 0 or not all(map(math.isfinite, numbers)):
         return None
-    if abs(length - 1) > 0.01:  # such as that of numbers with four decimals
+    if abs(length - 1) > 0.01:  # more than rounding, for example to four decimals, explains
         names = " ".join(f"q{letter}" for letter in order)
         raise InputError(f"the quaternion has length {length:.3g}", where=where, expected=f"1 ({names})")
     return [*numbers[:3], *(quaternion[letter] for letter in "xyzw")]

@@ -49,9 +49,8 @@ class Video:
                 raise _no_video(path, reason(error)) from error
             start = (container.start_time or 0) / 1e6  # microseconds
             shown = [(p.pts, float(p.pts * stream.time_base) - start) for p in found if not p.is_discard]
-        shown = sorted(
-            frame for frame in shown if frame[1] >= 0
-        )  # others are only needed to decode what follows
+        # Frames before the start are only needed to decode what follows.
+        shown = sorted(frame for frame in shown if frame[1] >= 0)
         if not shown:
             raise _no_video(path, "it has no frames")
         self._stamps, self.times = [stamp for stamp, _ in shown], [time for _, time in shown]
@@ -142,6 +141,7 @@ def is_video(path: Path) -> bool:
     except InputError:
         return False
     mp4 = head[4:8] == b"ftyp" and not looks_like_image(path)
+    # The second is the beginning of Matroska and WebM.
     return mp4 or head[:4] == b"\x1aE\xdf\xa3" or (head[:4] == b"RIFF" and head[8:12] == b"AVI ")
 
 
@@ -183,6 +183,8 @@ def _pixels(picture: Any) -> UInt8[np.ndarray, "h w 3"]:
     try:
         pixels: np.ndarray = picture.to_ndarray(format="rgb24")
     except OSError:  # FFmpeg does not support the colour space that the file names, such as BT.2020 with constant luminance
-        picture.colorspace = 9
+        picture.colorspace = (
+            9  # BT.2020's YCbCr-to-RGB matrix (ITU-T H.273), in place of those that FFmpeg lacks
+        )
         pixels = picture.to_ndarray(format="rgb24")
     return pixels

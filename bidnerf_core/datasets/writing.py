@@ -67,8 +67,7 @@ def _written(folder: Path, split: str, view: View, background: tuple[float, floa
 def frame_entry(
     file_path: str, name: str, camera: Intrinsics, T_world_camera: SE3, time: float | None = None
 ) -> dict[str, Any]:
-    """Return an entry of ``frames`` for a ``transforms.json``: an image, its camera, its pose and its time
-    (seconds).
+    """Return an entry of ``frames`` for a ``transforms.json``: an image, its camera, its pose and its time (seconds).
 
     Raises ``InputError`` for a lens that the format cannot describe.
     """

@@ -67,9 +67,9 @@ def _read(path: Path, models: list[Path], options: DatasetOptions) -> Capture:
 
 
 def colmap_project(path: Path) -> tuple[Path, Path, list[ModelImage], dict[int, Camera], dict[str, Path]]:
-    """Return the model that is used, the folder of its images, its images in natural order of names, its cameras by id, and
-    the image files that are there, by the images' names.
+    """Return the model that is used, the folder of its images, its images, cameras and image files.
 
+    The images are in the natural order of their names, the cameras by id, and the files that exist by the images' names.
     Raises ``InputError`` if the model is damaged or has no registered image.
     """
     model = _largest(path, colmap_models(path))
@@ -77,7 +77,7 @@ def colmap_project(path: Path) -> tuple[Path, Path, list[ModelImage], dict[int, 
     folder, files = _image_folder(path, model, images)
     others = _models_at(folder.parent / "sparse") if files else []
     if others and model.resolve() not in [each.resolve() for each in others]:
-        # such as dense/0, whose images are undistorted, while those of sparse/0 lie elsewhere
+        # Such a folder is dense/0, whose images are undistorted, while those of sparse/0 lie elsewhere.
         text = f"{folder.relative_to(path)} has a model of its own, which is used instead of {model.relative_to(path)}"
         remark(path, text)
         model = _largest(path, others)

@@ -69,7 +69,10 @@ def _sensor(file: Path, options: DatasetOptions) -> tuple[CameraSource, SE3]:
 
 
 def _numbers(file: Path, text: str, key: str, count: int) -> list[float]:
-    """Return the ``count`` numbers of a bracketed YAML list on one or several lines, possibly below a matrix's ``data:``."""
+    """Return the ``count`` numbers of a bracketed YAML list, on one or several lines, for ``key``.
+
+    The list may stand below a matrix's ``data:``.
+    """
     found = re.search(rf"^\s*{key}\s*:[^\[]*\[([^\]]*)\]", text, re.MULTILINE)
     try:
         numbers = [float(word) for word in found[1].replace(",", " ").split()] if found else []

@@ -60,7 +60,7 @@ def _read(path: Path, folder: Path, options: DatasetOptions) -> Capture:
 
 
 def _find(path: Path) -> Path | None:
-    """Return the folder of the camera whose images are used."""
+    """Return the folder of the first camera that has images, the left colour camera before others, or None."""
     if not is_file(path / "calib.txt"):
         return None
     folders = (path / f"image_{number}" for number in (2, 0, 3, 1))

@@ -55,7 +55,7 @@ def _read(path: Path, cameras: Path, options: DatasetOptions) -> Capture:
                 "is incomplete", expected="fx, fy, cx, cy, and t_00 to t_23, the rows of the camera's pose"
             )
         width, height = record.size("width"), record.size("height")
-        if width is None or height is None:  # as in newer exports
+        if width is None or height is None:  # newer exports do not store the size
             header = read_header(photo)
             width, height = width or header.width, height or header.height
         depth, confidence = (cameras.parent / kind / f"{time}.png" for kind in ("depth", "confidence"))
@@ -67,7 +67,7 @@ def _read(path: Path, cameras: Path, options: DatasetOptions) -> Capture:
                 T_world_camera=pose_of_rows(record, "t_00 to t_23", rows),
                 time=int(time) / 1_000_000 if time.isdecimal() else None,
                 depth=DepthFile(depth, measured) if has_depth else None,
-                border=15 if corrected else 0,  # the width that other software crops
+                border=15 if corrected else 0,  # pixels that are black in undistorted photos
                 folders=(),
                 usual_side=lidar.LARGEST_SIDE,
             )
@@ -78,7 +78,7 @@ def _read(path: Path, cameras: Path, options: DatasetOptions) -> Capture:
 
 
 def _find(path: Path) -> Path | None:
-    """Return the folder of cameras, without hidden files such as the companions ``._NAME`` of a Mac, beside that of photos."""
+    """Return the folder of cameras, beside that of photos; hidden files such as a Mac's ``._NAME`` do not count."""
     for prefix in ("corrected_", ""):
         for base in (path / "keyframes", path):
             cameras = base / f"{prefix}cameras"

@@ -67,7 +67,7 @@ def _shot(row: Row, values: dict[str, str], image: Path) -> Shot:
         return Shot(image=image)
     header = read_header(image)
     size, longer = (header.width, header.height), max(header.width, header.height)
-    focal = number("f") * longer / 36.0  # the width of the film in millimetres, to which focal lengths refer
+    focal = number("f") * longer / 36.0  # focal lengths refer to a film 36 mm wide
     centre = header.width / 2 + number("px") * longer, header.height / 2 + number("py") * longer
     lens = [number(key) for key in ("k1", "k2", "t1", "t2", "k3")]
     lens = lens if lens[4] else lens[:4]

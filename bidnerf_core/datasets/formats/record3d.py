@@ -67,8 +67,7 @@ class Recording:
             self.read(name),
             np.dtype(kind).itemsize * math.prod(size),
         )
-        # Compressed data is never much longer than its content, so longer data would unpack to more than
-        # expected.
+        # Compressed data is never much longer than its content, so longer data would unpack to more than expected.
         if len(packed) > count + count // 8 + 1024:
             expected = f"at most the {count} that it should unpack to"
             raise InputError(f"has {len(packed)} bytes", where=where, expected=expected)
@@ -76,7 +75,7 @@ class Recording:
             found = _lzfse(self.path)(packed)
         except InputError:
             raise
-        except Exception as error:  # raised by a C library
+        except Exception as error:  # a C library raises it
             raise InputError(
                 f"not readable as LZFSE ({error})", where=where, expected="a complete file"
             ) from error

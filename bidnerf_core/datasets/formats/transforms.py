@@ -53,7 +53,7 @@ def _read(path: Path, found: list[Path], options: DatasetOptions) -> Capture:
         depth = frame.depth_path and names.path(frame.depth_path, moved=True)
         unit = options.depth_unit or frame.depth_unit
         masks = [MaskFile(names.path(frame.mask_path, moved=True))] if frame.mask_path else []
-        dynamic = image.with_name(f"dynamic_mask_{image.stem}.png")  # of instant-ngp
+        dynamic = image.with_name(f"dynamic_mask_{image.stem}.png")  # where instant-ngp looks for a mask
         masks += [MaskFile(dynamic, "white")] if is_file(dynamic) else []
         shots.append(
             Shot(
@@ -83,7 +83,7 @@ def _find(path: Path) -> list[Path]:
 
 
 def _check_images(folder: Path, frames: Sequence[FrameRecord], images: Sequence[Path]) -> None:
-    """Report names that differ from the file names by more than an added extension.
+    """Report names that differ from the file names by more than an added extension, in one remark.
 
     Raises ``InputError`` if parts of several names fit one file.
     """
@@ -112,7 +112,7 @@ def _first_size(frames: Sequence[FrameRecord], images: Sequence[Path]) -> tuple[
     for frame, image in zip(frames, images, strict=True):
         try:
             header = read_header(image)
-        except InputError:  # missing, or raised again when that frame is read
+        except InputError:  # the image is missing, or the error is raised again when that frame is read
             continue
         size = header.width, header.height
         given = frame.camera.width or size[0], frame.camera.height or size[1]

@@ -19,7 +19,8 @@ from bidnerf_core.io import IMAGE_SUFFIXES, Record, read_record
 
 METRES_PER_DEPTH_UNIT = 0.001
 UNIT_KEYS = {"depth_file_path": "depth_unit_scale_factor", "depth_path": "integer_depth_scale"}
-"""The keys of a depth image, nerfstudio's, and that of instant-ngp and NeRFCapture; and those of the metres per step of its values."""
+"""The keys of a depth image, nerfstudio's and that of instant-ngp and NeRFCapture, with those of the metres per step of its
+values."""
 
 
 @dataclass(frozen=True, eq=False)
