@@ -36,9 +36,8 @@ class Anchor:
     orientation_sigma: float = 0.0  # degrees
 
     def __post_init__(self) -> None:
-        """Raise ``InputError`` for a place off the earth, a matrix that is not a pose, and numbers that are
-        not positive.
-        """
+        """Raise ``InputError`` for a place off the earth, a matrix that is no pose, and a length or angle out of range."""
+        # The height is in metres above or below the ellipsoid.
         for name, most in (("latitude", 90.0), ("longitude", 180.0), ("height", 1e6)):
             if not abs(getattr(self, name)) <= most:
                 raise InputError(f"{name} is {getattr(self, name)}", expected=f"{-most:g} to {most:g}")

@@ -122,8 +122,8 @@ def with_tracks_in(info: MapInfo, landmarks: LandmarkMap, names: Sequence[str]) 
 
 def check_alike(info: MapInfo, field: RadianceField, views: Sequence[View], where: str) -> None:
     """Raise ``InputError`` for photos that are unlike the field, regardless of whether the map was built from them."""
-    # The difference (RMS) between rendered and photographed colours is compared with that between the field and the photos
-    # the map was built from, which is unknown in a map that was never baked.
+    # The difference (RMS) between rendered and photographed colours indicates another scene if it is large relative to that of
+    # the photos the map was built from, or in itself if that is unknown, as in a map that was never baked.
     off, usual = colour_noise(field, info.bounds, views), info.colour_noise
     if off > (0.3 if usual is None else max(0.2, 2 * usual)):
         raise InputError(

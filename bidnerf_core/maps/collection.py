@@ -43,11 +43,10 @@ class Placement:
     map: str  # the map of the best answer, even if that was rejected
     found: Localization
     runner_up: tuple[str, Localization] | None  # the second best answer; None if only one map was tried
-    ranking: Mapping[
-        str, float
-    ]  # all maps, most similar first: the cosine between pooled descriptors, -1 if a map has none
+    # all maps, most similar first: the cosine between pooled descriptors, -1 if a map has none
+    ranking: Mapping[str, float]
     asked: tuple[str, ...]  # maps in which the image was localized, in order
-    backend: str  # of the map
+    backend: str  # that of the map
 
     @property
     def converged(self) -> bool:
@@ -91,9 +90,9 @@ class MapCollection:
         """Read the landmarks of all maps: those in the subfolders of one folder, a list of maps and of folders
         of maps, or maps by name.
 
-        ``asked`` is the largest number of maps that are tried, the most similar ones first, and ``localizers`` are existing ones by the
-        names of their maps. Raises ``InputError`` if there is no map, or
-        the same one twice, and ``Cancelled`` once ``cancel`` returns True.
+        ``asked`` is the largest number of maps that are tried, the most similar ones first. ``localizers`` holds existing
+        localizers by the names of their maps. Raises ``InputError`` if there is no map or the same one twice, and
+        ``Cancelled`` once ``cancel`` returns True.
         """
         if asked < 1:
             raise InputError(f"asked is {asked}", expected="1 or more")
@@ -135,13 +134,13 @@ class MapCollection:
             scene = self._maps[name]
             stored = scene if isinstance(scene, Map) else load_map(scene)
             self._localizers[name] = Localizer(stored, self.method, self.config, warm_up=False)
-            while len(self._localizers) > 6:  # maps that stay in memory after use
+            while len(self._localizers) > 6:  # so many maps stay in memory after use
                 self._localizers.popitem(last=False)
         self._localizers.move_to_end(name)
         return self._localizers[name]
 
     def ranked(self, frame: Frame) -> dict[str, float]:
-        """Return the similarity of each map to an image, most similar first; that of maps without landmarks is -1."""
+        """Return the similarity of each map to an image, most similar first; it is -1 for a map without landmarks."""
         vectors: dict[tuple[str, int], Float[Tensor, "p"]] = {}
         for key, vocabulary in self._vocabularies.items():
             descriptors = detected(find_features(key[0]), frame.rgb).descriptors if frame.has_colour else None

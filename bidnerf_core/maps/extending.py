@@ -119,7 +119,7 @@ def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> li
             "has no landmarks for localizing photos; 'bidnerf bake MAP --data DATA' builds them", where=where
         )
     localizer, cameras = Localizer(scene), {camera.name: camera.pose for camera in scene.info.cameras}
-    # within which a photo with the same name as one of the map's counts as that photo
+    # A photo that has the name of one of the map's counts as that photo if it was taken this near to it.
     near, count = 0.02 * scene.bounds.side, counter("locating", "photos")
     views, left_out, known = list[View](), list(unread), 0
     for number, frame in enumerate(frames, start=1):
@@ -142,6 +142,7 @@ def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> li
         count(number, len(frames))
     for name, why in left_out:
         log.info(f"{name}: left out: {why}")
+    # Photos of which fewer are localized do not show the scene of the map.
     if len(views) + known < max(1.0, 0.25 * len(frames)):
         raise InputError(
             f"localizes {len(views) + known} of {amount(len(frames), 'photo')}",
@@ -207,7 +208,7 @@ def _old_views(scene: Map, data: Images | None, split: str) -> list[View]:
         small, pose = camera.intrinsics.at_most(320), camera.pose
         image = render_image(scene.field, small, pose, scene.bounds)
         frame = Frame(camera.name, image.rgb.cpu().clamp(0, 1), small)
-        # Some of the distances that the field renders, so that training preserves them without treating them as measurements.
+        # Training preserves some of the distances that the field renders, without treating them as measurements.
         depth, generator = image.depth.cpu(), torch.Generator().manual_seed(number)
         solid = ((image.opacity.cpu() > 0.95) & (depth > 0)).nonzero()
         rows = solid[torch.randperm(len(solid), generator=generator)[:400]]
@@ -233,11 +234,11 @@ def _extended(
     tracked = tracked_views(given, scene.info.landmark_features)
     seeing = list(given)
     with contextlib.suppress(InputError):  # one photo, or photos without overlap
-        # Those without dense depth get the landmarks they show, from which training takes distances.
+        # Photos without dense depth get the landmarks they show, from which training takes distances.
         parts = zip(given, tracked.seen(DEFAULT_LANDMARKS), strict=True)
         seeing = [v if v.frame.has_dense_depth else replace(v, landmarks=part) for v, part in parts]
     new, weighted = (seeing[len(old) :], seeing) if complete else (seeing, [*old, *seeing])
-    if old and not complete:  # renderings, with fewer pixels than photos, which are to count as much
+    if old and not complete:  # renderings have fewer pixels than photos, but are to count as much
         pixels = [
             sum(v.frame.intrinsics.width * v.frame.intrinsics.height for v in part) / len(part)
             for part in (old, new)
@@ -252,8 +253,8 @@ def _extended(
         seconds=scene.info.seconds + time.monotonic() - began,
     )
     grown = replace(scene, info=info, field=info.in_map_unit(field), folder=None, record=scene.capture)
-    # From measured depth and, unlike ``bake_surface``, also from depth rendered from the other cameras: the photos of these are
-    # not at hand, and what they measured must not be lost.
+    # The surface is baked from measured depth and, unlike by ``bake_surface``, also from depth rendered from the other
+    # cameras: the photos of these are not at hand, and what they measured must not be lost.
     measured = [view for view in seeing if view.frame.has_dense_depth]
     names = {view.frame.name for view in measured}
     others = [(c.intrinsics, c.pose) for c in info.cameras if c.name not in names]
@@ -340,7 +341,7 @@ def _present(landmarks: LandmarkMap, more: LandmarkMap) -> Bool[Tensor, "n"]:
     index = torch.from_numpy(np.asarray(near).reshape(len(more), -1))
     deviation = more.deviations.amax(-1)[:, None] + landmarks.deviations.amax(-1)[index]
     descriptors = landmarks.descriptors[index].float() - more.descriptors[:, None].float()
-    # Relative to the distance between descriptors of different landmarks; those of one are nearer to each other.
+    # Descriptors of one landmark are nearer to each other than this fraction of the distance between those of different ones.
     alike = descriptors.norm(dim=-1) <= 0.42 * landmarks.unrelated_distance
     return ((distance <= 3 * deviation) & alike).any(-1)
 

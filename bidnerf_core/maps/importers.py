@@ -30,9 +30,8 @@ class Structure:
 
     capture: Capture  # the images, all with poses and named; without a file, if their keypoints are known
     positions: Float[Tensor, "p 3"]  # metres, world, float64
-    observed: tuple[
-        Int[Tensor, "k"], ...
-    ]  # number of the point that each keypoint of an image observes; -1: none
+    # number of the point that each keypoint of an image observes; -1: none
+    observed: tuple[Int[Tensor, "k"], ...]
     keypoints: tuple[Keypoints, ...] = ()  # of the images as stored; empty: to be detected in them
 
 
@@ -46,7 +45,7 @@ class ImportedField:
     bounds: SceneBounds
     _: KW_ONLY
     found: tuple[str, ...] = ()  # sentences on the content of the file, such as counts, and what was left out
-    steps: int = 1  # of its training, 1 if unknown
+    steps: int = 1  # of its training; 1 if unknown
     points: Float[Tensor, "n 3"] | None = (
         None  # metres, world: points on the matter, from which its extent is reported
     )
@@ -158,6 +157,7 @@ def bounds_about(
     """
     inner, outer = robust_box(points, 0.15, 0.25), robust_box(points)
     sides = [float((upper - lower).max()) for lower, upper in (inner, outer)]
+    # The scene is unbounded if nearly all of its matter takes a box several times as large as most of it.
     contracted = sides[1] > 3 * sides[0]
     lower, upper = inner if contracted else outer
     farthest = points[:: max(1, len(points) // 200_000)].double() - (lower + upper) / 2

@@ -114,7 +114,7 @@ def import_map(
         bounds = found.bounds
         if read is not None and read.source and any(view.frame.alpha is not None for view in views):
             bounds = replace(bounds, background=read.background)  # over which its images were composited
-        step = max(1, found.steps)  # 0 would be that of a map without a field
+        step = max(1, found.steps)  # 0 would mean a map without a field
         info = MapInfo(
             found.backend, to_plain(found.config, "config"), bounds, step, True, path.name,
             landmark_features=options.features, unit=unit, origin=origin,
@@ -135,7 +135,7 @@ def import_map(
         if views:
             check_alike(scene.info, scene.field, views, where)
             ratio = ratio_to_measured_depth(scene.field, scene.bounds, views)
-            if ratio is not None and abs(ratio - 1) > 0.03:
+            if ratio is not None and abs(ratio - 1) > 0.03:  # less is not worth reporting
                 text = f"the photos' measured depth is {ratio:.3g} times the field's; is its scale different?"
                 text = f"{where}: {text} The poses of the photos would have to be scaled as well"
                 warnings.warn(text, InputWarning, stacklevel=2)
@@ -208,7 +208,7 @@ def _described(structure: Structure, features: str, origin: Origin) -> tuple[Rea
         size = camera.height, camera.width
         blank.setdefault(size, torch.zeros((*size, 3), dtype=torch.uint8))
         order = (observed < 0).long().argsort(stable=True)
-        # As many as SIFT finds in a query; beyond, only those that observe a point.
+        # As many keypoints are used as SIFT finds in a query; if more observe a point, all of these.
         order = order[: max(int((observed >= 0).sum()), 2000)]
         scale = torch.tensor([camera.width / stored.width, camera.height / stored.height])
         chosen = Keypoints(
@@ -254,6 +254,7 @@ def _report_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
         f"{where}: extent {extent}"
         + (" metres" if unit == "metres" else "; its unit is not stored (--scale gives its length in metres)")
     )
+    # The longest side of a plausible scene is between 5 cm and 500 m; other lengths are probably in another unit.
     doubt = ""
     if max(size) > 500:
         doubt = "very large in metres; are its lengths millimetres?"
@@ -274,7 +275,7 @@ def ratio_to_measured_depth(field: RadianceField, bounds: SceneBounds, views: Se
     count = max(4096, len(measured))
     pixels = draw(measured, count, uniform, generator, device=device_of(field)).flattened()
     seen = render(field, bounds.rays(pixels.origins, pixels.directions), bounds.background)
-    both = (pixels.distance > 0) & (seen.opacity > 0.5)
+    both = (pixels.distance > 0) & (seen.opacity > 0.5)  # the depth of a less opaque ray means nothing
     if int(both.sum()) < 200:
         return None
     return float((pixels.distance[both] * seen.opacity[both] / seen.distance[both]).median())

@@ -66,7 +66,7 @@ def factor_of_poses(scene: Map, known: Mapping[str, SE3 | Position]) -> ScaleFit
     found = {name: camera for name in known if (camera := _camera_of(scene, name)) is not None}
     if len({camera.name for camera in found.values()}) < len(found):
         raise InputError("two known poses belong to the same camera of the map", expected="one for each")
-    if len(found) < 3:  # two give a scale that nothing checks
+    if len(found) < 3:  # two give a scale that cannot be checked
         cameras = scene.info.cameras
         example = f" such as {cameras[0].name!r}" if cameras else ""
         raise InputError(
@@ -77,6 +77,7 @@ def factor_of_poses(scene: Map, known: Mapping[str, SE3 | Position]) -> ScaleFit
     target = torch.stack([_position(known[name]) for name in found])
     fit = fit_similarity(source, target)
     off = float((fit.apply(source) - target).square().sum(-1).mean().sqrt())
+    # A misfit that is large relative to the spread of the positions indicates another capture.
     if off > 0.2 * spread(target):
         raise InputError(
             f"the cameras are {off:.3g} m (root mean square) from their known positions after the best"
@@ -132,9 +133,8 @@ def _no_camera(scene: Map, name: str) -> str:
     others = "NAME@U,V for what a camera shows at a pixel, or coordinates X,Y,Z"
     if not names:
         return "it has no cameras; expected coordinates X,Y,Z"
-    digits = re.compile(
-        r"\d+|\.\w+$"
-    )  # the parts in which the names of photos of one capture differ, and file extensions
+    # The names of photos of one capture differ only in numbers and file extensions.
+    digits = re.compile(r"\d+|\.\w+$")
     alike = [each for each in names if digits.sub("", each) == digits.sub("", name)]
     if not alike:
         hint = spelling_hint(name, names, f", expected a name such as {names[0]!r}")

@@ -126,9 +126,9 @@ def read_parts(
     They belong together even while a training run replaces the map. Raises ``InputError`` if one of them is damaged.
     """
     info = load_info(folder)
-    for _ in range(
-        5
-    ):  # checkpoints are seconds apart, so that each further failure takes a disk slower than that
+    # A training run may replace the map between the reading of its description and of its parts. Checkpoints are seconds
+    # apart, so that each further failure takes a disk slower than that.
+    for _ in range(5):
         try:
             weights = read_tensors(folder / info.weights, EXPECTED_PART)
             if not baked:
@@ -211,7 +211,7 @@ def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path
         raise InputError(
             f"tensor {surplus[0]!r} is not part of the field that map.json describes", where=path
         )
-    largest = 1e9  # beyond which products would overflow in float32; trained ones stay far below it
+    largest = 1e9  # products of larger weights would overflow in float32; trained ones stay far below it
     for name, _ in module.named_parameters():
         if name in tensors and not bool((tensors[name].abs() <= largest).all()):
             raise InputError(

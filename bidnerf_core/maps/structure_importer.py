@@ -81,7 +81,7 @@ class StructureImporter:
                 left_out.append(f"{image.name}: no such photo in {folder}")
             elif (
                 int((observed[number] >= 0).sum()) < 6
-            ):  # which do not even determine its own pose by consensus
+            ):  # too few to determine even its own pose by consensus
                 left_out.append(f"{image.name}: it observes fewer than 6 points")
             else:
                 kept.append(number)

@@ -91,15 +91,14 @@ def train(
             f"config is a {found}", expected=f"a {expected} or a dict of its settings, or 'quick'"
         )
     baking = bake_settings(bake)
-    working_device(options.device)  # rejected before anything is read
+    working_device(options.device)  # an invalid one is rejected before anything is read
     place, known = None if out is None else Path(out), None
     if place is not None and not options.overwrite:
         there = None
         with contextlib.suppress(InputError):
             there = load_info(place)
-        if (
-            there is not None and there.complete and not there.step
-        ):  # without a field, as an imported map may be
+        # A map that is complete without a field, as an imported one may be, gets one.
+        if there is not None and there.complete and not there.step:
             known = load_map(place)
     with (
         job_context(progress, cancel),
@@ -153,7 +152,7 @@ def train(
 def _with_field(
     scene: Map, data: Images, images: DatasetOptions, options: TrainOptions, config: BakeConfig | None
 ) -> Map:
-    """Train the field that a map of landmarks describes, and keep these with the map's cameras and their poses."""
+    """Train the field that a map of landmarks describes, keeping the landmarks, the cameras and their poses."""
     info, images = scene.info, replace(images, largest=longest_side(scene.info))
     read = read_views(data, images, options.depth_points, options.point_choice, scene.folder).about(
         info.origin
@@ -172,7 +171,7 @@ def _with_field(
 
 @contextlib.contextmanager
 def finished_parts(folder: Path | None) -> Iterator[None]:
-    """Say what of a map is in its folder if the work in the context is cancelled."""
+    """Add which parts of a map are in its folder to the error if the work in the context is cancelled."""
     try:
         yield
     except Cancelled as stopped:
@@ -200,10 +199,10 @@ def resume(
 ) -> Map:
     """Resume the interrupted training of the map in ``folder``, with the same result as an uninterrupted run.
 
-    A map that is trained but not baked is baked. With ``finish``, training ends with the steps done so far, and the map is
-    baked as it stands; without any steps, it is a map of landmarks alone. Backend, settings and poses are those of the original run; ``data`` and
-    those ``options`` that concern reading must give the same views. The other arguments and the errors are as for
-    ``train``. Raises ``InputError`` if nothing is left to do.
+    A map that is trained but not baked is baked. With ``finish``, training ends with the steps done so far, and the map
+    is baked as it stands; without any steps, it is a map of landmarks alone. Backend, settings and poses are those of
+    the original run; ``data`` and those ``options`` that concern reading must give the same views. The other arguments
+    and the errors are as for ``train``. Raises ``InputError`` if nothing is left to do.
     """
     out, baking, device = Path(folder), bake_settings(bake), working_device(options.device)
     interrupted(out, baking is not None)
@@ -222,9 +221,10 @@ def resume(
         views = at_stored_poses(read.views, info.cameras)
         tracked = None
         if not info.complete or info.landmarks is None or info.capture is None:
+            # These are the keypoints and views with which training began.
             tracked, views = located(
                 views, features=info.landmark_features, trust_poses=True, depth_unit=read.depth_unit
-            )  # the same as when training began
+            )
         state = None
         if info.complete or finish:
             scene = load_map(out, device)
@@ -236,7 +236,7 @@ def resume(
         if finish and not info.complete:
             log.info(f"{out}: ends with the {amount(info.step, 'step')} done so far")
             field = cast(nn.Module, trained_field(scene.field)).state_dict()
-            done = replace(info, complete=True)  # without what resuming would need
+            done = replace(info, complete=True)  # the state that resuming would need is dropped
             scene = replace(
                 scene, info=write_parts(out, done, TrainingState(info.step, field, {}), keep=True)
             )
@@ -339,7 +339,7 @@ def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> 
 def _trained(
     views: Sequence[View], scene: Map, options: TrainOptions, state: TrainingState | None = None
 ) -> Map:
-    """Train the field that a map describes, from a ``state``, or from the beginning, to the end."""
+    """Train the field that a map describes to the end, from a ``state`` or from the beginning."""
     out, device = scene.folder, working_device(options.device)
     backend, where = load_backend(scene.info.backend, str(out or "")), scene.name
     unsaved = scene.landmarks if scene.info.landmarks is None else None
@@ -366,7 +366,7 @@ def _trained(
 
 
 def _baked(scene: Map, views: Sequence[View], tracked: TrackedViews | None, config: BakeConfig | None) -> Map:
-    """Bake what a map with a field lacks: its surface, and the capture record of photos whose keypoints were ``tracked``."""
+    """Bake what a map with a field lacks: its surface and its capture record, the latter from ``tracked`` keypoints."""
     if config is not None:
         if scene.surface is None:
             scene = baked_if_possible(scene, lambda whole: whole.with_surface(views, config))

@@ -38,9 +38,9 @@ def viewpoints(
     distance = _distances(field, bounds, places)
     hit = distance > 0
     nearest = torch.where(hit, distance, torch.inf).quantile(0.1, dim=1)  # exceeded by nine out of ten rays
-    # Closer up than this, little is visible; a place is inside a room or the like if most rays from it hit matter.
+    # Closer to matter than this, little is visible; a place is inside a room or the like if most rays from it hit matter.
     free = (nearest > 0.04 * bounds.side) & (hit.float().mean(1) > 0.6)
-    # An object with hollows (Lego: 0.09) has some such places, and a room (0.5) has many.
+    # An object with hollows (Lego: 0.09) has some such places, and a room (0.5) has many: it is viewed from inside.
     if not is_solid and float(free.float().mean()) > 0.2:
         poses = _within(places[free], distance[free], up)
     else:  # from all around the box, at a distance from which it fills the images
@@ -61,9 +61,8 @@ def _distances(
     towards = sphere(DIRECTIONS).float().expand(len(places), -1, -1).reshape(-1, 3).to(device)
     near = torch.full_like(origins[:, 0], bounds.near)
     seen = render(field, Rays(origins, towards, near, torch.full_like(near, bounds.far)), bounds.background)
-    found = torch.where(
-        seen.opacity > 0.8, seen.distance / seen.opacity.clamp(min=0.8), 0
-    )  # of something solid
+    # A ray of less opacity hits nothing solid.
+    found = torch.where(seen.opacity > 0.8, seen.distance / seen.opacity.clamp(min=0.8), 0)
     return found.cpu().reshape(len(places), -1)
 
 

@@ -57,7 +57,7 @@ def chosen_origin(points: Float[Tensor, "n 3"]) -> Origin:
     """
     low, high = points.double().amin(0), points.double().amax(0)
     middle, size = (low + high) / 2, float((high - low).max())
-    # Single precision resolves 0.06 mm at 1000 m; at ten times a scene's size, recentring gains one digit.
+    # At 1000 m, single precision still resolves 0.06 mm, and at ten times the scene's size, recentring gains one digit.
     if not float(middle.abs().max()) > max(1000.0, 10 * size):
         return 0.0, 0.0, 0.0
     step = 10.0 ** math.ceil(math.log10(max(size, 1.0)))
@@ -80,9 +80,8 @@ class ReadViews:
     )
     sparse_depth: int = 0  # pixels whose depth comes from the points of a COLMAP model
     depth_unit: float | None = None  # metres per step of depth images, if their format accepts another
-    files: Mapping[str, str] = field(
-        default_factory=dict
-    )  # of images by name, relative to the dataset's folder
+    # files of images by name, relative to the dataset's folder
+    files: Mapping[str, str] = field(default_factory=dict)
 
     def about(self, origin: Origin) -> ReadViews:
         """Return the views with poses relative to ``origin``, a point of their world."""
