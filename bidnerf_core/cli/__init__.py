@@ -80,7 +80,7 @@ def _guarded(name: str, given: list[str]) -> int:
     except InputError as error:
         return _failed(name, str(error), WRONG_USAGE if isinstance(error, UsageError) else BAD_INPUT)
     except RuntimeError as error:
-        if type(error).__name__ != "OutOfMemoryError":  # of torch, which --help does not wait for
+        if type(error).__name__ != "OutOfMemoryError":  # it is torch's, whose import --help does not wait for
             raise
         return _failed(name, f"the GPU's memory is full, try --device cpu ({error})", BAD_INPUT)
 
@@ -102,7 +102,7 @@ def _dispatch(given: list[str]) -> int:
         return _failed("bidnerf", unknown, WRONG_USAGE, f"\n{usage}")
     if any("\0" in word for word in given):
         raise UsageError("an argument holds a NUL character", expected="text")
-    from bidnerf_core.cli.parser import parse  # imported here, for the sake of a quick --version
+    from bidnerf_core.cli.parser import parse  # imported here for the sake of a quick --version
 
     parse(given[0], importlib.import_module(f"bidnerf_core.cli.{given[0]}").run, given[1:])
     return DONE
@@ -118,7 +118,7 @@ def _warnings_as_lines(name: str) -> Iterator[None]:
             if not issubclass(category, InputWarning):
                 lines = warnings.formatwarning(message, category, *where[:2]).split("\n")
                 sys.stderr.write("\n".join(map(printable, lines)))
-            elif str(message) not in told:  # a broken plugin is found again with every folder
+            elif str(message) not in told:  # a broken plugin is reported again with every folder
                 told.add(str(message))
                 _failed(name, str(message), DONE)
 
@@ -145,7 +145,9 @@ def _remarks_as_lines() -> Iterator[None]:
 
 class _Lines(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
-        from bidnerf_core.cli.output import say  # imported here, because rich takes longer than --help should
+        from bidnerf_core.cli.output import (
+            say,
+        )  # imported here because importing rich takes longer than --help should
 
         say(record.getMessage())
 

@@ -49,7 +49,7 @@ def run(
         )
     if images.masks is not None and data is None:
         raise UsageError("--masks was given without --data", expected="the dataset that they belong to")
-    # Its baked parts may be damaged, and are replaced anyway.
+    # The parts that are baked may be damaged, and are replaced anyway.
     scene = load_map(map, device, baked=False)
     with working():
         scene.bake(

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from bidnerf_core.maps import Map
     from bidnerf_core.results import PoseError
 
-TRAINING_VIEWS, ANIMATED = 60, 14  # images, and frames of the animation
+TRAINING_VIEWS, ANIMATED = 60, 14
+"""Number of training images, and of frames of the animation."""
 DESCENT = {"rays": 768, "max_steps": 150, "decay_steps": 60}  # faster than the defaults, for small images
 
 
@@ -86,7 +87,7 @@ def run(
         auto, bid = Localizer(stored), Localizer(stored, "bid", settings_of("bid", DESCENT))
         trials, rows = [], []
         for number, view in enumerate(unseen):
-            # In scene units (the object fills a 2x2x2 cube) and degrees.
+            # The error of the start is in scene units (the object fills a 2x2x2 cube) and degrees.
             start = perturb(view.T_ref_camera, 0.55, 13.0, seed=seed + number)
             with console.status(f"localizing frame {number + 1}"):
                 trial = Trial(view, start, auto(view.frame, seed=seed), bid(view.frame, start, seed=seed))

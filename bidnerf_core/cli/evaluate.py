@@ -48,7 +48,7 @@ class TrialOptions:
         from bidnerf_core.localization import find_method
 
         registration = dataset.registration
-        _ = dataset.mask_folder  # rejects anything but a folder of masks
+        _ = dataset.mask_folder  # raises for anything but a folder of masks
         try:
             numbers = [[float(number) for number in size.split(":")] for size in self.size]
         except ValueError as error:

@@ -38,7 +38,7 @@ def check_folder(
 ) -> None:
     """Raise ``UsageError`` if an output folder lies inside a map, is one of the inputs, or is a map.
 
-    With ``create`` it is created, and ``InputError`` raised if that or files in it are not possible.
+    With ``create``, the folder is created; raises ``InputError`` if it or files in it cannot be.
     """
     require_outside_maps(out.parent, out)
     if not may_be_map:

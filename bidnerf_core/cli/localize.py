@@ -180,7 +180,7 @@ def _holds_maps(path: Path) -> bool:
 
 
 def _no_query(maps: Sequence[Path]) -> UsageError:
-    """Return the error for maps that no query follows."""
+    """Return the error that says that no QUERY follows the maps."""
     from bidnerf_core.maps import maps_in
 
     expected = "image files, folders of photos, or a folder of a dataset"
@@ -221,7 +221,7 @@ class Run:
     not_drawn: int = 0
 
     def show(self, query: Query, answer: Answer | Failure) -> None:
-        """Print an answer and draw it. A picture that cannot be written does not end the run."""
+        """Print an answer and draw it; a picture that cannot be written does not end the run."""
         from bidnerf_core.io import png_bytes, write_file
         from bidnerf_core.maps import MapCollection
         from bidnerf_core.results import Failure, overlay

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
-from bidnerf_core import datasets, mapping  # which load what is used of them
+from bidnerf_core import datasets, mapping  # their parts are loaded when they are used
 from bidnerf_core.cli.parser import FLAG, Option, Settings
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
@@ -16,7 +16,7 @@ from bidnerf_core.settings import LARGEST_SEED, WholeNumbers
 
 DEFAULT_BACKEND, USUAL_METHOD, USUAL_FEATURES = "hashgrid", "auto", "sift"
 TEST_IMAGES = DatasetOptions(split="test")
-"""Options of the images that a map is tried on."""
+"""The default options of images on which a map is tried."""
 
 MapFolder: TypeAlias = Annotated[
     Path, Option("MAP", "folder of a map, as written by 'bidnerf train'", positional=True)

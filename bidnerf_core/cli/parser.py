@@ -60,8 +60,8 @@ class Without(frozenset[str]):
 class Settings:
     """A parameter that takes a dataclass of settings, known only once the other arguments are, or slow to import.
 
-    ``load`` returns the default settings for the values of the options parsed so far, by parameter name, and all words.
-    ``--help-all`` describes their options, ``--help`` says only that there are some, called ``summary``.
+    ``load`` returns the default settings, given the values of the options parsed so far, by parameter name, and all words.
+    ``--help-all`` describes the options of the settings; ``--help`` only mentions that there are some, as ``summary``.
     """
 
     load: Callable[[Mapping[str, Any], Sequence[str]], Any]
@@ -110,7 +110,7 @@ def parse(command: str, target: Callable[..., T], arguments: Sequence[str]) -> T
 
     Raises ``UsageError`` for arguments that do not fit, and ``SystemExit`` after help was printed.
     """
-    # Names of options may be written with underscores, as in Python.
+    # The names of options may be written with underscores, as in Python.
     words = [re.sub("^--[^=]*", lambda name: name[0].replace("_", "-"), word) for word in arguments]
     if {"-h", HELP, HELP_ALL} & set(words):
         loaded = _loaded(command, target, words) if HELP_ALL in words else None
@@ -351,7 +351,7 @@ def _field_docs(kind: type) -> dict[str, str]:
 
 def _bare(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     """Return a type without ``Annotated``, and the annotations."""
-    if typing.get_origin(hint) is Annotated:  # one that is annotated twice is flat
+    if typing.get_origin(hint) is Annotated:  # typing flattens nested annotations
         kind, *notes = typing.get_args(hint)
         return kind, tuple(notes)
     return hint, ()

@@ -112,7 +112,7 @@ def stopped_by_ctrl_c(announcement: str = STEP) -> Iterator[Cancel]:
         with job_context(cancel=cancel):
             yield cancel
     except Cancelled as stopped:
-        if not pressed.is_set():  # something else stopped it
+        if not pressed.is_set():  # something other than Ctrl-C stopped it
             raise
         say(str(stopped))
         raise KeyboardInterrupt from stopped

@@ -87,7 +87,7 @@ class QueryOptions:
     ) -> QuerySource:
         """Return the queries for the QUERY arguments: image files and folders of them, or one dataset.
 
-        ``scene`` is the map, None if there are several. Raises ``InputError`` if there is nothing of either kind, and
+        ``scene`` is the map, or None if there are several. Raises ``InputError`` if there is nothing of either kind, and
         ``UsageError`` for options that belong to the other kind.
         """
         from bidnerf_core.datasets import (

@@ -46,7 +46,7 @@ def run(
     if out is not None:
         check_folder(out, (map,))
     load_info(map)  # raises if there is no map
-    # Locked before it is read, so that nobody changes it meanwhile.
+    # The map is locked before it is read, so that nobody changes it meanwhile.
     with map_folder(out or map, overwrite=out is None):
         scene = load_map(map)
         if poses is not None:

@@ -65,7 +65,7 @@ def run(
     folders = dict[str, str | Path]()
     for given in maps:
         name, equals, folder = given.partition("=")
-        if not equals or Path(given).is_dir():  # whose own name contains an equals sign
+        if not equals or Path(given).is_dir():  # a folder's own name may contain an equals sign
             name, folder = Path(given).resolve().name, given
         if name in folders:
             raise UsageError(f"two maps are named {name!r}", expected="a different name for each: NAME=MAP")

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from bidnerf_core import localization  # which loads what is used of it
+from bidnerf_core import localization  # its parts are loaded when they are used
 from bidnerf_core.cli.folders import check_output
 from bidnerf_core.cli.interruptions import uninterrupted
 from bidnerf_core.cli.options import USUAL_METHOD, MapFolder

@@ -146,7 +146,7 @@ def run(
         raise UsageError(
             f"{data}: photos without poses; find them with 'bidnerf poses', then train with --masks"
         )
-    # What was interrupted during pose estimation resumes by itself.
+    # A run that was interrupted during pose estimation resumes by itself.
     resumes = resumes and not (photos and not (out / DESCRIPTION).exists())
     if resumes:
         info = _interrupted(out, training.backend, config, target, given_poses, images)
@@ -168,8 +168,9 @@ def run(
 def _interrupted(
     out: Path, backend: str | None, config: Any, target: MapOptions, given_poses: PoseOptions, images: DatasetOptions
 ) -> MapInfo:  # fmt: skip
-    """Return the description of the map to resume. Raises ``UsageError`` for options that differ from its own, since they
-    would be ignored.
+    """Return the description of the map to resume.
+
+    Raises ``UsageError`` for options that differ from the map's own, since they would be ignored.
     """
     from bidnerf_core.backend import load_backend
     from bidnerf_core.io import from_plain

@@ -94,7 +94,7 @@ def _arriving(folder: Path) -> Iterator[FrameRequest]:
         photos, others = photos_in(folder)
         waiting = [photo for photo in photos if photo not in given]
         for photo in waiting:
-            # Other files are something else about the photo, such as NAME.json.
+            # Files of other kinds hold something else about the photo, such as NAME.json.
             depths = [
                 file for file in others
                 if file.name.startswith(f"{photo.stem}.") and file.suffix.lower() in (".npy", *IMAGE_SUFFIXES)

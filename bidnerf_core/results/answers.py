@@ -220,11 +220,12 @@ class Answers:
             evidence = each.diagnostics
             shows_scene = each.outcome in recognised
             if each.outcome is Outcome.AMBIGUOUS and isinstance(evidence, Evidence):
-                # It counts if far more landmarks fit its pose than by chance.
+                # An ambiguous image shows the scene if far more landmarks fit its pose than would by chance.
                 bounds = [bound for bound in LANDMARK_BOUNDS if bound.measure == "above_chance"]
                 shows_scene = all(evidence.above_chance >= bound.limit for bound in bounds)
             if shows_scene:
                 return ""
+        # One or two rejected images are no reason to doubt that the map is the right one.
         return "; do they show the scene of this map?" if len(found) >= 3 else ""
 
     @property
@@ -365,7 +366,7 @@ class Answers:
                 rows.append(("RPE per frame", str(errors.rpe)))
         if (share := self.consistency()) is not None:
             rows.append(("inside 95 % bound", f"{share:.1%} (by the poses' covariances)"))
-        # Frames that are training images of the map, judging by names and true poses, up to rounding in files.
+        # Frames are training images of the map if their names and true poses are the same, up to rounding in files.
         info = getattr(self.scene, "info", None)
         cameras = () if info is None else as_given(info.cameras)
         given = {camera.name: camera.pose.translated(self._origin).matrix() for camera in cameras}

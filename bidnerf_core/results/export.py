@@ -88,7 +88,7 @@ def export_clouds(scene: Map, out: Path) -> list[Path]:
         files.append(_write_landmarks(scene, images, out))
     if images:
         corners, length = list[Tensor](), 0.03 * scene.bounds.side
-        for image in images:  # a pyramid for each
+        for image in images:  # each is drawn as a pyramid
             camera = image.intrinsics
             x, y = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
             local = [[0.0, 0, 0], [-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1]]
@@ -132,7 +132,8 @@ def export_colmap(scene: Map, out: Path) -> list[Path]:
                 for landmark, (u, v) in zip(seen.tolist(), pixels.tolist(), strict=True):
                     tracks[landmark].append(f" {number + 1} {len(keypoints[number])}")
                     keypoints[number].append(f"{u:.6g} {v:.6g} {landmark + 1}")
-        # The mean distance from the projections; that of a single one says nothing, and -1 is COLMAP's for unknown.
+        # The error of a point is its mean distance from its keypoints. A single one says nothing, and -1 is COLMAP's
+        # value for an unknown error.
         errors = torch.where(count > 1, total / count.clamp(min=1), -1).tolist()
         colours = (_colours(scene).clamp(0, 1) * 255).round().long().tolist()
         digits = 16 if any(scene.origin) else 9
@@ -237,5 +238,5 @@ def _colours(scene: Map) -> Float[Tensor, "n 3"]:
     landmarks = scene.landmarks
     assert landmarks is not None
     if scene.surface is None:
-        return torch.full((len(landmarks), 3), 0.5)
+        return torch.full((len(landmarks), 3), 0.5)  # grey
     return scene.surface.surfels.rgb[scene.surface.nearest(landmarks.positions)]

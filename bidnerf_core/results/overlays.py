@@ -20,8 +20,8 @@ from bidnerf_core.io import reduced, write_file
 from bidnerf_core.localization import Localization, SceneMap, Start, checked_map, origin_of, start_pose
 
 SIDE = 240
-"""Pixels on the longer side of a picture: larger photos are downscaled, since each rendered pixel takes time, and smaller images
-are enlarged to about this, so that captions fit."""
+"""Pixels on the longer side of a picture: larger photos are downscaled, since each rendered pixel takes time, and smaller
+images are enlarged to about this size, so that captions fit."""
 
 
 def overlay(

@@ -97,9 +97,7 @@ def write_figure(figure: Any, path: Path, **options: Any) -> None:
     for formatter in (
         axis.get_major_formatter() for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)
     ):
-        if isinstance(
-            formatter, FuncFormatter
-        ):  # given labels, which are set again whenever a figure is drawn
+        if isinstance(formatter, FuncFormatter):  # its labels are set again whenever a figure is drawn
             formatter.func = lambda *place, labels=formatter.func: _drawable(str(labels(*place)))
     file = io.BytesIO()
     figure.savefig(file, format=path.suffix.lstrip(".") or "png", **options)
@@ -107,7 +105,7 @@ def write_figure(figure: Any, path: Path, **options: Any) -> None:
 
 
 def _drawable(text: str) -> str:
-    """Return a text that is printable, in lines of at most 200 characters."""
+    """Return a text without unprintable characters, its lines truncated to 200 characters."""
     lines = (printable(line) for line in text.split("\n"))
     return "\n".join(line if len(line) <= 200 else line[:197] + "..." for line in lines)
 
@@ -133,15 +131,16 @@ def draw_capture(
         panel = figure.add_subplot()
         cameras = _from_above([photo.position for photo in report.photos], report)
         looks_inwards = report.coverage.arrangement in ("around", "one side")
-        shown = np.concatenate([cameras, np.zeros((1, 2))]) if looks_inwards else cameras  # and the centre
+        # The plot shows the cameras, and the centre if they look at it, with a margin of half of their extent; landmarks
+        # farther away are left out.
+        shown = np.concatenate([cameras, np.zeros((1, 2))]) if looks_inwards else cameras
         low, high = shown.min(0), shown.max(0)
-        middle, reach = (
-            (low + high) / 2,
-            max(float((high - low).max()), 1e-6),
-        )  # with a margin of half of that
+        middle, reach = (low + high) / 2, max(float((high - low).max()), 1e-6)
         panel.set(xlim=(middle[0] - reach, middle[0] + reach), ylim=(middle[1] - reach, middle[1] + reach))
         panel.set(aspect="equal", xlabel=f"{unit}, from the centre of the capture")
-        if points is not None and seen_by is not None and len(points):  # darker if more photos show them
+        if (
+            points is not None and seen_by is not None and len(points)
+        ):  # the darker, the more photos show them
             step = max(1, math.ceil(len(points) / 20_000))
             views, places = seen_by.numpy()[::step], _from_above(points[::step].double().tolist(), report)
             order = np.argsort(views, kind="stable")
@@ -174,7 +173,10 @@ def _from_above(points: Any, report: CaptureReport) -> Float[np.ndarray, "n 2"]:
 def _draw_cameras(
     panel: Any, cameras: Float[np.ndarray, "v 2"], report: CaptureReport, ends: set[str]
 ) -> None:
-    """Draw the cameras with their directions and problems; name the first with problems, and those at the ``ends`` of gaps."""
+    """Draw the cameras with their directions and problems.
+
+    The first ones with problems or at the ``ends`` of gaps are named.
+    """
     looks: dict[PhotoProblem | None, tuple[str, str]] = {
         None: (COLOURS[2], "o"), "mirrored": (COLOURS[3], "P"), "turned": (COLOURS[3], "v"), "badly posed": (COLOURS[1], "X"),
         "apart": (COLOURS[7], "s"), "isolated": (COLOURS[6], "D"), "blurred": (COLOURS[4], "h"),
@@ -248,7 +250,9 @@ def draw_path(
         for panel, upward, title in zip(panels, (1, 2), ("from above", "from the side"), strict=True):
             projection = np.stack([axes[0], axes[upward]], axis=-1)
             places = poses.translation.double().numpy() @ projection
-            if surface is not None:  # a sample around the path, at least half of the scene's extent wide
+            if (
+                surface is not None
+            ):  # a sample of the surfels around the path, as far as half of the scene's extent or more
                 surfels = moved(surface.surfels, "cpu")
                 points, middle = surfels.positions.double().numpy() @ projection, places.mean(0)
                 size = max(0.5 * surface.extent, 1.5 * float(np.abs(places - middle).max()))

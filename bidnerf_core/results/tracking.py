@@ -55,7 +55,8 @@ def track(
             except BreaksOff:
                 raise
             except InputError as error:
-                if not answers.answers and number + 1 >= min(3, total):  # probably none can be read
+                # If none of the first three frames can be read, probably none can.
+                if not answers.answers and number + 1 >= min(3, total):
                     many = (
                         "the first frame cannot"
                         if number == 0

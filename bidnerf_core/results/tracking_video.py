@@ -61,7 +61,7 @@ class TrackingVideo:
             self._partial.replace(self._file)
 
     def add(self, frame: Frame, answer: Answer) -> None:
-        """Draw a frame: its colours, or its depth as grey values up to 5 m if no colours were recorded, beside the map."""
+        """Draw a frame beside the map: its colours or, if none were recorded, its depth as grey values up to 5 m."""
         found, time = answer.found, answer.time
         painter = Painter(self._scene, found.frame_as_taken(frame))
         observed = painter.observed
@@ -96,7 +96,9 @@ class TrackingVideo:
         codec = "libvpx-vp9" if self._file.suffix.lower() == ".webm" else "libx264"
         self._file_out = av.open(str(self._partial), "w")
         self._stream = self._file_out.add_stream(
-            codec, rate=Fraction(rate).limit_denominator(1000), options={"crf": "20"}
+            codec,
+            rate=Fraction(rate).limit_denominator(1000),
+            options={"crf": "20"},  # almost without visible loss
         )
         self._stream.height, self._stream.width = first.shape[:2]
         self._stream.pix_fmt = "yuv420p"

@@ -58,7 +58,9 @@ class TrajectoryErrors:
     def of(found: SE3, true: SE3, unit: LengthUnit = "units") -> TrajectoryErrors:
         """Compare poses ``T_world_camera`` (n, in ``unit``), in chronological order. Raises ``InputError`` if there are none."""
         count = len(found.translation)
-        distances = alignment_errors(found, true) if count >= 3 else None  # fewer determine no alignment
+        distances = (
+            alignment_errors(found, true) if count >= 3 else None
+        )  # fewer do not determine an alignment
         return TrajectoryErrors(
             count,
             ErrorSummary.of(pose_error(found, true, unit)),
@@ -84,7 +86,7 @@ def alignment_errors(found: SE3, true: SE3) -> Float[Tensor, "n"] | None:
 
 
 def relative_errors(found: SE3, true: SE3) -> PoseError:
-    """Return the relative pose errors (n - 1) of the motion from each pose to the next: Sturm et al. 2012, eq. 2."""
+    """Return the relative pose errors (n - 1), of the motion from each pose to the next (Sturm et al. 2012, eq. 2)."""
     found, true = found.to(torch.float64), true.to(torch.float64)
     moved = [T[:-1].inverse() @ T[1:] for T in (found, true)]
     return pose_error(moved[0], moved[1])
@@ -96,9 +98,8 @@ def world_of_truth(found: SE3, true: SE3) -> Similarity | None:
     None unless it explains all errors. Its rotation is the mean of those between the orientations, so that the
     positions confirm it.
     """
-    if (
-        len(found.translation) < 3
-    ):  # a transformation of seven degrees of freedom would explain nearly anything
+    # A transformation of seven degrees of freedom explains nearly any errors of fewer poses.
+    if len(found.translation) < 3:
         return None
     found, true = found.to(torch.float64), true.to(torch.float64)
     u, _, vh = torch.linalg.svd((found.rotation @ true.rotation.mT).sum(0))
@@ -115,6 +116,7 @@ def world_of_truth(found: SE3, true: SE3) -> Similarity | None:
         torch.linalg.vector_norm(source - target, dim=-1)
         for source in (worlds.apply(true.translation), true.translation)
     )
+    # No pose may keep more than a tenth of the median error.
     return worlds if bool(left.max() < 0.1 * error.median()) else None
 
 
