@@ -11,6 +11,7 @@ from .auto import localize_by_landmarks as localize_by_landmarks
 from .by_rays import RayTerms as RayTerms
 from .by_surface import is_blank as is_blank
 from .corrector import Corrector as Corrector
+from .explanations import CAMERAS as CAMERAS
 from .explanations import MOVING as MOVING
 from .localizer import LOADERS as LOADERS
 from .localizer import Localizer as Localizer

@@ -18,6 +18,7 @@ from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Evidence, least_confidence
 from bidnerf_core.localization.by_surface import localize_by_depth, localize_by_images, nearest_piece
+from bidnerf_core.localization.explanations import CAMERAS, MOVING
 from bidnerf_core.localization.loop import Answer, Loop
 from bidnerf_core.localization.methods import BidConfig, Method, SharedSettings, bid
 from bidnerf_core.localization.problem import Problem
@@ -120,8 +121,10 @@ def localization_of(problem: Problem, answer: Answer, began: float) -> Localizat
     if answer.fused:
         reason += f", fused with {enumeration(answer.fused)}"
     if corrected is not None:
-        reason += f", with another camera than the stated one ({answer.explanation})"
-    elif answer.explanation.endswith(" moving"):
+        reason += f", with {CAMERAS[answer.explanation.removesuffix(MOVING)]}"
+        # A focal length from EXIF, or an assumed one, was not stated to be exact.
+        reason += "" if problem.focal_is_approximate else " instead of the stated one"
+    if answer.explanation.endswith(MOVING):
         reason += ", with the motion of a rolling shutter"
     if (record := current_record()) is not None:
         record.answers.append(answer)

@@ -48,6 +48,20 @@ OF_MAP = (
 """Standard deviations about the camera of the map's images, as in ``STATED``, with shares of its odds."""
 NEARLY = (0.002, 0.002, 0.002, 0.002, 0.001, 0.001)
 """Differences of two good calibrations of one camera."""
+CAMERAS = {
+    "exact": "the given camera",
+    "right": "the given camera (well calibrated)",
+    "inexact": "the given camera (slightly off)",
+    "wrong": "a differently calibrated camera",
+    "cropped": "the camera of a cropped image",
+    "bent": "a camera of another lens distortion",
+    "resized": "the camera of a cropped and resized image",
+    "unlike": "the camera of a warped image, such as a photo of a picture",
+    "nominal": "a camera whose focal length is estimated",
+    "map": "the map's camera",
+    "map, about": "nearly the map's camera",
+}
+"""Descriptions of the explanations of the camera."""
 USUAL = ("exact", "right", "inexact", "nominal", "map", "map, about")
 """Explanations by which the stated camera or one of the map's is at least approximately right."""
 MOVING = " moving"

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 
 from bidnerf_core.geometry import SE3, symbol
 from bidnerf_core.localization import (
+    CAMERAS,
     DISPLACEMENT,
     MIRROR,
     MOVING,
@@ -20,20 +21,6 @@ from bidnerf_core.results import pose_error
 from bidnerf_core.viewer.packing import Json
 from bidnerf_core.viewer.scene import rows_of
 
-CAMERAS = {
-    "exact": "given camera",
-    "right": "given camera (well calibrated)",
-    "inexact": "given camera (slightly off)",
-    "wrong": "given camera (badly calibrated)",
-    "cropped": "a cropped image",
-    "bent": "given camera with another lens distortion",
-    "resized": "a cropped and resized image",
-    "unlike": "a warped image, such as a photo of a picture",
-    "nominal": "given camera (approximate)",
-    "map": "the camera of the map's images",
-    "map, about": "the camera of the map's images (slightly off)",
-}
-"""Descriptions of the explanations of the camera."""
 HERE, EARLIER = "the pose found", "an earlier pose by landmarks, which was given up"
 APART, TURNED_DEG = 0.1, 10.0
 """Distance (fraction of that to the scene) and angle beyond which two poses are different answers."""
@@ -105,7 +92,7 @@ def _of_cameras(found: Localization, answer: Answer) -> Json:
     shown = dict[str, float]()
     for row, probability in zip(posterior.states.row.tolist(), (own / own.sum()).tolist(), strict=True):
         camera = names[row].removesuffix(MOVING)
-        name = CAMERAS.get(camera, camera) + (", with rolling shutter" if names[row].endswith(MOVING) else "")
+        name = CAMERAS[camera] + (", with rolling shutter" if names[row].endswith(MOVING) else "")
         shown[name] = shown.get(name, 0.0) + probability
     likely = [each for each in sorted(shown.items(), key=lambda each: -each[1]) if each[1] >= 0.001]
     pose = earlier(found, answer)

@@ -83,11 +83,16 @@ def test_a_wrong_focal_length_from_the_photo_gives_way_to_that_of_the_map(photo:
     wrong = replace(CAMERA, fx=CAMERA.fx * factor, fy=CAMERA.fy * factor)
     frame = Frame.open(photo, assumed=[wrong])
     assert frame.focal_is_approximate
-    found = Localizer(replace(textured_map(surface=True), landmarks=landmarks_of(CAMERA)))(frame)
-    assert found.converged
-    assert found.focal_factor == pytest.approx(1 / factor, rel=0.01)
-    assert "with another camera than the stated one (map)" in found.reason
-    assert pose_error(found.T_world_camera, unseen().T_ref_camera).translation < 0.02
+    localizer = Localizer(replace(textured_map(surface=True), landmarks=landmarks_of(CAMERA)))
+    for given, remark in (
+        (frame, ", with the map's camera"),
+        (frame.replace(focal_is_approximate=False), ", with the map's camera instead of the stated one"),
+    ):
+        found = localizer(given)
+        assert found.converged
+        assert found.focal_factor == pytest.approx(1 / factor, rel=0.01)
+        assert found.reason.endswith(remark)
+        assert pose_error(found.T_world_camera, unseen().T_ref_camera).translation < 0.02
 
 
 def test_a_portrait_photo_in_a_map_of_landscape_ones_has_their_camera() -> None:

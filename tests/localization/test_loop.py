@@ -93,9 +93,9 @@ def assert_as_expected(found: Localization, truth: SE3, expected: Expected, true
     is_near = away <= largest[0] and turned <= largest[1]
     assert is_near or not found.converged, f"accepted, and off by {away} m and {turned} degrees"
     if isinstance(expected, Right):
-        camera = "map" if "(map" in found.reason else "estimated"
+        camera = "map" if "the map's camera" in found.reason else "estimated"
         camera = "given" if found.intrinsics is None else camera
-        moved = "rolling shutter" in found.reason or "moving)" in found.reason
+        moved = "rolling shutter" in found.reason
         assert (found.outcome, camera) == (Outcome.CONVERGED, expected.camera or camera), found.reason
         assert expected.moved in (None, moved), found.reason
         assert_covered(found.T_world_camera, truth, found.covariance, CHI2_999)
