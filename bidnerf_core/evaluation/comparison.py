@@ -64,7 +64,7 @@ class MapRow(Summary):
 
     @classmethod
     def of(cls, label: str, size: int, results: Sequence[TrialResult], samples: Sequence[float]) -> MapRow:
-        """Return the statistics of the trials on one map of ``size`` bytes; ``samples`` has the samples per ray of each."""
+        """Return the statistics of trials on one map of ``size`` bytes; ``samples`` holds the samples per ray of each."""
         first = results[0]
         return cls(
             map=label, backend=first.backend, weights=first.weights, samples_per_ray=statistics.fmean(samples),
@@ -210,7 +210,7 @@ def measured(
     (view,) = dataset.views(trial.split, trial.frames[-1:])
     number = to_flat(parse_settings(trial.method, trial.config)).get("level")
     level = stored.field if number is None else levels(stored.field)[number]
-    own, count = (View(view.frame, SE3.identity()),), 2048
+    own, count = (View(view.frame, SE3.identity()),), 2048  # rays on which samples are counted
     device = device_of(stored.field)
     pixels = draw(own, count, uniform, torch.Generator().manual_seed(trial.seed), device=device)
     with torch.no_grad():

@@ -135,7 +135,7 @@ class Plan(Setup, Settings):
         Settings.__post_init__(self)
         for name in ("faults", "frames", "sizes"):
             refuse_text(name, getattr(self, name))
-        for name in ("trials", "seed", "images", "shard", "shards"):  # generators and ranges take no 2.0
+        for name in ("trials", "seed", "images", "shard", "shards"):  # generators and ranges refuse 2.0
             if type(getattr(self, name)) not in (int, type(None)):
                 raise InputError(f"{name} is {getattr(self, name)!r}", expected="a whole number")
         if not 0 <= self.shard < self.shards:
@@ -252,7 +252,7 @@ def _rigs(plan: Plan, dataset: Capture, names: list[str], data: str) -> list[tup
     if isinstance(dataset, ClosedFormData):
         return [dataset.sequence(name, plan.images, plan.angle) for name in visible]
     poses = {view.frame.name: view.T_ref_camera for view in dataset.views(plan.split)}
-    seen = list(poses)  # without those that masks hide altogether
+    seen = list(poses)  # without frames that masks hide altogether
     arcs = (arc(list(poses.values()), seen.index(n), plan.images, plan.angle) for n in visible if n in poses)
     rigs = [tuple(seen[place] for place in places) for places in arcs if places is not None]
     if not rigs:

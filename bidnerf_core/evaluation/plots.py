@@ -55,7 +55,8 @@ from bidnerf_core.results import (
     write_figure,
 )
 
-WIDTH, COLUMNS = 10.8, 3  # inches, panels
+WIDTH, COLUMNS = 10.8, 3
+"""Width of a figure in inches, and number of panels side by side."""
 PER_INCH = 13
 """Average number of characters per inch of text."""
 MOST_LINES, MOST_SITUATIONS = 150, 16
@@ -182,9 +183,8 @@ class Figures:
         judged: dict[str, list[TrialResult]] = {label: [] for label in self.labels}
         measured: dict[str, list[TrialResult]] = {label: [] for label in self.labels}
         for group in self.groups:
-            results = (
-                () if group.situation.size is None else group.results
-            )  # pooled ones are among the others
+            # The results of a group that pools all sizes are among those of the others.
+            results = () if group.situation.size is None else group.results
             judged[group.label] += [r for r in results if r.confidence is not None]
             measured[group.label] += [r for r in results if r.covariance is not None and r.error is not None]
         panels: list[Panel] = []
@@ -209,7 +209,7 @@ class Figures:
         for label, results in judged.items():
             ordered = sorted(results, key=lambda r: r.confidence or 0.0)
             colour = line_look(self.labels.index(label))["color"]
-            bins = max(1, min(6, len(ordered) // 8))  # of eight trials or more
+            bins = max(1, min(6, len(ordered) // 8))  # each has at least eight trials, if there are as many
             for part in (
                 list(some) for some in np.array_split(np.array(ordered, dtype=object), bins) if len(some)
             ):
@@ -301,7 +301,7 @@ class Figures:
     def _by_situation(
         self, groups: Sequence[Group], error: Callable[..., None], other: Callable[..., None]
     ) -> list[Panel]:
-        """Return three panels for each situation: ``error`` draws those of both kinds of error, and ``other`` the third."""
+        """Return three panels for each situation: ``error`` draws one for each kind of error, ``other`` the third."""
         panels: list[Panel] = []
         for situation in situations(groups)[:MOST_SITUATIONS]:
             title, own = self.titles[situation], [group for group in groups if group.situation == situation]

@@ -22,9 +22,9 @@ from bidnerf_core.geometry import SE3
 def bid_start(T_true: SE3, size: float, seed: int, widest: float = math.pi / 4) -> SE3:
     """Return the start of BID-NeRF, ``T_true exp((e_t u1, e_r u2))`` with random unit u1, u2 and e_t = ``size``.
 
-    The paper does not state which e_r belongs to which e_t, only that errors stay below 45 degrees: here e_r grows linearly
-    from 0.2 rad at e_t = 0.5 to ``widest`` at 3.4. These are the ends of the range of e_t in the paper's tables: in units of a
-    scene whose object fills a 2x2x2 cube, in metres in rooms.
+    The paper does not state which e_r belongs to which e_t, only that errors stay below 45 degrees. Here e_r grows
+    linearly from 0.2 rad at e_t = 0.5 to ``widest`` (rad) at e_t = 3.4, the ends of the range of e_t in the paper's
+    tables. e_t is in units of a scene whose object fills a 2x2x2 cube, and in metres in rooms.
     """
     u1, u2 = random_units(2, torch.Generator().manual_seed(seed))
     e_r = max(0.0, 0.2 + (size - 0.5) / (3.4 - 0.5) * (widest - 0.2))
@@ -156,7 +156,7 @@ class Protocol:
 
     def check_size(self, size: Size) -> None:
         """Raise ``InputError`` for a size with the wrong number of values, or with one that is out of range."""
-        most = [180.0 if "deg" in unit else 1e6 for unit in self.units]
+        most = [180.0 if "deg" in unit else 1e6 for unit in self.units]  # degrees, metres
         if len(size) != len(self.units) or not all(0 <= x <= m for x, m in zip(size, most, strict=True)):
             expected = (
                 " : ".join(self.units) or "none, since this protocol has no sizes, as bid and others have"

@@ -36,9 +36,9 @@ from bidnerf_core.io import (
 from bidnerf_core.results import CRITERIA
 
 LARGEST_FILE = 512 * 2**20
-"""Bytes. A trial takes a few kilobytes, so this is enough for a hundred thousand trials."""
+"""Largest size of a file of results in bytes. A trial takes a few kilobytes, so that a hundred thousand trials fit."""
 BEGINNING = b'{"T_world_camera": '
-"""The beginning of each line."""
+"""The beginning of each line of a file of results."""
 
 
 class SummaryRow(NamedTuple):
@@ -138,16 +138,16 @@ def read_results(paths: Iterable[Path]) -> list[TrialResult]:
 class ResultsFile:
     """A file of results, one JSON object a line, locked by the process that has it open. Use it as a context manager.
 
-    It stays valid if the process is killed at any moment: a line is on disk before its trial counts as done, and an incomplete
-    last line is removed when the file is next opened. Anything else that is not a result raises an error that names the
-    line, and is never deleted. Without a path, results are kept in memory only.
+    The file stays valid if the process is killed at any moment: a line is on disk before its trial counts as done, and an
+    incomplete last line is removed when the file is next opened. Any other line that is not a result raises an error that
+    names the line, and is never deleted. Without a path, results are kept in memory only.
     """
 
     expected = "lines as written by 'bidnerf evaluate'"
 
     def __init__(self, path: Path | None) -> None:
         self.path = path
-        self.values: dict[str, TrialResult] = {}  # by ``key_of`` their trials
+        self.values: dict[str, TrialResult] = {}  # by the ``key_of`` of their trials
         self._file: BinaryIO | None = None
 
     @classmethod
@@ -157,14 +157,14 @@ class ResultsFile:
 
     @classmethod
     def _parsed(cls, path: Path, content: bytes) -> tuple[list[TrialResult], int]:
-        """Return the result of each line, and the number of bytes in complete lines."""
+        """Return the result of each complete line, and the number of bytes in these lines."""
         lines, found, length = content.split(b"\n"), [], 0
         for number, line in enumerate(lines, start=1):
             where = f"{path}: line {number}"
             try:
                 plain = parse_json(line, where, cls.expected) if line.strip() else None
             except InputError:
-                # The last line is dropped only if it begins as a result does: no unrelated file is truncated.
+                # The last line is dropped only if it begins as a result does, so that no unrelated file is truncated.
                 if number == len(lines) and (line.startswith(BEGINNING) or BEGINNING.startswith(line)):
                     break
                 raise
@@ -220,7 +220,7 @@ class ResultsFile:
             self._unmoved(self.path)
             if order != list(self.values):
                 ResultTable(tuple(self.values[key] for key in order)).save(self.path)
-                self.__exit__()  # the open file is the one that was replaced
+                self.__exit__()  # the file that is open is the one that was replaced
                 self._open(self.path)
         self.values = {key: self.values[key] for key in order}
 
@@ -244,7 +244,7 @@ class ResultsFile:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             if path.exists():
-                open_binary(path, self.expected).close()  # not a pipe, which would wait for a reader
+                open_binary(path, self.expected).close()  # raises for a pipe, which would wait for a reader
             self._file = path.open("a+b")
         except OSError as error:
             raise InputError(

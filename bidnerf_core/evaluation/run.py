@@ -82,15 +82,15 @@ def evaluate(
     """Localize many frames of ``data`` in a map, from the starts of a protocol or from none, and return all results.
 
     ``out`` is a results file: trials already in it are not run again, and each result is on disk before the next trial
-    begins, so that the same call resumes an evaluation that was interrupted or cancelled. The command of the running program
-    is recorded next to it as the origin of the results. ``workers`` is the number of processes (None:
-    one per core, and one on a GPU), or the address of a dask scheduler; more than one requires a map and data in folders
-    and an importable main module, and finds registered names only if importing that module registers them. With one,
+    begins, so that the same call resumes an evaluation that was interrupted or cancelled. The command of the running
+    program is recorded next to it as the origin of the results. ``workers`` is the number of processes (None: one per
+    core, and one on a GPU), or the address of a dask scheduler; more than one requires a map and data in folders and an
+    importable main module, and finds registered names only if importing that module registers them. With one,
     everything runs in the calling thread.
 
-    Raises ``InputError`` for an evaluation that cannot be carried out, also if the method does not use the plan's depth points or
-    the views of some trial observe none, and ``Cancelled`` once ``cancel`` returns True and
-    the running trials have ended.
+    Raises ``InputError`` for an evaluation that cannot be carried out, also if the method does not use the plan's depth
+    points or the views of some trial observe none, and ``Cancelled`` once ``cancel`` returns True and the running trials
+    have ended.
     """
     in_memory = isinstance(scene, Map) or not isinstance(data, str | Path)
     if in_memory and workers not in (1, None):

@@ -26,7 +26,7 @@ def refusal(scope: Scope, token: str | None, cookie: str | None = None) -> tuple
     try:
         is_local = is_loopback(urlsplit(f"//{host}").hostname)
         is_own_page = origin is None or urlsplit(origin).netloc == host
-    except ValueError:  # they are no addresses
+    except ValueError:  # the headers hold no valid addresses
         is_local = is_own_page = False
     if token is not None:
         given = [(f"Bearer {token}", request.headers.get("authorization", ""))]

@@ -77,7 +77,7 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
     app.state.pool, app.state.limits = pool, limits
 
     async def known(map: str = Path(json_schema_extra={"enum": [*names]})) -> str:
-        """Return the name of a map that is served. Raises ``Refused`` for another."""
+        """Return the name of a map if it is served. Raises ``Refused`` for any other."""
         if map not in names:
             raise Refused(404, f"no map with that name, expected one of {', '.join(names)}")
         return map
@@ -118,7 +118,7 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
     async def localize(request: Request) -> Response:
         with pool.queue.place() as job:
             upload = await photo_of(request, app.state.limits)
-            usual = names[0] if len(names) == 1 else None  # None: the one that the photo shows
+            usual = names[0] if len(names) == 1 else None  # None stands for the map that the photo shows
             name = request.path_params.get("map", upload.parameters.get("map", usual))
             task = {"map": name if name is None else await known(name), "upload": upload}
             return JSONResponse(await _answer(request, job, task))

@@ -48,9 +48,9 @@ class ServiceClient:
         """Return the JSON of ``bidnerf localize`` for a photo: a file, its bytes, or an array of bytes (h, w) or (h, w, 3).
 
         ``map`` is by default the one that the photo shows. ``depth`` is a file, its bytes, or an array (h, w) of planar z,
-        ``camera`` a file with the camera, or its content, and ``start`` the 4x4 rows of T_world_camera. What else is ``known`` is
-        given by name: ``name`` (of the frame, in the answer), ``focal`` (pixels of the stored image), ``hfov`` (degrees),
-        ``depth_unit`` (metres per step of the depth image) and ``seed``.
+        ``camera`` a file with the camera, or its content, and ``start`` the 4x4 rows of T_world_camera. ``known`` takes
+        further values by keyword: ``name`` (of the frame, in the answer), ``focal`` (pixels of the stored image), ``hfov``
+        (degrees), ``depth_unit`` (metres per step of the depth image) and ``seed``.
         """
         edge = uuid.uuid4().hex
         rows = getattr(start, "tolist", lambda: start)()
@@ -81,7 +81,7 @@ class ServiceClient:
         return self.ask("/health")
 
     def ask(self, path: str, body: bytes | None = None, kind: str = "application/json") -> dict[str, Any]:
-        """Return the JSON object at a path such as /maps, or the response to ``body``."""
+        """Return the JSON object at a path such as /maps; with a ``body``, post it and return the response."""
         headers = {"Content-Type": kind} | ({"Authorization": f"Bearer {self.token}"} if self.token else {})
         request = urllib.request.Request(self.url + path, body, headers)
         until = time.monotonic() + self.timeout

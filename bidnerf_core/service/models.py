@@ -46,7 +46,7 @@ class Refused(Exception):
 class Upload:
     """A photo and what is known about it, as sent with a request: no value is ever used as a file name."""
 
-    parameters: Mapping[str, Any] = field(default_factory=dict)  # those of ``PhotoForm`` that were given
+    parameters: Mapping[str, Any] = field(default_factory=dict)  # the fields of ``PhotoForm`` that were given
     files: Mapping[str, bytes] = field(default_factory=dict)  # "photo" and perhaps "depth"
 
     @property
@@ -61,7 +61,7 @@ class Upload:
 
 
 def _decimal(value: Any) -> Any:
-    """Return a number as a program writes it; Python's ``float`` takes digits of every script and underscores too."""
+    """Accept only numbers as a program writes them; Python's ``float`` takes digits of every script and underscores too."""
     if isinstance(value, str) and not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", value, re.ASCII):
         raise PydanticCustomError("number", "a number")
     return value
@@ -85,7 +85,7 @@ def _only_given_defaults(schema: dict[str, Any]) -> None:
 
 
 class PhotoForm(BaseModel):
-    """A photo and what may be known about it: a form, of which the query of a request may hold all but the files."""
+    """A photo and what may be known about it, as a form; all fields but the files may also be in the query of a request."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra=_only_given_defaults)
 

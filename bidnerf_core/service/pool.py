@@ -33,7 +33,7 @@ FORK_SECONDS = 60.0
 PAUSE = 1.0
 """Seconds between two looks at an idle worker, and between two attempts to reload the maps."""
 LOST = (OSError, EOFError, ValueError, psutil.Error)
-"""What a connection to a process that has died, or sends nonsense, raises."""
+"""The exceptions that a connection raises if the process at its other end has died or sends nonsense."""
 
 
 class Lost(Exception):
@@ -44,14 +44,13 @@ class WorkerProcess:
     """A running worker, as seen by the service."""
 
     def __init__(self, connection: Connection) -> None:
-        """Wait for a new worker's first message. Raises ``InputError`` if it cannot serve, and ``LOST`` if it is lost."""
+        """Wait for a new worker's first message. Raises ``InputError`` if the worker cannot serve, and ``LOST`` if it died."""
         self._connection = connection
         if not connection.poll(FORK_SECONDS):
             raise TimeoutError
         self.pid: int = _reply(connection)["pid"]
-        self._process = psutil.Process(
-            self.pid
-        )  # remembers when it began: its number may be another's, later
+        # It remembers when the process began, since its number may later be that of another.
+        self._process = psutil.Process(self.pid)
 
     @property
     def ended(self) -> bool:
@@ -73,7 +72,7 @@ class WorkerProcess:
 
 
 def _reply(connection: Connection) -> dict[str, Any]:
-    """Return the JSON that a process sends. Raises ``InputError`` if it states an error, and ``LOST`` if the process is lost."""
+    """Return the JSON that a process sends. Raises ``InputError`` if it states an error, and ``LOST`` if the process died."""
     reply: dict[str, Any] = json.loads(connection.recv_bytes(2**24))
     if "error" in reply:
         raise InputError(reply["error"])
@@ -159,11 +158,11 @@ class Pool:
                     self._busy.discard(number)
 
     def _answered(self, job: Job, number: int) -> dict[str, Any] | None:
-        """Return a worker's answer to a job; None if the job was stopped. Raises ``Lost`` if three workers died of it."""
+        """Return a worker's answer to a job, or None if the job was stopped. Raises ``Lost`` if three workers died of it."""
         self.metrics.waited.observe(job.waited or 0.0)
         os.makedirs(tempfile.gettempdir(), exist_ok=True)  # something may have removed it
         while job.attempts < 3 and (worker := self._workers.get(number)) is not None:
-            if worker.ended:  # since it was last looked at, and not by this job
+            if worker.ended:  # it ended since it was last looked at, and not because of this job
                 self._replace(number, "ended")
                 continue
             job.attempts += 1
@@ -194,8 +193,8 @@ class Pool:
                     self._workers[number] = self._fork()
                     return
                 except InputError:
-                    # A worker's own, such as too little memory on its accelerator: other maps would not help it. The process of
-                    # maps that cannot be served ends, which is noticed when it is to fork.
+                    # The error is the worker's own, such as too little memory on its accelerator, and reloading the maps would
+                    # not help. If the maps cannot be served, their process ends, which is noticed when it is to fork.
                     pass
                 except LOST:
                     self._end_maps()

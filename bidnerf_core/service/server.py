@@ -168,7 +168,9 @@ def _bound(host: str, port: int) -> socket.socket:
 async def _run(
     app: FastAPI, server: Any, bound: socket.socket, ready: Callable[[str], Any], stop: threading.Event | None
 ) -> None:  # fmt: skip
-    server.capture_signals = partial(_signals_end, server)  # its own would raise them again at the end
+    server.capture_signals = partial(
+        _signals_end, server
+    )  # uvicorn's own raises the signals again at the end
     async with app.router.lifespan_context(app):
         serving = asyncio.ensure_future(server.serve(sockets=[bound]))
         while not server.started and not serving.done():
@@ -184,7 +186,7 @@ async def _run(
 
 @contextlib.contextmanager
 def _signals_end(server: Any) -> Iterator[None]:
-    """Let the signals that ask a program to stop end the service, which is its normal end; a second one ends it immediately."""
+    """End the service normally on the signals that ask a program to stop; a second signal ends it immediately."""
 
     def end(*_: Any) -> None:
         server.force_exit = server.should_exit

@@ -65,7 +65,7 @@ Report = Callable[[Scope, int, float], None]
 
 
 class Application(FastAPI):
-    """An application that answers errors in the format of RFC 9457 and describes itself, see ``refusal`` for its access."""
+    """An application that answers errors in the format of RFC 9457 and describes itself; on access, see ``refusal``."""
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class Application(FastAPI):
             return HTMLResponse(page, headers={"Content-Security-Policy": policy})
 
     def openapi(self) -> dict[str, Any]:
-        """Return the description; what FastAPI says of checks that it does not make here is left out."""
+        """Return the OpenAPI description, without what FastAPI says of checks that it does not make here."""
         if self.openapi_schema is not None:
             return self.openapi_schema
         api = super().openapi()
@@ -255,7 +255,7 @@ async def _parts(request: Request, content: bytes) -> list[tuple[str, str | Uplo
 
 
 async def answered(request: Request, work: asyncio.Future[Any], seconds: float | None = None) -> Any:
-    """Return the result of work. Raises ``Refused`` if its client disconnects first, or it takes too long."""
+    """Return the result of ``work``. Raises ``Refused`` if the client disconnects first, or it takes too long."""
 
     async def left() -> None:
         while (await request.receive())["type"] != "http.disconnect":
@@ -306,7 +306,7 @@ def json_body(model: Any) -> dict[str, Any]:
 
 
 def errors(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Return error responses, as ``responses`` of a path."""
+    """Return the descriptions of error responses, for the argument ``responses`` of a path."""
     headers = {401: "WWW-Authenticate", 429: "Retry-After", 503: "Retry-After"}
     return {
         status: {

@@ -33,7 +33,7 @@ class Worker:
     """Everything needed to answer requests, loaded before workers are forked."""
 
     def __init__(self, maps: Mapping[str, Localizer], max_pixels: float) -> None:
-        """``maps`` are the localizers by the names of their maps; several form a collection, for photos whose map is not known."""
+        """Take the localizers by the names of their maps; several form a collection, for photos whose map is not known."""
         self.maps, self.max_pixels, first = maps, max_pixels, next(iter(maps.values()))
         self.together: MapCollection | None = None
         if len(maps) > 1:
@@ -41,7 +41,7 @@ class Worker:
             self.together = MapCollection(scenes, first.method, first.config, localizers=dict(maps))
 
     def describe(self) -> dict[str, Any]:
-        """Return the facts about each map that clients may see, by its name; the others name photos and folders."""
+        """Return the facts about each map, by its name, that clients may see; the others name photos and folders."""
         found = {}
         for name, localizer in self.maps.items():
             scene = _scene(localizer)
@@ -72,7 +72,7 @@ class Worker:
             found = {"status": error.status, "detail": error.detail, "more": error.more}
         except InputError as error:
             found = {"status": 422, "detail": public_message(error, folder)}
-        except Exception as error:  # the worker continues, and the log states what happened
+        except Exception as error:  # the worker goes on, and the log states what happened
             found = {"status": 500, "detail": "internal error", "fault": f"{type(error).__name__}: {error}"}
         return found | {
             "outcome": outcomes[-1] if outcomes else "bad input" if found["status"] < 500 else "fault"

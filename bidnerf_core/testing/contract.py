@@ -201,7 +201,7 @@ class BackendContract:
     def test_training_stops_and_resumes(self) -> None:
         recipes.check_resuming(self._backend(), self._build, self._config())
 
-    # Fields that are built and trained.
+    # The fields that the tests build and train follow.
 
     def _backend(self) -> Any:
         if self.name is not None:
@@ -228,7 +228,7 @@ class BackendContract:
             return self._backend().build(self._config() if config is None else config, SCENE_BOUNDS)
 
     def _trained(self) -> Any:
-        """Return a field trained on RGB-D views and frozen like that of a loaded map; trained once per test class."""
+        """Return a field that was trained on RGB-D views, once per test class, and frozen like that of a loaded map."""
         kept = type(self).__dict__.get("_kept")
         if kept is None:
             kept = self._build()
@@ -263,7 +263,7 @@ def precise(field: RadianceField) -> tuple[RadianceField, torch.dtype]:
         positions, directions = (x.double() for x in points(2))
         if query(doubled, positions, directions, "points").density.dtype == torch.float64:
             return doubled, torch.float64
-    except Exception:  # reported by the test of dtypes
+    except Exception:  # the test of dtypes reports it
         pass
     return field, torch.float32
 

@@ -78,7 +78,8 @@ def _naming(what: str) -> Iterator[None]:
 
 def _problem(field: RadianceField) -> Problem:
     view = rgbd_views(coverage=False)[0]
-    off = torch.tensor((0.05, -0.03, 0.04, 0.01, -0.02, 0.01), dtype=torch.float64)  # metres, radians
+    # Steps begin at this tangent vector (metres, radians) from the true pose.
+    off = torch.tensor((0.05, -0.03, 0.04, 0.01, -0.02, 0.01), dtype=torch.float64)
     start = view.T_ref_camera.to("cpu", torch.float64).retract(off)
     return rig(MapWithLandmarks(field, SCENE_BOUNDS, None), [view], start)
 

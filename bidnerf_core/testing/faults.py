@@ -32,7 +32,7 @@ def calling(doing: str) -> Iterator[None]:
 
 
 class Named:
-    """A contract of parts that are registered by ``name``."""
+    """The base of contracts of parts that are registered by ``name``."""
 
     name: ClassVar[str] = ""
 

@@ -64,7 +64,7 @@ def check_learning(
     """Check that ``config.steps`` steps bring the rendered views closer to the given ones."""
     field = make()
     before = colour_error(field)
-    most = 0.8 * before
+    most = 0.8 * before  # the squared error must fall by a fifth
     _train(backend, field, views, config, Recorder(), f"on {kind} views")
     after = colour_error(field)
     require_that(
@@ -82,7 +82,8 @@ def check_exposure(backend: Backend, config: Any) -> None:
     exchanged. If the two differ as the images do, exposure ended up in the field. A field that learns slowly
     shows little of either.
     """
-    # The share that may end up in the field is above 0.1 if a recipe ignores exposure, and 0.01 if it learns it.
+    # Within 100 steps, the exposures of the images can be learned. The share of them that ends up in the field is above
+    # 0.1 if a recipe ignores exposure, and 0.01 if it learns it.
     config, most = replace(config, steps=max(config.steps, 100)), 0.06
     fields = []
     for log_gain in (EXPOSURE, -EXPOSURE):

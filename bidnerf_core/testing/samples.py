@@ -38,7 +38,7 @@ def check_intervals(field: RadianceField) -> None:
 
 
 def _arrangements() -> Iterator[Rays]:
-    """Yield rays with any number of axes, also empty ones."""
+    """Yield rays with various numbers of axes, some of them without any ray."""
     for shape in ((), (1,), (2, 3), (0,), (2, 0)):
         index = torch.arange(torch.Size(shape).numel()).reshape(shape)
         yield picked(awkward_rays()["rays from outside"], index)
@@ -184,6 +184,7 @@ def _check_density(field: HitField, rays: Rays) -> None:
         density = field.query(places, rays.directions[..., None, :].expand_as(places)).density
     found = rendering_weights(density, samples).sum(-1)
     off = (found - expected).abs()
+    # The opacities must agree for nine rays out of ten.
     require_that(
         float((off <= 0.05).float().mean()) >= 0.9,
         f"{type(field).__name__}: query's density stops {float(found.mean()):.0%} of the light of rays on average and hits stop"

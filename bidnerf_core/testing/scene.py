@@ -22,7 +22,7 @@ SCENE_BOUNDS = demo_object().bounds
 SIDE = max(SCENE_BOUNDS.size)  # metres
 DIMMED = 0.6
 """Brightness of the views of ``exposed_views`` and of the background behind them, so that no exposure saturates."""
-DIMMED_BOUNDS = replace(SCENE_BOUNDS, background=(DIMMED,) * 3)  # that of the toy is white
+DIMMED_BOUNDS = replace(SCENE_BOUNDS, background=(DIMMED,) * 3)  # the toy's own background is white
 
 
 @cache

@@ -22,7 +22,7 @@ POSES = orbit(1.7, 3, elevation=(50.0, 70.0), seed=5)
 """Poses (T_world_camera) that no training image has."""
 
 
-@dataclass(init=False, eq=False)  # its tensors are fields, which go to a device with it
+@dataclass(init=False, eq=False)  # a dataclass, so that its tensors go to a device with it
 class TexturedGround:
     """A ground of height ``h(x, y)`` whose colours are sums of random waves; infinitely differentiable."""
 
@@ -41,7 +41,7 @@ class TexturedGround:
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         x, y, z = positions.unbind(-1)
         height = 0.12 * (3 * x).sin() * (2.5 * y + 1).sin()
-        density = 120 * torch.sigmoid((height - z) / 0.01)  # per metre; it rises within a centimetre
+        density = 120 * torch.sigmoid((height - z) / 0.01)  # per metre; it rises over about a centimetre
         signal = (positions[..., :2] @ self.waves.to(positions) + self.phases.to(positions)).sin()
         return FieldValues(density, torch.sigmoid(2 * signal @ self.weights.to(positions)))
 
@@ -114,7 +114,7 @@ T_MOVED_WORLD = SE3(
     torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64),
     torch.tensor([3.0, -2.0, 0.5], dtype=torch.float64),
 )
-"""The ground's world in another one in which its box is still axis-aligned: a quarter turn about z."""
+"""Pose of the ground's world in another one, a quarter turn about z, so that its box is still axis-aligned."""
 
 
 @functools.cache

@@ -47,7 +47,7 @@ MOST_MATCHES, MOST_STEPS = 600, 200
 
 
 def no_answer(name: str, outcome: str, reason: str) -> Json:
-    """Return an image that could not be localized as the page shows it, see ``shown_answer``."""
+    """Return the JSON values of an image that could not be localized, see ``shown_answer``."""
     texts = dict.fromkeys(("meaning", "advice", "method", "method_summary", "camera"), "")
     unknown = (
         "loss",
@@ -79,14 +79,15 @@ def shown_answer(
     scene: SceneMap, name: str, found: Localization, frame: Frame | None = None, record: SearchRecord | None = None,
     truth: SE3 | None = None, quick: bool = False,
 ) -> Json:  # fmt: skip
-    """Return a localization as JSON values, with renderings if its ``frame`` is known.
-
-    ``pose`` and ``truth`` are the 16 numbers of T_world_camera by rows, None if they are not finite or known; ``error`` is that of the
-    position, and of the orientation in degrees; ``path`` has the positions from the start to the pose found; ``camera`` says whose
-    intrinsics were taken, and ``meaning`` and ``advice`` what a rejection means and what to try.
+    """Return the JSON values of a localization, with renderings if its ``frame`` is known.
 
     ``record`` is that of its search, ``truth`` the true T_world_camera. A ``quick`` answer has renderings of the surface.
     Poses are shown in the map's own coordinates, see ``Map.origin``.
+
+    ``pose`` and ``truth`` in the result are the 16 numbers of T_world_camera by rows, None if they are not finite or not
+    known. ``error`` is that of the position, and of the orientation in degrees; ``path`` has the positions from the start
+    to the pose found. ``camera`` says whose intrinsics were taken, ``meaning`` and ``advice`` what a rejection means and
+    what to try.
     """
     found = found.translated(-origin_of(scene))
     truth = None if truth is None else truth.translated(-origin_of(scene))
@@ -98,7 +99,7 @@ def shown_answer(
         if found.intrinsics is not None:
             camera = f"intrinsics taken or estimated by the localization, focal length times {found.focal_factor:.3f}"
         frame = found.frame_as_taken(frame)
-        small = frame.intrinsics.at_most(320)  # pixels; rendering takes time
+        small = frame.intrinsics.at_most(320)  # pixels on the longer side, since rendering takes time
         observed = photograph(reduced(frame.rgb, small.width, small.height))
         if finite:
             rendered, depth = _compared(scene, small, T, frame, quick)
@@ -143,8 +144,8 @@ def shown_answer(
 def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> Json | None:
     """Return the ellipsoid of two standard deviations of a pose's position; None if its covariance is unknown or not finite.
 
-    ``axes`` are its semi-axes in the world, 9 numbers: an axis a row, the longest first, with their ``lengths``; ``rotation_deg``
-    the standard deviations about the camera's x, y and z axes.
+    ``axes`` are its semi-axes in the world, 9 numbers: one axis after the other, the longest first. ``lengths`` are their
+    lengths, and ``rotation_deg`` the standard deviations of the orientation about the camera's x, y and z axes.
     """
     if covariance is None or not bool(covariance.isfinite().all()):
         return None
@@ -160,7 +161,7 @@ def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> J
 def depth_difference(image: RenderedImage, frame: Frame) -> Json | None:
     """Return rendered minus measured depth at the pixels that have both, as a colour image; None if there are none.
 
-    ``range`` is the difference at the ends of its scale, and ``median`` that of the absolute values.
+    ``range`` is the difference at the ends of the colour scale, and ``median`` the median of the absolute differences.
     """
     if frame.depth is None or not frame.has_depth:
         return None
@@ -173,7 +174,8 @@ def depth_difference(image: RenderedImage, frame: Frame) -> Json | None:
     most = max(float(off.abs().quantile(0.95)), 1e-9)
     share = torch.zeros_like(measured)
     share[known] = (off / most).clamp(-1, 1)
-    # red where the rendered depth is smaller than the measured one, nearly white where equal, blue where larger
+    # Pixels are red where the rendered depth is smaller than the measured one, nearly white where it is equal, and blue
+    # where it is larger.
     near, middle, far = torch.tensor([(0.70, 0.09, 0.17), (0.97, 0.97, 0.96), (0.13, 0.40, 0.67)])
     towards = torch.where((share > 0)[..., None], far, near)
     rgb = middle + share.abs()[..., None] * (towards - middle)
@@ -213,7 +215,7 @@ def _steps(found: Localization, record: SearchRecord | None) -> tuple[Json, ...]
 
 
 def _step(caption: str, T: SE3, scores: list[float], kept: int, loss: float | None = None) -> Json:
-    """Return poses that were considered at the same time, the best first, with the ``loss`` of a step of a descent."""
+    """Return poses that were considered at the same time, the best first; a step of a descent has a ``loss``."""
     poses = packed(T.matrix()[:, :3].detach().cpu().double().flatten(1).numpy())
     known = tuple(map(_finite, scores))
     return {"caption": caption, "poses": poses, "scores": known, "kept": kept, "loss": _finite(loss)}
@@ -226,9 +228,9 @@ def _finite(value: float | None) -> float | None:
 def _matches(scene: SceneMap, found: Localization, answer: Answer) -> Json | None:
     """Return the matches in the last image at the last pose by landmarks: those by projection, then others by descriptors.
 
-    ``keypoints`` and ``projections`` of their landmarks (NaN behind the camera) are fractions of the image's size, float32 (m, 2);
-    ``accepted`` is uint8 (m). Of the ``refused``, those ``by_appearance`` were matched by descriptors alone. ``pose`` says at which
-    pose, if not at the one found.
+    ``keypoints`` and the ``projections`` of their landmarks (NaN behind the camera) are fractions of the image's size,
+    float32 (m, 2), and ``accepted`` is uint8 (m). ``by_appearance`` is the number of those ``refused`` that were matched by
+    descriptors alone. ``pose`` says at which pose, if not at the one found.
     """
     if scene.landmarks is None:
         return None
@@ -286,7 +288,7 @@ def _runner_up(
 
 
 def _rendered(scene: SceneMap, T: SE3, reason: str, frame: Frame | None, quick: bool) -> Json:
-    """Return another pose; its ``probability`` against the pose found alone is known if they were compared."""
+    """Return the JSON values of another pose, with a rendering if the ``frame`` is known, and without a probability."""
     picture = None
     if frame is not None:
         picture, _ = _compared(scene, frame.intrinsics.at_most(240), T, frame, quick)

@@ -65,7 +65,7 @@ def _contest(
     remark: str = "",
     of_pose: bool = True,
 ) -> Json:
-    """Return a comparison of poses or cameras: names, probabilities and, of other poses, the 16 numbers of T_world_camera."""
+    """Return a comparison of poses or cameras: names, probabilities and, for other poses, the 16 numbers of T_world_camera."""
     shown = [
         {"pose": None} | dict(zip(("name", "probability", "pose"), each, strict=False)) for each in answers
     ]

@@ -58,8 +58,8 @@ WITHOUT_LANDMARKS = {
 def bar(value: float, threshold: float, at_least: bool) -> Json | None:
     """Return a value on a linear scale from 0 to 1, whose middle is the threshold and whose end is twice that or more.
 
-    ``at_least`` says whether values below the threshold fail, else those above. None if the value is not finite or the threshold not
-    positive.
+    If ``at_least`` is set, values below the threshold fail, else those above it. Returns None if the value is not finite
+    or the threshold not positive.
     """
     if not math.isfinite(value) or threshold <= 0:
         return None

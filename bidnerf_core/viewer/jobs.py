@@ -68,7 +68,7 @@ class ShownJob:
 class Jobs:
     """Runs localizations in a thread, in the order in which they were requested.
 
-    ``shown`` has them by their ids. Closing the queue discards those that wait, and stops the one in progress soon.
+    ``shown`` holds them by their ids. Closing the queue discards those that wait, and soon stops the one in progress.
     """
 
     def __init__(self, localizer: Localizer) -> None:
@@ -79,7 +79,7 @@ class Jobs:
         """Queue a localization of what ``read`` returns, for a job of the queue."""
         shown = self.shown[job.id] = ShownJob(job.id, job.name)
         done = [each.id for each in self.shown.values() if each.state == "done"]
-        for old in done[: max(0, len(self.shown) - 64)]:  # the answers of so many localizations are kept
+        for old in done[: max(0, len(self.shown) - 64)]:  # the answers of 64 localizations stay in memory
             del self.shown[old]
         self.queue.put(job, read)
         return shown

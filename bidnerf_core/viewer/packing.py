@@ -17,11 +17,11 @@ JPEG_QUALITY = 85
 
 
 Json: TypeAlias = dict[str, Any]
-"""A part of the page's state. The function that makes one says what it holds; the page's scripts read it."""
+"""A part of the page's state, which its scripts read. The function that returns it says what it holds."""
 
 
 def packed(array: np.ndarray) -> Json:
-    """Return an array of bytes, 16-bit integers or floats: its ``type``, its ``shape``, and its numbers in ``base64``, row by row."""
+    """Return the ``type`` and ``shape`` of an array of bytes, 16-bit integers or floats, and its numbers in ``base64``."""
     kinds = {"i1": "int8", "u1": "uint8", "u2": "uint16", "f4": "float32", "f8": "float32"}
     kind = kinds[array.dtype.str[1:]]
     content = np.ascontiguousarray(array, dtype=np.dtype(kind).newbyteorder("<")).tobytes()
@@ -29,7 +29,7 @@ def packed(array: np.ndarray) -> Json:
 
 
 def packed_points(points: Float[Tensor, "n 3"]) -> Json:
-    """Return points as 16-bit integers: a coordinate is ``lower + integer / 65535 * size``, with the integers in ``places``."""
+    """Return points as 16-bit integers, ``places``: a coordinate is ``lower + place / 65535 * size``."""
     values = points.detach().cpu().double().numpy()
     lower = values.min(0) if len(values) else np.zeros(3)
     size = max(float((values - lower).max(initial=0.0)), 1e-9)
@@ -50,13 +50,13 @@ def jpeg(image: Float[Tensor, "h w 3"] | UInt8[np.ndarray, "h w 3"], quality: in
 
 
 def photograph(image: Float[Tensor, "h w 3"], quality: int = JPEG_QUALITY) -> Json:
-    """Return an image as a JPEG in a data ``url``, with its ``width`` and ``height`` in pixels."""
+    """Return an image as the data ``url`` of a JPEG, with its ``width`` and ``height`` in pixels."""
     url = "data:image/jpeg;base64," + base64.b64encode(jpeg(image, quality)).decode()
     return {"url": url, "width": int(image.shape[1]), "height": int(image.shape[0])}
 
 
 def drawing(image: UInt8[np.ndarray, "h w channels"]) -> Json:
-    """Return an image, which may have an alpha channel, as ``photograph`` does, but as a PNG."""
+    """Return an image, which may have an alpha channel, as ``photograph`` does but as a PNG."""
     file = io.BytesIO()
     Image.fromarray(image).save(file, "PNG", optimize=True)
     url = "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()

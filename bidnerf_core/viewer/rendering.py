@@ -26,13 +26,12 @@ def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Flo
         away = (scene.surface.surfels.positions.cpu().double() - place).norm(dim=-1).min()
         bounds = replace(bounds, near=min(bounds.near, float(away) / 2))  # the nearest matter is seen
     distance = float((place - torch.tensor(bounds.centre, dtype=torch.float64)).norm())
-    beyond = (
-        bounds.far if bounds.contracted else math.hypot(*bounds.size) / 2
-    )  # of the centre, there is no more matter
+    # Farther from the centre than this, there is no more matter.
+    beyond = bounds.far if bounds.contracted else math.hypot(*bounds.size) / 2
     bounds = replace(bounds, far=max(bounds.far, distance + beyond))
     if not has_field(scene.field):
         return picture_at(scene, camera, T_world_camera)
-    # so many pixels at a time, between which it is checked whether the rendering is still wanted, see ``job_context``
+    # After each 4,096 pixels, it is checked whether the rendering is still wanted, see ``job_context``.
     return render_image(scene.field, camera, T_world_camera, bounds, 4096).rgb
 
 

@@ -40,7 +40,7 @@ class MapView:
     camera_given: bool = False
 
     def __repr__(self) -> str:
-        """A one-line description, without the content of the page."""
+        """Return a one-line description, without the content of the page."""
         return f"<MapView of {self.map['name']} with {amount(len(self.answers), 'localization')}>"
 
     def _repr_html_(self) -> str:
@@ -65,7 +65,7 @@ class MapView:
         return re.sub(r"<!-- (\w+) -->", lambda found: parts[found[1]], _part("index.html"))
 
     def save(self, path: str | Path) -> Path:
-        """Write the page to a file, atomically, that opens without a server or a network.
+        """Write the page to a file that opens without a server or a network, in one atomic step.
 
         Raises ``InputError`` for a file extension other than .html or .htm, and for a file that cannot be written.
         """

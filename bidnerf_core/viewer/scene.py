@@ -27,10 +27,10 @@ MOST_THUMBNAILS = 60
 
 
 def shown_map(scene: Map, thumbnails: int = MOST_THUMBNAILS) -> Json:
-    """Return a map as JSON values; ``thumbnails`` is the maximum number of cameras whose view is rendered.
+    """Return the JSON values of a map; ``thumbnails`` is the maximum number of cameras whose view is rendered.
 
-    ``unit`` is the symbol that follows a length, ``up_source`` what the upward direction was found from, and ``extent`` (in the unit
-    of the map) the size of what the initial view should show.
+    ``unit`` is the symbol that follows a length, ``up_source`` says what the upward direction was found from, and
+    ``extent`` (in the unit of the map) is the size of what the initial view should show.
     """
     up = scene.up
     centre, extent = _framing(scene)
@@ -61,7 +61,7 @@ def shown_map(scene: Map, thumbnails: int = MOST_THUMBNAILS) -> Json:
 
 
 def frustum(camera: Intrinsics) -> Json:
-    """Return a camera's viewing frustum, without lens distortion: its sides' slopes on the plane z = 1, and its image's size (pixels)."""
+    """Return a camera's viewing frustum without lens distortion: its sides on the plane z = 1, and its image's size (pixels)."""
     return {
         "left": -camera.cx / camera.fx, "right": (camera.width - camera.cx) / camera.fx,
         "top": -camera.cy / camera.fy, "bottom": (camera.height - camera.cy) / camera.fy,
@@ -104,8 +104,10 @@ def _points(
     points: Float[Tensor, "n 3"], count: int, radius: float, colours: Json | None = None, sizes: Json | None = None,
     normals: Json | None = None,
 ) -> Json:  # fmt: skip
-    """Return points of a map that holds ``count``: their ``radius``, in the map's unit, times their ``sizes``, float32 (n), if these
-    differ; and their ``normals``, int8 (n, 3) in 127ths, towards the cameras, since back faces are culled.
+    """Return the JSON values of some of the ``count`` points of a map.
+
+    The radius of a point is ``radius``, in the map's unit, times its entry in ``sizes``, float32 (n), if radii differ. The
+    ``normals``, int8 (n, 3) in 127ths, point towards the cameras, since back faces are culled.
     """
     return {
         "points": packed_points(points), "count": count, "radius": radius, "colours": colours, "sizes": sizes, "normals": normals
@@ -174,6 +176,6 @@ def _framing(scene: Map) -> tuple[tuple[float, float, float], float]:
     if scene.info.cameras:  # weighted so that all cameras together count as a hundredth of the points
         places = poses_of(scene.info.cameras).translation
         points = torch.cat([points, places.repeat(1 + len(points) // (100 * len(places)), 1)])
-    low, high = (points.quantile(q, dim=0) for q in (0.01, 0.99))  # a few may be far away
+    low, high = (points.quantile(q, dim=0) for q in (0.01, 0.99))  # a few points may be far away
     x, y, z = ((low + high) / 2).tolist()
     return (x, y, z), max(float((high - low).max()), 1e-9)

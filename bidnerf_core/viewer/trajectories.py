@@ -26,9 +26,11 @@ def shown_trajectory(
 ) -> Json:
     """Read a trajectory: a JSON file of 'bidnerf track' or 'localize', which has uncertainties, or one of TUM, EuRoC or KITTI.
 
-    Its poses are shown relative to ``origin``, that of the map. A remark is logged if the file states another unit than the map's ``unit``. Raises ``InputError`` for a file without poses.
-    The ``poses`` are T_world_camera without the last row, float32 (n, 12), ``times`` in seconds, and ``sigmas`` standard deviations of
-    the position; what the file does not state is None, or an empty string.
+    Its poses are shown relative to ``origin``, that of the map. A remark is logged if the file states another unit than
+    the map's ``unit``. Raises ``InputError`` for a file without poses.
+
+    In the result, ``poses`` are T_world_camera without the last row, float32 (n, 12), ``times`` are in seconds, and
+    ``sigmas`` are standard deviations of the position. What the file does not state is None or an empty string.
     """
     content = read_file(path, "a trajectory")
     if path.suffix.lower() in (".json", ".jsonl"):
@@ -44,7 +46,7 @@ def shown_trajectory(
         ]
     if not found:
         raise InputError("holds no pose", where=path, expected="those of a trajectory")
-    some = found[:: max(1, math.ceil(len(found) / 20_000))]  # as many as a page draws smoothly
+    some = found[:: max(1, math.ceil(len(found) / 20_000))]  # longer ones are subsampled at a regular stride
     T, frames, times, sigmas, outcomes, _ = zip(*some, strict=True)
     other = {each[-1] for each in found} - {unit, None}
     if unit is not None and other:

@@ -33,8 +33,8 @@ def view(
 
     With the ``frame`` that was localized, the page compares it with the map as rendered from the pose. A frame without a
     ``localization`` is localized here, and the page then shows the search too. ``scene`` is a map, or a localizer with settings
-    of its own, and ``trajectory`` a file of poses. Raises ``InputError`` if it is neither,
-    and for a frame that cannot be localized at all.
+    of its own, and ``trajectory`` a file of poses. Raises ``InputError`` if ``scene`` is neither, and for a frame that
+    cannot be localized at all.
     """
     scene_map = map_of(scene)
     answers = list[Json]()
@@ -73,8 +73,8 @@ def localized(
 ) -> Json:
     """Localize a query, and return the answer with a record of its search. Raises ``InputError`` for an unusable query.
 
-    ``follow`` is called with the record of the search before it begins, and again with an answer whose pictures are of the surface,
-    before the field is rendered.
+    ``follow`` is called with the record of the search before it begins, and again, before the field is rendered, with an
+    answer whose pictures are of the surface.
     """
     with recorded() as record:
         if follow is not None:
@@ -102,9 +102,10 @@ def page_of(
 
 
 def shown_row(row: Any) -> Json:
-    """Return a row of the results of an evaluation, whose pose and covariance are rows of their matrices, as the page's table shows it.
+    """Return the JSON values of a row of the page's table, from a result of an evaluation.
 
-    ``error`` is that of the position, and of the orientation in degrees; ``sigma`` the standard deviation of the position.
+    The pose and the covariance of ``row`` are rows of their matrices. In the result, ``error`` is that of the position, and
+    of the orientation in degrees, and ``sigma`` the standard deviation of the position.
     """
     variance = math.nan if row.covariance is None else sum(row.covariance[i][i] for i in range(3))
     return {

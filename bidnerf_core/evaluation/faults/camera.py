@@ -88,9 +88,9 @@ def rolling_shutter(frame: Frame, degrees: float, generator: Generator) -> Frame
 
 
 def turned(*, columns: bool = False, rows: bool = False) -> Change:
-    """Return the fault that reverses columns or rows, or both: the camera held upside down.
+    """Return the fault that reverses columns, rows or both, as of a camera that is held upside down.
 
-    With one of them reversed, the result is not a view of the scene from anywhere.
+    If only one of them is reversed, the result is not a view of the scene from anywhere.
     """
     orientation = Orientation(mirrors_columns=columns, mirrors_rows=rows)
 
@@ -113,7 +113,7 @@ def _rays(camera: Intrinsics) -> Float[Tensor, "h w 3"]:
 
 
 def _of_images(frame: Frame, change: Callable[[Tensor], Tensor], **more: Any) -> Frame:
-    """Return the frame with its colours, depth, alpha and hidden pixels changed in the same way, and other attributes ``more``."""
+    """Return the frame with its colours, depth, alpha and hidden pixels changed alike; ``more`` replaces other attributes."""
     for name in ("rgb", "depth", "alpha", "hidden"):
         image = getattr(frame, name)
         more[name] = None if image is None else change(image)

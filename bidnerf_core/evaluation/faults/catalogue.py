@@ -13,7 +13,7 @@ from bidnerf_core.settings import Above, Range, WholeNumbers
 
 FACTOR, SHIFT = Above(0.0, 100.0), Range(0.0, 10_000.0)
 PIXELS = WholeNumbers(1, 1_000_000)
-"""Sizes of a window; the largest contains any image."""
+"""The allowed sizes of a window; the largest contains any image."""
 
 # fmt: off
 CATALOGUE: dict[str, Fault] = {

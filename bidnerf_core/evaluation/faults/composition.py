@@ -37,7 +37,7 @@ class AppliedFault:
         fault = FAULTS.load(self.name)
         if self.size == fault.neutral:
             return view
-        # The random choices of one fault on one frame have a seed of their own.
+        # Each fault on each frame has a seed of its own for its random choices.
         text = f"{seed}\n{view.frame.name}\n{self.name}".encode(errors="surrogatepass")
         stream = int.from_bytes(hashlib.blake2b(text, digest_size=7).digest(), "big")
         generator = torch.Generator().manual_seed(stream)

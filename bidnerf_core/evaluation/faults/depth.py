@@ -75,7 +75,10 @@ def one_wall(frame: Frame, on: float, generator: Generator) -> Frame:
 
 
 def _largest_plane(points: Float[Tensor, "n 3"], generator: Generator) -> Float[Tensor, "4"]:
-    """Return the plane (unit normal, offset) with the most points of a sample, among 256 planes through three points each."""
+    """Return the plane (unit normal, offset) that contains the most points, as found by trial.
+
+    256 planes through three random points each are compared on a sample of the points.
+    """
     corners = points[torch.randint(len(points), (256, 3), generator=generator)]
     sample = points[torch.randint(len(points), (4096,), generator=generator)]
     crossed = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -89,12 +92,12 @@ def _largest_plane(points: Float[Tensor, "n 3"], generator: Generator) -> Float[
 
 
 def _on_plane(points: Float[Tensor, "*p 3"], plane: Float[Tensor, "4"]) -> Bool[Tensor, "*p"]:
-    """Return which points are as near to a plane as a hundredth of their depth."""
+    """Return which points are no farther from a plane than a hundredth of their depth."""
     return (points @ plane[:3] + plane[3]).abs() <= 0.01 * points[..., 2]
 
 
 def _around_a_pixel(frame: Frame, size: int, generator: Generator) -> list[Bool[Tensor, "n"]]:
-    """Mark ``size`` adjacent rows and columns, centred on a random measured pixel as far as the borders allow."""
+    """Return masks of ``size`` adjacent rows and of columns, centred on a random measured pixel as far as borders allow."""
     found = []
     for middle, length in zip(
         random_pixel(depth_of(frame) > 0, generator), depth_of(frame).shape, strict=True

@@ -33,7 +33,7 @@ class Fault:
     allowed: Range
     neutral: float | None  # the size at which there is no fault; None if there is no such size
     sizes: tuple[float, ...]  # sizes worth measuring
-    change: Change  # not called for the neutral size
+    change: Change  # it is not called for the neutral size
     needs_depth: bool = False
     T_true_faulty: SE3 | None = None
     """Pose of the faulty camera in the true camera's frame, at any size but the neutral one; None if they coincide."""

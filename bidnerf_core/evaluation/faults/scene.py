@@ -27,7 +27,7 @@ def occluder(frame: Frame, share: float, generator: Generator) -> Frame:
     mask, colours = _textured_blob(frame, share, generator)
     if frame.depth is None or not frame.has_depth:
         return _pasted(frame, mask, colours, frame.depth)
-    # Nearer than the nearest part of the scene, the second percentile of its depth, with a relief of a twentieth.
+    # The object is nearer than the nearest part of the scene, the second percentile of its depth, with a relief of 5 %.
     near = float(np.quantile(frame.depth[frame.depth > 0].numpy(), 0.02))
     relief = 1 + 0.05 * _bounded_noise(frame, 3, generator)
     return _pasted(frame, mask, colours, uniform_number(generator, 0.4, 0.8) * near * relief)
@@ -48,6 +48,7 @@ def moved_thing(frame: Frame, share: float, generator: Generator) -> Frame:
     """
     height, width = frame.rgb.shape[:2]
     mask = blob(height, width, share, generator)
+    # The piece moves by a fraction of the image's shorter side, and comes slightly nearer.
     travel = uniform_number(generator, 0.15, 0.3) * min(height, width)
     move = torch.tensor(random_direction(generator)) * travel
     elsewhere = warped(frame, reflected(frame.intrinsics.pixel_centres() - move, width, height))
@@ -58,6 +59,7 @@ def moved_thing(frame: Frame, share: float, generator: Generator) -> Frame:
 def added_thing(frame: Frame, share: float, generator: Generator) -> Frame:
     """Put a textured object on ``share`` of the measured surface, from which it protrudes slightly."""
     mask = _surface_piece(frame, share, generator)
+    # The height above the surface, towards the camera, is relative to the depth.
     rise = uniform_number(generator, 0.02, 0.1) * (1 + 0.4 * _bounded_noise(frame, 6, generator))
     colours = texture(frame.intrinsics.height, frame.intrinsics.width, generator)
     return _pasted(frame, mask, colours, depth_of(frame) * (1 - rise))
@@ -79,7 +81,7 @@ def vanished_thing(frame: Frame, share: float, generator: Generator) -> Frame:
     if empty is not None and empty.any():
         background = frame.rgb[empty].median(dim=0).values.expand_as(frame.rgb)
         return _pasted(frame, mask, background, torch.zeros_like(depth), torch.zeros_like(depth))
-    # Continued from the surrounding colours (Telea 2004).
+    # The surrounding colours are continued (Telea 2004).
     colours = (frame.rgb * 255).round().to(torch.uint8).contiguous().numpy()
     filled = cv2.inpaint(colours, mask.to(torch.uint8).numpy(), RIM, cv2.INPAINT_TELEA)
     return _pasted(
@@ -136,12 +138,13 @@ def blob(height: int, width: int, share: float, generator: Generator) -> Bool[Te
     centre = uniform_number(generator, 0.2, 0.8) * width, uniform_number(generator, 0.2, 0.8) * height
     down = torch.arange(height, dtype=torch.float32)[:, None] + 0.5 - centre[1]
     across = torch.arange(width, dtype=torch.float32)[None, :] + 0.5 - centre[0]
-    # Every point of the irregular outline is visible from the centre, so that the blob is one piece.
+    # The logarithm of the outline's radius is a sum of waves around the centre. Every point of the outline is visible from
+    # there, so that the blob is one piece.
     angle = torch.atan2(down, across)
     waves = [
         uniform_number(generator, -0.35, 0.35)
         * torch.cos(n * angle + uniform_number(generator, 0, 2 * math.pi))
-        for n in range(2, 6)  # periods around the outline
+        for n in range(2, 6)  # number of periods around the outline
     ]
     distance = torch.hypot(down, across) / torch.stack(waves).sum(0).exp()
     covered = round(share * height * width)
@@ -154,7 +157,9 @@ def texture(height: int, width: int, generator: Generator) -> Float[Tensor, "h w
     """Return random colours with detail at several scales and full contrast, with as many features as a photo."""
     longer = max(height, width)
     layers = []
-    for octave in range(2, 8):  # of noise, whose cells along the longer side double
+    for octave in range(
+        2, 8
+    ):  # from one octave of noise to the next, the number of cells along the longer side doubles
         rows, columns = (max(2, round(2**octave * side / longer)) for side in (height, width))
         layer = [smooth_noise(height, width, rows, columns, generator) for _ in range(3)]
         layers.append(torch.stack(layer, -1) * 2 ** (1 - octave / 2))
