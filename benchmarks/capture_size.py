@@ -122,9 +122,8 @@ def draw(path: Path, number: int, textures: Sequence[np.ndarray]) -> None:
     for (corner, first, second), colours in zip(WALLS, textures, strict=True):
         edges = [T[:3, :3] @ (np.array(edge) * room) for edge in (first, second)]
         origin = T[:3, :3] @ (np.array(corner) * room) + T[:3, 3]
-        plane = np.linalg.inv(
-            np.stack([*edges, -origin], axis=1)
-        )  # of a point of the plane: (a, b, -1) up to scale
+        # It maps a point of the plane to (a, b, -1) up to scale.
+        plane = np.linalg.inv(np.stack([*edges, -origin], axis=1))
         solved = rays @ plane.T
         depth = -1 / np.minimum(solved[..., 2], -1e-9)  # z at which the ray meets the plane
         a, b = solved[..., 0] * depth, solved[..., 1] * depth

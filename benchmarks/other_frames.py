@@ -28,9 +28,8 @@ def split_again(source: Path, out: Path, on_record: set[str]) -> None:
     }
     train = old["train"]["frames"]
     left = [frame for frame in old["test"]["frames"] if Path(frame["file_path"]).stem not in on_record]
-    if (
-        train[0].keys() == old["test"]["frames"][0].keys()
-    ):  # else the training split lacks the depth of the test split
+    # Otherwise, the training split lacks the depth of the test split.
+    if train[0].keys() == old["test"]["frames"][0].keys():
         left += train[1::2]
     out.mkdir(parents=True)
     for split, frames in {"train": train[::2], "test": left}.items():

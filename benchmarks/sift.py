@@ -209,9 +209,8 @@ class SiftMatcher:
         squared = (2 - 2 * nearest.values).clamp(min=0)  # distances of unit vectors
         point = self.owner[nearest.indices]
         other = squared.masked_fill(point == point[:, :1], torch.inf).amin(dim=1)
-        second = torch.minimum(
-            other, squared[:, -1]
-        )  # if all belong to one point, other points are farther away than the last of these descriptors
+        # If all descriptors belong to one point, other points are farther away than the last of them.
+        second = torch.minimum(other, squared[:, -1])
         good = (squared[:, 0] < RATIO**2 * second).numpy()
         number = point[:, 0].numpy()[good]
         return keypoints[good, :2].astype(np.float64), self.points.positions[number]

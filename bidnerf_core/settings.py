@@ -99,9 +99,8 @@ class Expert:
 EXPERT = Expert()
 
 Count = Annotated[int, Range(1, 10**7)]
-Layers = Annotated[
-    int, Range(1, 100)
-]  # of a network: each takes time and memory even if its tensors have only shapes
+# Numbers of layers of a network: each takes time and memory even if its tensors have only shapes.
+Layers = Annotated[int, Range(1, 100)]
 NotNegative = Annotated[float, Range(0.0)]
 Positive = Annotated[float, Above(0.0, 1e6)]
 

@@ -145,9 +145,8 @@ def _remarks_as_lines() -> Iterator[None]:
 
 class _Lines(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
-        from bidnerf_core.cli.output import (
-            say,
-        )  # imported here because importing rich takes longer than --help should
+        # Imported here because importing rich takes longer than --help should.
+        from bidnerf_core.cli.output import say
 
         say(record.getMessage())
 

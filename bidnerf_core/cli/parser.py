@@ -179,7 +179,7 @@ class _Parser(argparse.ArgumentParser):
         self, command: str, target: Callable[..., Any], loaded: Mapping[str, Any] | None, *,
         for_help: bool = False, options_only: bool = False,
     ) -> None:  # fmt: skip
-        self.width = max(40, shutil.get_terminal_size().columns)
+        self.width = max(40, shutil.get_terminal_size().columns)  # 40 columns even in narrower terminals
         super().__init__(
             f"bidnerf {command}", add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS,
             description=self._filled(inspect.getdoc(target) or ""),

@@ -50,6 +50,7 @@ class Display:
             self.bar.update(self.bar.task_ids[0], completed=now.done, total=now.total, text=text)
             return
         last = now.done == now.total and (bool(now.text) or self._spoke > self._began)
+        # If stderr is not a terminal, a line every ten seconds is enough.
         if now.total > 1 and now.done and (last or time.monotonic() - self._spoke > 10):
             self._spoke = time.monotonic()
             counted = Progress(now.stage, now.done, now.total, now.unit, text)

@@ -78,6 +78,7 @@ def frame_entry(
     matrix = T_world_camera.to("cpu", torch.float64).matrix()
     return {
         "file_path": file_path,
+        # The y and z axes of the camera are reversed in OpenGL.
         "transform_matrix": (matrix * matrix.new_tensor([1.0, -1.0, -1.0, 1.0])).tolist(),
         **({} if time is None else {"time": time}),
         "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": camera.width, "h": camera.height,

@@ -118,9 +118,8 @@ class Plan(Setup, Settings):
     """
 
     sizes: Sequence[float | Sequence[float]] | None = None  # errors of the starts, in the protocol's units
-    config: Any = (
-        "{}"  # settings of the method, a dictionary of those that differ from the defaults, or its JSON
-    )
+    # settings of the method, a dictionary of those that differ from the defaults, or its JSON
+    config: Any = "{}"
     trials: Annotated[int, WholeNumbers(1, MOST_TRIALS)] | None = None  # of each size
     seed: Annotated[int, WholeNumbers(0, LARGEST_SEED)] | None = None
     frames: Sequence[str] | None = None  # use only these

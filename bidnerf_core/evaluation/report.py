@@ -71,7 +71,7 @@ def write_report(
     require_matplotlib()
     try:
         with open_binary(folder / "index.html", "the page of a report") as file:
-            is_ours = MARK.encode() in file.read(4096)
+            is_ours = MARK.encode() in file.read(4096)  # bytes that contain the mark of a report
     except InputError:
         is_ours = False
     if folder.is_dir() and not is_ours and not all(is_temporary(file.name) for file in folder.iterdir()):

@@ -106,6 +106,7 @@ def aligned(lines: Sequence[Sequence[str]]) -> str:
     cells: list[list[str]] = []
     for line in lines:
         first, *others = map(printable, line)
+        # A first cell that is too wide has a line of its own.
         cells += [[first], ["", *others]] if others and len(first) > 60 else [[first, *others]]
     columns = [[line[i] for line in cells if len(line) > max(i, 1)] for i in range(max(map(len, cells)))]
     widths = [max(map(len, column)) for column in columns]

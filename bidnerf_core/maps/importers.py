@@ -46,22 +46,18 @@ class ImportedField:
     _: KW_ONLY
     found: tuple[str, ...] = ()  # sentences on the content of the file, such as counts, and what was left out
     steps: int = 1  # of its training; 1 if unknown
-    points: Float[Tensor, "n 3"] | None = (
-        None  # metres, world: points on the matter, from which its extent is reported
-    )
+    # metres, world: points on the matter, from which its extent is reported
+    points: Float[Tensor, "n 3"] | None = None
     cameras: tuple[StoredCamera, ...] = ()  # those of its training images, if files next to it provide them
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # upward direction by the format's convention
-    surface: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]] | None = (
-        None  # points (metres, world) on the matter of a scan, and their colours: its surface, which then need not be rendered
-    )
+    # points (metres, world) on the matter of a scan, and their colours: its surface, which then need not be rendered
+    surface: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]] | None = None
     is_coloured: bool = True  # whether its colours are meaningful; otherwise renderings give no landmarks
-    photos: Path | None = (
-        None  # dataset of its training images, with poses in the world; unused if others are given
-    )
+    # dataset of its training images, with poses in the world; unused if others are given
+    photos: Path | None = None
     is_solid: bool = False  # whether matter encloses no free space, so that the scene is viewed from outside
-    structure: Structure | None = (
-        None  # from which landmarks are made; the field is then none (``NoField``), its backend ""
-    )
+    # from which landmarks are made; the field is then none (``NoField``), its backend ""
+    structure: Structure | None = None
 
 
 @runtime_checkable

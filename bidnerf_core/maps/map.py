@@ -441,9 +441,8 @@ def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None 
     if not info.step:
         return info.in_map_unit(NoField())
     where, path, checked = str((folder or Path()) / DESCRIPTION), (folder or Path()) / info.weights, False
-    load_backend(
-        info.backend, where
-    )  # outside of the context below, in which its module's tensors would have no values
+    # This is outside of the context below, in which the tensors of its module would have no values.
+    load_backend(info.backend, where)
     try:  # only the shapes, before memory is allocated for a field of whatever size map.json describes
         with torch.device("meta"):
             outline = build_field(info, where)

@@ -79,9 +79,7 @@ class StructureImporter:
                 left_out.append(f"{image.name}: it has no keypoints in the file of them")
             elif not known and image.name not in files:
                 left_out.append(f"{image.name}: no such photo in {folder}")
-            elif (
-                int((observed[number] >= 0).sum()) < 6
-            ):  # too few to determine even its own pose by consensus
+            elif int((observed[number] >= 0).sum()) < 6:  # too few even for its own pose by consensus
                 left_out.append(f"{image.name}: it observes fewer than 6 points")
             else:
                 kept.append(number)

@@ -75,9 +75,8 @@ class ReadViews:
     background: tuple[float, float, float]  # behind images with an alpha channel
     hidden: int = 0  # pixels that masks hide
     unit: LengthUnit = "units"  # of the poses
-    gravity_up: tuple[float, float, float] | None = (
-        None  # upward direction (world), if the capture measured gravity
-    )
+    # upward direction (world), if the capture measured gravity
+    gravity_up: tuple[float, float, float] | None = None
     sparse_depth: int = 0  # pixels whose depth comes from the points of a COLMAP model
     depth_unit: float | None = None  # metres per step of depth images, if their format accepts another
     # files of images by name, relative to the dataset's folder

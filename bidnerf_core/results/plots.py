@@ -138,9 +138,8 @@ def draw_capture(
         middle, reach = (low + high) / 2, max(float((high - low).max()), 1e-6)
         panel.set(xlim=(middle[0] - reach, middle[0] + reach), ylim=(middle[1] - reach, middle[1] + reach))
         panel.set(aspect="equal", xlabel=f"{unit}, from the centre of the capture")
-        if (
-            points is not None and seen_by is not None and len(points)
-        ):  # the darker, the more photos show them
+        # Landmarks are the darker, the more photos show them.
+        if points is not None and seen_by is not None and len(points):
             step = max(1, math.ceil(len(points) / 20_000))
             views, places = seen_by.numpy()[::step], _from_above(points[::step].double().tolist(), report)
             order = np.argsort(views, kind="stable")
@@ -250,9 +249,8 @@ def draw_path(
         for panel, upward, title in zip(panels, (1, 2), ("from above", "from the side"), strict=True):
             projection = np.stack([axes[0], axes[upward]], axis=-1)
             places = poses.translation.double().numpy() @ projection
-            if (
-                surface is not None
-            ):  # a sample of the surfels around the path, as far as half of the scene's extent or more
+            # A sample of the surfels around the path is drawn, as far as half of the scene's extent or more.
+            if surface is not None:
                 surfels = moved(surface.surfels, "cpu")
                 points, middle = surfels.positions.double().numpy() @ projection, places.mean(0)
                 size = max(0.5 * surface.extent, 1.5 * float(np.abs(places - middle).max()))

@@ -58,9 +58,8 @@ class TrajectoryErrors:
     def of(found: SE3, true: SE3, unit: LengthUnit = "units") -> TrajectoryErrors:
         """Compare poses ``T_world_camera`` (n, in ``unit``), in chronological order. Raises ``InputError`` if there are none."""
         count = len(found.translation)
-        distances = (
-            alignment_errors(found, true) if count >= 3 else None
-        )  # fewer do not determine an alignment
+        # Fewer than three poses do not determine an alignment.
+        distances = alignment_errors(found, true) if count >= 3 else None
         return TrajectoryErrors(
             count,
             ErrorSummary.of(pose_error(found, true, unit)),

@@ -73,7 +73,7 @@ class WorkerProcess:
 
 def _reply(connection: Connection) -> dict[str, Any]:
     """Return the JSON that a process sends. Raises ``InputError`` if it states an error, and ``LOST`` if the process died."""
-    reply: dict[str, Any] = json.loads(connection.recv_bytes(2**24))
+    reply: dict[str, Any] = json.loads(connection.recv_bytes(2**24))  # at most 16 MiB
     if "error" in reply:
         raise InputError(reply["error"])
     return reply

@@ -168,9 +168,8 @@ def _bound(host: str, port: int) -> socket.socket:
 async def _run(
     app: FastAPI, server: Any, bound: socket.socket, ready: Callable[[str], Any], stop: threading.Event | None
 ) -> None:  # fmt: skip
-    server.capture_signals = partial(
-        _signals_end, server
-    )  # uvicorn's own raises the signals again at the end
+    # uvicorn's own handler raises the signals again at the end.
+    server.capture_signals = partial(_signals_end, server)
     async with app.router.lifespan_context(app):
         serving = asyncio.ensure_future(server.serve(sockets=[bound]))
         while not server.started and not serving.done():

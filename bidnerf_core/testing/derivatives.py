@@ -54,9 +54,8 @@ def check_jacobian(field: RadianceField, dtype: torch.dtype) -> None:
     with calling(who):
         found = field.jacobian(positions, directions)
     expected = backward_derivatives(field.query, positions, directions)
-    across = (
-        torch.eye(3, dtype=dtype) - directions[:, :, None] * directions[:, None]
-    )  # directions are unit vectors
+    # Directions are unit vectors.
+    across = torch.eye(3, dtype=dtype) - directions[:, :, None] * directions[:, None]
     for what, ours, theirs in (
         ("density", found.values.density, expected.values.density),
         ("rgb", found.values.rgb, expected.values.rgb),

@@ -94,6 +94,7 @@ def _of_cameras(found: Localization, answer: Answer) -> Json:
         camera = names[row].removesuffix(MOVING)
         name = CAMERAS[camera] + (", with rolling shutter" if names[row].endswith(MOVING) else "")
         shown[name] = shown.get(name, 0.0) + probability
+    # Explanations that are less probable than one in a thousand are not listed.
     likely = [each for each in sorted(shown.items(), key=lambda each: -each[1]) if each[1] >= 0.001]
     pose = earlier(found, answer)
     return _contest("Whose camera took it?", likely, f"Weighed at {pose}." if pose else "", of_pose=False)

@@ -157,9 +157,8 @@ def texture(height: int, width: int, generator: Generator) -> Float[Tensor, "h w
     """Return random colours with detail at several scales and full contrast, with as many features as a photo."""
     longer = max(height, width)
     layers = []
-    for octave in range(
-        2, 8
-    ):  # from one octave of noise to the next, the number of cells along the longer side doubles
+    # From one octave of noise to the next, the number of cells along the longer side doubles.
+    for octave in range(2, 8):
         rows, columns = (max(2, round(2**octave * side / longer)) for side in (height, width))
         layer = [smooth_noise(height, width, rows, columns, generator) for _ in range(3)]
         layers.append(torch.stack(layer, -1) * 2 ** (1 - octave / 2))

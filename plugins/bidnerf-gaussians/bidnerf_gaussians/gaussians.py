@@ -27,9 +27,8 @@ class Gaussians:
     log_scales: Float[Tensor, "n 3"]  # logarithms of the standard deviations along the axes
     quaternions: Float[Tensor, "n 4"]  # w, x, y, z of the rotation from the axes to the world; not normalized
     logits: Float[Tensor, "n"]  # opacity is their sigmoid
-    harmonics: Float[
-        Tensor, "n k 3"
-    ]  # coefficients of the colour's spherical harmonics, minus a colour of 0.5
+    # coefficients of the colour's spherical harmonics, minus a colour of 0.5
+    harmonics: Float[Tensor, "n k 3"]
 
     def __len__(self) -> int:
         return len(self.means)

@@ -75,9 +75,8 @@ def first_pieces(field: ScanField, views: Sequence[View], generator: Generator) 
     points, colours = thinned(points, rgb, count)
     assert colours is not None
     found = cloud_pieces(points, colours)
-    missing = count - len(
-        found
-    )  # the number of grid cells is never exactly the wanted one; copies are transparent
+    # The number of grid cells is never exactly the wanted one; copies are transparent.
+    missing = count - len(found)
     again = torch.randint(len(found), (missing,), generator=generator)
     every = torch.cat([torch.arange(len(found)), again])
     logits = torch.cat([found.logits, torch.full((missing,), -20.0)])

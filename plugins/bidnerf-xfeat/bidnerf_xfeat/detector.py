@@ -120,9 +120,8 @@ def _probabilities(image: Float[Tensor, "1 1 h w"], step: int) -> Float[Tensor, 
     model, (height, width) = network(), image.shape[-2:]
     around = pad(model.norm(image), (CELL, CELL, CELL, CELL), mode="reflect")
     total, starts = torch.zeros_like(image), range(0, CELL, step)
-    for row, column in product(
-        starts, starts
-    ):  # one by one, because all of them would not fit into the cache
+    # The blocks are taken one by one, because all of them would not fit into the cache.
+    for row, column in product(starts, starts):
         cells = model._unfold2d(
             around[:, :, row : row + height + CELL, column : column + width + CELL], ws=CELL
         )

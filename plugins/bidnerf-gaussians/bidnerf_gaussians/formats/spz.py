@@ -88,9 +88,8 @@ def _unzipped(content: bytes, path: Path) -> tuple[list[bytes], int, int, int, i
             raise InputError(
                 f"declares {count:,} Gaussians, more than its {len(content):,} bytes can hold", where=path
             )
-        rest = stream.decompress(
-            stream.unconsumed_tail, sum(sizes) or 1
-        )  # no more than declared is ever unpacked
+        # No more than declared is ever unpacked.
+        rest = stream.decompress(stream.unconsumed_tail, sum(sizes) or 1)
     except zlib.error as error:
         raise InputError(f"is damaged ({error})", where=path, expected=EXPECTED) from error
     if len(rest) < sum(sizes):
