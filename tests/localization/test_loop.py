@@ -8,6 +8,7 @@ outcome of an image without a right answer. The confidence, which was fitted to 
 from __future__ import annotations
 
 import functools
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -489,3 +490,18 @@ def test_degenerate_input_has_a_finite_answer_that_is_not_accepted_or_none(
     assert bool(found.T_world_rig.matrix().isfinite().all())
     assert bool(found.posterior.probability.isfinite().all())
     assert not bool(found.covariance.isnan().any())
+
+
+def test_the_same_seed_gives_the_same_answer_in_any_thread() -> None:
+    localize = Localizer(with_landmarks(ground_landmarks()), config=QUICK, warm_up=False)
+    views = [ground_views("none", depth=True), ground_views("occluder:0.25"), ground_views("focal:0.95")]
+    expected = [localize(view, seed=3) for view in views]
+    torch.manual_seed(99)
+    with ThreadPoolExecutor(3) as pool:
+        again = list(pool.map(lambda view: localize(view, seed=3), views * 2))
+    for one, other in zip(expected * 2, again, strict=True):
+        assert torch.equal(one.T_world_camera.matrix(), other.T_world_camera.matrix())
+        assert one.covariance is not None
+        assert other.covariance is not None
+        assert torch.equal(one.covariance, other.covariance)
+        assert (one.outcome, one.reason) == (other.outcome, other.reason)

@@ -231,5 +231,5 @@ def test_a_baked_surface_stays_within_its_memory() -> None:
         surface = bake(
             baked.FIELD, baked.BOUNDS, [], baked.images(SCENE, 12, seed=0), BakeConfig(megabytes=0.2)
         )
-    assert surface.mebibytes < 0.24  # surfels move a little when planes are fitted
+    assert surface.mebibytes < 0.25e6 / 2**20  # surfels move a little when planes are fitted
     assert (surface.surfels.positions.abs().amax(-1) < 0.6 + surface.cell).all()
