@@ -198,8 +198,7 @@ def _hidden(widths: Sequence[int]) -> list[nn.Module]:
 
 
 def limited(grid: OccupancyGrid, count: int) -> RaySampler:
-    """Return a sampler of at most ``count`` intervals per ray, concentrated where the grid has observed
-    density.
+    """Return a sampler of at most ``count`` intervals per ray, concentrated where the grid has observed density.
 
     With a count of 0, or if the grid has observed nothing, as in maps stored by earlier versions, it is the
     grid itself, which samples all occupied cells.

@@ -179,8 +179,8 @@ def query(
         place = wanted.long().cumsum(0)
         index, count = place.new_empty(n + 1), place[-1:]
         index.scatter_(0, torch.where(wanted, place - 1, n), torch.arange(n, device=place.device))
-    # Derivatives are rounded to TF32 in their products; those of the values are as exact as single precision.
     block = POINTS if derivatives else 2 * POINTS
+    # Products of derivatives are rounded to TF32; those of values are as exact as single precision.
     with torch.cuda.device_of(values):
         field_kernel[_blocks(n, block)](
             positions.contiguous(), directions.contiguous(), values, by_both, index, count, *_launched(levels, tables),

@@ -107,7 +107,7 @@ class _Evaluate(torch.autograd.Function):
         geometry, colour = _networks(flat, ctx.geometry_layers)
         chunks, passed = slices(len(encoded), NETWORK_CHUNK), len(geometry[-1][1]) - 1
         each = len(inputs) // max(len(chunks), 1)
-        width = colour[0][0].shape[1] - passed  # of what the geometry does not pass to the colour
+        width = colour[0][0].shape[1] - passed  # of the input that the geometry does not pass to the colour
         to_encoded = torch.empty_like(encoded) if wants_encoded else None
         to_harmonics = encoded.new_empty(len(encoded), width) if wants_harmonics else None
         sizes = [part.numel() for part in flat]

@@ -22,8 +22,7 @@ _for_pools: ContextVar[int | None] = ContextVar("for_pools", default=None)  # th
 
 @contextmanager
 def pools_only(device: torch.device) -> Iterator[None]:
-    """Within the block, only ``concurrently`` uses several threads: torch's own operators use one. On a GPU,
-    it does nothing.
+    """Within the block, only ``concurrently`` uses several threads: torch's own operators use one. On a GPU, it does nothing.
 
     A training step consists of hundreds of short operators. On two cores, waking threads for each of them
     took longer than they saved.
@@ -71,9 +70,7 @@ def _run(task: Callable[[], None], inference: bool) -> None:
 
 
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Return a pool whose threads are all running, each limited to one core, so that a fork finds none of
-    them starting.
-    """
+    """Return a pool whose threads are all running, each limited to one core, so that a fork finds none of them starting."""
     with _opening:
         if threads in _pools:
             return _pools[threads]

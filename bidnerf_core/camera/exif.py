@@ -59,9 +59,8 @@ class Exif:
     size: tuple[int, int] | None = None  # width and height of the stored image when the photo was taken
     equivalent_mm: float | None = None  # focal length with the same diagonal field of view on 35 mm film
     focal_mm: float | None = None
-    pixels_per_mm: tuple[float, float] | None = (
-        None  # on the sensor, along the columns and rows of the stored image
-    )
+    # on the sensor, along the columns and rows of the stored image
+    pixels_per_mm: tuple[float, float] | None = None
     digital_zoom: float = 1.0
 
     @property
@@ -71,15 +70,13 @@ class Exif:
 
 
 def read_exif(path: Path) -> Exif:
-    """Read the tags of an image file; damaged tags count as missing. Raises ``InputError`` if it is not an
-    image.
-    """
+    """Read the tags of an image file; damaged tags count as missing. Raises ``InputError`` if it is not an image."""
     with open_image(path) as image:
         try:
             found = image.getexif()
             tags: dict[int, Any] = {**found, **found.get_ifd(IFD.Exif)}
             code = tags.get(Base.Orientation, 1)
-            # Millimetres of the resolution's unit: inch, centimetre, millimetre, micrometre.
+            # The length in millimetres of the resolution's unit: inch, centimetre, millimetre, micrometre.
             units = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
             unit = units.get(tags.get(Base.FocalPlaneResolutionUnit, 2))
             keys = (

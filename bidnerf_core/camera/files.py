@@ -52,8 +52,9 @@ EXPECTED = "YAML from ROS (camera_info), OpenCV, ORB-SLAM or Kalibr with the int
 
 @dataclass(frozen=True)
 class CameraRecord:
-    """Intrinsics before the image size is known; a focal length is in pixels or, if ``True`` follows, a field of view in
-    radians.
+    """Intrinsics before the image size is known.
+
+    A focal length is in pixels or, if ``True`` follows, a field of view in radians.
     """
 
     record: Record
@@ -121,8 +122,9 @@ def camera_record(record: Record) -> CameraRecord:
 
 
 def _focal(record: Record, axis: str) -> tuple[float, bool] | None:
-    """Return the focal length of an axis, or its field of view and ``True``. A frame's own value takes precedence over the
-    file's, and pixels over radians.
+    """Return the focal length of an axis and ``False``, or its field of view and ``True``.
+
+    A frame's own value takes precedence over the file's, and pixels over radians.
     """
     for scope in record.scopes():
         focal, angle = scope.number(f"fl_{axis}"), scope.number(f"camera_angle_{axis}")
@@ -210,9 +212,7 @@ def read_text_cameras(path: Path) -> dict[int, Camera]:
 
 
 def _text_cameras(path: Path, content: bytes, named: bool = True) -> dict[str, Camera]:
-    """Parse rows of ``CAMERA_ID MODEL WIDTH HEIGHT PARAMS...``, or hloc's rows with an image name instead of
-    the id.
-    """
+    """Parse rows of ``CAMERA_ID MODEL WIDTH HEIGHT PARAMS...``, or hloc's rows with an image name instead of the id."""
     expected = "transforms.json or cameras.txt (COLMAP's model_converter makes it from cameras.bin)"
     found: dict[str, Camera] = {}
     for row in parse_rows(content, path, expected, "CAMERA_ID MODEL WIDTH HEIGHT and parameters"):
@@ -232,10 +232,9 @@ def _text_cameras(path: Path, content: bytes, named: bool = True) -> dict[str, C
 
 
 def calibrated_camera(where: str, values: Mapping[str, Any], size: tuple[int, int]) -> Camera:
-    """Parse the camera in an object that a calibration tool or a robot wrote. If it gives no image size, ``size`` (width,
-    height) is assumed.
+    """Parse the camera in an object that a calibration tool or a robot wrote.
 
-    Raises ``InputError``, whose message begins with ``where``.
+    If it gives no image size, ``size`` (width, height) is assumed. Raises ``InputError``, whose message begins with ``where``.
     """
     inner = [value for key, value in values.items() if re.fullmatch(r"cam\d+", str(key))]
     if len(inner) > 1:

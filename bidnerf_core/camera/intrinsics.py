@@ -73,7 +73,7 @@ class Intrinsics:
         check_number("width", width, *LIMITS["size"])
         check_number("height", height, *LIMITS["size"])
         question_focal(focal, width, height)
-        if focal > 1000 * max(width, height):  # a telescope's field of view of 0.06 degrees
+        if focal > 1000 * max(width, height):  # a field of view of 0.06 degrees, as of a telescope
             found = f"focal length is {focal} px for an image of {width}x{height}"
             raise InputError(found, expected="at most 1000 times its longer side")
         return Intrinsics(focal, focal, width / 2, height / 2, width, height)
@@ -88,8 +88,7 @@ class Intrinsics:
 
     @staticmethod
     def from_opencv(K: Any, distortion: Any = None, size: tuple[int, int] | None = None) -> Intrinsics:
-        """Return the camera that OpenCV and ROS describe by a matrix, distortion coefficients and the image
-        size.
+        """Return the camera that OpenCV and ROS describe by a matrix, distortion coefficients and the image size.
 
         ``K`` (3 x 3) and ``distortion`` (4, 5, 8, 12 or 14 coefficients in any shape; None for an ideal lens)
         are arrays, tensors or lists, and ``size`` is (width, height) in pixels. OpenCV's first pixel has its
@@ -180,16 +179,12 @@ class Intrinsics:
         )
 
     def quarter_turns(self) -> tuple[Intrinsics, ...]:
-        """Return this camera rotated by 90 degrees to either side; none if its sensor is tilted (14
-        coefficients).
-        """
+        """Return this camera rotated by 90 degrees to either side; none if its sensor is tilted (14 coefficients)."""
         tilted = any(self.distortion[12:])
         return () if tilted else tuple(self.upright(Orientation.from_exif(code)) for code in (6, 8))
 
     def centre_crop(self, width: int, height: int) -> Intrinsics:
-        """Return the camera of the largest centred crop with the aspect ratio of the given size, resized to
-        that size.
-        """
+        """Return the camera of the largest centred crop with the aspect ratio of the given size, resized to that size."""
         scale = max(width / self.width, height / self.height)
         return replace(
             self, fx=self.fx * scale, fy=self.fy * scale, cx=width / 2 + (self.cx - self.width / 2) * scale,
@@ -204,7 +199,7 @@ class Intrinsics:
         """
         if orientation.transposes and any(self.distortion[12:]):
             raise InputError("a camera with a tilted sensor cannot be rotated", expected="an upright image")
-        # Coefficients that depend on the axes: tangential p1 p2 (2 3), thin prism s1 to s4 (8 to 11), tilt tau_x tau_y (12 13).
+        # These coefficients depend on the axes: tangential p1 p2 (2 3), thin prism s1 to s4 (8 to 11), tilt tau_x tau_y (12 13).
         fx, fy, cx, cy, k = self.fx, self.fy, self.cx, self.cy, self.distortion
         width, height = self.width, self.height
         if orientation.mirrors_columns:
@@ -311,9 +306,9 @@ def cameras_at_size(
 ) -> tuple[CameraGroup, ...]:
     """Return ``cameras`` resized to an image of another size, in groups of the same turn.
 
-    By default, only those are returned whose images have its aspect ratio, or else those that match after a quarter turn, in two groups:
-    turned to one side, and to the other; possibly none. With another ``fit``, all are returned, centre-cropped to the aspect ratio or
-    resized regardless of it; landscape cameras are turned to both sides for a portrait size, and vice versa.
+    By default, only those are returned whose images have its aspect ratio, or else those that match after a quarter turn, in
+    two groups: turned to one side, and to the other; possibly none. With another ``fit``, all are returned, centre-cropped to
+    the aspect ratio or resized regardless of it; landscape cameras are turned to both sides for a portrait size, and vice versa.
     """
     size = (width, height)
     if fit == "whole":

@@ -53,8 +53,7 @@ PANORAMA_FACES = {  # name: yaw to the right and pitch upwards, degrees
 
 
 class Lens(ABC):
-    """A camera whose images are resampled on reading to a ``pinhole`` camera at the same pose, or rotated
-    from it.
+    """A camera whose images are resampled on reading to a ``pinhole`` camera at the same pose, or rotated from it.
 
     Images are upright by the time they are resampled. The lens parameters refer to the stored image, which
     ``orientation`` turns upright.
@@ -152,8 +151,9 @@ class CentralLens(Lens):
 
     @property
     def flat(self) -> Intrinsics:
-        """A camera of the same focal length. It sees as far to each side as the lens does in the middle of
-        that side, but at most 60 degrees from the axis.
+        """A camera of the same focal length.
+
+        It sees as far to each side as the lens does in the middle of that side, but at most 60 degrees from the axis.
         """
         left, right, top, bottom = (math.tan(min(angle, WIDEST)) for angle in self._angles)
         fx, fy = self.stored.fx, self.stored.fy
@@ -162,17 +162,13 @@ class CentralLens(Lens):
 
     @property
     def _angles(self) -> tuple[float, ...]:
-        """Angles (radians) from the axis to the left, right, top and bottom sides; NaN if no ray meets a
-        side.
-        """
+        """Angles (radians) from the axis to the left, right, top and bottom sides; NaN if no ray meets a side."""
         c = self.stored
         sides = (c.cx / c.fx, (c.width - c.cx) / c.fx, c.cy / c.fy, (c.height - c.cy) / c.fy)
         return tuple(self._angle(radius) for radius in sides)
 
     def _angle(self, radius: float) -> float:
-        """Return the angle at which rays meet the image ``radius`` (over the focal length) from the principal
-        point.
-        """
+        """Return the angle at which rays meet the image ``radius`` (over the focal length) from the principal point."""
         if radius <= 0:
             return math.nan
         if MODELS[self.model][1] == DIVISION:
@@ -191,9 +187,8 @@ class CentralLens(Lens):
 
     def project(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         radius = np.linalg.norm(points, axis=-1)
-        if (
-            MODELS[self.model][1] == DIVISION
-        ):  # the smaller root of k r d^2 - d + r = 0, d being the distorted radius
+        if MODELS[self.model][1] == DIVISION:
+            # The smaller root of k r d^2 - d + r = 0, where d is the distorted radius
             inside = 1 - 4 * self.coefficients[0] * radius * radius
             ratio = np.where(inside >= 0, 2 / (1 + np.sqrt(np.maximum(inside, 0))), np.nan)
         else:
@@ -213,9 +208,7 @@ class CentralLens(Lens):
 
 @dataclass(frozen=True)
 class PanoramaFace(Lens):
-    """One of ``PANORAMA_FACES`` of an equirectangular image, whose middle shows what is in front of the
-    camera.
-    """
+    """One of ``PANORAMA_FACES`` of an equirectangular image, whose middle shows what is in front of the camera."""
 
     face: str
     stored_size: tuple[int, int]
@@ -278,9 +271,7 @@ class PanoramaFace(Lens):
 
 @lru_cache(maxsize=2)
 def _lookup(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """Return the column and row (OpenCV pixel convention) of the upright image that each resampled pixel
-    shows.
-    """
+    """Return the column and row (OpenCV pixel convention) of the upright image that each resampled pixel shows."""
     flat, turn = lens.flat, lens.orientation
     columns, rows = (np.arange(size) + 0.5 for size in (flat.width, flat.height))
     places = np.stack(np.meshgrid((columns - flat.cx) / flat.fx, (rows - flat.cy) / flat.fy), axis=-1)

@@ -44,8 +44,7 @@ STILL = MotionPrior()
 
 
 def exposure_times(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Tensor, "m"]:
-    """Return each pixel's exposure time as a fraction of the readout time: -0.5 to 0.5, zero at the middle
-    row.
+    """Return each pixel's exposure time as a fraction of the readout time: -0.5 to 0.5, zero at the middle row.
 
     Sensors are wider than they are high, so the sensor's rows are the columns of a portrait image; square
     images count as landscape. The direction of the readout does not matter: reversing it reverses the motion.

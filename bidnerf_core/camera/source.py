@@ -130,8 +130,7 @@ class CameraSource:
             raise InputError(why, where=path, expected=f"a camera: {WAYS}")
 
     def find(self, where: Path | str, raster: Raster, exif: Exif | None = None) -> FoundCamera:
-        """Return the camera of an upright image: the given one, else the one in EXIF, else one of the
-        ``assumed`` ones.
+        """Return the camera of an upright image: the given one, else the one in EXIF, else one of the ``assumed`` ones.
 
         Raises ``InputError``, whose message begins with ``where``, if several cameras are given, if none is
         known, and if the camera has another aspect ratio than the image.
@@ -220,8 +219,8 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: boo
     """Return the camera that EXIF describes, accurate to a few percent and assumed to be free of distortion.
 
     An image that was cropped after it was taken, if it may be, is assumed to have kept its resolution unless its size
-    differs by more than half; then it is treated as a resized centre crop. Raises ``InputError`` if there is no focal length, and for
-    any other cropped image.
+    differs by more than half; then it is treated as a resized centre crop. Raises ``InputError`` if there is no focal length,
+    and for any other cropped image.
     """
     taken, whole = exif.size, raster.size  # ``whole`` is the size before the image was cropped
     part = ""
@@ -238,7 +237,7 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: boo
         whole = round(taken[0] * scale), round(taken[1] * scale)
         part = f"; cropped from a photo of {taken[0]}x{taken[1]}"
     if exif.equivalent_mm is not None:
-        focal = exif.equivalent_mm / math.hypot(36, 24) * math.hypot(*whole)  # CIPA DCG-001: of film
+        focal = exif.equivalent_mm / math.hypot(36, 24) * math.hypot(*whole)  # of 35 mm film (CIPA DCG-001)
         origin = f"{exif.equivalent_mm:g} mm equivalent in EXIF"
     elif exif.focal_mm is not None and exif.pixels_per_mm is not None:
         # ``pixels_per_mm`` refers to the image as it was taken.

@@ -95,7 +95,7 @@ def _sentences(report: CaptureReport) -> Iterator[str]:
             f"there are no photos from {_between(covered.open_side)}: take some there if you expect queries"
             " from that side"
         )
-    if outside and high - low < 10:
+    if outside and high - low < 10:  # degrees
         yield "all photos were taken at the same height: add some from higher and lower"
     if not few and covered.seen_by_two > 0.6:
         yield (

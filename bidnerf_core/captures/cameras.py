@@ -139,9 +139,7 @@ def with_wrong_pose(cameras: Sequence[StoredCamera]) -> list[str]:
 
 
 def pose_updates(cameras: Sequence[StoredCamera]) -> list[Float[Tensor, "6"] | None]:
-    """Return the right updates (translation in metres first) from given to refined poses; None for unchanged
-    poses.
-    """
+    """Return the right updates (translation in metres first) from given to refined poses; None for unchanged poses."""
     if not cameras:
         return []
     given = _pose([camera.given_T_world_camera or camera.T_world_camera for camera in cameras])

@@ -23,8 +23,8 @@ def coverage(
     """Return how well the views cover their scene.
 
     ``matched`` are all matched keypoints, ``seen`` those consistent with a triangulated point,
-    ``positions`` these points, and ``least_parallax`` is the angle (degrees) between rays below which a point cannot be triangulated. ``up``
-    is the upward direction of the scene, estimated from the cameras by default.
+    ``positions`` these points, and ``least_parallax`` is the angle (degrees) between rays below which a point cannot be
+    triangulated. ``up`` is the upward direction of the scene, estimated from the cameras by default.
     """
     angle = _median(_cones_deg(matched))
     centres = torch.stack([v.T_ref_camera.translation.cpu().double() for v in views])
@@ -36,8 +36,8 @@ def coverage(
     if not converge and len(positions):
         centre = positions.median(dim=0).values
         behind = [((positions - c) @ axis < 0).double().mean() for c, axis in zip(centres, axes, strict=True)]
-        # On average, up to 0.02 of the landmarks are behind a camera in captures of things seen from outside, and 0.08 to 0.5
-        # in those of rooms and corridors.
+        # On average, up to 0.02 of the landmarks are behind a camera if things are seen from outside, and 0.08 to 0.5 in rooms
+        # and corridors.
         surrounded = float(torch.stack(behind).mean()) > 0.05
     arrangement: Arrangement = "inside" if len(positions) else "unknown"
     open_side, gaps, heights = None, tuple[Gap, ...](), _range_deg(axes @ upward)
@@ -74,8 +74,8 @@ def _around(
     widest = steps.argsort(descending=True).tolist()
     is_open = float(steps[widest[0]]) >= 120
     # Random directions have exponentially distributed steps: among n, one exceeds mean * log(n / p) with
-    # probability p. SIFT matches well across 15 degrees, so narrower gaps do no harm, and from the middle of 45, neither
-    # side well.
+    # probability p. Gaps below 15 degrees do no harm, since SIFT matches well across them. Those above 45 count however irregular
+    # the capture: from their middle, SIFT matches neither side well.
     mean = float(steps.median()) / math.log(2)
     least = min(max(15.0, mean * math.log(len(names) / 0.01)), 45.0)
     gaps = tuple(named[i] for i in widest[int(is_open) :] if float(steps[i]) > least)
@@ -111,6 +111,7 @@ def _meeting_point(
     before = ((away * axes).sum(-1) > 0).double().mean()
     missed = torch.linalg.vector_norm(torch.linalg.cross(away, axes), dim=-1).median()
     typical = torch.linalg.vector_norm(away, dim=-1).median()
+    # Nine tenths of the cameras must have the point in front of them.
     return point, bool((typical <= 1.5 * depth) & (before >= 0.9) & (missed <= 0.5 * typical))
 
 

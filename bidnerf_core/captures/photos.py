@@ -97,9 +97,7 @@ def sharpness(grey: np.ndarray, hidden: Bool[Tensor, "h w"] | None = None) -> fl
 
 
 def _energy(image: np.ndarray, rows: int, columns: int, step: int, counted: np.ndarray | None) -> float:
-    """Return the mean squared second difference along a direction, over the ``counted`` pixels (None for
-    all).
-    """
+    """Return the mean squared second difference along a direction, over the ``counted`` pixels (None for all)."""
     ahead = np.roll(image, (-rows * step, -columns * step), (0, 1))
     behind = np.roll(image, (rows * step, columns * step), (0, 1))
     inner = (ahead + behind - 2 * image)[step:-step, step:-step]
@@ -167,7 +165,7 @@ def exposures(
     if not bool(enough.any()):
         return brightness - near.medians(brightness).nan_to_num(float(brightness.median()))
     found = torch.zeros(count, dtype=torch.float64)
-    for _ in range(20):
+    for _ in range(20):  # alternations
         of_points = _medians(light - found[image], point, seen.count)
         found = torch.where(enough, _medians(light - of_points[point], image, count), 0.0)
         found = found - found[enough].median()

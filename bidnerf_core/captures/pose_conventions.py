@@ -85,9 +85,10 @@ def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | 
     agreeing = torch.stack([pair.agreeing(understood).double() for pair in pairs]).sum(0)
     best = int(agreeing.max())
     refused = as_given < 0.5 * len(pairs)
-    # Some mistakes hardly show when cameras move in a plane: then given poses that most pairs agree with may be wrong, too.
+    # Some mistakes hardly show when cameras move in a plane, so poses that most pairs agree with may be wrong, too.
     if best >= (AGREED if refused else 0.9) * len(pairs):
-        number = int((agreeing >= 0.9 * best).nonzero()[0, 0])  # a more common one that is almost the best
+        # A more common reading is preferred if it is almost the best.
+        number = int((agreeing >= 0.9 * best).nonzero()[0, 0])
         return PoseContradiction(len(pairs), as_given, tried[number], int(agreeing[number]))
     if not refused:
         return None
@@ -116,8 +117,7 @@ class MatchedPair:
     pixel: float  # size on the plane z = 1
 
     def agreeing(self, T: SE3) -> Bool[Tensor, "h"]:
-        """Return for which poses T_world_camera (h n) the matches are near their epipolar lines and in front
-        of both cameras.
+        """Return for which poses T_world_camera (h n) the matches are near their epipolar lines and in front of both cameras.
 
         Only points with enough parallax show on which side of the cameras they are. Their depths solve
         ``a seen = b rays + moved`` in the least-squares sense along the common normal of both rays.
@@ -133,7 +133,7 @@ class MatchedPair:
         still = torch.linalg.vector_norm(rays[..., :2] / rays[..., 2:] - seen[..., :2], dim=-1)
         at_rest = torch.linalg.vector_norm(moved[:, 0], dim=-1) < LEAST_BASELINE
         away = torch.where(at_rest[:, None], still, away)
-        # Two pixels; small errors of correct poses may cause four in usual images.
+        # Matches may be off by two pixels, and small errors of correct poses may cause four in a usual image.
         near = (away.abs() <= max(4 / USUAL_FOCAL, 2 * self.pixel)).double().mean(-1) >= AGREED
         normal = torch.linalg.cross(seen, rays)
         a = (torch.linalg.cross(moved, rays) * normal).sum(-1)
@@ -145,8 +145,7 @@ class MatchedPair:
 
 
 def _fitted_positions(pairs: Sequence[MatchedPair], poses: SE3) -> list[Reading]:
-    """Return readings whose positions are a linear function of the given ones, fitted to the epipolar lines
-    of all pairs.
+    """Return readings whose positions are a linear function of the given ones, fitted to the epipolar lines of all pairs.
 
     They cover positions scaled along one axis, and positions and rotations from different world frames.
     """
@@ -161,7 +160,7 @@ def _fitted_positions(pairs: Sequence[MatchedPair], poses: SE3) -> list[Reading]
                 "their positions are in a different frame from their rotations",
                 "take both from one source",
             )
-            # Noise explains entries beside the diagonal of up to 3 % of the largest.
+            # Entries off the diagonal of up to 3 % of the largest are attributed to noise.
             if bool(((B - torch.diag(B.diagonal())).abs() < 0.03 * B.abs().max()).all()):
                 scales = ", ".join(f"{value:.3g}" for value in (B.diagonal() / B[0, 0]).tolist())
                 clause = "the axes of their positions are scaled differently"
@@ -200,7 +199,7 @@ def _reweighted(
 ) -> Float[Tensor, "9"]:
     """Return a robust solution of ``A b = 0``; ``solve`` solves given normal equations (9x9)."""
     share = weight
-    for _ in range(10):
+    for _ in range(10):  # reweighting
         solution = solve(A.mT @ (share[:, None] * A))
         off = (A @ solution).abs()
         share = weight / (1 + (off / off.median().clamp(min=1e-9)) ** 2)
@@ -210,7 +209,7 @@ def _reweighted(
 def _near_identity(H: Float[Tensor, "9 9"]) -> Float[Tensor, "9"]:
     """Minimize ``b H b + prior |b - 1|^2`` over matrices b of trace 3."""
     identity = torch.eye(3, dtype=H.dtype).flatten()
-    prior = 1e-4 * H.diagonal().mean()  # of the weight of the matches
+    prior = 1e-4 * H.diagonal().mean()  # the identity's weight, relative to that of the matches
     system = torch.zeros((10, 10), dtype=H.dtype)
     system[:9, :9] = H + prior * torch.eye(9, dtype=H.dtype)
     system[:9, 9] = system[9, :9] = identity
@@ -231,8 +230,10 @@ def _pairs(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
 
 
 def _similar(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
-    """Return pairs of images that probably show the same things, most similar first: each of up to 60 images with the two that
-    have most matches with it among the 300 strongest keypoints, twelve at least.
+    """Return pairs of images that probably show the same things, most similar first.
+
+    Each of up to 60 images is paired with the two that have most matches with it, twelve at least, among the 300 strongest
+    keypoints.
     """
     chosen = range(0, len(images), max(1, -(-len(images) // 60)))
     strongest = [images[i].keypoints.descriptors[:300] for i in chosen]

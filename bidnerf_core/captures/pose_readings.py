@@ -1,5 +1,4 @@
-"""Readings of camera poses: what given matrices would mean under another convention, or after another common
-mistake.
+"""Readings of camera poses: what given matrices would mean under another convention, or after another common mistake.
 
 Each reading is a transformation of all poses of a capture: of camera axes, full or partial inverses, quaternion orders,
 left-handed worlds, axes of the positions, and the order of the images.
@@ -53,9 +52,7 @@ def changed(
 
 @cache
 def readings(count: int) -> tuple[Reading, ...]:
-    """Return the readings of ``count`` poses, common ones first: among those that fit equally well, the first
-    is preferred.
-    """
+    """Return the readings of ``count`` poses, common ones first: among those that fit equally well, the first is preferred."""
     return (
         *_of_axes(),
         *_of_parts(),
@@ -197,9 +194,7 @@ def _of_orders(count: int) -> Iterator[Reading]:
 
 
 def _in_file_axes(clause: str, remedy: str, understand: Understand) -> Iterator[Reading]:
-    """Yield a reading of matrices as they are here, and as they were in a file that had the y and z axes
-    reversed.
-    """
+    """Yield a reading of matrices as they are here, and as they were in a file that had the y and z axes reversed."""
 
     def whole(T: SE3, before: Tensor, after: Tensor) -> SE3:
         return changed(understand(changed(T, before)), after)
@@ -213,9 +208,7 @@ def _in_file_axes(clause: str, remedy: str, understand: Understand) -> Iterator[
 
 
 def signed_permutations(determinant: int) -> list[Float[Tensor, "3 3"]]:
-    """Return the 24 signed permutation matrices with a determinant of 1 or -1, starting with the identity if
-    included.
-    """
+    """Return the 24 signed permutation matrices with a determinant of 1 or -1, starting with the identity if included."""
     orders, signs = itertools.permutations(range(3)), list(itertools.product((1.0, -1.0), repeat=3))
     found = (AS_GIVEN[list(order)] * torch.tensor([s]).mT for order in orders for s in signs)
     return [A for A in found if round(float(torch.linalg.det(A))) == determinant]

@@ -36,8 +36,7 @@ MOST_EVIDENCE = 10.0
 def adjusted_poses(
     tracked: TrackedViews, config: LandmarkConfig, least: float = 0.0
 ) -> tuple[TrackedViews, Float[Tensor, "v"], PoseRefinement] | None:
-    """Adjust the poses of ``tracked`` images and the points that they show; None if there are too few of
-    either.
+    """Adjust the poses of ``tracked`` images and the points that they show; None if there are too few of either.
 
     Returns the tracks with these poses, rematched with them; the median shift (pixels) in each image of the points that it
     shows, 0 without points; and how well the given poses and these fit the keypoints.

@@ -1,5 +1,6 @@
-"""Links between the photos of a capture that show the same things, and photos with suspicious poses, localized with the
-landmarks of the others.
+"""Photos of a capture that are linked since they show the same things, and photos with suspicious poses.
+
+The latter are localized with the landmarks of the others.
 """
 
 from __future__ import annotations
@@ -63,15 +64,18 @@ class Relocation:
 
     @property
     def problem(self) -> PhotoProblem | None:
-        """What is wrong with the given pose: it is off by at least six standard deviations, and by four pixels, which is twice
-        as far as a match may lie from its epipolar line.
+        """What is wrong with the given pose, or None.
+
+        It is right if the photo is not mirrored and it is off by less than six standard deviations, or by less than four pixels,
+        which is twice as far as a match may lie from its epipolar line.
         """
         angle = float(torch.linalg.vector_norm(self.update[3:]))
         if self.mirrored:
             return "mirrored"
         if self.deviations < 6 or self.pixels < 4:
             return None
-        about_axis = abs(float(self.update[5])) >= 0.9 * angle  # the optical axis
+        # 0.9 is the smallest cosine between the axis of the rotation and the optical axis.
+        about_axis = abs(float(self.update[5])) >= 0.9 * angle
         return "turned" if about_axis and math.degrees(angle) >= 60 else "badly posed"
 
 
@@ -131,7 +135,7 @@ def relocated(
     for number in numbers:
         view, features = views[number], tracked.detector_of(views[number], number)
         found = Loop([View(view.frame, SE3.identity())], matcher, features=features)()
-        # Only these outcomes determine the pose, or which poses look the same.
+        # Only these outcomes tell the pose, or which poses look the same.
         telling = (Outcome.CONVERGED, Outcome.AMBIGUOUS, Outcome.MIRRORED)
         if found is None or found.verdict.outcome not in telling:
             continue
@@ -147,8 +151,6 @@ def relocated(
 
 
 def image_motion(update: Float[Tensor, "6"], view: View, distance: float) -> float:
-    """Return how far (pixels, at most) an update of the pose moves the image of a point at ``distance``
-    (metres).
-    """
+    """Return how far (pixels, at most) an update of the pose moves the image of a point at ``distance`` (metres)."""
     translation, rotation = (float(torch.linalg.vector_norm(part)) for part in update.split(3))
     return view.frame.intrinsics.fx * (rotation + translation / max(distance, 1e-9))

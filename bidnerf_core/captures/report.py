@@ -56,25 +56,19 @@ class CoverageRecord:
     """How well a capture covers its scene."""
 
     arrangement: Arrangement = "unknown"
-    centre: tuple[float, float, float] = (
-        0.0,
-        0.0,
-        0.0,
-    )  # metres: where the optical axes converge, or the median landmark
+    # metres: where the optical axes converge, or the median landmark
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # unit, world: the upward direction of the scene
     parallax_deg: float = 0.0  # median angle between the rays to a point
     landmarks: int = 0  # triangulated
     seen_by: float = 0.0  # median number of photos that show a landmark
     seen_by_two: float = 0.0  # fraction of the landmarks that only two photos show
     seen_within_deg: float = 0.0  # median angle between the directions from which a landmark is seen
-    # Widest range of directions without a camera if the cameras do not go all the way around; ``gaps`` are
-    # the others.
+    # widest range of directions without a camera if the cameras do not go all the way around; ``gaps`` are the others
     open_side: Gap | None = None
     gaps: tuple[Gap, ...] = ()  # much wider than the capture's other steps, the widest first
-    heights_deg: tuple[float, float] = (
-        0.0,
-        0.0,
-    )  # elevation of the cameras above the centre's horizon, or of the axes of cameras inside: 5th and 95th percentiles
+    # elevation of the cameras above the centre's horizon, or of the axes of cameras inside: 5th and 95th percentiles
+    heights_deg: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)

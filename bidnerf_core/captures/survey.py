@@ -60,8 +60,9 @@ def surveyed(
     exposure, sharpness = exposures(views, seen, brightness, near), near.excess(sharp)
     clipped = torch.maximum(near.excess(overexposed), near.excess(underexposed))
     is_blurred = blurred(-sharpness)
-    is_badly_exposed = standing_out(exposure.abs(), 1.0) | (clipped > 0.25)  # training corrects less
-    grouped = bool((group >= 0).any())  # if no photos are linked at all, none is reported for it
+    # Training corrects differences of less than a stop.
+    is_badly_exposed = standing_out(exposure.abs(), 1.0) | (clipped > 0.25)
+    grouped = bool((group >= 0).any())  # if no photos are linked at all, no photo is reported as unlinked
     photos = []
     for i, (view, image) in enumerate(zip(views, seen.images, strict=True)):
         found, pose, problems = posed.get(i), view.T_ref_camera.to("cpu", torch.float64), list[PhotoProblem]()
@@ -98,8 +99,7 @@ def surveyed(
 def _by_own_landmarks(
     seen: TrackedKeypoints, positions: Float[Tensor, "n 3"], views: Sequence[View]
 ) -> dict[int, Relocation]:
-    """Compare the poses that fit the photos' own landmarks with the given ones, relative to the scatter in
-    this capture.
+    """Compare the poses that fit the photos' own landmarks with the given ones, relative to the scatter in this capture.
 
     Poses from fewer landmarks scatter more: the variance is inversely proportional to their number.
     """

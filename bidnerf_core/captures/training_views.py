@@ -129,8 +129,7 @@ def _tracked(
     trust_poses: bool,
     depth_unit: float | None,
 ) -> TrackedViews:
-    """Track the keypoints of the views. Raises ``InputError`` if poses contradict the images, or depth is in
-    another unit.
+    """Track the keypoints of the views. Raises ``InputError`` if poses contradict the images, or depth is in another unit.
 
     The unit is checked last: under wrong poses, triangulated distances say nothing about it.
     """
@@ -149,8 +148,7 @@ def _check_poses(images: Sequence[ImageKeypoints]) -> None:
 
 
 def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> None:
-    """Raise ``InputError`` if measured depth is in another unit than the poses; log a scale that is a few
-    percent off.
+    """Raise ``InputError`` if measured depth is in another unit than the poses; log a scale that is a few percent off.
 
     ``depth_unit`` is the one with which depth images were read, if another can be given.
     """
@@ -165,7 +163,7 @@ def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> 
     remedy = "check the unit of the depth images (depth_unit_scale_factor in a transforms.json)"
     if depth_unit is not None:
         right = depth_unit / ratio
-        # Metres per step of depth images: floats, and integers of sensors and datasets.
+        # The usual units (metres per step of depth images) of floats, and of the integers of sensors and datasets.
         usual = min(
             (1.0, 0.01, 0.001, 1e-4, 1 / 4000, 1 / 5000), key=lambda unit: abs(math.log(unit / right))
         )

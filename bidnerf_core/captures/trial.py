@@ -47,8 +47,8 @@ def tried_landmarks(
     because many given poses are wrong. Raises ``InputError`` if there are no landmarks.
     """
     landmarks = tracked.landmarks(config, report)
-    # One in eight images is held out, evenly spread, 24 at most; of few images, one in three, but no more than eight, as fewer
-    # would leave the scatter unknown.
+    # One in eight images is held out, evenly spread, but 24 at most. Of few images, one in three is, up to eight, since fewer would
+    # leave the scatter unknown.
     wanted = max(min(len(views) // 8, 24), min(len(views) // 3, 8))
     held_out = [int((i + 0.5) * len(views) / wanted) for i in range(wanted)]
     answers, updates = _answers(tracked, views, held_out, config, landmarks)
@@ -59,7 +59,7 @@ def tried_landmarks(
     )
     trial = HeldOutTrial(wanted, len(answers), float(translation), float(rotation.rad2deg()))
     landmarks = replace(landmarks, trial=trial)
-    if len(answers) < 6:  # too few for an estimate of scatter
+    if len(answers) < 6:  # too few to estimate the scatter from
         return landmarks
     matches = [len(answer.mode.matches) for answer in answers]
     landmarks = replace(landmarks, usual_matches=float(torch.tensor(matches).float().median()))
@@ -78,15 +78,16 @@ def _answers(
     config: LandmarkConfig,
     landmarks: LandmarkMap,
 ) -> tuple[list[Answer], Float[Tensor, "n 6"]]:
-    """Localize the held-out images by the landmarks of the others, and return the accepted answers, and the right updates from
-    the given poses to them.
+    """Localize the held-out images by the landmarks of the others.
 
-    In a map of many images, those of its ``landmarks`` that the held-out images do not show are not built anew.
+    Returns the accepted answers, and the right updates from the given poses to them. In a map of many images, those of its
+    ``landmarks`` that the held-out images do not show are not built anew.
     """
     answers, updates = list[Answer](), [torch.zeros((0, 6), dtype=torch.float64)]
     if not held_out:
         return answers, updates[0]
     try:
+        # In maps of more images, most landmarks are in none of the held-out ones.
         if len(views) <= 200 or landmarks.tracks is None:
             landmarks = tracked.without(held_out).landmarks(config)
         else:

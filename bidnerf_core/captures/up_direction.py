@@ -54,8 +54,7 @@ def given_up(direction: Sequence[float]) -> UpDirection:
 
 
 def up_direction(poses: SE3, normals: Float[Tensor, "n 3"] | None = None) -> UpDirection:
-    """Estimate the upward direction of a scene from its cameras and, if there is a surface, its surfels'
-    normals.
+    """Estimate the upward direction of a scene from its cameras and, if there is a surface, its surfels' normals.
 
     ``poses`` are T_world_camera of the images (n), at least one; the signs of normals are ignored.
     """
@@ -63,7 +62,7 @@ def up_direction(poses: SE3, normals: Float[Tensor, "n 3"] | None = None) -> UpD
     planes = _planes(normals)
     weight = min(len(rotations), INDEPENDENT)
     tried = list[tuple[float, Tensor, UpSource]]()
-    # Phones that are held upright store images that are sideways, with the camera mostly at the top.
+    # Log odds against sideways images, which phones store if they are held upright, mostly with the camera at the top.
     for up_axis, level_axis, prior in (
         (-rotations[:, :, 1], rotations[:, :, 0], 0.0),
         (-rotations[:, :, 0], rotations[:, :, 1], -2.0),
@@ -71,9 +70,10 @@ def up_direction(poses: SE3, normals: Float[Tensor, "n 3"] | None = None) -> UpD
     ):
         for direction, support, source in [*planes, (_level(up_axis, level_axis), 0.0, "cameras")]:
             direction = direction if float((up_axis @ direction).mean()) >= 0 else -direction
-            looking_up = max(0.0, float((rotations[:, :, 2] @ direction).mean()))  # which is rare
+            looking_up = max(0.0, float((rotations[:, :, 2] @ direction).mean()))
             tilt = (level_axis @ direction).square().mean() / ROLL
             score = prior + math.log(CHANCE + support) - 0.5 * weight * float(tilt)
+            # Cameras rarely all look straight up; the log odds against it are proportional to the sine of the angle.
             tried.append((score - 3 * looking_up, direction, source))
     _, up, source = max(tried, key=lambda one: one[0])
     near = [(share, axis) for axis, share, _ in planes if abs(float(axis @ up)) > 1 - CHANCE]
@@ -84,8 +84,7 @@ def up_direction(poses: SE3, normals: Float[Tensor, "n 3"] | None = None) -> UpD
 
 
 def _level(up_axis: Float[Tensor, "v 3"], level_axis: Float[Tensor, "v 3"]) -> Float[Tensor, "3"]:
-    """Return the direction most nearly perpendicular to all horizontal image axes, nearest to the mean upward
-    axis.
+    """Return the direction most nearly perpendicular to all horizontal image axes, nearest to the mean upward axis.
 
     If all cameras face the same way, only the plane of such directions is known, and the one nearest to the mean is
     chosen; the deviation of the tilt is about 20 degrees.
@@ -97,9 +96,7 @@ def _level(up_axis: Float[Tensor, "v 3"], level_axis: Float[Tensor, "v 3"]) -> F
 
 
 def _planes(normals: Float[Tensor, "n 3"] | None) -> list[tuple[Tensor, float, UpSource]]:
-    """Return up to six directions with which most normals agree, and the fraction of normals, beyond chance, that
-    do.
-    """
+    """Return up to six directions with which most normals agree, and the fraction of normals, beyond chance, that do."""
     if normals is None or not len(normals):
         return []
     some = normals.detach().cpu().double()[:: max(1, len(normals) // 20_000)]
@@ -110,12 +107,8 @@ def _planes(normals: Float[Tensor, "n 3"] | None) -> list[tuple[Tensor, float, U
     found = list[tuple[Tensor, float, UpSource]]()
     for _ in range(6):
         start = axis = tried[int(share.argmax())]
-        for degrees in (
-            ALIKE_DEG,
-            ALIKE_DEG,
-            ALIKE_DEG / 2,
-            ALIKE_DEG / 4,
-        ):  # the mean of the normals near it
+        # Refined to the mean of the normals near it, in ever smaller cones.
+        for degrees in (ALIKE_DEG, ALIKE_DEG, ALIKE_DEG / 2, ALIKE_DEG / 4):
             along = some @ axis
             near = along.abs() > math.cos(math.radians(degrees))
             if not bool(near.any()):

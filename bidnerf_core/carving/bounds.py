@@ -68,7 +68,7 @@ def estimate_bounds(
         middle, half = (box[0] + box[1]) / 2, float((box[1] - box[0]).amax()) / 2
         away = torch.linalg.vector_norm(places - middle, dim=-1).clamp(min=half)
         shown = list(zip(views, away.tolist(), strict=True))
-    # A camera may be slightly farther away than any of the views; contracted scenes reach well beyond their box.
+    # A camera may be slightly farther away than any of the views, and a contracted scene reaches well beyond its box.
     far = max(beyond, _farthest(places, box)) * (2.0 if contracted else 1.1)
     cameras = [(view.frame.intrinsics, distance) for view, distance in shown]
     footprint = statistics.median(2 * distance / (camera.fx + camera.fy) for camera, distance in cameras)
@@ -102,11 +102,10 @@ def measured_points(view: View, share: int) -> tuple[Float[Tensor, "n 3"], Float
 def _guessed_box(views: Sequence[View], places: Float[Tensor, "v 3"]) -> AxisBox:
     """Return the box that the cameras alone suggest, see ``estimate_bounds``."""
     corners = torch.stack([_corner_rays(view) for view in views])
-    tangents = torch.linalg.vector_norm(corners[..., :2], dim=-1).amax(
-        dim=-1
-    )  # of the farthest corner's angle
-    # The point nearest to all optical axes (least squares), if most cameras see it and from different sides: the mean squared sine
-    # of the angles between the axes and their mean is that of about 6 degrees.
+    # The tangent of the farthest corner's angle
+    tangents = torch.linalg.vector_norm(corners[..., :2], dim=-1).amax(dim=-1)
+    # The point nearest to all optical axes (least squares) counts if most cameras see it, and from different sides: the mean
+    # squared sine of the angles between the axes and their mean is at least that of about 6 degrees.
     axes = torch.stack([view.T_ref_camera.rotation[:, 2].double() for view in views])
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
     normal = across.mean(dim=0)

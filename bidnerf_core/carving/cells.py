@@ -22,10 +22,11 @@ BLOCK = 8
 def occupied_voxels(
     views: Sequence[View], grid: VoxelGrid, device: torch.device = CPU
 ) -> Bool[Tensor, "x y z"]:
-    """Return which cells of ``grid`` may hold matter, see ``occupied_cells``, to within a relative depth error of 5 %: sensors err
-    by a few per cent, and a cell that training finds empty is never filled again.
+    """Return which cells of ``grid`` may hold matter, see ``occupied_cells``.
 
-    Contracted cells always may. In contracted space, the inner half of the grid, whose shape is divisible by 4, is the box.
+    The relative tolerance of depth is 5 %, since sensors err by a few per cent, and an emptied cell is never filled again.
+    Contracted cells always may hold matter. In contracted space, the inner half of the grid, whose shape is divisible by 4, is
+    the box.
     """
     inner, middle = grid, [slice(None)] * 3
     if grid.contracted is not None:
@@ -64,14 +65,13 @@ def occupied_cells(
     votes = torch.zeros(blocks.shape[1], BLOCK**3, dtype=torch.uint8, device=device)
     needed = 1 if len(views) < 2 else 2
     undecided = torch.ones(len(votes), dtype=torch.bool, device=device)
-    at_once = 128 if device.type == "cpu" else max(1, len(votes))  # blocks: few enough to stay in the cache
+    at_once = 128 if device.type == "cpu" else max(1, len(votes))  # so few blocks stay in the cache
     with threads_at_most(1):  # the operations are short
         for view in (view for view in views if view.frame.has_depth or view.frame.alpha is not None):
             space = moved(FreeSpace.seen_by(view, tolerance, footprint), device)
-            # The middles of the blocks' first cells, and the offsets of a block's cells from it (metres, camera frame)
-            T_camera_world = view.T_ref_camera.to(
-                torch.float64
-            ).inverse()  # the world's origin may be far away
+            # In double precision, since the world's origin may be far away.
+            T_camera_world = view.T_ref_camera.to(torch.float64).inverse()
+            # The middles of the blocks' first cells, and the offsets of a block's cells from them (metres, camera frame)
             step = T_camera_world.rotation * size
             corner = T_camera_world.apply(first + size / 2)[:, None] + step @ (blocks * BLOCK).double()
             corners, within = moved((corner.float(), (step @ cells.double()).float()), device)

@@ -1,5 +1,4 @@
-"""The free space of a view: how far each of its pixels sees before any matter, and which spheres lie entirely
-within that space.
+"""The free space of a view: how far its pixels see before any matter, and which spheres lie entirely within it.
 
 When in doubt, space counts as occupied: where nothing was measured, and wherever a neighbouring pixel sees
 less far.
@@ -31,14 +30,15 @@ class FreeSpace:
     intrinsics: Intrinsics  # of the shrunken image
     levels: Float[Tensor, "k h w"]  # metres; 0: unknown
     reach: float  # metres: the largest free depth of any pixel
-    edges: Float[
-        Tensor, "4 3"
-    ]  # inward normals of planes through the camera's centre that enclose the whole view
+    # inward normals of planes through the camera's centre that enclose the whole view
+    edges: Float[Tensor, "4 3"]
 
     @staticmethod
     def seen_by(view: View, tolerance: float = 0.02, footprint: int = 8) -> FreeSpace:
-        """Return the free space of a view: its image is shrunk by a whole factor to at most 400 pixels a side, which bounds the time,
-        as cells are coarse. In a block of pixels, the smallest depth counts.
+        """Return the free space of a view.
+
+        Its image is shrunk by a whole factor to at most 400 pixels a side, which suffices for coarse cells and bounds the time.
+        The smallest depth of a block of pixels counts.
         """
         free, camera = _free_depth(view.frame, tolerance), view.frame.intrinsics
         height, width = free.shape
@@ -64,9 +64,8 @@ class FreeSpace:
         count, height, width = self.levels.shape
         known = (points[2] > radius) & (deepest < self.reach) & (pixels < count)
         known &= (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-        place = (
-            pixels * height + rows
-        ) * width + columns  # integers in floats are exact, since there are fewer than 2^24 of them
+        # Integers in floats are exact, since these are below 2^24.
+        place = (pixels * height + rows) * width + columns
         least = self.levels.flatten()[torch.where(known, place, 0).long()]
         return known & (deepest < least)
 
@@ -79,9 +78,8 @@ class FreeSpace:
         slope = radius * inverse  # becomes the tangent of the sphere's angular radius in the next line
         slope = slope * (1 + squared - slope * slope).rsqrt()
         product = squared.sqrt() * slope
-        wide = (
-            slope * (1 + squared) / (1 - product)
-        )  # tan(a + b) - tan(a): the far side of the sphere's image
+        # tan(a + b) - tan(a): the far side of the sphere's image
+        wide = slope * (1 + squared) / (1 - product)
         pixels = (wide * max(camera.fx, camera.fy)).ceil()
         pixels = torch.where(product < 1, pixels, torch.inf)  # also where it is NaN
         if not camera.distortion:

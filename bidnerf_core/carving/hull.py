@@ -20,8 +20,7 @@ AxisBox: TypeAlias = tuple[Float[Tensor, "3"], Float[Tensor, "3"]]
 def grown(
     lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], at_least: float = 0.0, share: float = 0.03
 ) -> AxisBox:
-    """Return the box with a margin of ``share`` of its size at each end, or of ``at_least`` metres if that is
-    more.
+    """Return the box with a margin of ``share`` of its size at each end, or of ``at_least`` metres if that is more.
 
     A flat box is given some thickness.
     """

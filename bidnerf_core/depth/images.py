@@ -57,8 +57,7 @@ class DepthImage:
 
 
 def read_depth_image(path: Path, unit: float | None) -> DepthImage:
-    """Read a grey image of integer or floating-point numbers, or the ``.npy`` file of an array; see
-    ``depth_image``.
+    """Read a grey image of integer or floating-point numbers, or the ``.npy`` file of an array; see ``depth_image``.
 
     Raises ``InputError`` for anything else.
     """
@@ -67,14 +66,13 @@ def read_depth_image(path: Path, unit: float | None) -> DepthImage:
 
 
 def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> DepthImage:
-    """Convert an array (h, w) or (h, w, 1) with ``unit`` metres per step; None means 0.001 for integers and 1
-    for floats.
+    """Convert an array (h, w) or (h, w, 1) with ``unit`` metres per step; None means 0.001 for integers and 1 for floats.
 
     Values that no sensor measures become 0: NaN, infinite and negative values, the largest value of an
     integer type, 65535 and 65.535 in a floating-point one, and floats above 1e9 m (1e10, the largest float).
     So does the largest value of the image if it is the sensor's limit: a round number in at least a twentieth of all
-    pixels, far more frequent than any other, but not the only value measured. Raises ``InputError``, whose message begins with ``what``, for arrays of another
-    shape or type and a unit that is not positive.
+    pixels, far more frequent than any other, but not the only value measured. Raises ``InputError``, whose message begins
+    with ``what``, for arrays of another shape or type and a unit that is not positive.
     """
     values = to_numpy(raw)
     values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
@@ -129,7 +127,7 @@ def _at_limit(values: np.ndarray, metres: np.ndarray, unmeasured: np.ndarray) ->
     largest = float(measured.max())
     mask = ~unmeasured & (metres == largest)
     count = int(mask.sum())
-    # Round as ranges in settings and data sheets are, a multiple of 0.5 m from 4 m on, or with all bits of a sensor set.
+    # A sensor's limit is round, as ranges in settings and data sheets are (a multiple of 0.5 m from 4 m on), or has all bits set.
     is_round = largest >= 4 and abs(largest - round(2 * largest) / 2) < 1e-6 * largest
     value = float(values[mask][0])
     fills_bits = values.dtype.kind != "f" and value in [2**bits - 1 for bits in range(11, 17)]
@@ -143,8 +141,7 @@ def _at_limit(values: np.ndarray, metres: np.ndarray, unmeasured: np.ndarray) ->
 
 
 class DepthReader:
-    """Reads the depth images of a recording, and warns once about each kind of value that means "not
-    measured".
+    """Reads the depth images of a recording, and warns once about each kind of value that means "not measured".
 
     ``documented`` are the kinds that the recording's format defines, by their names in
     ``DepthImage.replaced``; they cause no warning.

@@ -46,18 +46,18 @@ def estimated_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -
     off = 1 / z - (1 / z).mean(-1, keepdim=True)
     off = off - (x @ torch.linalg.solve(x.mT @ x, x.mT @ off[..., None]))[..., 0]
     middle, spare = z.median(-1).values, z.shape[-1] / (z.shape[-1] - 3)
-    # A quarter of the windows is assumed planar (the others may show edges, curved surfaces and relief): the noise is that quantile
-    # of their residuals, times the ratio of the two if all windows are planar and all pixels independent.
+    # A quarter of the windows is assumed to be planar (the others may show edges, curved surfaces and relief): the noise is that
+    # quantile of their residuals, times the ratio of the two if all windows are planar and all pixels independent.
     noise = 1.11 * MAD_TO_SIGMA * spare**0.5 * middle * off.abs().median(-1).values
     ranges = middle.argsort().tensor_split(min(8, len(z) // LEAST_WINDOWS))
     at = torch.stack([middle[some].median() for some in ranges]).numpy()
     found = torch.stack([noise[some].quantile(0.25) for some in ranges]).numpy()
-    # The rounding to the usual step of the values, unless they are continuous or few.
+    # The noise is at least the rounding to the usual step of the values, unless they are continuous or few.
     measured = depth[(depth > 0) & depth.isfinite()]
     values = measured.unique()
     if len(values) >= LEAST_VALUES and len(measured) >= 4 * len(values):
         found = np.maximum(found, float(values.diff().median()) / math.sqrt(12) / at)
-    if at.max() < 1.5 * at.min():  # too small a range for the growth of the noise with depth
+    if at.max() < 1.5 * at.min():  # too small a range to estimate how the noise grows with depth
         return DepthNoise(linear=float(np.median(found)))
     from scipy.optimize import nnls  # imported here, since it takes as long as the rest of scipy
 
@@ -86,8 +86,7 @@ def _lines_of_sensor(depth: Float[Tensor, "h w"]) -> tuple[Int[Tensor, "r"], Int
 
 
 def noise_remark(depth: Float[Tensor, "h w"], intrinsics: Intrinsics, sensor: str) -> str | None:
-    """Return one line that compares the noise estimated from a depth image (metres) with that of a named
-    sensor.
+    """Return one line that compares the noise estimated from a depth image (metres) with that of a named sensor.
 
     Returns None if the noise cannot be estimated from the image.
     """

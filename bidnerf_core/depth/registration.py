@@ -27,8 +27,7 @@ class DepthCamera:
 
     @staticmethod
     def read(path: Path) -> DepthCamera:
-        """Read a JSON file with intrinsics as in ``transforms.json``, including ``w`` and ``h``, and
-        ``T_colour_depth`` (4x4).
+        """Read a JSON file with intrinsics as in ``transforms.json``, including ``w`` and ``h``, and ``T_colour_depth`` (4x4).
 
         Raises ``InputError`` if one of them is missing or invalid.
         """
@@ -70,7 +69,7 @@ class DepthCamera:
         rays = camera.unproject(camera.pixel_centres(torch.float64)[measured])
         points = self.T_colour_depth.apply(rays * depth[measured].double()[:, None])
         found = nearest_depth(points[_ahead(points, coarse)], coarse)
-        # Of a few measurements, all may be at its borders.
+        # A few measurements may all be at its borders.
         if int(measured.sum()) >= 1000 and not bool((found > 0).any()):
             away = float(torch.linalg.vector_norm(self.T_colour_depth.translation))
             raise InputError(
@@ -92,9 +91,7 @@ def nearest_depth(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Float[Ten
 
 
 def _ahead(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Bool[Tensor, "n"]:
-    """Return which points lie within the image's frustum; a polynomial lens model maps some others into the
-    image as well.
-    """
+    """Return which points lie within the image's frustum; a polynomial lens model maps some others into the image as well."""
     centres = camera.pixel_centres(torch.float64)
     border = torch.cat([centres[[0, -1]].reshape(-1, 2), centres[:, [0, -1]].reshape(-1, 2)])
     edge = camera.unproject(border)[:, :2]

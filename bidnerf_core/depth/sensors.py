@@ -66,23 +66,24 @@ UNKNOWN_SENSOR = "unknown"
 
 DEPTH_SENSORS: dict[str, DepthSensorModel] = {
     UNKNOWN_SENSOR: UNKNOWN,
-    # Microsoft's first Kinect, and other sensors by PrimeSense, with factory calibration. The noise follows from half a pixel of
-    # disparity: 1.4 mm at 1 m, 36 mm at 5 m (Khoshelham and Elberink, "Accuracy and Resolution of Kinect Depth Data for Indoor
-    # Mapping Applications", Sensors 12, 2012). The scale is the root mean square of the corrections of 3.5 %, 3.1 % and 0 % that the
-    # TUM RGB-D benchmark publishes for its three Kinects (Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS
-    # 2012). They are scale factors only, without an offset.
+    # Microsoft's first Kinect, and other sensors by PrimeSense, with factory calibration. The noise follows from half a pixel
+    # of disparity: 1.4 mm at 1 m, 36 mm at 5 m (Khoshelham and Elberink, "Accuracy and Resolution of Kinect Depth Data for
+    # Indoor Mapping Applications", Sensors 12, 2012). The scale is the root mean square of the corrections of 3.5 %, 3.1 % and
+    # 0 % that the TUM RGB-D benchmark publishes for its three Kinects (Sturm et al., "A Benchmark for the Evaluation of RGB-D
+    # SLAM Systems", IROS 2012). They are scale factors only, without an offset.
     "kinect": DepthSensorModel(scale=0.027, noise=DepthNoise(quadratic=0.001425)),
-    # Intel's RealSense D4xx, stereo cameras with a projector. The noise was fitted to a D435 (Ahn et al., "Analysis and Noise Modeling
-    # of the Intel RealSense D435 for Mobile Robots", UR 2019). It agrees with Intel's formula for the root mean square error, 0.08 px
-    # z^2 / (focal length x baseline) = 0.0038 z^2 at 848x480; that of a D415 is 0.0015 z^2 at 1280x720, so this model is cautious
-    # there. The data sheet of the D400 series limits the error of the distance to 2 % within 2 m, taken as two standard deviations.
+    # Intel's RealSense D4xx, stereo cameras with a projector. The noise was fitted to a D435 (Ahn et al., "Analysis and Noise
+    # Modeling of the Intel RealSense D435 for Mobile Robots", UR 2019). It agrees with Intel's formula for the root mean square
+    # error, 0.08 px z^2 / (focal length x baseline) = 0.0038 z^2 at 848x480; that of a D415 is 0.0015 z^2 at 1280x720, so this
+    # model is cautious there. The data sheet of the D400 series limits the error of the distance to 2 % within 2 m, which is
+    # taken as two standard deviations.
     "realsense": DepthSensorModel(
         scale=0.01, noise=DepthNoise(constant=0.001063, linear=0.0007278, quadratic=0.003949)
     ),
-    # The lidar of Apple's phones and tablets, as ARKit returns it: few measured points, interpolated along image edges. Luetzenburg,
-    # Kroon and Bjørk, "Evaluation of the Apple iPhone 12 Pro LiDAR for an Application in Geosciences", Scientific Reports 11, 2021,
-    # found an accuracy of 1 cm on objects with sides of more than 10 cm, which is taken as the offset and, at 2 m, as the noise. The
-    # scale is that of an unknown sensor.
+    # The lidar of Apple's phones and tablets, as ARKit returns it: few measured points, interpolated along image edges.
+    # Luetzenburg, Kroon and Bjørk, "Evaluation of the Apple iPhone 12 Pro LiDAR for an Application in Geosciences", Scientific
+    # Reports 11, 2021, found an accuracy of 1 cm on objects with sides of more than 10 cm, which is taken as the offset and, at
+    # 2 m, as the noise. The scale is that of an unknown sensor.
     "lidar": DepthSensorModel(scale=0.01, offset=0.01, noise=DepthNoise(constant=0.005, linear=0.0025)),
     # Depth computed from a model of the scene: exact up to rounding, such as to the whole millimetres of a PNG from 1 m on.
     "rendered": DepthSensorModel(scale=0.0, noise=DepthNoise(linear=0.001)),

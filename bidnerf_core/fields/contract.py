@@ -213,9 +213,7 @@ def backward_derivatives(
 
 
 def device_of(field: RadianceField) -> torch.device:
-    """Return the device of a field's parameters or buffers, or of the first field that a dataclass wraps;
-    else the CPU.
-    """
+    """Return the device of a field's parameters or buffers, or of the first field that a dataclass wraps; else the CPU."""
     tensors = (first for kind in ("parameters", "buffers") for first in _tensors_of(field, kind))
     found = next(tensors, None)
     return torch.device("cpu") if found is None else found.device
@@ -350,8 +348,6 @@ def crossed_box(
 
 
 def widened(rays: Rays, factor: float) -> Rays:
-    """Return rays whose interval is ``factor`` times as long (the paper's "wide"), but does not begin behind
-    the camera.
-    """
+    """Return rays whose interval is ``factor`` times as long (the paper's "wide"), but does not begin behind the camera."""
     middle, half = (rays.near + rays.far) / 2, (rays.far - rays.near) / 2 * factor
     return replace(rays, near=(middle - half).clamp(min=0), far=middle + half)

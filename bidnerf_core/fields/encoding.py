@@ -54,8 +54,8 @@ def query_network(
     """Return a network's values; positions are scaled to the cube [-1, 1], so that the length unit has no effect."""
     shape = positions.shape[:-1]
     raw, rgb = network(bounds.normalized(positions.reshape(-1, 3)), directions.reshape(-1, 3))
-    # Shifted, so that an untrained field is nearly transparent (Barron et al. 2021, mip-NeRF); 30 per side of the scene at a raw
-    # density of about 1, so that networks with small outputs can represent surfaces.
+    # The shift makes an untrained field nearly transparent (Barron et al. 2021, mip-NeRF). The density is 30 per side of the scene
+    # at a raw density of about 1, so that networks with small outputs can represent surfaces.
     density = functional.softplus(raw - 1) * (30 / bounds.side)
     return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
 

@@ -175,16 +175,15 @@ class PieceField(nn.Module, ABC):
             index = index.view(rays, width).gather(1, order)
             alpha = torch.where(key < torch.inf, alpha.view(rays, width).gather(1, order), 0)
             thickness = -torch.log1p(-alpha)
-            # Behind a transmittance of 1e-4 nothing is considered, as in the code of 3D Gaussian splatting.
+            # Nothing behind a transmittance of 1e-4 is considered, as in the code of 3D Gaussian splatting.
             valid = (key < torch.inf) & (thickness.cumsum(1) - thickness < -math.log(1e-4))
             if waiting:
                 width = int(valid.sum(1).max()) if valid.numel() else 0
                 return index[:, :width], valid[:, :width]
             return index, valid
 
-        some = (
-            384 if waiting else max(1, len(rays.near))
-        )  # what so few rays meet stays in the processor's cache
+        # What 384 rays meet stays in the processor's cache.
+        some = 384 if waiting else max(1, len(rays.near))
         parts = _in_parts(met_by_few, tuple(vars(rays).values()), some)
         width = max(piece.shape[1] for piece, _ in parts)
         piece, valid = (
@@ -219,12 +218,11 @@ class PieceField(nn.Module, ABC):
     ) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"], Bool[Tensor, "p"]]:  # fmt: skip
         """Return pairs of a line and a piece whose box it meets between ``near`` and ``far``, sorted by line, and which of them count.
 
-        If the host must not wait, each line has equally many pairs, of the boxes that it enters first. Otherwise all pairs are returned and
-        count, and ``TooMany`` is raised if several lines meet so many boxes that memory might not suffice.
+        If the host must not wait, each line has equally many pairs, of the boxes that it enters first. Otherwise all pairs are
+        returned and count, and ``TooMany`` is raised if several lines meet so many boxes that memory might not suffice.
         """
-        least = torch.full_like(
-            directions, 1e-9
-        )  # components of a direction are at least so large: slopes are finite
+        # Smaller components of a direction are replaced by this one, so that slopes stay finite.
+        least = torch.full_like(directions, 1e-9)
         slopes = 1 / torch.where(directions.abs() < least, torch.copysign(least, directions), directions)
         offsets, slopes = -(origins * slopes).mT.contiguous(), slopes.mT.contiguous()
         lines, waiting, boxes = len(near), may_wait(near.device), self.boxes
@@ -242,7 +240,7 @@ class PieceField(nn.Module, ABC):
                 low, high = (torch.addcmul(offset, corners[side + axis], slope) for side in (0, 3))
                 enter = torch.maximum(enter, torch.minimum(low, high))
                 leave = torch.minimum(leave, torch.maximum(low, high))
-            # The corners of an empty box are swapped, at infinity, and its slabs would hold all lines.
+            # The corners of an empty box are swapped and at infinity, so every line would lie within its slabs.
             hit = (enter <= leave) & (corners[0] <= corners[3])
             if waiting:
                 parent, child = hit.nonzero(as_tuple=True)
@@ -275,7 +273,7 @@ def _in_parts(function: Callable[..., T], parts: Sequence[Tensor], count: int) -
 
 def _morton(centres: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]) -> Int[Tensor, "n"]:
     """Return the positions along a Morton curve; unseen pieces come last."""
-    # Quantiles, so that a few distant pieces do not put all others into one cell.
+    # Between quantiles, so that a few distant pieces do not put all others into one cell.
     some = centres[:: max(1, len(centres) // 10_000)].double()
     low, high = (some.quantile(q, dim=0) for q in (0.02, 0.98))
     side = (high - low).amax().clamp(min=1e-12)

@@ -386,7 +386,7 @@ def render_picture(
     between = interpolate(coarse, size=size, mode="bilinear", align_corners=True)[0].movedim(0, -1)
     largest, least = max_pool2d(coarse, 3, 1, 1)[0], -max_pool2d(-coarse, 3, 1, 1)[0]
     distance, shown = largest[3], torch.cat([largest[:3] - least[:3], largest[4:] - least[4:]])
-    # Neighbours differ by more than 0.12 in a colour or the opacity, or by this share of the distance.
+    # Neighbours differ if a colour or the opacity does by more than 0.12, or the distance by more than 12 %.
     differs = (shown > 0.12).any(0) | (distance - least[3] > 0.12 * distance)
     differs = differs.repeat_interleave(2, 0).repeat_interleave(2, 1)
     again = ~first

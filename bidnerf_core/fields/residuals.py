@@ -66,8 +66,7 @@ DEPTH_RESIDUALS: dict[str, DepthResidual] = {
 
 
 def free_space(rendering: Rendering, distance: Float[Tensor, "*p"], margin: float) -> Float[Tensor, "*p"]:
-    """Return how far (metres) matter on a ray lies in front of ``distance - margin``, summed with the
-    rendering weights.
+    """Return how far (metres) matter on a ray lies in front of ``distance - margin``, summed with the rendering weights.
 
     A sensor that measured a distance saw nothing in front of it. The error of the mean distance can be 0 with
     matter on both sides of the measured point; this residual cannot.
@@ -88,9 +87,8 @@ class Term:
     residual: Residual
     robust: Robust
     weight: float
-    of_depth: bool = (
-        True  # whether it applies to rays with a measured distance, or else to those with a colour
-    )
+    # whether it applies to rays with a measured distance, or else to those with a colour
+    of_depth: bool = True
 
     def loss(self, rendering: Rendering, observed: Observations) -> Float[Tensor, "*k"]:
         """Return the weighted mean of rho over the rays (last axis) that the term applies to, summed over channels."""
@@ -132,9 +130,7 @@ def depth_term(robust: Robust, weight: float, residual: DepthResidual = depth_re
 
 
 def free_space_term(robust: Robust, weight: float) -> Term:
-    """Return the term for matter that lies in front of the measured distance by more than the scale of
-    ``robust`` (metres).
-    """
+    """Return the term for matter that lies in front of the measured distance by more than the scale of ``robust`` (metres)."""
     return Term(
         lambda seen, observed: free_space(seen, observed.distance, robust.scale)[..., None], robust, weight
     )

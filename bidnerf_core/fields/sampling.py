@@ -40,8 +40,7 @@ density for a cell that is only partly dense; what lies behind the empty part mu
 
 @dataclass(frozen=True)
 class Stratified:
-    """``count`` intervals of [near, far]; with jitter, their borders are shifted randomly by up to half an
-    interval.
+    """``count`` intervals of [near, far]; with jitter, their borders are shifted randomly by up to half an interval.
 
     They have equal length in the coordinate of ``SceneBounds.spacing`` or, without bounds, in distance.
     """
@@ -87,8 +86,7 @@ def rows_of(of: OfRays, index: Int[Tensor, "n"]) -> OfRays:
 
 @dataclass(frozen=True)
 class Importance:
-    """Hierarchical sampling (Mildenhall et al. 2020, section 5.2): more intervals where ``field`` has its
-    weight.
+    """Hierarchical sampling (Mildenhall et al. 2020, section 5.2): more intervals where ``field`` has its weight.
 
     The field's own valid intervals are split at ``count`` further distances; space that its sampler skips,
     such as one with an occupancy grid, remains skipped. No gradient flows through the choice of distances.
@@ -251,9 +249,7 @@ def concentrated(
 
 
 def _levels(count: int, like: Float[Tensor, "*r b"], jitter: Generator | None) -> Float[Tensor, "*r n"]:
-    """Return ``count`` evenly spaced numbers from 0 to 1; with jitter, the inner ones are shifted by up to
-    half a step.
-    """
+    """Return ``count`` evenly spaced numbers from 0 to 1; with jitter, the inner ones are shifted by up to half a step."""
     levels = torch.linspace(0, 1, count, dtype=like.dtype, device=like.device).repeat(*like.shape[:-1], 1)
     if jitter is not None and count > 2:
         shift = torch.rand((*like.shape[:-1], count - 2), generator=jitter, device=jitter.device) - 0.5

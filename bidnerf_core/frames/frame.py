@@ -277,8 +277,7 @@ class Frame:
         return self.replace(rgb=rgb.clamp(0, 1), awaits_background=False)
 
     def with_hidden(self, hidden: Bool[Tensor, "h w"] | None) -> Frame:
-        """Return the frame with more pixels hidden; the frame itself if ``hidden`` is None or false
-        everywhere.
+        """Return the frame with more pixels hidden; the frame itself if ``hidden`` is None or false everywhere.
 
         Raises ``WhollyHidden`` if nothing would be left.
         """
@@ -372,8 +371,7 @@ class Frame:
         return moved(self, device)
 
     def at_most(self, largest: int) -> Frame:
-        """Return the frame downscaled to ``largest`` pixels along its longer side; the frame itself if it is
-        not larger.
+        """Return the frame downscaled to ``largest`` pixels along its longer side; the frame itself if it is not larger.
 
         Colours are averaged over areas and rounded to bytes. Depth is that of the nearest pixel, and a pixel
         is hidden if any pixel it covers is.

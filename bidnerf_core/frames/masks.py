@@ -113,9 +113,7 @@ class MaskFolder:
                 self._by_name["_".join(parts[-depth:])].append(file)
 
     def file_of(self, name: str) -> Path | None:
-        """Return the mask of the frame named ``name``; None if there is none. Raises ``InputError`` if there
-        are several.
-        """
+        """Return the mask of the frame named ``name``; None if there is none. Raises ``InputError`` if there are several."""
         found = self._by_name.get(name, [])
         if len(found) > 1:
             raise InputError(f"{found[0]} and {found[1]} both match {name} by name", expected="one mask")

@@ -115,11 +115,11 @@ DrawerName = Literal["uniform", "interest-points", "interest-regions"]
 
 def interest_points(frame: Frame) -> Int[Tensor, "n 2"]:
     """Return corners (column, row) by Shi and Tomasi 1994, "Good features to track"; possibly none."""
-    if min(frame.rgb_bytes.shape[:2]) <= 3:  # the margin that the detector needs
+    if min(frame.rgb_bytes.shape[:2]) <= 3:  # no larger than the margin that the detector needs
         return torch.zeros((0, 2), dtype=torch.long)
     grey = rgb_to_grayscale(frame.rgb.detach().float().cpu().permute(2, 0, 1)[None])
     response = nms2d(gftt_response(grey), (5, 5))[0, 0]
-    # Relative to the strongest in the image; and the noise of 1/255 of a blank wall stays below 1e-5.
+    # Corners are at least a hundredth as strong as the strongest. A blank wall with noise of 1/255 stays below 1e-5.
     strong = response > max(0.01 * float(response.max()), 1e-5)
     return strong.nonzero().flip(-1)
 

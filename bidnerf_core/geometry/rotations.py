@@ -39,7 +39,7 @@ def rotation_vector(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"
     axis = np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
     sine, cosine = math.sqrt(float(axis @ axis)), 0.5 * (float(np.trace(rotation)) - 1)
     angle = math.atan2(sine, cosine)
-    if angle > 2.5:  # the skew part no longer determines the axis well
+    if angle > 2.5:  # beyond it, the skew part does not determine the axis well
         found: np.ndarray = Rotation.from_matrix(rotation).as_rotvec()
         return found
     return axis * (1 + angle**2 / 6 if angle < SERIES_ANGLE else angle / sine)

@@ -77,9 +77,8 @@ class SE3:
     def update_to(self, other: SE3) -> Float[Tensor, "*b 6"]:
         """Return ``(self.inverse() @ other).log()`` in fewer operations, for rotations that differ by clearly less than half a turn."""
         back = self.rotation.mT
-        least = (
-            torch.finfo(back.dtype).tiny ** 0.5
-        )  # keeps 0 / 0 from being NaN without changing any other ratio
+        # Keeps 0 / 0 from being NaN without changing any other ratio.
+        least = torch.finfo(back.dtype).tiny ** 0.5
         R, off = back @ other.rotation, _matvec(back, other.translation - self.translation)
         twice = torch.stack([R[..., i, j] - R[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1)
         sine = twice.square().sum(-1).sqrt() / 2 + least

@@ -51,9 +51,8 @@ def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
     try:
         mode = path.stat().st_mode
         file = path.open("rb") if stat.S_ISREG(mode) else None
-        pointer = (
-            b"version https://git-lfs.github.com/spec/"  # what a clone without Git LFS has in place of a file
-        )
+        # Begins a file that stands for another one in a repository cloned without Git LFS.
+        pointer = b"version https://git-lfs.github.com/spec/"
         is_pointer = file is not None and file.peek(len(pointer)).startswith(pointer)
     except FileNotFoundError as error:
         raise InputError("no such file", where=path, expected=expected) from error
@@ -74,9 +73,7 @@ def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
 
 
 def read_file(path: Path, expected: str, most: int = LARGEST_TEXT) -> bytes:
-    """Return the content of a regular file. Raises ``InputError`` as ``open_binary`` does, and if it exceeds
-    ``most`` bytes.
-    """
+    """Return the content of a regular file. Raises ``InputError`` as ``open_binary`` does, and if it exceeds ``most`` bytes."""
     with open_binary(path, expected) as file:
         return read_open_file(file, path, expected, most)
 

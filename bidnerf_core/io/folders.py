@@ -17,8 +17,7 @@ def output_folder(
     is_leftover: Callable[[Path], bool] = lambda file: False,
     described: Callable[[Path], str | None] = lambda folder: None,
 ) -> Iterator[None]:
-    """Create a folder, and check before hours of work that it is writable and that no other process writes to
-    it.
+    """Create a folder, and check before hours of work that it is writable and that no other process writes to it.
 
     A folder that is not empty is rejected unless ``overwrite`` is set; temporary files, and those that
     ``is_leftover`` recognizes, do not count. ``described`` returns what a folder holds, for the message. If

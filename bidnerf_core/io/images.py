@@ -93,8 +93,7 @@ def read_image(
 def read_compact_image(
     path: ImageSource, background: Sequence[float] = (0.0, 0.0, 0.0), size: tuple[int, int] | None = None
 ) -> tuple[Shaped[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
-    """Read an image like ``read_image``, but keep colours as bytes (uint8) if the file has 8 bits and no
-    alpha.
+    """Read an image like ``read_image``, but keep colours as bytes (uint8) if the file has 8 bits and no alpha.
 
     Images downscaled to ``size`` (width, height) have bytes as well; a JPEG file is decoded no larger than
     needed.
@@ -103,8 +102,8 @@ def read_compact_image(
     with open_image(path) as image:
         if image.mode in ("L", "RGB", *CONVERTED) and not _is_deep(image):
             if size is not None and image.format == "JPEG":
-                # It decodes to a half, a quarter or an eighth along each side. Sizes that are not multiples are kept, since their last
-                # column or row would be weighted too heavily.
+                # It decodes to a half, a quarter or an eighth along each side. Images whose sizes are not multiples are decoded
+                # whole, since their last column or row would be weighted too heavily.
                 sides = [
                     (image.width // f, image.height // f)
                     for f in (8, 4, 2)
@@ -257,7 +256,7 @@ def _strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[np.ndarray,
     whole = _pixels(path, image) if _is_deep(image) else None
     full = None
     if whole is not None and (whole.ndim == 2 or whole.shape[2] not in (2, 4)):
-        # Sensors of 10, 12 or 14 bits are stored in 16: the smallest that fits the largest value is assumed.
+        # Values of 10, 12 or 14 bits are stored in 16; the fewest bits that fit the largest value are assumed.
         bits = next((bits for bits in (10, 12, 14) if whole.max(initial=0) < 2**bits), 16)
         full = 2**bits - 1
     rows = max(1, STRIP // image.width)
@@ -327,7 +326,7 @@ def open_image(path: ImageSource) -> Iterator[Image.Image]:
         file.seek(0)
         _check_segments(path, file)
         Image.preinit()
-        with contextlib.suppress(ImportError):  # Pillow from 11.3 on
+        with contextlib.suppress(ImportError):  # Pillow has it from 11.3 on
             from PIL import AvifImagePlugin  # noqa: F401
         try:
             with Image.open(file, formats=[name for name in FORMATS if name in Image.OPEN]) as image:
@@ -354,12 +353,11 @@ def _check_segments(path: ImageSource, file: BinaryIO) -> None:
     """Raise ``InputError`` for a JPEG file whose decoding takes far longer than its size suggests; rewind others."""
     content = file.read() if file.read(2) == b"\xff\xd8" else b""
     file.seek(0)
-    # Each scan goes through the whole image, and libjpeg's usual script has ten of them; of segments, the depth map that a phone stores
-    # with a photo takes a few hundred.
+    # Each scan goes through the whole image, and libjpeg's usual script has ten of them. The depth map that a phone stores with a
+    # photo takes a few hundred segments.
     at, scans, segments, most_scans, most_segments = 0, 0, 0, 100, 1000
-    begins = re.compile(
-        rb"\xff([\xc0-\xcf\xd8-\xfe])"
-    )  # within a scan, 0xff is followed by 0 or a restart marker
+    # Within a scan, 0xff is followed by 0 or a restart marker.
+    begins = re.compile(rb"\xff([\xc0-\xcf\xd8-\xfe])")
     while marker := begins.search(content, at):
         code, segments = marker[1], segments + 1
         scans += code == b"\xda"
@@ -389,13 +387,8 @@ def looks_like_image(path: Path) -> bool:
             head = file.read(12)
     except InputError:
         return False
-    first = (
-        b"\x89PNG\r\n",
-        b"\xff\xd8\xff",
-        b"II*\0",
-        b"MM\0*",
-        b"GIF8",
-    )  # PNG, JPEG, TIFF of both byte orders, GIF
+    # PNG, JPEG, TIFF of both byte orders, GIF; the others are identified by later bytes.
+    first = (b"\x89PNG\r\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"GIF8")
     webp = head[:4] == b"RIFF" and head[8:12] == b"WEBP"
     bitmap = head[:2] == b"BM" and head[6:10] == bytes(4)
     avif = head[4:12] in (b"ftypavif", b"ftypavis")

@@ -1,6 +1,4 @@
-"""PLY files: elements with named numeric properties, whose size is checked against the file before memory is
-allocated.
-"""
+"""PLY files: elements with named numeric properties, whose size is checked against the file before memory is allocated."""
 
 from __future__ import annotations
 
@@ -81,7 +79,8 @@ def check_ply_size(path: Path, header: PlyHeader) -> None:
     left = path.stat().st_size - header.length
     for element in header.elements:
         binary = sum(np.dtype(of).itemsize for _, of in element.properties)
-        size = 2 * len(element.properties) if header.order == "=" else binary  # a digit and a separator
+        # A number in a text takes at least a digit and a separator.
+        size = 2 * len(element.properties) if header.order == "=" else binary
         if element.count * (size + element.has_lists) > left + 1:  # the last line of a text may lack its end
             raise InputError(
                 f"declares {element.count:,} elements {element.name!r}, but its {left:,} bytes of data"

@@ -37,8 +37,7 @@ class Row:
         return InputError(f"line {self.line}{finding}", where=self.path, expected=self.columns)
 
     def numbers(self, words: Sequence[str] | None = None, count: int | None = None) -> list[float]:
-        """Parse the ``words`` (by default the whole row) as finite numbers, exactly ``count`` of them if
-        given.
+        """Parse the ``words`` (by default the whole row) as finite numbers, exactly ``count`` of them if given.
 
         Raises ``InputError`` for anything else.
         """
@@ -69,8 +68,7 @@ class Row:
 
 
 def read_rows(path: Path, expected: str, columns: str, most: int = LARGEST_ROWS) -> list[Row]:
-    """Read the non-empty rows of a file, without comments. Raises ``InputError`` as ``read_file`` does, and
-    for non-text files.
+    """Read the non-empty rows of a file, without comments. Raises ``InputError`` as ``read_file`` does, and for non-text files.
 
     ``expected`` briefly describes the file, ``columns`` a row.
     """

@@ -27,13 +27,13 @@ class _Ignored:
 
 
 def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
-    """Read a file written by ``torch.save``: tensors and numbers in dicts and lists. NumPy numbers come back
-    as placeholders.
+    """Read a file written by ``torch.save``: tensors and numbers in dicts and lists. NumPy numbers come back as placeholders.
 
     ``expected`` briefly describes what the file should be. With ``mapped``, tensors stay in the file until they are used, so that
     one of any size is recognised quickly; files in the format of torch before version 1.6, which are not zip archives,
     cannot be mapped and are read. Raises a one-line ``InputError`` if there is no such file, it is damaged, it would
-    run code, it unpacks to more than its size or, unless ``mapped``, it holds a tensor that does, such as an expanded one (stride 0).
+    run code, it unpacks to more than its size or, unless ``mapped``, it holds a tensor that does, such as an expanded one
+    (stride 0).
     """
     if not path.is_file():
         raise InputError("no such file", where=path, expected=expected)

@@ -45,13 +45,13 @@ _Loader.yaml_multi_constructors = {"": _plain}
 
 
 def parse_yaml(content: bytes, where: str, expected: str) -> Any:
-    """Return the first document of a YAML text. Raises ``InputError``, whose message begins with ``where``, if it is malformed, too
-    large or too deep, or has aliases or merge keys.
+    """Return the first document of a YAML text.
+
+    Raises ``InputError``, whose message begins with ``where``, if it is malformed, too large or too deep, or has aliases or merge
+    keys.
     """
-    most, deepest = (
-        2**20,
-        50,
-    )  # bytes (the points of all images of a calibration take some 100,000), and levels
+    # Bytes, of which a calibration with the points of all its images takes some 100,000, and nested lists and mappings
+    most, deepest = 2**20, 50
     if len(content) > most:
         found = f"has {len(content):,} bytes of YAML"
         raise InputError(found, where=where, expected=f"{expected} of at most {most:,}")

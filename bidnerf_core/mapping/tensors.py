@@ -83,7 +83,7 @@ def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
         raise ValueError("expected as many normals and colours of surfels as positions, and at least one")
     _check_range(tensors, "entries", 0, count - 1)
     cell = float(tensors["cell"])
-    _check_range(tensors, "rgb_gradient", -1000 / cell, 1000 / cell)  # full scales per cell of the grid
+    _check_range(tensors, "rgb_gradient", -1000 / cell, 1000 / cell)  # in full scales per cell of the grid
     _check_unit_length(tensors, "normals")
     if not len(tensors["keyframes"]) or not bool(SE3.from_matrix(tensors["keyframes"]).is_rigid().all()):
         raise ValueError("keyframes are missing, or one is not a rigid transform")

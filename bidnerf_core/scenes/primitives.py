@@ -113,8 +113,7 @@ class Primitive:
     def distance(
         self, origins: Float[Tensor, "3 #n"], directions: Float[Tensor, "3 n"]
     ) -> Float[Tensor, " n"]:
-        """Return the distance to the first crossing in front of the origin (metres; world, unit directions);
-        inf: none.
+        """Return the distance to the first crossing in front of the origin (metres; world, unit directions); inf: none.
 
         From inside a solid, this is where the ray leaves it: a box seen from inside is a room.
         """

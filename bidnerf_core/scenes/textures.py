@@ -63,9 +63,7 @@ class Faces:
 
 
 def checker(first: Colour, second: Colour, period: float | Vector, phase: float = 0.7) -> Waves:
-    """Return soft cubes of alternating colour; ``period`` (metres) is twice the side of a cube, for all axes
-    or per axis.
-    """
+    """Return soft cubes of alternating colour; ``period`` (metres) is twice the side of a cube, for all axes or per axis."""
     px, py, pz = period if isinstance(period, tuple) else (period,) * 3
     waves = ((2 * math.pi / px, 0.0, 0.0), (0.0, 2 * math.pi / py, 0.0), (0.0, 0.0, 2 * math.pi / pz))
     return Waves(first, second, waves, (phase, phase + 0.5, phase + 0.9), hardness=5.0)

@@ -14,9 +14,9 @@ import numpy as np
 def agreement(model: Any, database: Any, pycolmap: Any) -> tuple[int, int]:
     """Compare the verified pairs of a database with the poses and cameras of a model.
 
-    Returns the number of pairs of registered photos with at least a hundred verified matches, as pairs of different places with
-    repeated details have up to 80, and of those that contradict the model's poses: fewer than half of a pair's matches are within
-    four pixels, of the photos in which keypoints were found, of their epipolar lines.
+    Returns the number of pairs of registered photos with at least a hundred verified matches, since pairs of different places
+    with repeated details have up to 80, and the number of those that contradict the model's poses: fewer than half of their
+    matches are within four pixels of their epipolar lines, in the photos in which keypoints were found.
     """
     placed, keypoints = set(model.reg_image_ids()), dict[int, np.ndarray]()
     pairs = contradicting = 0

@@ -93,7 +93,7 @@ def _first_guess(photo: ListedPhoto, given: Intrinsics | str | Path | None) -> t
             return camera_from_exif(str(photo.image.file), raster, exif).intrinsics, True
         except InputError:  # cropped after it was taken
             pass
-    return Intrinsics.from_focal(1.2 * max(photo.size), *photo.size), False  # COLMAP's default
+    return Intrinsics.from_focal(1.2 * max(photo.size), *photo.size), False  # as COLMAP assumes
 
 
 def key(number: int) -> str:

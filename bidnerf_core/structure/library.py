@@ -16,7 +16,7 @@ def pycolmap_for(what: str) -> Any:
         raise InputError(
             "finding the poses of photos needs the extra 'sfm' (pip install 'bidnerf[sfm]')", where=what
         ) from error
-    if not hasattr(pycolmap, "CancellationToken"):  # which exists from 4.2 on
+    if not hasattr(pycolmap, "CancellationToken"):  # a name that exists from 4.2 on
         raise InputError(
             f"pycolmap is {pycolmap.__version__}",
             where=what,

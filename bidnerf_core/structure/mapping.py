@@ -24,8 +24,7 @@ LEAST_PHOTOS = 3
 def reconstructed(
     database: Path, folder: Path, found: Described, fixed: bool, threads: int, pycolmap: Any
 ) -> list[Any]:
-    """Reconstruct the photos of a database, keeping their cameras if ``fixed``; models are written to
-    ``folder``.
+    """Reconstruct the photos of a database, keeping their cameras if ``fixed``; models are written to ``folder``.
 
     Returns the models, largest first; parts without overlap have one each. There may be no model at all.
     """

@@ -14,8 +14,7 @@ from bidnerf_core.structure.pairs import Pairs
 
 
 def match(database: Path, numbers: Sequence[int], pairs: Pairs, threads: int, pycolmap: Any) -> None:
-    """Match the ``pairs`` of photos that are missing from the database; ``numbers`` are the photos' numbers
-    there.
+    """Match the ``pairs`` of photos that are missing from the database; ``numbers`` are the photos' numbers there.
 
     Matches found until the job is cancelled are stored. A batch, which cannot be interrupted, takes about two seconds.
     """

@@ -1,5 +1,4 @@
-"""Selection of the pairs of photos to match: all pairs if there are few photos, else neighbours in order and similar
-photos.
+"""Selection of the pairs of photos to match: all pairs if there are few photos, else neighbours in order and similar photos.
 
 Neighbours are likely to overlap since photos and frames are taken one after another. Similar photos close
 loops, and connect photos in arbitrary order. The similarity of two photos is the product of their vectors of

@@ -66,8 +66,7 @@ def find_poses(
     *,
     reuse: bool = False,
 ) -> FoundPoses:
-    """Find the poses of photos by structure from motion (COLMAP, extra ``sfm``), and write them as a dataset
-    into ``out``.
+    """Find the poses of photos by structure from motion (COLMAP, extra ``sfm``), and write them as a dataset into ``out``.
 
     ``photos`` is a folder of photos, or a video, from which frames are chosen by motion and sharpness and
     written as images. ``camera`` (intrinsics or a file of them) is kept fixed; without it, focal length and

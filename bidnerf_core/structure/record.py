@@ -61,19 +61,17 @@ class FoundPoses:
     inputs: str  # digest of the names, sizes and times of the files, and of the camera
     pycolmap: str  # its version
     video: bool = False  # whether the photos are frames of a video, which were written next to this record
-    sure_pairs: int = (
-        0  # pairs of registered photos with so many matches that they certainly show the same place
-    )
+    # pairs of registered photos with so many matches that they certainly show the same place
+    sure_pairs: int = 0
     contradicting: int = 0  # of these, pairs whose matches contradict the poses
-    turned: int = (
-        0  # registered photos with an EXIF orientation; their cameras are those of the images as stored
-    )
+    # registered photos with an EXIF orientation; their cameras are those of the images as stored
+    turned: int = 0
 
     @property
     def doubt(self) -> str | None:
         """Why the poses may be wrong as a whole, with a remedy; None if there is no sign of that.
 
-        Repeated details cause a few contradicting pairs among those with many matches.
+        Half a per cent of the pairs with many matches may contradict the poses, as repeated details cause a few such pairs.
         """
         if self.contradicting <= 0.005 * self.sure_pairs:
             return None

@@ -81,9 +81,8 @@ def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
 
     def is_copy(place: Path, other: Path) -> bool:
         (width, height), (whole_width, whole_height) = sizes[place], sizes[other]
-        smaller = (
-            width < whole_width and abs(height - width * whole_height / whole_width) <= 1
-        )  # sizes are rounded
+        # Sizes are rounded.
+        smaller = width < whole_width and abs(height - width * whole_height / whole_width) <= 1
         names = [{photo.stem for photo in groups[each]} for each in (place, other)]
         return smaller and place.parent == other.parent and names[0] == names[1]
 
@@ -106,9 +105,8 @@ def refuse_panoramas(photos: Sequence[SourceImage]) -> None:
             continue
         wide += 1
         with open_binary(photo.file, "a photo") as file:
-            if b"equirectangular" in file.read(
-                2**18
-            ):  # XMP: a segment has at most 64 KiB, and EXIF precedes it
+            # So many bytes contain the XMP: a segment has at most 64 KiB, and EXIF precedes it.
+            if b"equirectangular" in file.read(2**18):
                 expected = (
                     "poses with camera_model EQUIRECTANGULAR in transforms.json, or pinhole views cut from it"
                 )

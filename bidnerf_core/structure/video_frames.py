@@ -1,10 +1,9 @@
-"""Selection of video frames for structure from motion: as many as the image motion requires, each the sharpest among
-its neighbours.
+"""Selection of video frames for structure from motion: as many as the image motion requires, and sharp ones.
 
-The image motion is the displacement of tracked corners, accumulated along the video. A shaking camera does
-not add to it, since corners are tracked from one anchor frame until they have moved by a few percent of the
-image. Frames are chosen at equal steps of the accumulated motion: none while the camera rests, many while it
-turns.
+Each is the sharpest among its neighbours. The image motion is the displacement of tracked corners, accumulated
+along the video. A shaking camera does not add to it, since corners are tracked from one anchor frame until they
+have moved by a few percent of the image. Frames are chosen at equal steps of the accumulated motion: none while
+the camera rests, many while it turns.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ def measured(video: Path) -> list[Measure]:
                 is_anchor = away > 0.02 or len(points) < 0.5 * corners
         if is_anchor:
             until_anchor = motion
-            detected = cv2.goodFeaturesToTrack(grey, 200, 0.01, 7)  # quality, distance (pixels)
+            detected = cv2.goodFeaturesToTrack(grey, 200, 0.01, 7)  # corners, quality, and distance in pixels
             points = start = np.zeros((0, 1, 2), np.float32) if detected is None else np.asarray(detected)
             corners = len(points)
         before = grey

@@ -116,7 +116,7 @@ def fit(
         else:
             with without_waiting():
                 seen[key] += 1
-                # Two steps before load kernels and create Adam's moments, as a capture does not allow this.
+                # Two steps before the capture load kernels and create Adam's moments, which a capture does not allow.
                 if seen[key] > 2 and key not in graphs:
                     graphs[key] = captured(partial(take, step), device, generator, memory)
                 graphs.get(key, partial(take, step))()

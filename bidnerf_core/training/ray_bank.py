@@ -32,9 +32,7 @@ LANDMARK_SHARE = 0.125
 
 @dataclass(frozen=True, eq=False)
 class TrainingBatch:
-    """Rays of training views, the measurements along them, and the background over which their colours were
-    composited.
-    """
+    """Rays of training views, the measurements along them, and the background over which their colours were composited."""
 
     rays: Rays  # world
     observed: Observations  # of the same rays, in the world; all of them have a colour

@@ -27,9 +27,8 @@ class SupervisionConfig(Settings):
 
     # weight of depth, from sensors or landmarks, relative to colour; 0 leaves it out
     depth_weight: NotNegative = 0.1
-    distortion_weight: NotNegative = (
-        0.0  # weight of the distortion loss, which concentrates a ray's weight at one depth
-    )
+    # weight of the distortion loss, which concentrates a ray's weight at one depth
+    distortion_weight: NotNegative = 0.0
     exposure: bool = True  # learn a colour transform of each image, unless images have alpha
     sharpness: bool = True  # down-weight blurred images
 
@@ -92,7 +91,7 @@ class Supervision:
         depth_weight = self.config.depth_weight if self.bank.has_distances else 0.0
         loss, mse = supervised_loss(rendering, batch, self.side, depth_weight, weight)
         if self.colours is not None:
-            loss = loss + 1e-3 * self.colours.penalty()
+            loss = loss + 1e-3 * self.colours.penalty()  # relative to the colour error
         if self.config.distortion_weight:
             loss = loss + self.config.distortion_weight * distortion(rendering, self.side)
         return loss, mse

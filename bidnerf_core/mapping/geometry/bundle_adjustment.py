@@ -65,7 +65,7 @@ def adjusted(
     """
     state, damping = start, 1e-4
     system = linearized(sightings, state, prior, noise, correlation)
-    for _ in range(30):  # from poses that are off by a few pixels, about ten suffice
+    for _ in range(30):  # about ten suffice from poses that are off by a few pixels
         of_images, of_points = system.step(damping)
         motion = state.motion + of_images[:, 6:] if of_images.shape[1] > 6 else state.motion
         poses = state.T_world_camera.retract(of_images[:, :6])
@@ -73,7 +73,7 @@ def adjusted(
         tried = linearized(sightings, moved, prior, noise, correlation)
         if not tried.cost <= system.cost:
             damping *= 10
-            if damping > 1e6:  # relative to the diagonal
+            if damping > 1e6:  # relative to the diagonal; no smaller step is tried
                 break
             continue
         gained = system.cost - tried.cost
@@ -162,8 +162,9 @@ def linearized(
 def _prior_term(
     state: Adjustment, prior: PosePrior
 ) -> tuple[float, Float[Tensor, "v k"], Float[Tensor, "v k"]]:
-    """Return cost, gradient and precision of the prior: the deviations from the given poses under a Cauchy loss, and the motions under a quadratic
-    loss, in standard deviations.
+    """Return cost, gradient and precision of the prior, in standard deviations.
+
+    Deviations from the given poses have a Cauchy loss, and motions a quadratic one.
     """
     given, T = prior.T_world_camera, state.T_world_camera
     away = (T.rotation.mT @ (T.translation - given.translation)[..., None])[..., 0]  # camera

@@ -23,10 +23,10 @@ def intersected(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
 def refined_points(
     sightings: Sightings, points: Float[Tensor, "n 3"], scale: float, steps: int = 8
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """Minimize the reprojection errors under a Cauchy loss of ``scale`` pixels by a number of Gauss-Newton ``steps``; from the
-    linear solution, four or five suffice.
+    """Minimize the reprojection errors under a Cauchy loss of ``scale`` pixels by ``steps`` Gauss-Newton iterations.
 
-    Returns the points and their covariances for a noise of one pixel (the inverses of their normal matrices).
+    From the linear solution, four or five suffice. Returns the points and their covariances for a noise of one pixel (the
+    inverses of their normal matrices).
     """
     for _ in range(steps):
         matrix, gradient = _normal_equations(sightings, points, scale)

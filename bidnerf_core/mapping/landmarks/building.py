@@ -94,7 +94,7 @@ def robust_covariance(values: Float[Tensor, "n c"]) -> Float[Tensor, "c c"]:
     channels = values.shape[1]
     scale = values.square().median(0).values.clamp(min=1e-30)
     covariance = torch.diag(scale)
-    for _ in range(10):  # after five, the weights hardly change
+    for _ in range(10):  # the weights hardly change after five
         squared = (values @ torch.linalg.inv(covariance) * values).sum(-1).clamp(min=1e-12)
         squared = squared * (chi_squared_quantile(0.5, channels) / float(squared.median()))
         weight = inlier_weight(squared, channels**0.5)
@@ -286,7 +286,7 @@ def _located(
     pixel_noise = noise(sightings, positions)
     triangulated = replace(
         fused_landmarks(kept, positions, pixel_noise**2 * covariance, pixel_noise),
-        # 200 images tell deviations to within 7 %.
+        # With 200 images, the deviations are known to 7 %.
         pose_covariance=update_scatter(list(pose_updates(kept, positions, 200).values())),
     )
     relative = keypoint_depth_noise(kept, positions)
@@ -312,7 +312,7 @@ def _triangulated(
     count = observations.count
     covariance = torch.zeros((count, 3, 3), dtype=torch.float64)
     points = intersected(observations.sightings, count) if known is None else known[former]
-    # The largest reprojection error of an observation that stays in its track, round by round, is that of two pixels at last.
+    # Observations with larger reprojection errors (pixels) leave their tracks, round by round.
     for tolerance in (10.0, 4.0, 2.0) if known is None else (2.0,):
         scale, steps = tolerance / 2, 8 if known is None else 0
         points, covariance = refined_points(observations.sightings, points, scale, steps)
@@ -323,8 +323,9 @@ def _triangulated(
 
 
 def _inliers(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:
-    """Return a mask of the keypoints that fit their points, for points with at least two such keypoints; two alone must fit to
-    within 1.5 pixels.
+    """Return a mask of the keypoints that fit their points, for points with at least two such keypoints.
+
+    Two alone must fit to within 1.5 pixels.
     """
     fit = fitting(sightings, points, tolerance)
     seen = torch.bincount(sightings.point[fit], minlength=len(points))

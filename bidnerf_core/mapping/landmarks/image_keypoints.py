@@ -45,7 +45,7 @@ def image_keypoints(view: View, features: Features) -> ImageKeypoints:
     hidden = None if frame.hidden is None else frame.hidden.cpu()
     keypoints = detected(features, frame.rgb)
     if hidden is not None and len(keypoints):
-        # Those whose neighbourhoods contain no hidden pixel
+        # Keypoints stay if their neighbourhoods contain no hidden pixel.
         visible = np.ascontiguousarray((~hidden.numpy()).astype(np.uint8))
         away = torch.from_numpy(cv2.distanceTransform(visible, cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
         columns, rows = keypoints.pixels.long().unbind(-1)

@@ -47,7 +47,7 @@ def placed(
     sightings, depth = observations.sightings, observations.depth
     ray = torch.cat([sightings.image, torch.ones_like(sightings.image[:, :1])], dim=-1) * depth[:, None]
     world = (sightings.rotation.mT @ ray[..., None])[..., 0] + sightings.centre
-    # Depth has noise along the ray, and the keypoint across it.
+    # The noise of depth is along the ray, and that of the keypoint across it.
     d = sightings.directions()
     along = d[:, :, None] * d[:, None]
     sideways = (pixel_noise * depth / sightings.focal) ** -2
@@ -55,7 +55,7 @@ def placed(
     information = along * ((relative * depth) ** -2)[:, None, None] + information
     mean, _ = _weighted(world, information, observations.point)
     off = (world - mean[observations.point])[..., None]
-    agree = (off.mT @ information @ off)[:, 0, 0] <= 3**2  # standard deviations
+    agree = (off.mT @ information @ off)[:, 0, 0] <= 3**2  # three standard deviations
     tracks = torch.bincount(observations.point)
     majority = 2 * torch.bincount(observations.point[agree], minlength=len(tracks)) > tracks
     kept = agree & majority[observations.point]

@@ -78,8 +78,8 @@ def epipolar_matches(a: ImageKeypoints, b: ImageKeypoints) -> Matches:
     mutual = banded.argmin(dim=0)[partner] == torch.arange(len(partner))
     rows = (mutual & best.isfinite()).nonzero()[:, 0]
     best, partner = best[rows], partner[rows]
-    # SIFT returns a keypoint for each dominant orientation, and keypoints within the radius of a keypoint's neighbourhood also have
-    # similar descriptors.
+    # Duplicates do not make a match ambiguous: SIFT returns one keypoint for each dominant orientation, and keypoints within the
+    # radius of a keypoint's neighbourhood also have similar descriptors.
     reach = (b.keypoints.sizes[partner, None] / 2).clamp(min=4.0)  # pixels
     near = torch.cdist(b.keypoints.pixels[partner], b.keypoints.pixels) < reach
     next_best = distance[rows].masked_fill(near, torch.inf).amin(dim=1)

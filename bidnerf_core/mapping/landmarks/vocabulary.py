@@ -28,7 +28,10 @@ BLOCK = 2**20
 def k_means(
     descriptors: UInt8[Tensor, "n d"], count: int, generator: torch.Generator
 ) -> Float[Tensor, "c d"]:
-    """Return the centres of k-means clusters (Lloyd 1982) of a sample of twenty a cluster; the centre of an emptied cluster stays in place."""
+    """Return the centres of k-means clusters (Lloyd 1982) of a sample of twenty descriptors per cluster.
+
+    The centre of an emptied cluster stays where it is.
+    """
     sample = torch.randperm(len(descriptors), generator=generator)[: 20 * count]
     values = descriptors[sample.to(descriptors.device)].float()
     centres = values[:count].clone()
@@ -89,6 +92,9 @@ def pooled_views(
 
 
 def visible(landmarks: LandmarkMap, camera: Intrinsics, T_world_camera: SE3) -> Int[Tensor, "m"]:
-    """Return the numbers of the landmarks visible to a camera, ignoring occlusion, also up to 10 degrees beyond their cones."""
+    """Return the numbers of the landmarks visible to a camera, ignoring occlusion.
+
+    They count as visible up to 10 degrees beyond their cones of viewing directions.
+    """
     slopes = torch.tensor([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy])
     return landmarks.in_view(T_world_camera, slopes, math.radians(10))[0]

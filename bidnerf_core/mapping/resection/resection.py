@@ -35,8 +35,8 @@ def resections(
 
     ``correlation`` is the number of sightings that count as one because their errors are correlated. Yields the numbers of b
     images; their states under the first prior, then under the next, whose poses are right updates of the images' given ones; and
-    the normal equations there. The Hessian is the inverse covariance of an estimate from twenty points or more. All states of an image share the noise of
-    the best, so that their evidence can be compared; the last prior should be the widest.
+    the normal equations there. The Hessian is the inverse covariance of an estimate from twenty points or more. All states of
+    an image share the noise of the best, so that their evidence can be compared; the last prior should be the widest.
     """
     local, order = sightings.in_camera(points), sightings.view.argsort(stable=True)
     count = torch.bincount(sightings.view)
@@ -54,9 +54,8 @@ def resections(
         times = sightings.exposure_times[own]
         sights = Sights(sightings.image[own], times, rotation, torch.zeros_like(local[own]), single=True)
         correlated, focal = torch.full((b,), correlation, dtype=torch.float64), sightings.focal[own]
-        area = (
-            float(focal.max()) ** 2
-        )  # of a view that is 53 degrees wide; what matters is that outliers are rare
+        # The area of a view that is 53 degrees wide; what matters is that outliers are rare.
+        area = float(focal.max()) ** 2
         term = Landmarks(
             local[own],
             sights,
@@ -74,7 +73,7 @@ def resections(
             SE3(torch.eye(3, dtype=torch.float64).expand(h, 3, 3), zero[:, :3]), zero, zero,
             deviation.repeat_interleave(b, 0), zero[:, 0], zero[:, 0], mode, torch.arange(h) // b,
         )  # fmt: skip
-        for _ in range(3):  # estimates of the noise
+        for _ in range(3):  # each time, the noise is estimated anew
             states, _ = descend(term.with_noise(states), [term], 10)
         states = term.with_noise(states)
         noise = states.noise.view(-1, b).amin(0).repeat(len(motions))

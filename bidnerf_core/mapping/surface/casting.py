@@ -42,7 +42,7 @@ def cast(
     left, on = torch.arange(len(best), device=best.device), rays.near < rays.far
     here, o, d, far = rays.near, origins, directions, rays.far
     for step in range(steps):
-        # Every sixth step, rays that have hit the surface or left the grid are dropped.
+        # Rays that have hit the surface or left the grid are dropped every six steps.
         if step % 6 == 0 and may_wait(best.device):
             left, here, o, d, far = left[on], here[on], o[on], d[on], far[on]
             on = torch.ones_like(left, dtype=torch.bool)

@@ -26,8 +26,8 @@ COARSER = 2**0.25
 def finest_cell(images: Sequence[PosedDepthImage], opacity: float) -> float:
     """Return the finest cell (metres) that the images' resolution and the noise of measured depth justify.
 
-    It is a fraction of a pixel's footprint, since several images together resolve more than one, and at least two standard
-    deviations of depth; with finer ones, a plane would become several layers of surfels. Rendered images are too sparsely
+    It is 0.7 times a pixel's footprint, since several images together resolve more than one, and at least two standard
+    deviations of depth: with finer cells, a plane would become several layers of surfels. Rendered images are too sparsely
     sampled to distinguish noise from scene structure.
     """
     measured = [posed for posed in images if posed.measured]
@@ -68,8 +68,8 @@ def _spread(
 ) -> float:
     """Return the robust deviation of the differences at up to 400 points of each of 40 images.
 
-    Those of more than five times the median are occlusions or gross errors. Images that differ by more than two standard
-    deviations of an unknown sensor are inconsistent.
+    Differences of more than five times the median are occlusions or gross errors. The result is at most two standard deviations
+    of an unknown sensor, since images that differ by more are inconsistent.
     """
     found = [torch.zeros(0)]
     for number in range(0, len(images), max(1, math.ceil(len(images) / 40))):
@@ -90,9 +90,10 @@ def chosen_grid(
 ) -> VoxelGrid:
     """Return a grid with cells of ``finest`` metres, or coarser if points (metres, world) or memory are scarce.
 
-    Randomly scattered points leave 5/9 of the cells empty if there are 1.32 per occupied cell; with fewer, the mean distance between
-    surfels exceeds the radius of their discs, which is 1.5 cells. If points are scarce, cells grow up to ``coarsest`` at most, at which each contains a pixel. If the limit of ``megabytes``
-    makes them larger, an ``InputWarning`` states by how much. Raises ``InputError`` if no cell size satisfies that limit.
+    Points are scarce below 1.32 per occupied cell. At that number, randomly scattered ones leave 5/9 of the cells empty; with
+    fewer, the mean distance between surfels exceeds the radius of their discs, which is 1.5 cells. Cells then grow up to
+    ``coarsest`` at most, at which each contains a pixel. If the limit of ``megabytes`` makes them larger, an ``InputWarning``
+    states by how much. Raises ``InputError`` if no cell size satisfies that limit.
     """
     grid = VoxelGrid.covering(bounds, finest)
     while grid.cell < coarsest and len(points) < 1.32 * len(grid.numbers(points).unique()):

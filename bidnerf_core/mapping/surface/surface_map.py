@@ -48,7 +48,8 @@ def merged(cells: Int[Tensor, "p"], *values: Float[Tensor, "p _"]) -> tuple[Int[
 def fused_surfels(positions: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"]) -> Surfels:
     """Make surfels of merged points: fit a plane to the neighbours of each point and project it onto that plane."""
     points = positions.numpy()
-    _, index = cKDTree(points).query(points, k=min(12, len(points)), workers=-1)  # with itself
+    # One of the twelve is the point itself.
+    _, index = cKDTree(points).query(points, k=min(12, len(points)), workers=-1)
     near = torch.from_numpy(np.asarray(index, dtype=np.int64).reshape(len(points), -1))
     offsets = positions[near] - positions[:, None]
     mean = offsets.mean(1)
@@ -123,11 +124,11 @@ class SurfaceMap(Resident):
     def surfel_radius(self) -> float:
         """Distance from a surfel within which a ray counts as hitting it (metres).
 
-        It is a fraction of the 90th percentile of the surfels' distances to their fourth neighbours: large enough to leave
+        It is 0.7 times the 90th percentile of the surfels' distances to their fourth neighbours: large enough to leave
         few holes between them, small enough to preserve edges.
         """
         points = self.surfels.positions.cpu().numpy()  # scipy's tree is the host's
-        neighbour = min(5, len(points))  # with itself
+        neighbour = min(5, len(points))  # the point itself and its four neighbours
         away, _ = cKDTree(points).query(points[:: max(1, len(points) // 5000)], k=neighbour)
         fourth = np.asarray(away).reshape(-1, neighbour)[:, -1]
         return 0.7 * float(np.quantile(fourth, 0.9)) or self.cell

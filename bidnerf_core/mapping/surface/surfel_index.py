@@ -52,7 +52,7 @@ class SurfelIndex:
         level = block_levels(positions, grid)
         counts = CELLS_OF_BLOCK >> 3 * level.view(-1).long()
         first = (counts.cumsum(0) - counts).int().view(level.shape)
-        # Leaves of 32 are the fastest in measurements with points some cells away from a plane of surfels.
+        # Leaves of 32 surfels were the fastest in measurements with points some cells away from a plane of surfels.
         tree = cKDTree(positions.numpy(), leafsize=32)
         return SurfelIndex(grid, first, level, _nearest_to_middles(tree, grid, level))
 
@@ -147,7 +147,7 @@ def _nearest_to_middles(tree: cKDTree, grid: VoxelGrid, level: UInt8[Tensor, "x 
     corners = torch.cartesian_prod(*3 * [torch.arange(BLOCK_SIDE)])
     corners = corners[_morton(corners).argsort()]
     levels, found = level.view(-1).long(), []
-    step = 2**20 // CELLS_OF_BLOCK  # a million entries at once at most
+    step = 2**20 // CELLS_OF_BLOCK  # at most a million entries are computed at once
     for at in range(0, len(levels), step):
         number = torch.arange(at, min(at + step, len(levels)))
         block = torch.stack(torch.unravel_index(number, level.shape), dim=-1)
