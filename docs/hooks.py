@@ -53,7 +53,8 @@ def page_of_site(text: str) -> str:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Replace the markers of a page."""
+    """Replace the markers of a page, and the link to the measurements by that to their page."""
+    markdown = markdown.replace("](../benchmarks/results/README.md", "](measurements.md")
     return SETTINGS.sub(lambda found: settings_table(found[1]), markdown).replace(NAMES, public_names())
 
 

@@ -72,8 +72,8 @@ def _sentences(report: CaptureReport) -> Iterator[str]:
             f", median error {trial.translation:.3g} and {trial.rotation_deg:.2g}°" if trial.found else ""
         )
         yield (
-            f"of {amount(trial.images, 'photo')} held out, {trial.found} {'was' if trial.found == 1 else 'were'} localized with the"
-            f" landmarks of the others alone{errors}; expect similar results for new photos taken the same way"
+            f"of {amount(trial.images, 'photo')} of the map, {trial.found} {'was' if trial.found == 1 else 'were'} localized with"
+            f" the landmarks of the others alone{errors}; expect similar results for new photos taken the same way"
         )
     if covered.arrangement == "one place":
         yield (

@@ -41,6 +41,7 @@ def run(
     from images rendered by the field, which are only as sharp as the field. Landmarks from photos are kept unless --data gives
     new photos or --rendered-landmarks is set.
     """
+    from bidnerf_core.mapping import find_features
     from bidnerf_core.maps import load_map
 
     if rendered_landmarks and data is not None:
@@ -49,6 +50,8 @@ def run(
         )
     if images.masks is not None and data is None:
         raise UsageError("--masks was given without --data", expected="the dataset that they belong to")
+    if landmark_features is not None:
+        find_features(landmark_features)
     # The parts that are baked may be damaged, and are replaced anyway.
     scene = load_map(map, device, baked=False)
     with working():

@@ -26,9 +26,8 @@ def run(
     overwrite: Annotated[Flag, Option(None, "write into a non-empty folder")] = False,
 ) -> None:
     """Export the surface, landmarks and cameras of a map for other software, in the map's frame and unit."""
-    from bidnerf_core.maps import load_map
     from bidnerf_core.results import export_map
 
     check_folder(out, (map,))
-    for file in export_map(load_map(map), out, to, overwrite):
+    for file in export_map(map, out, to, overwrite):
         show(f"{file}: {file.stat().st_size / 1e6:.2f} MB")

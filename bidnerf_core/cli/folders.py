@@ -57,11 +57,12 @@ def check_folder(
 
 
 def require_outside_maps(folder: Path, out: Path) -> None:
-    """Raise ``UsageError`` if ``folder``, which would hold the output ``out``, is a map."""
+    """Raise ``UsageError`` if ``folder``, which is the output ``out`` or would hold it, is a map."""
     from bidnerf_core.maps import DESCRIPTION
 
     if (folder / DESCRIPTION).exists():
-        raise UsageError("lies in the folder of a map", where=out, expected="a name outside of it")
+        found = "exists already, as a map" if folder == out else "lies in the folder of a map"
+        raise UsageError(found, where=out, expected="a name outside of it")
 
 
 def _require_writable(folder: Path, out: Path) -> None:

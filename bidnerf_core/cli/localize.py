@@ -73,7 +73,8 @@ class OutputOptions:
         Path | None,
         Option(
             "POSES",
-            "write poses to this file: .txt or .tum, transforms.json, images.txt (COLMAP), or .json with all details",
+            "write poses to this file: .txt or .tum, transforms.json, images.txt (COLMAP; with cameras.txt and points3D.txt),"
+            " or .json with all details",
         ),
     ] = None
     draw: Annotated[
@@ -83,10 +84,10 @@ class OutputOptions:
 
     def check(self, inputs: Sequence[Path]) -> None:
         """Check, before any work, that the outputs can be written."""
-        from bidnerf_core.results import pose_format
+        from bidnerf_core.results import check_pose_file
 
         if self.out is not None:
-            pose_format(self.out)
+            check_pose_file(self.out)
             check_output(self.out, inputs)
         if self.draw is not None:
             check_folder(self.draw, inputs, create=True)

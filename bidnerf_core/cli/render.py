@@ -40,15 +40,15 @@ def run(
     prints PSNR and depth error against the dataset's images.
     """
     from bidnerf_core.io import output_folder
-    from bidnerf_core.maps import load_map
+    from bidnerf_core.maps import load_info, load_map
 
     check_folder(out, (map, data))
     with output_folder(out, overwrite), displayed():
-        scene = load_map(map)
-        dataset = replace(images, background=scene.bounds.background).open(data)
+        dataset = replace(images, background=load_info(map).bounds.background).open(data)
         names = list(frame) or dataset.frame_names(images.split)
         if not names:
             raise InputError(f"split {images.split!r} has no frames", where=data)
+        scene = load_map(map)
         views = dataset.views(images.split, names, counter("reading", "images"))
         names = [view.frame.name for view in views]
         for name in {f"{name}.depth" for name in names} & set(names):

@@ -43,6 +43,11 @@ def run(
     from bidnerf_core.results import read_positions
 
     require_one({"--distance": distance, "--poses": poses, "--factor": factor}, required=True)
+    first, second, length = distance or ("", "", "1")
+    try:
+        metres = float(length)
+    except ValueError as error:
+        raise UsageError(f"METRES is {length!r}", where="--distance", expected="a number") from error
     if out is not None:
         check_folder(out, (map,))
     load_info(map)  # raises if there is no map
@@ -54,11 +59,6 @@ def run(
             say(f"{poses}: {fit}")
             factor = fit.factor
         elif distance is not None:
-            first, second, length = distance
-            try:
-                metres = float(length)
-            except ValueError as error:
-                raise UsageError(f"METRES is {length!r}", where="--distance", expected="a number") from error
             factor = factor_of_distance(scene, first, second, metres)
         assert factor is not None
         stored = scene.scaled(factor).stored_in(out or map)

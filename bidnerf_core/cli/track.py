@@ -48,10 +48,10 @@ class OutputOptions:
 
     def check(self, inputs: list[Path]) -> None:
         """Check, before any work, that the outputs can be written."""
-        from bidnerf_core.results import check_video, pose_format, require_matplotlib
+        from bidnerf_core.results import check_pose_file, check_video, require_matplotlib
 
         if self.out is not None:
-            pose_format(self.out)
+            check_pose_file(self.out)
         if self.plot is not None:
             require_matplotlib()
             if self.plot.suffix.lower() not in (".png", ".svg"):

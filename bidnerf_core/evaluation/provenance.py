@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import json
 import os
 import platform
@@ -11,8 +12,10 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib.metadata import version
+from importlib.metadata import distribution, version
 from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 import psutil
 import torch
@@ -31,7 +34,9 @@ class Provenance:
 
     date: str  # UTC, when it began
     command: str
-    commit: str | None  # of the checkout that the code was run from
+    commit: (
+        str | None
+    )  # of the checkout that the code was run from, or was installed from without changes since
     dirty: bool  # whether files of that checkout were modified
     cpu: str
     cores: int | None
@@ -84,9 +89,17 @@ def read_runs(results: Path) -> list[Provenance]:
 
 def _git(*arguments: str) -> str:
     """Return the output of a git command in this package's checkout; empty if there is no checkout or no git."""
-    root = Path(bidnerf_core.__file__).resolve().parents[1]
-    if not (root / ".git").exists():  # installed, perhaps inside another project
-        return ""
+    package = Path(bidnerf_core.__file__).resolve().parent
+    root = package.parent
+    if not (
+        root / ".git"
+    ).exists():  # installed, perhaps inside another project; PEP 610 names the folder it is from
+        stated = json.loads(distribution("bidnerf").read_text("direct_url.json") or "{}").get("url", "")
+        root = Path(url2pathname(urlsplit(stated).path))
+        code = [str(file.relative_to(package)) for file in package.rglob("*.py")]
+        _, *others = filecmp.cmpfiles(package, root / "bidnerf_core", code)
+        if any(others) or not (root / ".git").exists():
+            return ""
     try:
         done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):

@@ -202,7 +202,7 @@ def _facts(name: str, runs: Sequence[Provenance]) -> dict[str, str]:
         return {}
     first, last = runs[0], runs[-1]
     commits = [
-        "unknown (not run from a checkout)" if r.commit is None
+        "unknown (no checkout of this code)" if r.commit is None
         else r.commit + (", with local changes" if r.dirty else "")
         for r in runs
     ]  # fmt: skip

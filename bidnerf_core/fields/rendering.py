@@ -409,7 +409,7 @@ def _rendered(
     times = exposure_times(pixels, intrinsics).to(T.translation).split(chunk)
     parts = []
     for directions, when in zip(ray.to(device).split(chunk), times, strict=True):
-        check_cancelled()
+        check_cancelled("rendering")
         at = T if motion is None else T @ poses_of_rows(when, motion)
         turned = at.rotate(directions)
         rendering = render(field, bounds.rays(at.translation.expand_as(turned), turned), bounds.background)

@@ -35,7 +35,7 @@ from bidnerf_core.fields import RadianceField, render_image, trained_field
 from bidnerf_core.frames import Frame, SeenLandmarks, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import from_plain, locked
-from bidnerf_core.localization import Localizer, landmark_cameras
+from bidnerf_core.localization import Localizer, Outcome, landmark_cameras
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
     BakeConfig,
@@ -121,7 +121,7 @@ def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> li
     localizer, cameras = Localizer(scene), {camera.name: camera.pose for camera in scene.info.cameras}
     # A photo that has the name of one of the map's counts as that photo if it was taken this near to it.
     near, count = 0.02 * scene.bounds.side, counter("locating", "photos")
-    views, left_out, known = list[View](), list(unread), 0
+    views, left_out, known, outcomes = list[View](), list(unread), 0, list[Outcome]()
     for number, frame in enumerate(frames, start=1):
         check_cancelled("extending")
         try:
@@ -131,6 +131,7 @@ def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> li
         else:
             like = _names_like(frame.name, cameras)
             place = found.T_world_camera.translation
+            outcomes.append(found.outcome)
             if not found.converged:
                 left_out.append((frame.name, f"{found.outcome}: {found.reason}"))
             elif any(float((place - cameras[name].translation).norm()) < near for name in like):
@@ -144,11 +145,12 @@ def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> li
         log.info(f"{name}: left out: {why}")
     # Photos of which fewer are localized do not show the scene of the map.
     if len(views) + known < max(1.0, 0.25 * len(frames)):
-        raise InputError(
-            f"localizes {len(views) + known} of {amount(len(frames), 'photo')}",
-            where=where,
-            expected="photos of its scene",
-        )
+        problem = f"localizes {len(views) + known} of {amount(len(frames), 'photo')}"
+        expected = "photos of its scene"
+        if vague := outcomes.count(Outcome.IMPRECISE):
+            problem += f", and {vague} more, but too imprecisely to add"
+            expected = "photos that show more of what the map's show, from as near, or with depth"
+        raise InputError(problem, where=where, expected=expected)
     log.info(
         f"{where}: {len(views)} of {amount(len(frames) + len(unread), 'photo')} localized, {known}"
         f" already in the map, {len(left_out)} left out"

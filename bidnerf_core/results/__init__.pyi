@@ -4,6 +4,7 @@ from .answers import Answers as Answers
 from .answers import Failure as Failure
 from .answers import localize_each as localize_each
 from .answers import plain_localization as plain_localization
+from .colmap_poses import check_pose_file as check_pose_file
 from .errors import CRITERIA as CRITERIA
 from .errors import PoseError as PoseError
 from .errors import Rate as Rate

@@ -14,21 +14,32 @@ from pathlib import Path
 from bidnerf_core.camera import Intrinsics, colmap_model
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.io import write_file
-from bidnerf_core.results.pose_files import PosedImage, frame_of
+from bidnerf_core.results.pose_files import PosedImage, frame_of, pose_format
 
 HEAD = "# written by bidnerf"
+
+
+def check_pose_file(path: Path) -> None:
+    """Raise, before any work is done, ``UsageError`` for a name without the ending of a format, and ``InputError`` for an images.txt
+    beside another program's cameras.txt or points3D.txt, which would be replaced.
+    """
+    if pose_format(path) != "images.txt":
+        return
+    for beside in (path.with_name("cameras.txt"), path.with_name("points3D.txt")):
+        if beside.exists() and HEAD not in beside.read_text(errors="replace")[:100]:
+            expected = f"{path.name} in a folder without another model"
+            raise InputError(
+                "would be replaced, since a COLMAP model has one;", where=beside, expected=expected
+            )
 
 
 def write_colmap_poses(path: Path, images: Sequence[PosedImage]) -> None:
     """Write ``path`` (images.txt), and the cameras.txt and points3D.txt that COLMAP requires with it.
 
     Image names are file paths relative to the folder that contains all of them. Raises ``InputError`` for a
-    lens that COLMAP cannot describe, and if another program's cameras.txt exists there.
+    lens that COLMAP cannot describe, and as ``check_pose_file`` does.
     """
-    beside = path.with_name("cameras.txt")
-    if beside.exists() and HEAD not in beside.read_text(errors="replace")[:100]:
-        expected = f"{path.name} in a folder without another model"
-        raise InputError("would be replaced, since a COLMAP model has one;", where=beside, expected=expected)
+    check_pose_file(path)
     files = [image.file for image in images if image.file is not None]
     folder = os.path.commonpath([file.resolve().parent for file in files]) if files else ""
     stored = list[PosedImage]()

@@ -20,7 +20,7 @@ from bidnerf_core.captures import write_inria_cameras
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.io import output_folder, write_file
 from bidnerf_core.localization import origin_of
-from bidnerf_core.maps import Map
+from bidnerf_core.maps import Map, load_map
 from bidnerf_core.registry import Plugins, interface_defects
 from bidnerf_core.results.colmap_poses import write_colmap_model
 from bidnerf_core.results.pose_files import PosedImage, frame_of, write_pose_transforms
@@ -42,8 +42,8 @@ EXPORTERS: Plugins[Exporter] = Plugins("exporters", _defects, first=("ply", "col
 """The formats in which maps are exported, by name."""
 
 
-def export_map(scene: Map, out: str | Path, to: str, overwrite: bool = False) -> list[Path]:
-    """Write a map into folder ``out`` in a format of other software, and return the files.
+def export_map(scene: Map | str | Path, out: str | Path, to: str, overwrite: bool = False) -> list[Path]:
+    """Write a map, or the one in a folder, into folder ``out`` in a format of other software, and return the files.
 
     - ``"ply"``: surface.ply (points with normals and colours), landmarks.ply (points with colours and the number of photos that show
       each) and cameras.ply (a pyramid for each camera), and cameras.json (the cameras as 3D Gaussian splatting writes them, from which
@@ -63,10 +63,11 @@ def export_map(scene: Map, out: str | Path, to: str, overwrite: bool = False) ->
     """
     if to not in EXPORTERS:
         raise UsageError(f"format {to!r}", expected=f"one of {', '.join(EXPORTERS)}")
-    write, scene, out = EXPORTERS[to], scene.whole(), Path(out)
-    surface = None if scene.surface is None else scene.surface.to("cpu")
-    landmarks = None if scene.landmarks is None else scene.landmarks.to("cpu")
+    write, out = EXPORTERS[to], Path(out)
     with output_folder(out, overwrite):
+        scene = (scene if isinstance(scene, Map) else load_map(scene)).whole()
+        surface = None if scene.surface is None else scene.surface.to("cpu")
+        landmarks = None if scene.landmarks is None else scene.landmarks.to("cpu")
         return sorted(write(replace(scene, surface=surface, landmarks=landmarks), out))
 
 

@@ -20,8 +20,8 @@ from bidnerf_core.io import reduced, write_file
 from bidnerf_core.localization import Localization, SceneMap, Start, checked_map, origin_of, start_pose
 
 SIDE = 240
-"""Pixels on the longer side of a picture: larger photos are downscaled, since each rendered pixel takes time, and smaller
-images are enlarged to about this size, so that captions fit."""
+"""Pixels on the longer side of a picture of many, since each rendered pixel takes time, and the width to which smaller images
+are enlarged, so that captions fit."""
 
 
 def overlay(
@@ -31,7 +31,7 @@ def overlay(
 
     ``found`` is the answer for the photo, whose corrected intrinsics are used if it has any, or a pose
     ``T_world_camera``. With a ``start``, the picture also shows the rendering from there. The photo is
-    downscaled to at most 240 pixels a side. Raises ``InputError`` for arguments that are not a map, a frame
+    downscaled to at most 640 pixels a side, since each rendered pixel takes time. Raises ``InputError`` for arguments that are not a map, a frame
     or a pose.
     """
     scene = checked_map(scene, "overlay")
@@ -42,17 +42,17 @@ def overlay(
     frame = frame.over(scene.bounds.background)
     if isinstance(found, Localization):
         frame, found = found.frame_as_taken(frame), found.T_world_camera
-    painter, pose = Painter(scene, frame), start_pose(found, "found")
+    painter, pose = Painter(scene, frame, 640), start_pose(found, "found")
     if start is not None:
         return comparison(painter.observed, painter.rendered(start_pose(start)), painter.rendered(pose))
     return painter.row(painter.observed, "observed", pose, "rendered at the pose found")
 
 
 class Painter:
-    """Draws overlays of one photo with renderings of a map."""
+    """Draws overlays of one photo, of at most ``side`` pixels a side, with renderings of a map."""
 
-    def __init__(self, map: SceneMap, frame: Frame) -> None:
-        scale = SIDE / max(frame.intrinsics.width, frame.intrinsics.height)
+    def __init__(self, map: SceneMap, frame: Frame, side: int = SIDE) -> None:
+        scale = side / max(frame.intrinsics.width, frame.intrinsics.height)
         self._map = map
         self._camera = frame.intrinsics if scale >= 1 else frame.intrinsics.scaled(scale)
         size = (self._camera.width, self._camera.height)

@@ -24,7 +24,7 @@ import torch
 # Inside: signals within sections that a command passes in microseconds, and paths that it must refuse
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, Localization, Localizer, Outcome, Tracker
 from bidnerf_core.cli import main
-from bidnerf_core.cli.folders import check_output
+from bidnerf_core.cli.folders import check_folder, check_output
 from bidnerf_core.cli.interruptions import Interrupted, interruptions, uninterrupted
 from bidnerf_core.datasets import DatasetFrames, Query, read_trajectory
 from bidnerf_core.errors import UsageError
@@ -284,6 +284,17 @@ def test_a_folder_in_which_no_file_can_be_created_is_refused_before_any_work(
         ["view", "MAP", data, "--save", tmp_path / "page.html"],
     ):
         assert_refused(bidnerf(*words), 1, words[-1], "Read-only file system")
+
+
+def test_a_map_and_a_model_that_exist_are_refused_before_any_work(
+    bidnerf: Run, data: Path, files: Path
+) -> None:
+    with pytest.raises(UsageError, match="exists already"):
+        check_folder(files / "map", ())
+    (files / "points3D.txt").write_text("of another program")
+    for command in ("localize", "track"):
+        found = bidnerf(command, "MAP", data, "--out", files / "images.txt")
+        assert_refused(found, 1, files / "points3D.txt", "would be replaced")
 
 
 def test_new_files_beside_inputs_are_outputs(files: Path) -> None:

@@ -16,6 +16,7 @@ from bidnerf_core.mapping import BakeConfig
 
 # Inside: the location of new photos alone, without the training that follows
 from bidnerf_core.maps.extending import locate
+from bidnerf_core.progress import job_context
 from bidnerf_core.testing import training_views, view
 from commands import Run
 from photo_files import write_photo
@@ -86,6 +87,17 @@ def test_another_scene_is_refused(map_folder: Path) -> None:
     assert files(map_folder) == before
 
 
+def test_photos_found_too_imprecisely_are_not_called_another_scene(
+    stored: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solved = bn.Localizer.solved
+    monkeypatch.setattr(
+        bn.Localizer, "solved", lambda *given: replace(solved(*given), outcome=bn.Outcome.IMPRECISE)
+    )
+    with refused(found="localizes 0 of 1 photo, and 1 more, but too imprecisely", expected="from as near"):
+        locate(bn.load_map(stored), [training_views()[7].frame], [])
+
+
 def test_a_cancelled_extension_leaves_the_map(map_folder: Path) -> None:
     before, steps = files(map_folder), []
     with pytest.raises(Cancelled):
@@ -94,6 +106,8 @@ def test_a_cancelled_extension_leaves_the_map(map_folder: Path) -> None:
             progress=lambda p: steps.append(p) if p.stage == "training" else None, cancel=lambda: len(steps) > 3,
         )  # fmt: skip
     assert files(map_folder) == before
+    with job_context(cancel=lambda: True), pytest.raises(Cancelled, match="rendering"):
+        bn.load_map(map_folder).render(training_views()[0])
 
 
 def test_the_images_of_the_map_may_be_given(map_folder: Path) -> None:

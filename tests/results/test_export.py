@@ -158,6 +158,8 @@ def test_what_cannot_be_exported_is_said(scene: Map, tmp_path: Path) -> None:
         bn.export_map(bare, tmp_path / "out", "ply")
     with refused(found="format 'obj'", expected="one of ply"):
         bn.export_map(scene, tmp_path / "out", "obj")
+    with refused(found="format 'obj'"):  # before the map is read
+        bn.export_map(tmp_path / "missing", tmp_path / "out", "obj")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
     with refused(where=tmp_path / "full", found="exists already and is not empty"):

@@ -482,5 +482,5 @@ def test_poses_that_many_pairs_contradict_are_doubted(search: Search) -> None:
     assert search.found.sure_pairs > 0
     doubt = replace(search.found, sure_pairs=400, contradicting=3).doubt
     assert doubt is not None
-    assert doubt.startswith("3 of 400 pairs")
+    assert doubt.startswith("3 of 400 pairs of photos that share many keypoints (0.8%)")
     assert replace(search.found, sure_pairs=400, contradicting=2).doubt is None

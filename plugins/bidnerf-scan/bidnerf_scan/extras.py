@@ -8,12 +8,9 @@ from typing import Any
 from bidnerf_core.errors import InputError
 
 
-def library(name: str, what: str, extra: str) -> Any:
-    """Import a package of an extra. Raises ``InputError``, which names ``what`` needs it, if it is not installed."""
+def library(name: str, what: str, package: str) -> Any:
+    """Import a module. Raises ``InputError``, which names ``what`` needs it and what pip installs, if it is missing."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        package = name.split(".")[0].replace("skimage", "scikit-image")
-        raise InputError(
-            f"{what} needs {package}, which is not installed (pip install 'bidnerf-scan[{extra}]')"
-        ) from error
+        raise InputError(f"{what} needs a missing package: pip install '{package}'") from error

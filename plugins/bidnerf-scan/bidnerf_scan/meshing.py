@@ -166,7 +166,7 @@ def _blocks(
     distance: SignedDistance, cell: float
 ) -> Iterator[tuple[Float64[np.ndarray, "n 3"], Int64[np.ndarray, "m 3"]]]:
     """Yield the vertices, in units of cells, and the faces of each block with some."""
-    measure = library("skimage.measure", "making a mesh of a surface", "mesh")
+    measure = library("skimage.measure", "making a mesh of a surface", "scikit-image")
     # The mesh extends as far beyond a surfel as the surfels are apart.
     reach = distance.spacing + math.sqrt(3) * cell
     box = reach * np.array(np.meshgrid(*3 * [[-1, 1]])).reshape(3, -1).T

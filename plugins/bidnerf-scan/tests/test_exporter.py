@@ -133,7 +133,7 @@ def test_what_gives_no_mesh(scene: Map, tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setitem(sys.modules, "skimage.measure", None)
     with pytest.raises(
         InputError,
-        match=re.escape("needs scikit-image, which is not installed (pip install 'bidnerf-scan[mesh]')"),
+        match=re.escape("making a mesh of a surface needs a missing package: pip install 'scikit-image'"),
     ):
         export_map(scene, tmp_path / "out", "mesh.ply")
     assert not (tmp_path / "out").exists()

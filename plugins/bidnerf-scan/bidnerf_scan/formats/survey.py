@@ -23,7 +23,7 @@ def recognises_e57(path: Path) -> bool:
 
 def read_las(path: Path) -> Scan:
     """Return the points of a LAS or LAZ file."""
-    laspy = library("laspy", f"{path}: reading it", "las")
+    laspy = library("laspy", f"{path}: reading it", "laspy[lazrs]")
     try:
         with laspy.open(str(path)) as file:
             header = file.header
@@ -53,7 +53,7 @@ def read_las(path: Path) -> Scan:
 
 def read_e57(path: Path) -> Scan:
     """Read the points of all scans of an E57 file, each transformed by its pose."""
-    pye57 = library("pye57", f"{path}: reading it", "e57")
+    pye57 = library("pye57", f"{path}: reading it", "pye57")
     parts = []
     try:
         file = pye57.E57(str(path))
