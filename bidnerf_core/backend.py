@@ -56,14 +56,11 @@ class Backend(Protocol):
         ...
 
     def build(self, config: Any, bounds: SceneBounds) -> RadianceField:
-        """Return an untrained field: an ``nn.Module`` with ``query`` and ``sampler``, whose ``state_dict`` is
-        saved.
-        """
+        """Return an untrained field: an ``nn.Module`` with ``query`` and ``sampler``, whose ``state_dict`` is saved."""
         ...
 
     def train(self, field: RadianceField, views: Sequence[View], config: Any, report: Report) -> None:
-        """Fit the field to views whose reference frame is the world, and report each step's progress to
-        ``report``.
+        """Fit the field to views whose reference frame is the world, and report each step's progress to ``report``.
 
         Photos of one place differ in exposure, some are blurred, and landmarks provide depth where no sensor
         did; ``training.Supervision`` handles all of this.

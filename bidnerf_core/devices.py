@@ -69,9 +69,7 @@ def without_waiting() -> Iterator[None]:
 
 
 def may_wait(device: torch.device) -> bool:
-    """Return whether code may read values from tensors on ``device``; always True on the CPU, where nothing
-    is queued.
-    """
+    """Return whether code may read values from tensors on ``device``; always True on the CPU, where nothing is queued."""
     return device.type == "cpu" or _allowed.get()
 
 
@@ -275,8 +273,7 @@ def _rebuilt(value: Any, tensors: Iterator[Tensor]) -> Any:
 
 
 def working_device(device: torch.device | str) -> torch.device:
-    """Return a device after a test computation on it; a valid name does not mean that the device works on
-    this machine.
+    """Return a device after a test computation on it; a valid name does not mean that the device works on this machine.
 
     Raises ``InputError`` if it does not work.
     """
@@ -346,11 +343,10 @@ _setting = Lock()
 
 @contextmanager
 def threads_at_most(count: int) -> Iterator[int]:
-    """Run torch operators called from this Python thread on at most ``count`` threads within the block; yields
-    the usual number.
+    """Run torch operators called from this Python thread on at most ``count`` threads within the block.
 
-    On one thread, sums are the same on any machine. Other Python threads are not affected, and may be in such
-    blocks too.
+    Yields the usual number. On one thread, sums are the same on any machine. Other Python threads are not
+    affected, and may be in such blocks too.
     """
     usual = torch.get_num_threads()
     if usual > count:

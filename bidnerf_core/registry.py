@@ -49,9 +49,7 @@ registered: dict[tuple[str, str], Any] = {}
 
 
 class PluginError(InputError):
-    """A plugin cannot be loaded, or violates the contract of its kind; the message names the plugin and the
-    cause.
-    """
+    """A plugin cannot be loaded, or violates the contract of its kind; the message names the plugin and the cause."""
 
 
 @dataclass(frozen=True)
@@ -89,8 +87,7 @@ class PluginInfo:
 
 
 def register(group: str, name: str, value: Any, replace: bool = False) -> None:
-    """Make ``value`` available under ``name`` in this process, for scripts and notebooks; other processes do
-    not see it.
+    """Make ``value`` available under ``name`` in this process, for scripts and notebooks; other processes do not see it.
 
     ``group``: one of ``GROUPS``, such as "methods". ``replace``: whether ``value`` may replace a plugin of
     that name, whether registered before, installed or bundled. Raises ``InputError`` for an unknown group, an
@@ -272,11 +269,11 @@ class Plugins(Mapping[str, Plugin], Generic[Plugin]):
 def interface_defects(
     plugin: Any, attributes: Sequence[str], methods: Mapping[str, Sequence[str]]
 ) -> Iterator[str]:
-    """Yield the reasons why an object lacks an interface: ``attributes`` by name, ``methods`` by name with
-    their parameters.
+    """Yield the reasons why an object lacks an interface.
 
-    If ``summary`` is one of the attributes, it must be text; ``config_type`` must be a frozen dataclass with
-    defaults. A plain function counts as an object with the method ``__call__``.
+    ``attributes`` are given by name, ``methods`` by name with their parameters. If ``summary`` is one of the
+    attributes, it must be text; ``config_type`` must be a frozen dataclass with defaults. A plain function counts
+    as an object with the method ``__call__``.
     """
     missing = [name for name in (*attributes, *methods) if not hasattr(plugin, name)]
     if missing:

@@ -106,8 +106,7 @@ Positive = Annotated[float, Above(0.0, 1e6)]
 
 
 class Settings:
-    """Base class of frozen dataclasses whose fields are checked against the ranges or names in their
-    annotations.
+    """Base class of frozen dataclasses whose fields are checked against the ranges or names in their annotations.
 
     Creating an instance with an invalid value raises ``InputError`` with the setting's name, its value and
     what was expected.
@@ -147,8 +146,7 @@ def to_flat(settings: Any) -> dict[str, Any]:
 
 
 def from_flat(base: S | type[S], values: dict[str, Any], where: str) -> S:
-    """Return the settings ``base`` (an instance, or a class for its defaults) updated with ``values`` by flat
-    name.
+    """Return the settings ``base`` (an instance, or a class for its defaults) updated with ``values`` by flat name.
 
     Raises ``InputError``, whose message begins with ``where``, for an unknown name, a value of the wrong type, and a value out of
     range.

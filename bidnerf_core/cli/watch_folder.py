@@ -63,8 +63,7 @@ class FrameRequest:
 
 
 def requests(source: str) -> Iterator[FrameRequest | InputError]:
-    """Yield frames as they arrive: lines of stdin until it ends, or the images of a folder until the program
-    is stopped.
+    """Yield frames as they arrive: lines of stdin until it ends, or the images of a folder until the program is stopped.
 
     A line that is not a request is yielded as the error with which to answer it.
     """

@@ -39,8 +39,7 @@ class SparseChoice:
 
 
 class SparsePoints:
-    """The points of the model in ``folder``, scaled with the training cameras ``places`` (frame name,
-    T_world_camera).
+    """The points of the model in ``folder``, scaled with the training cameras ``places`` (frame name, T_world_camera).
 
     The unit of the model is ``metres`` long, as found from ``cameras`` training cameras. ``misfit`` is the median
     distance of these from the model's, relative to their spread.
@@ -112,10 +111,9 @@ class SparsePoints:
         return points[points[:, 2] > 0]
 
     def rays(self, views: Sequence[View], split: str) -> Observations:
-        """Return the points observed by all ``views`` as rays in the last camera's frame, using the views'
-        relative poses.
+        """Return the points that all ``views`` observe as rays in the last camera's frame.
 
-        Raises ``InputError`` if they observe none.
+        The views' relative poses bring them there. Raises ``InputError`` if they observe none.
         """
         T_last_ref = views[-1].T_ref_camera.to("cpu", torch.float64).inverse()
         found = [(view, self.seen(view.frame.name, split)) for view in views]
@@ -155,8 +153,7 @@ class _Names:
                 self._by_name[name].append((parts[:-1], image))
 
     def find(self, name: str, split: str) -> ModelImage | None:
-        """Return the image of a frame, or None. Folders named train, val or test separate the frames of
-        splits.
+        """Return the image of a frame, or None. Folders named train, val or test separate the frames of splits.
 
         Raises ``InputError`` if the name is ambiguous.
         """

@@ -99,8 +99,9 @@ def read_posed_images(folder: Path) -> tuple[list[ModelImage], dict[int, Camera]
 
 
 def count_posed_images(folder: Path) -> int:
-    """Return the number of images that the model in ``folder`` declares. Raises ``InputError`` as
-    ``read_posed_images`` does.
+    """Return the number of images that the model in ``folder`` declares.
+
+    Raises ``InputError`` as ``read_posed_images`` does.
     """
     _, images = files_of(folder, "cameras", "images") or (folder, folder / "images.bin")
     return int(_Bytes(images).take("<Q")[0]) if images.suffix == ".bin" else len(_images(images))

@@ -71,12 +71,12 @@ class DatasetOptions:
             raise InputError(f"depth_unit is {self.depth_unit:g}", expected=expected)
 
     def open(self, path: str | Path, readers: Sequence[Reader] | None = None) -> Capture:
-        """Open the dataset in the folder ``path``. Metadata are read and checked immediately, images when views are
-        requested.
+        """Open the dataset in the folder ``path``.
 
-        Files that are listed but missing, and images without a pose, are left out with an ``InputWarning`` that counts
-        them. Raises ``InputError`` if there is no such folder, if no reader recognizes it, if nothing is left, and if
-        a metadata file is invalid.
+        Metadata are read and checked immediately, images when views are requested. Files that are listed but
+        missing, and images without a pose, are left out with an ``InputWarning`` that counts them. Raises
+        ``InputError`` if there is no such folder, if no reader recognizes it, if nothing is left, and if a
+        metadata file is invalid.
         """
         from bidnerf_core.datasets.reader import read_dataset
 

@@ -57,8 +57,7 @@ def pose_and_scale(record: Record, key: str = "transform_matrix") -> tuple[SE3, 
 
 
 def pose_of_rows(record: Record, key: str, rows: list[Any] | None) -> SE3:
-    """Convert the rows (3x4 or 4x4, OpenGL axes) of a rigid transform to ``T_world_camera`` (OpenCV axes,
-    float64).
+    """Convert the rows (3x4 or 4x4, OpenGL axes) of a rigid transform to ``T_world_camera`` (OpenCV axes, float64).
 
     ``key`` is the key of ``rows`` in ``record``, for messages. Raises ``InputError`` for any other matrix.
     """

@@ -205,8 +205,7 @@ def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]
 
 
 def depth_files(photos: Sequence[Path], depth: Sequence[Path]) -> dict[Path, Path]:
-    """Return the depth file of each photo: by name if the names agree (``NAME.png``, ``NAME.depth.png``),
-    else in order.
+    """Return the depth file of each photo: by name if the names agree (``NAME.png``, ``NAME.depth.png``), else in order.
 
     Raises ``UsageError`` if depth files can be assigned in neither way.
     """

@@ -57,8 +57,9 @@ def read_sequence(
 
 
 def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
-    """Return what a reader reads, in splits, with masks. Raises ``InputError`` for options that the format does not
-    accept, and if a third-party reader fails.
+    """Return what a reader reads, in splits, with masks.
+
+    Raises ``InputError`` for options that the format does not accept, and if a third-party reader fails.
     """
     source, accepts = options.camera_source, reader.accepts
     refused = {
@@ -146,15 +147,14 @@ def open_sequence(
     readers: Sequence[Reader] | None = None,
     **options: Any,
 ) -> Capture:
-    """Open the frames of ``path`` in chronological order: a dataset, a folder of images, or a video. Nothing
-    is decoded yet.
+    """Open the frames of ``path`` in chronological order: a dataset, a folder of images, or a video.
 
-    The camera of images and videos is ``camera`` (intrinsics or a file), ``focal`` (pixels) or ``hfov``
-    (degrees), as in ``Frame.open``. Without these, images use their EXIF; images without a focal length, and
-    videos, use one of the ``assumed`` cameras. Datasets have their own cameras, except those for which
-    ``open_dataset`` accepts one. Further ``options`` are those of ``DatasetOptions``; depth in a folder of images is
-    registered if a sensor is given, and in millimetres unless a unit is given. Raises ``InputError`` as
-    ``DatasetOptions.open_sequence`` does.
+    Nothing is decoded yet. The camera of images and videos is ``camera`` (intrinsics or a file), ``focal``
+    (pixels) or ``hfov`` (degrees), as in ``Frame.open``. Without these, images use their EXIF; images without a
+    focal length, and videos, use one of the ``assumed`` cameras. Datasets have their own cameras, except those
+    for which ``open_dataset`` accepts one. Further ``options`` are those of ``DatasetOptions``; depth in a folder
+    of images is registered if a sensor is given, and in millimetres unless a unit is given. Raises ``InputError``
+    as ``DatasetOptions.open_sequence`` does.
     """
     source = CameraSource(camera, focal, hfov, tuple(assumed))
     return DatasetOptions(source, **options).open_sequence(path, readers)

@@ -176,13 +176,12 @@ class Trajectory:
 
 
 def read_trajectory(path: Path, times: Sequence[float] | None = None) -> Trajectory:
-    """Read a trajectory in one of the formats above. ``times`` (seconds) are the image times, for KITTI's
-    format, which has none.
+    """Read a trajectory in one of the formats above.
 
-    Poses that are not finite, and those whose quaternion is zero, are left out with a remark that counts
-    them. Raises ``InputError``, with the file and line, if a row is truncated, a quaternion does not have
-    length 1, two rows have the same time but different poses, or the number of KITTI rows differs from the
-    number of images.
+    ``times`` (seconds) are the image times, for KITTI's format, which has none. Poses that are not finite, and
+    those whose quaternion is zero, are left out with a remark that counts them. Raises ``InputError``, with the
+    file and line, if a row is truncated, a quaternion does not have length 1, two rows have the same time but
+    different poses, or the number of KITTI rows differs from the number of images.
     """
     content = read_file(path, "a trajectory", LARGEST_ROWS)
     rows = parse_rows(content, path, "a trajectory", f"timestamp {POSE}")
@@ -259,8 +258,9 @@ def _kitti_pose(row: Row) -> SE3:
 
 
 def read_matrices(path: Path) -> list[SE3]:
-    """Read KITTI's rows of twelve numbers as poses ``T_world_camera``. Raises ``InputError``, with file and
-    line, for others.
+    """Read KITTI's rows of twelve numbers as poses ``T_world_camera``.
+
+    Raises ``InputError``, with file and line, for others.
     """
     columns = f"{KITTI_ROW} numbers, a 3x4 matrix"
     rows = [(row, _words(row)) for row in read_rows(path, "a file of KITTI poses", columns)]

@@ -24,8 +24,7 @@ LARGEST_DEPTH = 65534  # readers interpret the largest 16-bit number as "not mea
 def write_transforms(
     folder: str | Path, splits: Mapping[str, Sequence[View]], background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> None:  # fmt: skip
-    """Write ``transforms_SPLIT.json``, ``images/SPLIT/NAME.png`` (8 bits) and ``depth/SPLIT/NAME.png`` (16
-    bits).
+    """Write ``transforms_SPLIT.json``, ``images/SPLIT/NAME.png`` (8 bits) and ``depth/SPLIT/NAME.png`` (16 bits).
 
     ``background`` is the colour behind frames that have an alpha channel; it is removed from their colours.
     Depth is stored in millimetres, or in larger steps if 16 bits would not suffice. A split without views is

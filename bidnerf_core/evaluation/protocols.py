@@ -132,8 +132,9 @@ def once_each(frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class Protocol:
-    """A way of choosing frames, seeds and starts. ``start`` takes the true pose, a size, the seed and the
-    number of frames.
+    """A way of choosing frames, seeds and starts.
+
+    ``start`` takes the true pose, a size, the seed and the number of frames.
     """
 
     summary: str

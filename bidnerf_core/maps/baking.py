@@ -36,8 +36,7 @@ log = logging.getLogger("bidnerf")
 def bake_surface(
     info: MapInfo, field: RadianceField, views: Sequence[View], config: BakeConfig, where: str
 ) -> SurfaceMap:
-    """Build the surface of a map from the measured depth of ``views`` or, if there is none, from depth
-    rendered by ``field``.
+    """Build the surface of a map from the measured depth of ``views``, or else from depth rendered by ``field``.
 
     Depth is rendered from the map's cameras, or from those of the views if the map has none. Raises
     ``InputError`` if there are neither, and if images do not agree on a surface. ``where`` begins log

@@ -18,11 +18,11 @@ from bidnerf_core.training import TrainingState, TrainingStep
 
 
 class Checkpoints:
-    """The ``Report`` of a training run. States are saved to ``folder``, unless that is None; ``info``
-    describes the last one.
+    """The ``Report`` of a training run.
 
-    Progress goes to the current job, which may also stop the training. ``state`` is the one to resume from, ``seconds`` the
-    time between checkpoints, and ``landmarks`` are stored with the first if they are not in the folder yet.
+    States are saved to ``folder``, unless that is None; ``info`` describes the last one. Progress goes to the
+    current job, which may also stop the training. ``state`` is the one to resume from, ``seconds`` the time
+    between checkpoints, and ``landmarks`` are stored with the first if they are not in the folder yet.
     """
 
     def __init__(

@@ -70,11 +70,10 @@ class Placement:
 
 
 class MapCollection:
-    """Finds the map that an image shows, and its pose there. Maps are ranked by pooled descriptors, and only
-    the first are tried.
+    """Finds the map that an image shows, and its pose there.
 
-    Maps without landmarks cannot be ranked and are tried last. Some of the loaded maps stay in memory. Use it
-    from one thread only.
+    Maps are ranked by pooled descriptors, and only the first are tried. Maps without landmarks cannot be ranked
+    and are tried last. Some of the loaded maps stay in memory. Use it from one thread only.
     """
 
     def __init__(
@@ -87,12 +86,12 @@ class MapCollection:
         cancel: Cancel | None = None,
         localizers: Mapping[str, Localizer] | None = None,
     ) -> None:
-        """Read the landmarks of all maps: those in the subfolders of one folder, a list of maps and of folders
-        of maps, or maps by name.
+        """Read the landmarks of all maps.
 
-        ``asked`` is the largest number of maps that are tried, the most similar ones first. ``localizers`` holds existing
-        localizers by the names of their maps. Raises ``InputError`` if there is no map or the same one twice, and
-        ``Cancelled`` once ``cancel`` returns True.
+        ``scenes`` is a folder whose subfolders are maps, a list of maps and of folders of maps, or maps by name.
+        ``asked`` is the largest number of maps that are tried, the most similar ones first. ``localizers`` holds
+        existing localizers by the names of their maps. Raises ``InputError`` if there is no map or the same one
+        twice, and ``Cancelled`` once ``cancel`` returns True.
         """
         if asked < 1:
             raise InputError(f"asked is {asked}", expected="1 or more")
@@ -123,8 +122,9 @@ class MapCollection:
         return tuple(camera.intrinsics for info in self._infos.values() for camera in info.cameras)
 
     def localizer(self, name: str) -> Localizer:
-        """Return the localizer of a map, loaded from its folder unless used recently. Raises ``InputError``
-        for an unknown name.
+        """Return the localizer of a map, loaded from its folder unless used recently.
+
+        Raises ``InputError`` for an unknown name.
         """
         if name not in self._maps:
             raise InputError(f"no map {name!r}", expected=f"one of {', '.join(self._maps)}")
@@ -175,8 +175,9 @@ class MapCollection:
         return Placement(chosen, found, runner_up, ranking, tuple(quick), backend)
 
     def _by_landmarks(self, name: str, frame: Frame, seed: int) -> Localization:
-        """Localize a frame with the landmarks of a map; the full method is used for maps without landmarks,
-        and for other methods.
+        """Localize a frame with the landmarks of a map.
+
+        The full method is used for maps without landmarks, and for other methods.
         """
         localizer = self.localizer(name)
         try:

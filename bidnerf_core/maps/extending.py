@@ -73,8 +73,7 @@ def extend(
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Map:
-    """Return a map extended with more photos of its scene; a map in a folder is replaced there once
-    everything is done.
+    """Return a map extended with more photos of its scene; a map in a folder is replaced there once everything is done.
 
     The photos are localized in the map; those that fail, and those the map was built from, are left out.
     Training continues with the others and with ``data``, the images that the map was built from, or, without
@@ -334,8 +333,9 @@ def _in_field_unit(view: View, factor: float) -> View:
 
 
 def _present(landmarks: LandmarkMap, more: LandmarkMap) -> Bool[Tensor, "n"]:
-    """Return which landmarks of ``more`` match one of ``landmarks``: near in space, given its accuracy, with
-    a similar descriptor.
+    """Return which landmarks of ``more`` match one of ``landmarks``.
+
+    They are near in space, given their accuracy, and have similar descriptors.
     """
     count = min(4, len(landmarks))
     away, near = cKDTree(landmarks.positions.numpy()).query(more.positions.numpy(), k=count)

@@ -97,8 +97,7 @@ IMPORTERS: Plugins[Importer] = Plugins("importers", _defects)
 
 
 def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
-    """Return an importer and its name: the one with that name or, without a name, the one that recognizes the
-    file.
+    """Return an importer and its name: the one with that name or, without a name, the one that recognizes the file.
 
     Raises ``InputError`` if there is no such file, if it is unreadable or a pointer of Git LFS, and if none or several recognize it.
     """
@@ -130,8 +129,7 @@ def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
 def robust_box(
     points: Float[Tensor, "n 3"], outside: float = 0.005, margin: float = 0.05
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Return the corners of a box around all points except a fraction of ``outside`` at each end of each
-    axis.
+    """Return the corners of a box around all points except a fraction of ``outside`` at each end of each axis.
 
     It is widened by ``margin`` times its longest side.
     """

@@ -57,11 +57,10 @@ def factor_of_distance(scene: Map, first: Place, second: Place, metres: float) -
 
 
 def factor_of_poses(scene: Map, known: Mapping[str, SE3 | Position]) -> ScaleFit:
-    """Return the factor by which the map's cameras fit ``known`` poses (T_world_camera) or positions, in
-    metres in any world, matched by name.
+    """Return the factor by which the map's cameras fit ``known`` poses (T_world_camera) or positions.
 
-    Only positions count. Raises ``InputError`` if fewer than three cameras are known, all are in one place,
-    or they do not fit with any factor.
+    These are in metres in any world, and matched by name. Only positions count. Raises ``InputError`` if fewer
+    than three cameras are known, all are in one place, or they do not fit with any factor.
     """
     found = {name: camera for name in known if (camera := _camera_of(scene, name)) is not None}
     if len({camera.name for camera in found.values()}) < len(found):

@@ -178,8 +178,7 @@ class Map:
         return str(self.folder or self.info.data or "map in memory")
 
     def to(self, device: torch.device | str) -> Map:
-        """Return the map with its field, surface and landmarks on ``device``; only what is not there yet is
-        copied.
+        """Return the map with its field, surface and landmarks on ``device``; only what is not there yet is copied.
 
         Of all computations with landmarks, only the comparison of descriptors runs there, see
         ``LandmarkMap.to``. Raises ``InputError`` for a device that does not work here.
@@ -191,12 +190,12 @@ class Map:
         return MapSummary.of(self)
 
     def scaled(self, factor: float, unit: LengthUnit = "metres") -> Map:
-        """Return the map with all lengths multiplied by ``factor``, in memory: field, bounds, surface,
-        landmarks, record and anchor.
+        """Return the map with all lengths multiplied by ``factor``, in memory.
 
-        ``unit`` is the resulting length unit; ``scaled(1)`` declares that lengths are metres. ``save`` stores
-        it, also over the map itself. Raises ``InputError`` for a factor that is not positive or makes lengths
-        too large or too small, and for a map whose training is not complete.
+        These are the lengths of its field, bounds, surface, landmarks, record and anchor. ``unit`` is the
+        resulting length unit; ``scaled(1)`` declares that lengths are metres. ``save`` stores it, also over the
+        map itself. Raises ``InputError`` for a factor that is not positive or makes lengths too large or too
+        small, and for a map whose training is not complete.
         """
         if isinstance(factor, bool) or not (isinstance(factor, int | float) and 0 < factor < math.inf):
             raise InputError(f"factor is {factor!r}", expected="a positive number")
@@ -222,8 +221,7 @@ class Map:
         )
 
     def render(self, view: View, level: int | None = None) -> RenderedImage:
-        """Render colour (h, w, 3) in [0, 1] and depth (h, w), planar z in metres, with the camera and pose of
-        ``view``.
+        """Render colour (h, w, 3) in [0, 1] and depth (h, w), planar z in metres, with the camera and pose of ``view``.
 
         ``level`` is the level of detail, 0 being the coarsest; None is the field itself. Raises
         ``InputError`` for a level that the field does not have, and if ``view`` is not a view.
@@ -300,8 +298,7 @@ class Map:
         tracked: TrackedViews | None = None,
         surface: SurfaceMap | None = None,
     ) -> Map:
-        """Bake as ``bake`` does, with views at the map's poses, while the caller holds the lock of the
-        folder.
+        """Bake as ``bake`` does, with views at the map's poses, while the caller holds the lock of the folder.
 
         ``tracked`` holds the views' keypoints if they were tracked already, ``surface`` the surface if known.
         """

@@ -250,8 +250,7 @@ def resume(
 
 
 def interrupted(folder: Path, baking: bool = True) -> MapInfo:
-    """Return the description of the map in ``folder``, whose training or, with ``baking``, whose surface is
-    incomplete.
+    """Return the description of the map in ``folder``, whose training or, with ``baking``, whose surface is incomplete.
 
     Raises ``InputError`` if nothing is left to do.
     """

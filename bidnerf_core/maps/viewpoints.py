@@ -26,8 +26,7 @@ def viewpoints(
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     is_solid: bool = False,
 ) -> tuple[StoredCamera, ...]:
-    """Return cameras that see the matter of a field: from all around an object, or from free places within a
-    room.
+    """Return cameras that see the matter of a field: from all around an object, or from free places within a room.
 
     ``up`` is the upward direction in the images. The inside of an ``is_solid`` object is not free, although
     rays hit nothing there. Deterministic.

@@ -52,8 +52,9 @@ Origin: TypeAlias = tuple[float, float, float]
 
 
 def chosen_origin(points: Float[Tensor, "n 3"]) -> Origin:
-    """Return the origin for a map of ``points``, such as its cameras: 0, or a round position near their middle
-    if they are far from 0.
+    """Return the origin for a map of ``points``, such as its cameras.
+
+    It is 0, or a round position near their middle if they are far from 0.
     """
     low, high = points.double().amin(0), points.double().amax(0)
     middle, size = (low + high) / 2, float((high - low).max())

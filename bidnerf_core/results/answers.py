@@ -172,10 +172,11 @@ class Answers:
         return answer
 
     def plain(self, answer: Answer | Failure) -> dict[str, Any]:
-        """Return an answer as the JSON object that ``bidnerf localize --json`` prints: with ``time`` for a frame of a sequence,
-        with the map and the runner-up for an image in several maps.
+        """Return an answer as the JSON object that ``bidnerf localize --json`` prints.
 
-        Numbers and matrices that are not finite are None. For an image that could not be read, the outcome is "bad input".
+        It has the ``time`` of a frame of a sequence, and the map and the runner-up of an image in several maps.
+        Numbers and matrices that are not finite are None. For an image that could not be read, the outcome is
+        "bad input".
         """
         backend = getattr(getattr(self.scene, "info", None), "backend", "")
         placement, values = None, dict[str, Any](frame=answer.name)
@@ -209,9 +210,7 @@ class Answers:
 
     @property
     def question(self) -> str:
-        """A question to append to a summary: empty unless there are several images and none shows the scene
-        of the map.
-        """
+        """A question to append to a summary if none of several images shows the scene of the map, else empty."""
         recognised = {
             Outcome.CONVERGED, Outcome.IMPRECISE, Outcome.MIRRORED, Outcome.MISCALIBRATED, Outcome.UNCERTAIN
         }  # fmt: skip
@@ -308,9 +307,7 @@ class Answers:
         return TrajectoryErrors.of(found, true, self.unit)
 
     def consistency(self) -> float | None:
-        """Return the fraction of accepted poses whose error lies within the 95 % bound of their covariance,
-        or None if unknown.
-        """
+        """Return the share of accepted poses whose errors are inside their 95 % bounds, or None if unknown."""
         inside = [
             bool(within(answer.found.T_world_camera, answer.truth, answer.found.covariance))
             for answer in self.accepted

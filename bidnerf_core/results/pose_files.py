@@ -129,11 +129,11 @@ def write_pose_json(path: Path, images: Sequence[PosedImage]) -> None:
 
 
 def write_pose_transforms(path: Path, images: Sequence[PosedImage], **more: Any) -> None:
-    """Write a ``transforms.json`` in nerfstudio's format: poses with OpenGL axes, one camera per image, ``file_path`` relative
-    to it; ``more`` holds further entries.
+    """Write a ``transforms.json`` in nerfstudio's format: poses with OpenGL axes, and one camera per image.
 
-    It describes the image files as stored, so the poses and cameras of photos with an EXIF orientation are
-    rotated. Raises ``InputError`` for a photo stored mirrored, for which no rigid pose exists.
+    ``file_path`` is relative to it; ``more`` holds further entries. It describes the image files as stored, so
+    the poses and cameras of photos with an EXIF orientation are rotated. Raises ``InputError`` for a photo stored
+    mirrored, for which no rigid pose exists.
     """
     frames = []
     for image in images:
@@ -162,8 +162,9 @@ POSE_WRITERS: Plugins[PoseWriter] = Plugins(
 
 
 def pose_format(path: Path) -> str:
-    """Return the file-name ending that selects the format of a pose file. Raises ``UsageError`` for a name
-    without any of them.
+    """Return the file-name ending that selects the format of a pose file.
+
+    Raises ``UsageError`` for a name without any of them.
     """
     found = max((e for e in POSE_WRITERS if path.name.lower().endswith(e)), key=len, default=None)
     if found is None:
@@ -205,8 +206,7 @@ def read_pose(path: str | Path) -> SE3:
 
 
 def read_poses(path: str | Path) -> dict[str, SE3]:
-    """Read poses T_world_camera by frame name, as ``localize`` writes them with ``--out`` or prints them with
-    ``--json``.
+    """Read poses T_world_camera by frame name, as ``localize`` writes them with ``--out`` or prints them with ``--json``.
 
     The file holds one object, a list of objects, or one object per line; objects with a null pose are left
     out. A single pose may be unnamed; its name is then empty. Raises ``InputError`` if a matrix is not a

@@ -28,8 +28,7 @@ def write_kitti_poses(path: Path, images: Sequence[PosedImage]) -> None:
 
 
 def write_euroc_poses(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write EuRoC poses: rows of nanoseconds, position and quaternion (w, x, y, z), of the camera, not of a
-    body.
+    """Write EuRoC poses: rows of nanoseconds, position and quaternion (w, x, y, z), of the camera, not of a body.
 
     The time of an image without one is its number, in seconds. The head names the unit of the positions, which is ``[m]`` only
     for metric maps.

@@ -39,10 +39,9 @@ from bidnerf_core.service.web import (
 
 
 def application(order: dict[str, Any], limits: ServiceLimits, token: str | None) -> FastAPI:
-    """Build the service for the maps, method and device of an ``order``, see ``worker.main``; it runs between ASGI startup and
-    shutdown.
+    """Build the service for the maps, method and device of an ``order``, see ``worker.main``.
 
-    Its startup raises ``InputError`` if a map cannot be served.
+    It runs between ASGI startup and shutdown. Its startup raises ``InputError`` if a map cannot be served.
     """
     pool, names = Pool(order, limits), list(order["maps"])
 

@@ -26,8 +26,9 @@ class ServiceError(Exception):
 
 
 class ServiceClient:
-    """Requests poses from a ``bidnerf serve`` service at ``url``. A busy service is retried for up to
-    ``timeout`` seconds. All methods raise ``ServiceError``.
+    """Requests poses from a ``bidnerf serve`` service at ``url``.
+
+    A busy service is retried for up to ``timeout`` seconds. All methods raise ``ServiceError``.
     """
 
     def __init__(

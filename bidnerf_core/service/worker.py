@@ -79,8 +79,9 @@ class Worker:
         }
 
     def localize(self, name: str | None, upload: Upload, folder: Path) -> tuple[Answer, dict[str, Any]]:
-        """Localize a photo in a map, or in the one of several that it shows; return the answer, and its JSON values as printed
-        by ``bidnerf localize --json``.
+        """Localize a photo in a map, or in the one of several that it shows.
+
+        Returns the answer, and its JSON values as printed by ``bidnerf localize --json``.
         """
         several = self.together if name is None else None
         localizer = next(iter(self.maps.values())) if name is None else self.maps[name]

@@ -29,8 +29,9 @@ def check_position_derivatives(field: RadianceField, dtype: torch.dtype) -> None
 
 
 def check_direction_derivatives(field: RadianceField, dtype: torch.dtype) -> None:
-    """Check the derivative with respect to direction, along a random great circle through each, since
-    directions are unit vectors.
+    """Check the derivative with respect to direction.
+
+    It is that along a random great circle through each direction, since directions are unit vectors.
     """
     positions, directions = (x.to(dtype) for x in points(COUNT))
     along = points(COUNT, seed=1)[1].to(dtype)
@@ -110,8 +111,7 @@ DETACHED = "expected one: query must not detach positions or run under no_grad"
 def agreement(
     ask: Asked, moved: Callable[[float], Tensor], speed: Float[Tensor, "n 3"], dtype: torch.dtype
 ) -> Float[Tensor, ""]:
-    """Return the fraction of values whose derivative along a curve agrees with finite differences at the best
-    step size.
+    """Return the fraction of values whose derivative along a curve agrees with finite differences at the best step size.
 
     ``moved(t)`` are the points at ``t`` on their curves, ``speed`` (n 3) is its derivative at 0.
     """

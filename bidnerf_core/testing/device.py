@@ -39,11 +39,10 @@ CHECKED_RAYS = 48
 
 
 def check_steps(field: RadianceField) -> None:
-    """Check that steps at each level neither copy between devices nor wait for one, and reach the same pose
-    as on the CPU.
+    """Check that steps at each level stay on the device and reach the same pose as on the CPU.
 
-    The device is simulated, see ``simulated_device``. Fields without parameters and buffers have no device
-    and pass.
+    They must neither copy between devices nor wait for one. The device is simulated, see ``simulated_device``.
+    Fields without parameters and buffers have no device and pass.
     """
     for number in range(len(levels(field))):
         expected = _first_order(_problem(field), number, None)

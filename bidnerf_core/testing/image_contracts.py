@@ -24,8 +24,7 @@ NEAR = 1.5
 
 
 class FeaturesContract(Named):
-    """Tests of a detector: derive a class whose name begins with ``Test``, and set ``name``, under which it
-    is registered.
+    """Tests of a detector: derive a class whose name begins with ``Test``, and set its registered ``name``.
 
     ``repeated`` is the minimum repeatability: the fraction of keypoints that must be detected again, and
     matched by their descriptors, in an image shifted by a few pixels.
@@ -102,9 +101,7 @@ class FeaturesContract(Named):
 
 
 class FaultContract(Named):
-    """Tests of a fault: derive a class whose name begins with ``Test``, and set ``name``, under which it is
-    registered.
-    """
+    """Tests of a fault: derive a class whose name begins with ``Test``, and set its registered ``name``."""
 
     def test_fault_says_what_it_is(self) -> None:
         fault, who = self._part(FAULTS.load), f"fault {self.name!r}"

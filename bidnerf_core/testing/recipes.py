@@ -133,9 +133,7 @@ def check_reports(backend: Backend, field: Any, config: Any) -> None:
 
 
 def check_resuming(backend: Backend, make: Callable[[], Any], config: Any) -> None:
-    """Check that a training run that stops midway with ``TrainingStopped`` and is resumed gives a bitwise
-    identical result.
-    """
+    """Check that training that stops midway with ``TrainingStopped`` and is resumed gives a bitwise identical result."""
     who, middle = f"{type(backend).__name__}.train", config.steps // 2
     first, second, third = make(), make(), make()
     beginning = stored(first.state_dict())

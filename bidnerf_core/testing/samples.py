@@ -27,8 +27,9 @@ BACKGROUND = (0.1, 0.5, 0.9)
 
 
 def check_intervals(field: RadianceField) -> None:
-    """Check that valid samples are sorted, disjoint and in [near, far], and that rays that miss have none,
-    even with 0 rays.
+    """Check that valid samples are sorted, disjoint and in [near, far].
+
+    Rays that miss have none, and there may be 0 rays.
     """
     for of, rays in awkward_rays().items():
         for jitter, how in ((None, ""), (_generator(), " with jitter")):
@@ -133,8 +134,9 @@ def check_levels(field: RadianceField) -> None:
 
 
 def check_hits(field: RadianceField) -> None:
-    """Check the hits of a field that provides them: values in range, distances in [near, far], and the opacity of its
-    density.
+    """Check the hits of a field that provides them.
+
+    Values must be in range, distances in [near, far], and the opacity that of the field's density.
     """
     if not isinstance(field, HitField):
         return

@@ -118,8 +118,7 @@ def _unposed(trajectory: Trajectory | None) -> str:
 
 
 def associate(times: Sequence[float], others: Sequence[float], largest: float) -> dict[int, int]:
-    """Return the pairs of indices that are mutual nearest neighbours in time, at most ``largest`` seconds
-    apart.
+    """Return the pairs of indices that are mutual nearest neighbours in time, at most ``largest`` seconds apart.
 
     Both lists are in chronological order.
     """

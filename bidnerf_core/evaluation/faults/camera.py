@@ -57,8 +57,9 @@ def principal_point_moved(frame: Frame, pixels: float, generator: Generator) -> 
 
 
 def distorted(frame: Frame, k1: float, generator: Generator) -> Frame:
-    """Distort the image with a lens whose first radial coefficient is larger by ``k1``, without changing the
-    stated intrinsics.
+    """Distort the image with a lens whose first radial coefficient is larger by ``k1``.
+
+    The stated intrinsics are unchanged.
     """
     camera = frame.intrinsics
     own = camera.distortion or (0.0, 0.0, 0.0, 0.0)
@@ -67,8 +68,7 @@ def distorted(frame: Frame, k1: float, generator: Generator) -> Frame:
 
 
 def rolling_shutter(frame: Frame, degrees: float, generator: Generator) -> Frame:
-    """Simulate a rolling shutter while the camera rotates by ``degrees`` about a random axis through its
-    centre.
+    """Simulate a rolling shutter while the camera rotates by ``degrees`` about a random axis through its centre.
 
     The rows are those of the sensor, which are the columns of a portrait image. The middle one is exposed at
     the frame's pose. A camera that only rotates sees the same points, so no depth is needed.

@@ -21,8 +21,9 @@ RIM = 3
 
 
 def occluder(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Put a textured object in front of ``share`` of the image. If the frame has depth, the object's depth is
-    measured.
+    """Put a textured object in front of ``share`` of the image.
+
+    If the frame has depth, the object's depth is measured.
     """
     mask, colours = _textured_blob(frame, share, generator)
     if frame.depth is None or not frame.has_depth:
@@ -41,8 +42,7 @@ def unmeasured_occluder(frame: Frame, share: float, generator: Generator) -> Fra
 
 
 def moved_thing(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Show a piece of the scene at a second place in the image, slightly nearer, so that it covers ``share``
-    of the image.
+    """Show a piece of the scene, slightly nearer, at a second place that covers ``share`` of the image.
 
     The features of the copy match those of the map, and consistently support a wrong pose.
     """
@@ -66,8 +66,7 @@ def added_thing(frame: Frame, share: float, generator: Generator) -> Frame:
 
 
 def vanished_thing(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Remove ``share`` of the measured surface in one piece, and show the background or the surroundings in
-    its place.
+    """Remove ``share`` of the measured surface in one piece, and show the background or the surroundings in its place.
 
     If the frame has alpha and the piece reaches the edge of the scene, the background is visible; otherwise
     the surrounding colours are continued, at the depth of the farthest surrounding surface.

@@ -36,8 +36,7 @@ class Peaks(Meeting):
 
 
 class GaussiansField(PieceField):
-    """Gaussians, each evaluated at its peak along a ray, nearest first, as in 3D Gaussian ray tracing
-    (Moenne-Loccoz et al. 2024).
+    """Gaussians, each evaluated at its peak along a ray, nearest first (Moenne-Loccoz et al. 2024).
 
     Along a ray with origin o and direction d, a Gaussian with precision P and mean m is largest at ``t =
     d'P(m - o) / d'Pd``; its opacity times its value there is alpha. ``hits`` returns these in compositing

@@ -40,8 +40,9 @@ class NgpConfig(RadianceConfig, SupervisionConfig):
 
 
 class OccupancyLevels(nn.Module):
-    """Boxes of cells with a common centre, each twice as wide as the previous one; a point is looked up in the
-    smallest that contains it.
+    """Boxes of cells with a common centre, each twice as wide as the previous one.
+
+    A point is looked up in the smallest that contains it.
     """
 
     cells: Bool[Tensor, "l n n n"]

@@ -120,8 +120,7 @@ class HashNetwork(nn.Module):
 def unit_cube(
     positions: Float[Tensor, "p 3"], box: SceneBounds
 ) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p"]]:
-    """Return positions (training coordinates) in [0, 1], 0 if outside, and a mask that is 1 inside and 0
-    outside.
+    """Return positions (training coordinates) in [0, 1], 0 if outside, and a mask that is 1 inside and 0 outside.
 
     In a contracted scene, all space within a cube around the origin fills the inner half of each axis,
     regardless of its box.

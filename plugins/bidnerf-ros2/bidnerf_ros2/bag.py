@@ -138,8 +138,9 @@ class BagReader(Reader):
         return (path / METADATA).is_file() or (path.is_file() and path.suffix.lower() in SUFFIXES)
 
     def read(self, path: Path, options: DatasetOptions) -> Capture:
-        """Return the images of a bag, without poses. Raises ``InputError`` for a bag without images and matching camera
-        infos.
+        """Return the images of a bag, without poses.
+
+        Raises ``InputError`` for a bag without images and matching camera infos.
         """
         topics, given = _topics(path), options.given_camera
         if given is not None and not isinstance(given, Intrinsics):

@@ -131,8 +131,7 @@ def imported(
 
 @torch.no_grad()
 def is_solid(field: ScanField) -> bool:
-    """Return whether rays from within a mesh hit the backs of its faces, as in a model of an object but not
-    in one of a room.
+    """Return whether a mesh is a model of an object: rays from within hit the backs of its faces, unlike in a room.
 
     If faces point to either side at random, or few rays from within the box hit any, it counts as not solid.
     """

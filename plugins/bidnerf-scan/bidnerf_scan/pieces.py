@@ -39,8 +39,9 @@ class Textures:
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Parallelograms ``corner + u first + v second``, of which a triangle is ``u, v >= 0, u + v <= 1`` and a disc
-    ``u^2 + v^2 <= 1``. Metres, world frame.
+    """Parallelograms ``corner + u first + v second`` in metres, in the world frame.
+
+    A triangle is the part with ``u, v >= 0, u + v <= 1``, a disc that with ``u^2 + v^2 <= 1``.
     """
 
     corner: Float[Tensor, "n 3"]  # of a triangle; middle of a disc
@@ -85,8 +86,7 @@ def _textures(scan: Scan) -> Textures | None:
 
 
 def cloud_pieces(points: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"] | None) -> Pieces:
-    """Return a disc around each point (metres, world), in the plane fitted to its neighbours and as wide as
-    their distances.
+    """Return a disc around each point (metres, world), in the plane of its neighbours and as wide as their distances.
 
     The colours of its neighbours give that of a disc, as a linear function within its plane (Park et al. 2017,
     eq. 10). There must be three points at least.

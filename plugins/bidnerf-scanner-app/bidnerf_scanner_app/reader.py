@@ -89,10 +89,10 @@ class ScannerAppReader(Reader):
             return False
 
     def read(self, path: Path, options: DatasetOptions) -> Capture:
-        """Read the metadata of all frames; those with only depth are in no split. Raises ``InputError`` if a file is
-        missing or invalid.
+        """Read the metadata of all frames; those with only depth are in no split.
 
-        Depth is expected for all frames or, from phones without a LiDAR, for none.
+        Raises ``InputError`` if a file is missing or invalid. Depth is expected for all frames or, from phones
+        without a LiDAR, for none.
         """
         numbered = {file: PHOTO.fullmatch(file.name) for file in path.iterdir()}
         photos = sorted((int(found[1]), file) for file, found in numbered.items() if found)

@@ -88,8 +88,9 @@ class _Scene:
 
 
 def read(path: Path) -> Gaussians:
-    """Read the Gaussians of all nodes of a file, each with its node's transform applied. Raises
-    ``InputError`` for a damaged file.
+    """Read the Gaussians of all nodes of a file, each with its node's transform applied.
+
+    Raises ``InputError`` for a damaged file.
     """
     scene = _opened(path)
     try:
