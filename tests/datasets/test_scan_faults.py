@@ -12,7 +12,17 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.datasets import Shot, Video, hold_out, open_dataset, open_sequence
+from bidnerf_core.datasets import (
+    Capture,
+    DatasetOptions,
+    Reader,
+    Shot,
+    Video,
+    hold_out,
+    open_dataset,
+    open_sequence,
+)
+from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.testing import training_views
@@ -246,6 +256,23 @@ def test_five_frames_a_second_are_kept() -> None:
         found = hold_out(frames, rate=5.0)
         assert [int(shot.stem) for shot in found if shot.splits] == list(range(0, 120, kept))
         assert len(found) == 120
+
+
+def test_frames_that_a_dataset_leaves_out_are_counted(tmp_path: Path) -> None:
+    class Fast(Reader):
+        expected = "frames"
+
+        def recognises(self, path: Path) -> bool:
+            return True
+
+        def read(self, path: Path, options: DatasetOptions) -> Capture:
+            shots = [Shot(stem=f"{n}", T_world_camera=SE3.identity(), time=n / 30) for n in range(60)]
+            return Capture(path, shots, rate=5.0)
+
+    with pytest.warns(InputWarning, match="has 10 of 60 frames, 5 per second; the sequence has all"):
+        dataset = open_dataset(tmp_path, readers=[Fast()])
+    assert len(dataset.frame_names("all")) == 10
+    assert len(dataset) == 60
 
 
 # Data sets
