@@ -25,9 +25,8 @@ answers that the model was fitted to show falsified cameras, which may be why; n
 class Evidence:
     """All that the decision about a pose by landmarks depends on; no number depends on the unit of length or the image's size."""
 
-    log10_nfa: (
-        float  # false alarms of the matches by descriptors alone; 0 if the pose was found by other means
-    )
+    # false alarms of the matches by descriptors alone; 0 if the pose was found by other means
+    log10_nfa: float
     inliers: int  # matches by projection within three standard deviations
     by_chance: float  # such matches expected at a wrong pose
     recall: float  # fraction of the landmarks in view, or of the keypoints, that match

@@ -107,8 +107,7 @@ def follow_gradient(
         count = min(WINDOW, config.max_steps - first)
         with without_waiting():
             for step in range(count):
-                # Steps before the capture, which fill caches and load kernels, as a capture does not allow
-                # this
+                # Three steps before the capture fill caches and load kernels, which a capture does not allow.
                 if generator is not None and first + step == 3:
                     take = captured(steps, device, generator)
                 take()

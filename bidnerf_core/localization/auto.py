@@ -40,7 +40,7 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
         loop = Loop(problem.views, problem.matcher, problem, config.fused_rays, seed)
     answer = None if loop is None else loop()
     found = None if answer is None else localization_of(problem, answer, began)
-    # Outcomes of a pose by landmarks that no other measurement can correct
+    # No other measurement can correct a pose by landmarks with these outcomes.
     if found is None or not (
         found.converged or found.outcome in (Outcome.MISCALIBRATED, Outcome.MIRRORED, Outcome.AMBIGUOUS)
     ):
@@ -71,7 +71,7 @@ def _on_surface(
             raise InputError("method 'auto' then needs a start; give one", where=why)
         descended = bid(problem, BidConfig(), seed)
         return replace(descended, reason=f"{why}; {descended.reason}")
-    # Where images of the map usually have so many matches, one without recognised landmarks shows something else.
+    # Where usual images of the map have 150 matches, one without recognised landmarks shows something else.
     if surface is None or (loop is not None and loop.landmarks.usual_matches >= 150):
         return best or unrecognized(problem)
     config = config if loop is None else replace(config, rounds=1)
@@ -81,7 +81,7 @@ def _on_surface(
         if found is None:
             break
         if occluder is not None and given is not problem:
-            # Minimum fraction of an occluder's points that must lie in front of the surface
+            # An occluder lies in front of the surface, but for a tenth of its points.
             if not found.converged or occluder.share_in_front(surface, found.T_world_camera) < 0.9:
                 continue
             share = f"the nearest {occluder.share:.0%} of the measured points, which are on an occluder"

@@ -88,8 +88,7 @@ def localize_by_depth(
         steps: list[tuple[SE3, Tensor]] = []
         there, _ = descend(best, [refined, rays], config.refine_steps, middle, steps)
         inliers = 0.0
-        # Maximum increase of the cost on the surface by refinement; beyond it, field and surface contradict
-        # each other
+        # If the refinement raises the cost on the surface by more, field and surface contradict each other.
         if float(score(there)) <= float(score(best)) + 0.05:
             path = SE3.cat([path, *(T for T, _ in steps[1:]), there.T])
             losses = torch.cat([losses, *(cost for _, cost in steps)])
@@ -147,7 +146,7 @@ def by_depth(problem: Problem, points: Surface, count: int, seed: int) -> Propos
     surface, middle, stages = points.surface, points.points.median(0).values, list[Stage]()
     for n, steps, keep, distance, colour in POINT_STAGES:
         noise = distance * surface.extent / 2 or surface.cell
-        # Minimum number of points on which poses are compared
+        # Poses are compared on at least 200 points, even if fewer suffice for the steps.
         score = _score(points.first(max(n, 200))) if steps else None
         stages.append(
             Stage([replace(points.first(n), noise=noise, colour_weight=colour)], steps, keep, score)
@@ -162,8 +161,8 @@ def by_images(
     """Compare the images with renderings of the surface from ``count`` hypotheses all over the scene, then run ``later`` stages.
 
     Returns the best poses and the middle of the visible scene (metres, last camera's frame): rays cast from the keyframes give its
-    typical distance, and whether it has a background. ``detailed``: for images that something partly hides. Scales are narrow then, as
-    wider ones favour poses that partly explain the occluders' colours, and the exposure is about that of the map.
+    typical distance, and whether it has a background. ``detailed``: for images that something partly hides. Scales are narrow
+    then, as wider ones favour poses that partly explain the occluders' colours, and the exposure is about that of the map.
     """
     small = moved(Thumbnail.of(problem.views[-1], 16), surface.device)
     keyframes = SE3.from_matrix(surface.keyframes[:: max(1, len(surface.keyframes) // 16)]).to(small.flat)
@@ -171,7 +170,7 @@ def by_images(
     origins = keyframes.translation[:, None].expand_as(directions)
     seen = cast(surface, origins.reshape(-1, 3), directions.reshape(-1, 3))
     away = float(seen.along[seen.met].median()) if bool(seen.met.any()) else surface.extent
-    # Fraction of the keyframes' rays that hit nothing above which the map counts as having a background
+    # A map has a background if more than a fifth of the keyframes' rays hit nothing.
     has_background = float(seen.met.float().mean()) < 1 - 0.2
     middle = torch.tensor([0.0, 0.0, away], dtype=torch.float64)
     renderer = surface_renderer(surface, problem.bounds.background if has_background else None)
@@ -307,8 +306,7 @@ def _covariance(
 def is_blank(frame: Frame) -> bool:
     """Return whether the image has a single colour, as if the lens were covered, or the frame has no colours at all."""
     shown = frame.rgb.flatten(0, 1) if frame.hidden is None else frame.rgb[~frame.hidden]
-    # Standard deviation of an image's colours, in [0, 1], below which a gain and an offset can fit any view
-    # to it
+    # A gain and an offset can fit any view to an image whose colours, in [0, 1], deviate by less.
     return not frame.has_colour or float(shown.std(0, correction=0).max()) < 0.02
 
 
@@ -347,7 +345,7 @@ def nearest_piece(problem: Problem) -> Occluder | None:
     values, pairs = np.where(measured, depth, 0), []
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         near, far = np.minimum(values[a], values[b]), np.maximum(values[a], values[b])
-        # Relative depth difference above which neighbouring pixels belong to different segments
+        # Neighbouring pixels belong to different segments if their depths differ by more than 5 %.
         joined = (near > 0) & (far - near <= 0.05 * near)
         pairs.append(np.stack([number[a][joined], number[b][joined]]))
     first, second = np.concatenate(pairs, axis=1)

@@ -110,7 +110,7 @@ class Explanations:
 
         With another focal length or principal point, the camera is moved along its axis and turned so that it sees about the same.
         """
-        # Explanations that are not tried by themselves at first
+        # These three are not tried by themselves at first, since they are similar to others.
         kinds = [
             i
             for i, name in enumerate(self.names)
@@ -158,7 +158,7 @@ def explanations(
         known = cameras_of_map(query, landmarks)
         nearly = torch.tensor(NEARLY, dtype=torch.float64)
         as_map = any(bool((c.abs() < nearly).all()) for c in known) and not query.approximate
-        # Other than the stated intrinsics are less likely where those are the intrinsics of the map's images.
+        # If the stated intrinsics are those of the map's images, others are a tenth as probable.
         rows = [
             (name, [0.0] * 6, deviation, share * (0.1 if as_map and name != "exact" else 1), credible)
             for name, *deviation, share, credible in (APPROXIMATE if query.approximate else STATED)
@@ -166,7 +166,7 @@ def explanations(
         for c in known:
             if query.approximate or bool((c.abs() > nearly).any()):
                 similar = bool((c.abs() <= torch.tensor((0.16, 0.06, 0.06, 0.2, 0.02, 0.01))).all())
-                # Prior odds that the image is from the map's camera, if the stated one is similar but different, and if it differs much
+                # The prior odds that the image is from the map's camera depend on how much the stated one differs from it.
                 odds = 0.5 if similar else 0.05
                 rows += [
                     (name, c.tolist(), deviation, share * odds, True) for name, *deviation, share in OF_MAP
@@ -209,8 +209,7 @@ def cameras_of_map(query: Query, landmarks: LandmarkMap) -> list[Float[Tensor, "
     nearly = torch.tensor(NEARLY, dtype=torch.float64)
     for group in groups:
         cameras = sorted(group, key=lambda camera: camera.fx)
-        # Maximum number of a map's cameras of one size, evenly chosen by focal length, that are compared with
-        # the stated one
+        # At most nine cameras, evenly chosen by focal length, are compared with the stated one.
         chosen = torch.linspace(0, len(cameras) - 1, min(len(cameras), 9)).round().int().unique().tolist()
         corrections = (correction_between(stated, cameras[i]) for i in chosen)
         known = [correction for correction in corrections if correction is not None]
@@ -227,7 +226,7 @@ def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "6"
     It minimizes the squared differences in pixels. None if these remain large.
     """
     true = true.resized(given.width, given.height)
-    # Number of rows and columns of pixels at which cameras are compared
+    # The cameras are compared at seven rows and columns of pixels.
     u, v = (torch.linspace(0, size, 7, dtype=torch.float64) for size in (given.width, given.height))
     pixels = torch.stack(torch.meshgrid(u, v, indexing="ij"), dim=-1).reshape(-1, 2)
     stated, real = (camera.unproject(pixels)[:, :2] for camera in (given, true))
@@ -247,8 +246,7 @@ def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "6"
     solved = torch.linalg.lstsq(rows.reshape(-1, 5), target.reshape(-1, 1), driver="gels").solution
     left = (rows @ solved - target)[..., 0].norm(dim=-1)
     across, down, shift_u, shift_v, bent = solved[:, 0]
-    # Root mean square difference, as a fraction of the image's width, above which a correction does not
-    # describe a camera
+    # A correction does not describe the camera if the root mean square difference exceeds this fraction of the image's width.
     if not bool(left.square().mean().sqrt() <= 0.002 * given.width) or min(across, down) <= 0:
         return None
     factor = (across * down).sqrt()

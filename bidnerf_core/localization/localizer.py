@@ -65,9 +65,10 @@ class Localizer:
     ) -> None:
         """Prepare the map ``scene``, or the one in that folder, for ``method``.
 
-        ``config`` holds the method's settings: an instance of their type (``METHODS[method].config_type``), or a dictionary of those
-        that differ from the defaults, or from ``preset``, the name of other settings (``METHODS[method].presets``). ``device`` is that of the
-        field, the surface and the landmarks, by default where they are; parts of the map on another device are copied.
+        ``config`` holds the method's settings: an instance of their type (``METHODS[method].config_type``), or a dictionary of
+        those that differ from the defaults, or from ``preset``, the name of other settings (``METHODS[method].presets``).
+        ``device`` is that of the field, the surface and the landmarks, by default where they are; parts of the map on another
+        device are copied.
         ``warm_up``: initialize now, so that the first call is not delayed. Raises ``InputError`` for unsuitable arguments.
         """
         scene = checked_map(scene, "Localizer")
@@ -105,8 +106,8 @@ class Localizer:
         ``query`` is a frame, the file of a photo (whose camera is from its EXIF or the map), or views with known relative
         poses (``T_ref_camera`` in any common frame): a rig, or a window of a sequence. ``start`` is a guess at T_world_camera
         of the last view, which some methods do not need. ``depth_rays`` are distances measured by another sensor, such as a
-        lidar, in the frame of the last camera; methods that use colour alone reject them. Raises ``InputError`` for a query that cannot be localized at all; a doubtful pose is returned with an
-        ``outcome`` other than ``CONVERGED``.
+        lidar, in the frame of the last camera; methods that use colour alone reject them. Raises ``InputError`` for a query
+        that cannot be localized at all; a doubtful pose is returned with an ``outcome`` other than ``CONVERGED``.
         """
         if depth_rays is not None:
             require_use_of_depth(self.method)
@@ -135,8 +136,7 @@ class Localizer:
                 raise InputError("contains no photos", where=queries)
             queries = photos
         device = device_of(self.scene.field)
-        # Number of queries that share an accelerator, which computes for some while the host detects
-        # keypoints of others
+        # Eight queries share an accelerator, which computes for some while the host detects keypoints of others.
         count = (torch.get_num_threads() if device.type == "cpu" else 8) if workers is None else workers
         if count < 1:
             raise InputError(f"workers is {workers!r}", expected="at least 1")
@@ -198,7 +198,7 @@ class Localizer:
     def solved(self, problem: Problem, seed: int = 0) -> Localization:
         """Solve a ``problem`` created by this localizer."""
         # On a CPU, operators are so short that sharing each of them among threads takes longer, and far longer on a busy machine.
-        # Largest number of threads on the host of a GPU, which has little to compute
+        # Four threads suffice for the host of a GPU, which has little to compute.
         with threads_at_most(1 if problem.device.type == "cpu" else 4):
             found = self._method.solve(problem, self.config, _checked_seed(seed))
         if not isinstance(found, Localization):
@@ -240,8 +240,9 @@ class Localizer:
 
 
 def checked_map(given: object, where: str) -> SceneMap:
-    """Return ``given`` if it is a map, or the map in the folder ``given``. Raises ``InputError``, prefixed with ``where``, for
-    anything else, and as ``load_map`` does.
+    """Return ``given`` if it is a map, or the map in the folder ``given``.
+
+    Raises ``InputError``, prefixed with ``where``, for anything else, and as ``load_map`` does.
     """
     if LOADERS and isinstance(given, str | Path):
         return LOADERS[0](Path(given))

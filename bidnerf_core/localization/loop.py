@@ -130,14 +130,15 @@ class Loop:
     ) -> None:  # fmt: skip
         """Detect keypoints of ``views``, whose poses are relative to the last one.
 
-        Without a ``problem``, only landmarks are used. ``rays`` is the number that may be rendered if the map has a field, 0 for none.
-        ``features`` detects the keypoints, by default the map's detector. ``moving`` is whether the camera may have moved during the readout.
+        Without a ``problem``, only landmarks are used. ``rays`` is the number that may be rendered if the map has a field, 0
+        for none. ``features`` detects the keypoints, by default the map's detector. ``moving`` is whether the camera may have
+        moved during the readout.
         """
         self.matcher, self.problem, self.seed, self.moving = matcher, problem, seed, moving
         self.landmarks: LandmarkMap = matcher.landmarks
         self.query = Query.of(views, features or matcher.features)
         noise = None if problem is None else problem.colour_noise
-        # Colour noise of a field on its training images above which its rays add nothing to the landmarks
+        # The rays of a field with more colour noise on its training images add nothing to the landmarks.
         shows = problem is not None and has_field(problem.field) and (noise is None or noise <= 0.04)
         self.rays = rays if shows else 0
         places = {matcher.device} if problem is None else {matcher.device, problem.device}
@@ -280,7 +281,7 @@ class Loop:
     def _compared(self, mode: Mode, seed: Seed, given: Explanations, noise: float) -> States:
         """Return the most probable state of a mode, comparing kinds of cameras, each with its own noise, on some of the matches."""
         count = len(mode.matches)
-        # Number of matches on which kinds of cameras are compared
+        # At most a hundred matches are compared, evenly spread.
         some = torch.linspace(0, count - 1, min(count, 100)).long()
         states = given.first(seed, 0, noise)
         term = self._term([replace(mode, matches=mode.matches[some])], states[:1])
@@ -324,10 +325,10 @@ class Loop:
         agreeing[nearest.keypoint] = near[:, 0]
         others = nearest.others(near)
         others = others[agreeing[others.keypoint]]
-        # Least number of inliers of another place, as a fraction of those of the first
+        # Another place has at least three tenths as many inliers as the first.
         if len(others.keypoint.unique()) >= max(LEAST_AGREEING, 0.3 * int(agreeing.sum())):
             rivals.append(("another place", query, others))
-        # Log10 of the number of false alarms below which no mirror image is tried
+        # A pose with fewer false alarms than 1e-150 is unmistakable, so that no mirror image is tried.
         if nfa > -150.0 and self.landmarks.features == "sift" and len(query.images) == 1:
             mirrored = query.mirrored
             rivals.append((MIRROR, mirrored, Nearest.of(mirrored, self.matcher, STRONGEST).best))
@@ -341,7 +342,7 @@ class Loop:
     ) -> Answer:
         """Fuse all measurements under all explanations, and judge the result."""
         problem, terms = self.problem, list[Term]([landmarks])
-        # Most fits of a mode until the explanation that it is linearized about is the most probable one
+        # Up to three fits, until the explanation that a mode is linearized about is its most probable one.
         for _ in range(3):
             row = best.row
             there, minima, best = run_on(self.device, settle, best, landmarks, given)
@@ -356,9 +357,8 @@ class Loop:
             points = Surface.of(problem.views, problem.depth_rays, problem.surface, self.seed, device=where)
         if points is not None:
             noise, near, _ = run_on(self.device, fit_noise, points, found.chosen)
-            # Least fraction of the measured points on the surface; with fewer, depth is in another unit or of
-            # another scene, and is left out. No pose on record with fewer was right, nor would any have been
-            # accepted without depth.
+            # If less than a tenth of the points lies on the surface, depth is in another unit or of another scene, and is left
+            # out. No pose on record with fewer was right, nor would any have been accepted without depth.
             points = replace(points, noise=noise) if float(near) >= 0.1 else None
         if points is not None and found.mode == 0:
             terms.append(points)
@@ -366,7 +366,7 @@ class Loop:
             best, minima = run_on(self.device, fit, best, terms, given, 5)
             found = self._posterior(minima, landmarks)
         before = found  # rays about one camera's pose must not decide between cameras
-        # Standard deviation of the scene's projection by landmarks, in pixels, from which rays add to them
+        # Rays add to landmarks if the projection of the scene that these determine is uncertain by more than 0.6 pixels.
         position = float(found.mixture()[:3, :3].trace().sqrt().nan_to_num(math.inf))
         blurred = float(landmarks.focal.max()) * position / landmarks.distance(found.chosen) > 0.6
         if problem is not None and self.rays and found.mode == 0 and blurred:
@@ -399,8 +399,7 @@ class Loop:
             # Of two places that look the same, the one nearer to the start is the likelier.
             update = (start.inverse() @ quadratic.here.T).log()
             away = update[:, :3].norm(dim=-1) + self._distance(start) * update[:, 3:].norm(dim=-1)
-            # Log odds of a place per factor e of its distance from the start: in six dimensions, the density
-            # of a normal distribution of unknown width falls with the sixth power of the distance
+            # In six dimensions, the density of a normal distribution of unknown width falls with the sixth power of the distance.
             log_odds = -6.0 * away.clamp(min=1e-9).log()
         scatter = self.landmarks.calibration_scatter.double()
         return Posterior.of(states, normal, quadratic, landmarks, scatter, systematic, log_odds, self.device)

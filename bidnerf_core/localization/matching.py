@@ -61,7 +61,7 @@ class LandmarkMatcher:
         self._found_once: FoundOnce | None = None
         if self.device.type != "cpu":
             self._index = _Products(landmarks.descriptors)
-        # The number of landmarks up to which the search is exhaustive, without cells
+        # The search of up to 4,000 landmarks is exhaustive, without cells.
         elif len(landmarks) > 4_000:
             self._index = _Cells(landmarks.descriptors, seed)
 
@@ -99,9 +99,8 @@ class LandmarkMatcher:
                 f"the map's descriptors have {channels} channels, those of the image {descriptors.shape[1]}; "
                 "use the detector with which the map was baked, or bake it again"
             )
-        few = (
-            len(descriptors) * len(self.landmarks) <= 4_000_000
-        )  # pairs, which are compared faster than cells are searched
+        # Comparing up to four million pairs is faster than searching cells.
+        few = len(descriptors) * len(self.landmarks) <= 4_000_000
         if self._index is None or (few and isinstance(self._index, _Cells)):
             distance, landmark = _smallest(squared_distances(descriptors, self._descriptors), count)
         else:
@@ -126,11 +125,10 @@ class _Products:
     ) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
         """Return squared distances, which are exact, and indices of the nearest; on the CPU."""
         found, n = [], len(self._half)
-        # Number of products of descriptors at a time on an accelerator, which bounds the memory
+        # At most 2^26 products are computed at a time, which bounds the memory.
         for part in descriptors.split(max(1, 2**26 // max(1, n))):
             alike = 2 * (self._unit(part) @ self._half.T).float() - self._squares
-            # Number of further landmarks that are looked up by products in half precision, and then compared
-            # exactly
+            # Products in half precision may be out of order: four more landmarks are looked up, and all are compared exactly.
             index = alike.topk(min(count + 4, n)).indices
             exact = (part[:, None].float() - self._descriptors[index].float()).square().sum(-1)
             distance, best = exact.topk(min(count, n), largest=False)
@@ -143,8 +141,7 @@ class _Cells:
     """An inverted file: descriptors sorted by cell."""
 
     def __init__(self, descriptors: UInt8[Tensor, "n d"], seed: int) -> None:
-        # Mean number of landmarks per cell in large maps, where comparing them would otherwise take most of
-        # the time
+        # In large maps, cells have 500 landmarks on average, since comparing more would take most of the time.
         count = round(max(math.sqrt(len(descriptors)), len(descriptors) / 500))
         generator = torch.Generator().manual_seed(seed)
         self._centres = k_means(descriptors, count, generator)
@@ -161,7 +158,7 @@ class _Cells:
         self, descriptors: UInt8[Tensor, "q d"], count: int
     ) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
         queries = len(descriptors)
-        # Number of cells that are searched for each keypoint
+        # Twelve cells are searched for each keypoint.
         probed = _smallest(squared_distances(descriptors, self._centres), 12)[1]
         cell, order = probed.flatten().sort(stable=True)
         query = order // probed.shape[1]
@@ -238,7 +235,7 @@ class Nearest:
     def best(self) -> Matches:
         """The unambiguous matches, filled up with others if they are few."""
         order = self.ambiguity.argsort(stable=True)
-        # Number of matches up to which ambiguous ones are added
+        # Ambiguous matches are added up to 60.
         count = max(60, int((self.ambiguity <= AMBIGUITY).sum()))  # host
         return Matches(self.keypoint[order[:count]], self.landmark[order[:count], 0])
 
@@ -317,7 +314,7 @@ class Projected:
         distance = paired_squared_distances(
             query.keypoints.descriptors, landmarks.descriptors, keypoint, landmark
         )
-        # Largest descriptor distance of a match by projection, relative to that of unrelated descriptors
+        # Descriptors of a match are at most 0.6 times as far from each other as unrelated ones.
         most = (0.6 * landmarks.unrelated_distance) ** 2
         q = len(query.view)
         best = torch.full((q,), torch.inf).scatter_reduce_(0, keypoint, distance, "amin")
@@ -336,8 +333,10 @@ class Projected:
 
 
 def log10_nfa(matches: int, agreeing: int, probability: float, sample: int = 3) -> float:
-    """Return log10 of the number of false alarms (Moisan and Stival 2004, eq. 10): the expected number of poses with ``agreeing``
-    inliers among ``matches`` if all are wrong, each an inlier with ``probability``; ``sample`` matches determine a pose.
+    """Return log10 of the number of false alarms (Moisan and Stival 2004, eq. 10).
+
+    It is the expected number of poses with ``agreeing`` inliers among ``matches`` if all are wrong, each an inlier with
+    ``probability``; ``sample`` matches determine a pose.
     """
     if agreeing <= sample:
         return 0.0

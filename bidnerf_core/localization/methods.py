@@ -302,7 +302,7 @@ def _halved(
     terms, rays = RayTerms(steps.colour, depth, config.exposure), steps.fine_rays
     if depth is not None and problem.has_depth:
         poses = SE3.cat([poses, centred(problem, poses, middle)])
-        # Width, in pixels, of the squares over which colours are averaged in coarse steps with depth
+        # Coarse steps with depth average colours over squares of eight pixels.
         coarse = partial(terms.term, problem, level=0, blur=8)
         stages: Iterable[Stage] = (
             Stage([coarse(rays // 8, seed, wide=3.0)], 0, 6),

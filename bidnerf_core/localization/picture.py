@@ -26,7 +26,7 @@ def shown_in(scene: SceneMap, frame: Frame) -> Callable[[Localization], str]:
 
     Answers may outlive the map, whose memory they do not hold: then, and where it cannot be rendered from the pose, it returns "".
     """
-    # Longer side (pixels) of the photo and the rendering: each rendered pixel takes time
+    # At most 240 pixels along the longer side, since each rendered pixel takes time.
     small, reference = frame.replace(depth=None).at_most(240), weakref.ref(scene)
     stated, photo = (
         small.intrinsics,
@@ -66,6 +66,6 @@ def picture_at(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Floa
             T_world_camera.to("cpu", torch.float64).inverse().apply(scene.landmarks.positions.cpu().double())
         )
         rows, columns, inside = camera.cells(local)
-        # Colour of landmarks, which stand for the rendering in a map without a field
+        # Green dots stand for the rendering in a map without a field.
         image[rows[inside], columns[inside]] = torch.tensor((0.0, 0.75, 0.43))
     return image

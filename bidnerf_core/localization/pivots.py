@@ -30,8 +30,10 @@ class Pivot:
 
     @property
     def lever_arm(self) -> float:
-        """Distance (metres) by which a rotation of one radian moves the camera. In the world's frame it is 1, since iNeRF does not
-        balance steps of translation and rotation; so it is at the camera, which no rotation moves.
+        """Distance (metres) by which a rotation of one radian moves the camera.
+
+        In the world's frame it is 1, since iNeRF does not balance steps of translation and rotation; so it is at the camera, which
+        no rotation moves.
         """
         reach = 0.0 if self.T_camera_pivot is None else float(self.T_camera_pivot.translation.norm())
         return reach if reach > 0 else 1.0
@@ -89,7 +91,7 @@ def rendered_middle(
 ) -> Float[Tensor, "h 3"]:
     """Return the median of the rendered points along each axis, in the last camera's frame; NaN if no ray hits anything."""
     device, generator = device_of(field), torch.Generator().manual_seed(0)
-    # Number of rays whose renderings give the middle of the visible scene
+    # The renderings of 128 rays give the middle of the visible scene.
     some = draw(views, 128, uniform, generator, device=device).flattened()
     rays = some.rays(T.to(device), bounds)
     seen = render(field, rays, bounds.background)

@@ -48,10 +48,9 @@ class Posterior:
         log = log_evidence(states, normal)
         member = states.mode[None] == torch.arange(len(terms.here))[:, None]
         norm = torch.where(member, log[None], -torch.inf).logsumexp(-1)
-        # Evidence below which places are not compared: a few chance matches are no evidence against even
-        # fewer
-        # Log odds per factor e between the evidence for two places: it is not proportional to the number of
-        # matches, since the right place rarely has fewer than two thirds as many as another
+        # Log odds of places do not grow in proportion to the number of matches, since the right place rarely has fewer than two
+        # thirds as many as another: a factor e of the evidence adds ten. Below an evidence of 50, places are not compared, since
+        # a few chance matches are no evidence against even fewer.
         log = log + (log_odds + 10.0 * by_mode.clamp(min=50.0).log() - norm)[states.mode]
         probability = log.nan_to_num(-torch.inf).softmax(0)
         best = int(probability.argmax())
@@ -125,9 +124,10 @@ def mass_within(
 
 @lru_cache(maxsize=1)
 def normal_draws() -> Float[Tensor, "d 6"]:
-    """Return draws of a standard normal distribution that cover it evenly (Sobol)."""
-    # Draws of the pose from each explanation's Gaussian, with which the probability mass within a tolerance
-    # is integrated
+    """Return 256 draws of a standard normal distribution that cover it evenly (Sobol).
+
+    With as many draws of the pose from each explanation's Gaussian, the probability mass within a tolerance is integrated.
+    """
     even = torch.quasirandom.SobolEngine(6, scramble=True, seed=0).draw(256).double()
     return torch.distributions.Normal(0.0, 1.0).icdf(even.clamp(1e-6, 1 - 1e-6))
 
@@ -166,8 +166,8 @@ def _robust_covariance(
     is no ``sound`` factor.
     """
     values, vectors = torch.linalg.eigh(curvature)
-    # With few matches the curvature may be indefinite; well-behaved residuals keep it near the Hessian.
-    # Smallest curvature, relative to the reweighted Hessian
+    # With few matches the curvature may be indefinite; well-behaved residuals keep it near the Hessian. It counts as at least a
+    # fifth of the reweighted one.
     basis = torch.linalg.solve_triangular(factor.mT, vectors, upper=True) / values.clamp(min=0.2)[:, None]
     bread = basis @ torch.linalg.solve_triangular(factor.mT, vectors, upper=True).mT
     found = unit[..., None] * (bread @ scatter @ bread.mT) * unit[..., None, :]
@@ -187,9 +187,8 @@ def _true_cameras(
     prior = (apparent - scatter.square()).clamp(min=0)
     share, doubt = torch.ones_like(states.z), torch.zeros_like(states.z)
     share[:, :4] = prior / apparent.clamp(min=1e-24)
-    # Part of what seems spurious may be real, as image stabilisers shift each image.
-    # Standard deviation of a camera's parameters that no photo rules out: lenses move with focus and image
-    # stabilisers
+    # Part of what seems spurious may be real: as lenses move with focus and image stabilisers, no photo rules out a standard
+    # deviation of 0.005 of a camera's parameters.
     least = prior.clamp(min=0.005**2) + scatter.square() / 2
     doubt[:, :4] = least * scatter.square() / (least + scatter.square()) / apparent.clamp(min=1e-24)
     follows = -torch.linalg.solve_ex(H[:, :6, :6], H[:, :6, 6:])[0]  # (h 6 N) by the whitened nuisances

@@ -43,8 +43,7 @@ class SearchRecord:
         compared = scores is not None
         if scores is None:
             scores = torch.arange(len(T.translation), dtype=torch.float64)
-        # Maximum number of poses kept per step, the best ones
-        best = scores.argsort()[:400]
+        best = scores.argsort()[:400]  # only the best poses of a step are kept
         T, scores = moved((T[best], scores[best]), "cpu")
         self.steps.append(RecordedStep(caption, T, scores.double(), min(kept, len(best)), compared))
 

@@ -33,7 +33,7 @@ def most_probable(states: States, term: Landmarks) -> States:
 
 
 def graduate(states: States, term: Landmarks) -> States:
-    # Noise of graduated fits, relative to that of usual ones
+    # The noise is decreased to that of usual fits.
     for factor in (16.0, 8.0, 4.0, 2.0, 1.0):
         states = replace(states, noise=torch.full_like(states.noise, factor * term.most_noise))
         states, _ = descend(states, [term], 4)
@@ -61,7 +61,7 @@ def fit(best: States, terms: Sequence[Term], given: Explanations, steps: int) ->
 
 
 def linearize(best: States, terms: Sequence[Term], given: Explanations) -> Quadratic:
-    # A prior that fixes nothing which any explanation frees
+    # The prior fixes nothing that any explanation frees.
     free = best.under(given.deviation.new_zeros(N), given.deviation.amax(0))
     return Quadratic.of(total(free, terms) - prior(free), free)
 

@@ -68,7 +68,7 @@ def halve(
         other = order[~same_pose(states.T[order[0]], states.T[order], middle, 2 * DISPLACEMENT)]
         passing = order[: stage.keep]
         if len(other):
-            # Maximum number of other poses with which the best one is compared
+            # The best pose is compared with three others at most.
             margin, rivals = float(scores[other[0]] - scores[order[0]]), states[other[:3]]
             if stage.keep > 1 and not torch.isin(passing, other).any():
                 passing = torch.cat([passing[:-1], other[:1]])

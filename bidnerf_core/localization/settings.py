@@ -144,10 +144,10 @@ def mean_side(bounds: SceneBounds) -> float:
 def rendered_depth_scale(bounds: SceneBounds) -> float:
     """Return the depth difference (metres) at which outliers begin in rendered rays.
 
-    A field's resolution, and hence the error of its depth, is a fraction of its box. The resolution of a baked surface does not
-    matter: it may come from measured depth, which is more accurate than the field's renderings.
+    A field's resolution, and hence the error of its depth, is a fraction of its box, and so is this difference: 3.8 % of the
+    mean side. The resolution of a baked surface does not matter: it may come from measured depth, which is more accurate than
+    the field's renderings.
     """
-    # Depth difference at which outliers begin in rendered rays, as a fraction of the scene's mean side
     return 0.038 * mean_side(bounds)
 
 

@@ -63,9 +63,8 @@ Costs = Callable[[SE3], Float[Tensor, "h n"]]
 class Support:
     """How well measurements other than landmarks support a pose; None for what was not measured."""
 
-    explained: float | None = (
-        None  # fraction of the contrast: 1 - the ratio of the cost to that of the mean colour
-    )
+    # Fraction of the contrast: 1 - the ratio of the cost to that of the mean colour
+    explained: float | None = None
     # Log odds against rivals, ``NO_RIVAL`` if there is none:
     plain: float = NO_RIVAL  # the mean colour, unless more than colours is compared
     displaced: float | None = None  # the best of the displaced poses
@@ -145,8 +144,8 @@ def log_odds(rivals: Float[Tensor, "h n"], here: Float[Tensor, "n"]) -> Float[Te
     """Return the log odds against each rival, from the costs of each measurement for it and the pose; 0 where not finite."""
     difference = rivals - here
     error = difference.std(-1) * difference.shape[-1] ** 0.5
-    # Log odds per standard error of the difference between two costs. Independent measurements would justify
-    # more, but the errors of a field's rays are correlated. Chosen on frames held out for tuning.
+    # Half a unit of log odds per standard error of the difference: independent measurements would justify more, but the errors of
+    # a field's rays are correlated. It was chosen on frames held out for tuning.
     odds = 0.5 * difference.sum(-1) / error.clamp(min=1e-12)
     return torch.where(odds.isfinite(), odds, 0)
 

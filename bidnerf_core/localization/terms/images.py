@@ -116,9 +116,8 @@ def field_renderer(field: RadianceField, bounds: SceneBounds) -> Renderer:
 class ColourScales:
     """Scales for comparing colours and for fitting an image's exposure relative to the map."""
 
-    colour: float = (
-        0.2  # norm of a pixel's colour difference (three channels) at which its inlier weight is 1/2
-    )
+    # norm of a pixel's colour difference (three channels) at which its inlier weight is 1/2
+    colour: float = 0.2
     gain: float = 0.2  # standard deviation of the prior about 1
     offset: float = 0.1  # standard deviation of the prior about 0
     rounds: int = 2  # of reweighting for the exposure
@@ -165,7 +164,7 @@ class Images:
         corrected = gain * seen + offset
         error = corrected.clamp(0, 1) - measured
         near = inlier(error)
-        # Cost of a pixel for which the map renders nothing, relative to that of a pixel that disagrees
+        # A pixel for which the map renders nothing costs 0.7 times as much as one that disagrees.
         cost = (sure * (1 - near) + (1 - sure) * 0.7)[..., 0].mean(-1)
         # Where the camera clips, the colour does not depend on the pose.
         inside = (corrected - 0.5).abs() < 0.5

@@ -50,9 +50,8 @@ class Rays:
     # of the norm of a colour difference: wide enough for a wide basin, and narrow enough to reject occluders
     loss: Robust = Robust("geman-mcclure", 0.1)
     depth_loss: Robust | None = None  # of depth differences, metres; None: colours alone
-    depth_weight: float = (
-        1.0  # of a squared depth difference relative to that of a colour, each in units of its scale
-    )
+    # of a squared depth difference relative to that of a colour, each in units of its scale
+    depth_weight: float = 1.0
     exposure: bool = True
     sigma: float = 0.0  # metres: uncertainty of the map's surfaces; steep residuals have less weight in steps
 
@@ -175,8 +174,7 @@ class Rays:
         """Return the measured distances of all rays from ``count`` states, and by how much a ray that hits nothing is off."""
         if self.depth_loss is None:
             return None, 0.0
-        # Depth residual, in scales of the loss, of a ray that hits nothing: that of an outlier, but less than
-        # the whole distance
+        # The residual of a ray that hits nothing is that of an outlier, but less than the whole distance.
         return self.distance.float().repeat(count), 3.0 * self.depth_loss.scale
 
     def _differences(
@@ -195,8 +193,7 @@ class Rays:
         if not (self.exposure or always):
             return torch.ones_like(seen[:, :1]), torch.zeros_like(seen[:, :1])
         half = 2 * self.loss.scale
-        # Precision of the gain's prior, relative to the number of rays. It matters only if everything in view
-        # has one colour.
+        # The prior of the gain is so weak that it matters only if everything in view has one colour.
         known, precision = self.coloured[None, :, None], 0.001 * len(self)
         gain, offset = fit_exposure(
             seen, self.rgb, lambda off: 1 / (1 + (off / half).square()), known, (precision, 0.0)

@@ -33,7 +33,7 @@ class SampledLoss:
     def __post_init__(self) -> None:
         problem = self.problem
         self._field, self._bounds = problem.level(self.rays.level), problem.bounds
-        # Preferring other pixels pays only if more than a few, without measured depth, have the background's colour.
+        # Preferring the other pixels is worth its cost only if more than 2 % have the background's colour and no measured depth.
         self._candidates = 1
         for frame in (view.frame for view in problem.views) if self.reach.candidates > 1 else ():
             background = constant(problem.bounds.background, frame.rgb)
@@ -50,7 +50,7 @@ class SampledLoss:
         pixels = draw(problem.views, many, DRAWERS[self.rays.pixels], generator, device=device)
         if self._candidates > 1:
             count = max(1, self.rays.rays // len(problem.views))
-            # 2 or more for pixels that show matter in the image, and 1 for others whose rays may hit it in the map
+            # The rank is 2 or more for pixels that show matter in the image, and 1 for others whose rays may hit it in the map.
             background = constant(self._bounds.background, pixels.rgb)
             shows = pixels.measured | ((pixels.rgb - background).abs().amax(-1) > DIFFERENT)
             rank = 2 * shows.int() + self._field.sampler(self._rays(pixels, here)).valid.any(-1).int()

@@ -82,9 +82,8 @@ class Surface:
             depth = torch.zeros((0, 0)) if frame.depth is None else frame.depth.cpu()
             row, column = ((depth > 0) & depth.isfinite()).nonzero().unbind(-1)
             most = -(-count // len(views))
-            # Ratio of measured to compared points above which they are drawn with replacement, which takes
-            # far less time
-            if len(row) > 20 * most:  # hardly any is drawn twice
+            # Drawing with replacement takes far less time, and hardly any of so many points is drawn twice.
+            if len(row) > 20 * most:
                 drawn = torch.randint(len(row), (most,), generator=generator)
             else:
                 drawn = torch.randperm(len(row), generator=generator)[:most]
@@ -196,8 +195,8 @@ class Surface:
         rgb = ((self.rgb - offset[0]) / gain[0].clamp(min=0.1)).clamp(0, 1)
         changed = replace(self, rgb=rgb)
         gained = near * (changed._alike(surface - rgb) - self._alike(difference)) * self.coloured
-        # Minimum increase of the colour inliers by an exposure, as a fraction of all points, for it to be
-        # applied. Blur also lowers contrast, but restoring that contrast only enlarges the differences.
+        # An exposure must add a twentieth of all points to the colour inliers. Blur also lowers contrast, but restoring that
+        # contrast only enlarges the differences.
         return changed if float(gained.mean()) > 0.05 else self  # host
 
     def _alike(self, difference: Float[Tensor, "h n 3"]) -> Float[Tensor, "h n"]:
@@ -227,7 +226,7 @@ class Surface:
         normal = self.surface.surfels.normals[index].double()
         across = (offset * normal).sum(-1)
         along = offset - across[..., None] * normal
-        # Radius of a surfel in cells: beyond it, a point does not lie on the surface
+        # A point farther from a surfel than its radius, 1.5 cells, does not lie on the surface.
         beyond = (along.norm(dim=-1) - 1.5 * self.surface.cell).clamp(min=0)
         return across, across.square() + beyond.square(), normal, index, along, local, rays
 

@@ -95,8 +95,7 @@ class Determined:
         back = torch.linalg.inv(at_middle)
         values, axes = torch.linalg.eigh((back.T @ found.hessian[0] @ back)[:6, :6])
         good = torch.eye(P, dtype=torch.float64)
-        # Ratio to the mean information of the three best directions below which the prediction is kept along
-        # a direction
+        # Along directions with less than a tenth of the mean information of the three best ones, the prediction is kept.
         good[:6, :6] = axes @ (axes * (values >= 0.1 * values[3:].mean())).T
         determined = back @ good @ at_middle
         return Normal(found.cost, found.gradient @ determined, determined.T @ found.hessian @ determined)
@@ -129,7 +128,7 @@ class Measurer:
         if len(known) >= LEAST_AGREEING:
             correlation = landmarks.correlation_of(len(known))
             fit = Fit.of(known, frame.intrinsics, predicted.T_world_camera, correlation)
-            # Recognised anew if fewer than half of those at first are left, unless there are many; and after some frames
+            # Landmarks are recognised anew every 20 frames, and once fewer than half of them are left, unless these are many.
             enough = max(ENOUGH_LANDMARKS, min(0.5 * state.sought, 125))
             if int(fit.is_inlier.sum()) >= enough and state.age < 20:
                 tracked = self._by_landmarks(landmarks, frame, state, fit, predicted)
@@ -173,7 +172,7 @@ class Measurer:
             seen = Projected(query, landmarks, States.known(T, still), within)
             return points_of(seen.matches(within)), seen
 
-        # Radius of matching by projection around an accurate pose, in units of the inlier threshold
+        # Around an accurate pose, this radius of matching by projection suffices.
         tight = 1.5 * query.threshold
         if radius > 2 * tight:
             # Matching by projection would compare a keypoint with the few landmarks nearest to it: compare it with all in view.
@@ -271,7 +270,7 @@ class Measurer:
         ratio = ratio[depth > 0]
         if len(ratio) >= LEAST_AGREEING:
             scale = float(ratio.median())
-            # Depth is wrong if its scale deviates from that of a few landmarks, known to a hundredth, by five deviations.
+            # Depth is wrong if its scale is five standard deviations from that of the landmarks, which a few of them tell to 1 %.
             if abs(scale - 1) > 5.0 * math.hypot(DEPTH_WIDTH * sensor.scale, 0.01):
                 return None, 1 / scale
         view = View(frame, SE3.identity())
@@ -296,8 +295,7 @@ class Measurer:
             mass=mass_within(one, torch.zeros((1, 6)).double(), covariance[None], distance),
             other_place=0.0, credible=1.0, replaced=0.0, searched=True,
         )  # fmt: skip
-        # Log odds that a pose is right if none of an image was rejected before it: one in fifty is wrong, far
-        # more than tracked sequences show
+        # Prior log odds of 4 if no image was rejected before: one pose in fifty is wrong, far more than tracked sequences show.
         verdict = judge(evidence, 0.0 if state.searchable else 4.0)
         if fit.is_recognised:
             inliers = inliers.well_spread(fit.camera, self.config.points)
@@ -323,8 +321,7 @@ class Measurer:
         if points is None and (image is None or not has_field(self.scene.field)):
             return None
         off = math.sqrt(float((covariance.diagonal() * torch.tensor([1.0] * 3 + [reach**2] * 3)).sum() / 3))
-        # Maximum uncertainty of a prediction that measured points may correct, as a fraction of the distance
-        # to the scene
+        # Measured points alone may correct a prediction that is uncertain by up to 0.35 of the distance to the scene.
         if image is None and off > 0.35 * reach:
             why = "no colours were recorded, and the prediction is too uncertain for the shape"
             return Measurement(predicted, Verdict(Outcome.UNDETERMINED, why), 1.0, state)
@@ -333,7 +330,7 @@ class Measurer:
         hessian[0, :6, :6] = torch.linalg.inv(covariance)
         prediction = Quadratic(states, zero[:, 0], zero, hessian)
         if points is None:
-            # Number of rays rendered for a frame in a map without landmarks
+            # In a map without landmarks, 256 rays are rendered for a frame. The start is close, so that few steps suffice.
             rays = Rays.of([view], self.scene.field, self.scene.bounds, 256, state.frames)
             rays = replace(rays, independent=ALONE)
             for _ in range(2):
@@ -343,7 +340,7 @@ class Measurer:
             words = f"{share:.0%} of the rays have the rendered colours"
         else:
             points = replace(points, colour_weight=float(image is not None))
-            # Scales of the robust loss, in units of that which suits the residuals
+            # The robust loss begins three times as wide as suits the residuals. The start is close, so that few steps suffice.
             for wider in (3.0, 1.0):
                 fitted = replace(points, noise=max(points.noise, off)).fitted_noise(states)
                 # The same information from a wider basin.
@@ -352,7 +349,7 @@ class Measurer:
                 )
                 term = Determined(fitted) if image is None else fitted
                 states, normal = descend(states, [prediction, term], 2)
-            # Distance from the surface at which a point counts half, in cells of the surface's grid
+            # A point counts half at a distance of four cells from the surface.
             near, alike = replace(points, noise=2 * points.surface.cell).inliers(states)
             share, colours = float(near.mean()), float((near * alike).mean())
             measured = Support(on_surface=share, colour_inliers=None if image is None else colours)
@@ -373,13 +370,13 @@ class Measurer:
         uncertain = f"{words}, but the position is uncertain by {deviation:.3g}"
         verdict = measured.verdict(words)
         doubts = [
-            # A squared Mahalanobis distance between the prediction and the pose
+            # The pose is within five standard deviations of the prediction (a squared Mahalanobis distance).
             (float(moved @ torch.linalg.solve(covariance, moved)) <= 25,
              Outcome.AMBIGUOUS, "the measurements fit a place that is inconsistent with the motion"),
             (image is not None or state.clock.stamped,
              Outcome.IMPRECISE, f"{words}, but without a time stamp the motion is unknown"),
             (deviation <= TOLERANCE * reach, Outcome.IMPRECISE, uncertain),
-            # In median errors of the map's own images
+            # Without colours, the position is bounded in terms of the median error of the map's own images.
             (image is not None or not typical or deviation <= 4.5 * typical,
              Outcome.IMPRECISE, f"{uncertain}, images by {typical:.3g}"),
         ]  # fmt: skip
@@ -406,7 +403,7 @@ def search_radius(frame: Frame, predicted: Motion) -> float | None:
     """Return the radius (pixels) within which landmarks very likely project; None if that is most of the image."""
     camera = frame.intrinsics
     radius = INLIER * pixel_radius(predicted.covariance, camera.fx, predicted.reach)
-    # Maximum search radius around the predicted landmarks, as a fraction of the image's diagonal
+    # A search within more than 0.4 of the diagonal would be one of most of the image.
     return radius if radius <= 0.4 * math.hypot(camera.width, camera.height) else None
 
 

@@ -83,9 +83,8 @@ class Motion:
     noise: Float[Tensor, "12 12"]  # covariance of pose and velocity
     bias: Float[Tensor, "6 6"]  # covariance of the pose error shared by frames
     reach: float  # metres: distance to the visible scene, which scales translations
-    agility: float = (
-        1.0  # factor on the acceleration: how briskly the camera has recently changed its velocity
-    )
+    # factor on the acceleration: how briskly the camera has recently changed its velocity
+    agility: float = 1.0
 
     @staticmethod
     def at(pose: PoseEstimate, reach: float) -> Motion:
@@ -169,8 +168,7 @@ class Motion:
             return self
         off = update_between(self.T_world_camera, measured.T_world_camera)
         spread = self.noise[:6, :6] + measured.noise
-        # Squared Mahalanobis distance of a measured pose from the prediction beyond which the prediction is
-        # discarded
+        # Beyond this squared Mahalanobis distance, the prediction is discarded.
         if float(off @ torch.linalg.solve(spread, off)) > 60.0:
             return Motion.at(measured, self.reach)
         return replace(self.corrected(measured), agility=self._observed_agility(off[:3], spread[:3, :3]))
@@ -182,8 +180,7 @@ class Motion:
         translation of a walking person, and measurements determine them well.
         """
         velocity = float(self.noise.diagonal()[6:9].mean()) / (self.reach * SPEED) ** 2
-        # Variance of a velocity, relative to that of an unknown one, below which innovations update the
-        # agility
+        # Innovations update the agility only once the variance of the velocity is less than half that of an unknown one.
         if velocity > 0.5:
             return self.agility
         # Each pose updates a fraction of the squared agility by the squared innovation, relative to what is expected.

@@ -35,9 +35,9 @@ INLIER = 3.0
 FLOW: dict[str, Any] = {
     "winSize": (13, 13),  # pixels: of the compared patches
     "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
-    # On each level, the largest number of iterations, and the step (pixels) below which they end
+    # on each level, the largest number of iterations, and the step (pixels) below which they end
     "criteria": (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02),
-    # Of a patch's gradient matrix, as normalised by OpenCV; a blank wall with noise stays below it.
+    # of a patch's gradient matrix, as normalised by OpenCV; a blank wall with noise stays below it
     "minEigThreshold": 1e-3,
 }
 """Options of the optical flow."""
@@ -214,7 +214,7 @@ def flow(
     back, seen_back, _ = cv2.calcOpticalFlowPyrLK(now, before, there, start.copy(), maxLevel=1, **FLOW)
     height, width = now.shape
     inside = ((there >= 0) & (there <= (width - 1, height - 1))).all(-1)
-    # Maximum forward-backward error of a point, pixels
+    # The forward-backward error is at most 0.7 pixels.
     returned = np.linalg.norm(back - start, axis=-1) <= 0.7
     found = inside & returned & (seen[:, 0] > 0) & (seen_back[:, 0] > 0)
     return torch.from_numpy(there + FIRST_CENTRE).to(pixels), torch.from_numpy(found)
@@ -257,8 +257,7 @@ def _corner_based(pixels: Float[Tensor, "m 2"]) -> Float[np.ndarray, "m 2"]:
 def _as_bright_as(model: Grey, image: Grey) -> Grey:
     """Return ``image`` with about the mean and standard deviation of ``model``; unchanged if the means hardly differ."""
     (mean, spread), (wanted, wanted_spread) = (np.ravel(cv2.meanStdDev(x)).tolist() for x in (image, model))
-    # Relative change of an image's mean above which its brightness is matched first, since the flow assumes
-    # constant brightness
+    # The flow assumes constant brightness, so larger changes of the mean than 2 % are compensated.
     if abs(wanted - mean) <= 0.02 * mean or spread < 1:
         return image
     gain = min(4.0, max(0.25, wanted_spread / spread))

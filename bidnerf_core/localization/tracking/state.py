@@ -96,9 +96,8 @@ def load_tracker_state(path: Path, key: str) -> TrackerState:
     state = from_plain(TrackerState, with_tensors(found.get("state"), tensors, str(path)), str(path))
     for name, value in tensors.items():
         kind = torch.float32 if name == "points.pixels" else torch.float64
-        sound = value.dtype == kind and bool(
-            (value.abs() <= LARGEST_LENGTH).all()
-        )  # false for what is not a number
+        # The comparison is false for what is not a number.
+        sound = value.dtype == kind and bool((value.abs() <= LARGEST_LENGTH).all())
         if value.is_floating_point() and not sound:
             largest = f"finite numbers up to {LARGEST_LENGTH:g}, {kind}"
             raise InputError(f"{name} has others, or is {value.dtype}", where=path, expected=largest)

@@ -65,7 +65,7 @@ class Tracker:
         self._start = None if start is None else start_pose(start).translated(-self._origin)
         matcher = localizer.matcher if localizer.matches_landmarks else None
         self._landmarks = None if matcher is None else matcher.landmarks
-        # Number of keypoints of an image that are matched with landmarks
+        # The 600 strongest keypoints of an image are matched with landmarks.
         features = None if matcher is None else strongest(matcher.features, 600)
         self._measure = Measurer(self._scene, self._landmarks, features, localizer.depth_sensor, self.config)
         surface, bounds = self._scene.surface, self._scene.bounds
@@ -163,7 +163,7 @@ class Tracker:
                     why, path, losses, METHOD, clocks.perf_counter(), 1.0, deviation.square().diag()
                 )
             return found, state
-        # Fraction of the velocity kept with each lost frame
+        # With each lost frame, 0.6 of the velocity is kept.
         state = replace(
             state, motion=replace(predicted, velocity=0.6 * predicted.velocity),
             points=self._corners(frame, image, state.points, predicted.T_world_camera),
@@ -176,7 +176,7 @@ class Tracker:
 
     def _at(self, frame: Frame, T: SE3, covariance: torch.Tensor | None) -> Motion:
         """Return a camera of unknown velocity at a pose, by default with the uncertainty of a start."""
-        # A start is off by a fraction of the scene's extent, and by radians.
+        # A start of unknown uncertainty is off by 3 % of the scene's extent, and by 0.1 radians.
         deviation = torch.tensor([0.03 * self._extent] * 3 + [0.1] * 3, dtype=torch.float64)
         noise, bias = (deviation.square().diag(), 0.0 * deviation.diag())
         if covariance is not None:
@@ -229,7 +229,7 @@ class Tracker:
     def _corners(self, frame: Frame, image: Grey | None, points: Points, T_world_camera: SE3) -> Points:
         """Return the corners among ``points``, or new ones at the pose of this frame if they have become few."""
         points, count = points.fresh, self.config.points
-        # Remaining fraction of the corners at which new ones are detected
+        # New corners are detected once fewer than half of them are left.
         if image is None or not frame.has_depth or len(points) >= 0.5 * count:
             return points
         return Points.measured(frame, image, T_world_camera, count, self.localizer.depth_sensor.noise)
@@ -246,8 +246,7 @@ class Tracker:
         lost = max(state.searchable, min(state.lost, 1)) if has_begun else state.searchable
         if image is None or (not shows_shape(frame) and is_blank(frame)):
             return None
-        # The number of lost frames after which the whole surface is searched, and again each time that number
-        # has doubled
+        # The whole surface is searched after so many lost frames, and again each time that their number has doubled.
         first = 4 if self._landmarks is not None else 1
         is_due = lost == 0 or (lost % first == 0 and (lost // first).bit_count() == 1)
         if self._landmarks is None and not is_due:
