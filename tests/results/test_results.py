@@ -129,6 +129,10 @@ def test_an_overlay_shows_photo_rendering_and_both(folder: Path) -> None:
     with_start = overlay(scene(), frame, T, start=T)
     assert with_start.shape[0] > picture.shape[0]
     assert np.array_equal(overlay(scene(), frame, T.matrix().numpy()), picture)
+    wide = frame.replace(
+        rgb=torch.zeros((10, 800, 3)), depth=None, intrinsics=bn.Intrinsics(400.0, 400.0, 400.0, 5.0, 800, 10)
+    )
+    assert overlay(scene(), wide, T).shape[1] // 3 // 10 == 64  # a tile has 640 pixels of the photo
 
 
 @pytest.mark.usefixtures("unchecked")
