@@ -210,7 +210,10 @@ class RowStore:
 
     @staticmethod
     def parse(content: bytes) -> dict[str, Any]:
-        """Return the rows of all complete lines, by the JSON of their keys. Raises ``ValueError`` for a file of something else."""
+        """Return the rows of all complete lines, by the JSON of their keys.
+
+        Raises ``ValueError`` for a file of something else.
+        """
         *lines, last = content.split(b"\n")
         if not b'{"key": '.startswith(last[:8]):  # a row that a kill has cut begins as all do
             raise ValueError("no file of rows")

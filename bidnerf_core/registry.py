@@ -139,7 +139,10 @@ def list_plugins(group: str) -> list[PluginInfo]:
 
 @functools.cache
 def _declared(group: str) -> tuple[PluginInfo, ...]:
-    """Return what installed distributions declare in a group. Of several versions of one, the first on ``sys.path`` counts."""
+    """Return what installed distributions declare in a group.
+
+    Of several versions of one, the first on ``sys.path`` counts.
+    """
     infos = list[PluginInfo]()
     for p, source in _points(f"bidnerf.{group}"):
         try:

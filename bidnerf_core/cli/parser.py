@@ -173,7 +173,10 @@ def _built(
 
 
 class _Parser(argparse.ArgumentParser):
-    """The options of a command. ``loaded`` holds the settings that depend on other arguments; None: they are only announced."""
+    """The options of a command.
+
+    ``loaded`` holds the settings that depend on other arguments; None: they are only announced.
+    """
 
     def __init__(
         self, command: str, target: Callable[..., Any], loaded: Mapping[str, Any] | None, *,

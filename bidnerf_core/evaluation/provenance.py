@@ -34,9 +34,8 @@ class Provenance:
 
     date: str  # UTC, when it began
     command: str
-    commit: (
-        str | None
-    )  # of the checkout that the code was run from, or was installed from without changes since
+    # of the checkout that the code was run from, or was installed from without changes since
+    commit: str | None
     dirty: bool  # whether files of that checkout were modified
     cpu: str
     cores: int | None
@@ -91,9 +90,8 @@ def _git(*arguments: str) -> str:
     """Return the output of a git command in this package's checkout; empty if there is no checkout or no git."""
     package = Path(bidnerf_core.__file__).resolve().parent
     root = package.parent
-    if not (
-        root / ".git"
-    ).exists():  # installed, perhaps inside another project; PEP 610 names the folder it is from
+    # An installed package may lie inside another project; PEP 610 names the folder from which it was installed.
+    if not (root / ".git").exists():
         stated = json.loads(distribution("bidnerf").read_text("direct_url.json") or "{}").get("url", "")
         root = Path(url2pathname(urlsplit(stated).path))
         code = [str(file.relative_to(package)) for file in package.rglob("*.py")]

@@ -458,7 +458,10 @@ def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None 
 
 
 def build_field(info: MapInfo, where: str) -> RadianceField:
-    """Build the untrained field (an ``nn.Module``) that ``info`` describes. Raises ``InputError`` as ``frozen_field`` does."""
+    """Build the untrained field (an ``nn.Module``) that ``info`` describes.
+
+    Raises ``InputError`` as ``frozen_field`` does.
+    """
     backend = load_backend(info.backend, where)
     config: Any = from_plain(backend.config_type, info.config, f"{where}: config")
     try:

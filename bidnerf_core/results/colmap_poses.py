@@ -20,8 +20,10 @@ HEAD = "# written by bidnerf"
 
 
 def check_pose_file(path: Path) -> None:
-    """Raise, before any work is done, ``UsageError`` for a name without the ending of a format, and ``InputError`` for an images.txt
-    beside another program's cameras.txt or points3D.txt, which would be replaced.
+    """Check the name of a pose file before any work is done.
+
+    Raises ``UsageError`` for a name without the ending of a format, and ``InputError`` for an images.txt beside another
+    program's cameras.txt or points3D.txt, which would be replaced.
     """
     if pose_format(path) != "images.txt":
         return

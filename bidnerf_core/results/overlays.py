@@ -20,8 +20,8 @@ from bidnerf_core.io import reduced, write_file
 from bidnerf_core.localization import Localization, SceneMap, Start, checked_map, origin_of, start_pose
 
 SIDE = 240
-"""Pixels on the longer side of a picture of many, since each rendered pixel takes time, and the width to which smaller images
-are enlarged, so that captions fit."""
+"""Pixels on the longer side of each of many pictures, since each rendered pixel takes time, and the width to which smaller
+images are enlarged, so that captions fit."""
 
 
 def overlay(
@@ -31,8 +31,8 @@ def overlay(
 
     ``found`` is the answer for the photo, whose corrected intrinsics are used if it has any, or a pose
     ``T_world_camera``. With a ``start``, the picture also shows the rendering from there. The photo is
-    downscaled to at most 640 pixels a side, since each rendered pixel takes time. Raises ``InputError`` for arguments that are not a map, a frame
-    or a pose.
+    downscaled to at most 640 pixels a side, since each rendered pixel takes time. Raises ``InputError`` for arguments
+    that are not a map, a frame or a pose.
     """
     scene = checked_map(scene, "overlay")
     if not isinstance(frame, Frame):

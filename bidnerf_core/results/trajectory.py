@@ -56,7 +56,10 @@ class TrajectoryErrors:
 
     @staticmethod
     def of(found: SE3, true: SE3, unit: LengthUnit = "units") -> TrajectoryErrors:
-        """Compare poses ``T_world_camera`` (n, in ``unit``), in chronological order. Raises ``InputError`` if there are none."""
+        """Compare poses ``T_world_camera`` (n, in ``unit``), in chronological order.
+
+        Raises ``InputError`` if there are none.
+        """
         count = len(found.translation)
         # Fewer than three poses do not determine an alignment.
         distances = alignment_errors(found, true) if count >= 3 else None

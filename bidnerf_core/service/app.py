@@ -169,7 +169,10 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
 
 
 async def _answer(request: Request, job: Job, task: dict[str, Any]) -> Any:
-    """Return the JSON of a worker's answer; stop the work if it takes too long or the client disconnects. Raises ``Refused``."""
+    """Return the JSON of a worker's answer; stop the work if it takes too long or the client disconnects.
+
+    Raises ``Refused``.
+    """
     pool: Pool = request.app.state.pool
     upload = task.get("upload")
     sizes = [] if upload is None else map(len, upload.files.values())

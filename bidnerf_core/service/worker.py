@@ -161,7 +161,10 @@ def _loaded(order: Mapping[str, Any]) -> Worker:
 
 
 def _serve(worker: Worker, device: str, connection: Connection) -> None:
-    """Answer requests until the connection ends. On an accelerator, which does not survive a fork, the localizers are made anew."""
+    """Answer requests until the connection ends.
+
+    On an accelerator, which does not survive a fork, the localizers are made anew.
+    """
     try:
         if device != "cpu":
             moved = {

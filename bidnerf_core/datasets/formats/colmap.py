@@ -140,7 +140,10 @@ def _image_folder(path: Path, model: Path, images: Sequence[ModelImage]) -> tupl
 
 
 def shot_of(model: Path, image: ModelImage, file: Path | None, cameras: dict[int, Camera]) -> Shot:
-    """Return an image of a model as a shot, without pixels if it has no file. Raises ``InputError`` if its camera is missing."""
+    """Return an image of a model as a shot, without pixels if it has no file.
+
+    Raises ``InputError`` if its camera is missing.
+    """
     if image.camera not in cameras:
         found = f"image {image.name!r} has the camera {image.camera}, which is missing from cameras"
         raise InputError(found, where=model)

@@ -45,7 +45,10 @@ def _export(scene: Map, file: Path) -> list[Path]:
 
 
 def gaussians_of_map(scene: Map) -> Gaussians:
-    """Return the Gaussians of a map of splats, or else a disc for each surfel. Raises ``InputError`` for a map that has neither."""
+    """Return the Gaussians of a map of splats, or else a disc for each surfel.
+
+    Raises ``InputError`` for a map that has neither.
+    """
     field, scale = scene.field, 1.0
     while isinstance(field, ScaledField):
         field, scale = field.trained, scale * field.scale
