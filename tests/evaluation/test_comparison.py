@@ -202,7 +202,10 @@ def test_the_command_prints_a_table_and_writes_what_it_says(
     maps: list[Path], data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folders = [str(maps[0]), str(data)]
-    options = [*["--method", "bid", "--trials", "2", "--rays", "32", "--max-steps", "2", "--out"], str(tmp_path / "out")]
+    options = [
+        *["--method", "bid", "--trials", "2", "--rays", "32", "--max-steps", "2", "--out"],
+        str(tmp_path / "out"),
+    ]
     assert main(["compare", *folders, *options]) == 0
     shown = capsys.readouterr()
     assert "short" in shown.out
