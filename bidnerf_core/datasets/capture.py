@@ -473,8 +473,7 @@ def remark(where: Path | str, text: str) -> None:
 def with_files(capture: Capture) -> list[Shot]:
     """Return the shots whose image files exist, without masks and depth images that do not exist.
 
-    Remarks count what is missing.
-    Raises ``InputError`` if all images are missing, or all masks.
+    Remarks count what is missing. Raises ``InputError`` if all images are missing, or all masks.
     """
 
     def missing(noun: str, files: Sequence[object]) -> set[object]:
