@@ -30,13 +30,7 @@ from bidnerf_core.fields import (
 )
 from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, NotNegative, Positive, Range
-from bidnerf_core.training import (
-    Replayable,
-    Report,
-    StepOutcome,
-    Supervision,
-    SupervisionConfig,
-)
+from bidnerf_core.training import Replayable, Report, StepOutcome, Supervision, SupervisionConfig
 from bidnerf_hashgrid.field import CoarseField, FieldConfig, HashGridField
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 from bidnerf_hashgrid.threads import pools_only

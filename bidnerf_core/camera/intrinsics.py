@@ -234,9 +234,7 @@ class CameraBatch:
         )
 
     def unproject(self, pixels: Float[Tensor, "p 2"], camera: Int[Tensor, "p"]) -> Float[Tensor, "p 3"]:
-        """Return the points on the plane z = 1 that appear at ``pixels`` (u, v); ``camera`` is the index of
-        each pixel's camera.
-        """
+        """Return the points on the plane z = 1 that appear at ``pixels`` (u, v) of the cameras with these indices."""
         matrix, exact = self.matrices[camera], pixels.double()
         if self.distortion.shape[1]:
             exact = undistort_points(exact[:, None], matrix, self.distortion[camera], num_iters=20)[:, 0]

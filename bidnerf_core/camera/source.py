@@ -13,12 +13,7 @@ from torch import Tensor
 
 from bidnerf_core.camera.exif import UPRIGHT, Exif, Orientation
 from bidnerf_core.camera.files import read_camera
-from bidnerf_core.camera.intrinsics import (
-    Intrinsics,
-    cameras_at_size,
-    reduced_size,
-    same_aspect,
-)
+from bidnerf_core.camera.intrinsics import Intrinsics, cameras_at_size, reduced_size, same_aspect
 from bidnerf_core.camera.lenses import Camera, Lens
 from bidnerf_core.errors import InputError
 

@@ -218,8 +218,9 @@ def _near_identity(H: Float[Tensor, "9 9"]) -> Float[Tensor, "9"]:
 
 
 def _pairs(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
-    """Return pairs that probably show the same things: nearby according to the poses, which may be wrong, or
-    in the given order.
+    """Return pairs that probably show the same things.
+
+    They are nearby according to the poses, which may be wrong, or in the given order.
     """
     count = len(images)
     pairs = {(i, i + step) for step in (1, 3) for i in range(count - step)}

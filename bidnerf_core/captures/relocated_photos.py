@@ -115,10 +115,7 @@ def _has_support(images: Sequence[ImageKeypoints], links: csr_array, number: int
 
 
 def relocated(
-    tracked: TrackedViews,
-    views: Sequence[View],
-    numbers: Sequence[int],
-    config: LandmarkConfig,
+    tracked: TrackedViews, views: Sequence[View], numbers: Sequence[int], config: LandmarkConfig
 ) -> dict[int, Relocation]:
     """Localize the suspects with landmarks built without them.
 

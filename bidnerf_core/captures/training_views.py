@@ -124,10 +124,7 @@ def _lacks_distances(view: View) -> bool:
 
 
 def _tracked(
-    views: Sequence[View],
-    features: str,
-    trust_poses: bool,
-    depth_unit: float | None,
+    views: Sequence[View], features: str, trust_poses: bool, depth_unit: float | None
 ) -> TrackedViews:
     """Track the keypoints of the views. Raises ``InputError`` if poses contradict the images, or depth is in another unit.
 

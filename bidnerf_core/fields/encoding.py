@@ -46,10 +46,7 @@ def frequency_encoding(
 
 
 def query_network(
-    network: Network,
-    bounds: SceneBounds,
-    positions: Float[Tensor, "*p 3"],
-    directions: Float[Tensor, "*p 3"],
+    network: Network, bounds: SceneBounds, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]
 ) -> FieldValues:
     """Return a network's values; positions are scaled to the cube [-1, 1], so that the length unit has no effect."""
     shape = positions.shape[:-1]

@@ -268,8 +268,9 @@ def _interpolated(
 
 
 class ScaledField(nn.Module):
-    """A field whose world is ``scale`` times as large as that of the wrapped field; colours stay, and
-    densities are per new length.
+    """A field whose world is ``scale`` times as large as that of the wrapped field.
+
+    Colours stay, and densities are per new length.
     """
 
     def __init__(self, field: RadianceField, scale: float) -> None:

@@ -354,8 +354,9 @@ class Frame:
         return Frame(name, laid, intrinsics, metres, cover, hidden=unused, awaits_background=awaits)
 
     def replace(self, **changes: Any) -> Frame:
-        """Return the frame with other attributes. Images that stay are neither converted nor checked again, as they
-        are by ``dataclasses.replace``.
+        """Return the frame with other attributes.
+
+        Images that stay are neither converted nor checked again, as they are by ``dataclasses.replace``.
         """
         other = object.__new__(Frame)
         other.__dict__.update({name: self.__dict__[name] for name in self.__dataclass_fields__})
@@ -414,8 +415,9 @@ class Frame:
 
 
 def _check_image(where: str, what: str, image: object, camera: Intrinsics, is_new: bool) -> None:
-    """Raise ``InputError`` unless the image is a tensor of the camera's size and, if ``is_new``, has measured, finite
-    floats (bytes also for ``rgb``, booleans for ``hidden``).
+    """Raise ``InputError`` unless the image is a tensor of the camera's size.
+
+    If it ``is_new``, it must also have measured, finite floats (bytes also for ``rgb``, booleans for ``hidden``).
     """
     if not isinstance(image, Tensor):
         raise InputError(

@@ -1,5 +1,6 @@
-"""The images of many frames: stored in a few large blocks of memory or, if there are many, in a mapped file, and
-read at pixels of many images at once.
+"""The images of many frames, which are read at pixels of many images at once.
+
+They are stored in a few large blocks of memory or, if there are many, in a mapped file.
 """
 
 from __future__ import annotations
@@ -103,8 +104,9 @@ class ImagePixels:
         default: float = 0.0,
         device: torch.device | str = "cpu",
     ) -> ImagePixels:
-        """Build this on ``device`` from ``images``; None has the value ``default`` everywhere. On the CPU, images that share few
-        blocks of memory are not copied.
+        """Build this on ``device`` from ``images``; None has the value ``default`` everywhere.
+
+        On the CPU, images that share few blocks of memory are not copied.
         """
         device, present = torch.device(device), {i: x.detach() for i, x in enumerate(images) if x is not None}
         block, start = torch.tensor([[-1], [0]]).repeat(1, len(images))

@@ -1,5 +1,6 @@
-"""Rotations and updates of single poses in NumPy, in microseconds; ``SE3`` and SciPy are built for batches
-and take a millisecond.
+"""Rotations and updates of single poses in NumPy, which take microseconds.
+
+``SE3`` and SciPy are built for batches and take a millisecond.
 """
 
 from __future__ import annotations

@@ -14,10 +14,7 @@ from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.geometry.conversions import (
-    rotation_matrix_to_axis_angle,
-    rotation_matrix_to_quaternion,
-)
+from kornia.geometry.conversions import rotation_matrix_to_axis_angle, rotation_matrix_to_quaternion
 from torch import Tensor
 
 from bidnerf_core.devices import constant
@@ -142,8 +139,9 @@ class SE3:
         return SE3(self.rotation, self.translation + offset.to(self.translation))
 
     def retract_linearly(self, tangent: Float[Tensor, "*c 6"]) -> SE3:
-        """Approximate ``retract`` to first order in ``tangent``: cheaper, with the same value and derivative
-        at 0, but not rigid elsewhere.
+        """Approximate ``retract`` to first order in ``tangent``.
+
+        It is cheaper, with the same value and derivative at 0, but not rigid elsewhere.
         """
         rho, phi = tangent[..., :3], tangent[..., 3:]
         return SE3(self.rotation + self.rotation @ skew(phi), self.translation + _matvec(self.rotation, rho))
@@ -221,8 +219,9 @@ def skew(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def _guarded_angle(phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the squared angle, whether it is small, and the angle (1 if small): neither branch of a
-    ``where`` may divide by 0. For small angles, below 0.01 rad, series are used, since sin and cos cancel.
+    """Return the squared angle, whether it is small, and the angle (1 if small).
+
+    Neither branch of a ``where`` may divide by 0. For small angles, below 0.01 rad, series are used, since sin and cos cancel.
     """
     squared = (phi * phi).sum(-1)
     small = squared < 1e-4

@@ -150,9 +150,7 @@ def channels(
     return split_alpha(torch.from_numpy(scaled))
 
 
-def split_alpha(
-    values: Float[Tensor, "h w c"],
-) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
+def split_alpha(values: Float[Tensor, "h w c"]) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
     """Split grey, grey with alpha, RGB or RGBA (1 to 4 channels) into colour and alpha."""
     count = values.shape[-1]
     alpha = values[..., -1].clone() if count in (2, 4) else None

@@ -89,8 +89,9 @@ def parse_rows(content: bytes, path: Path, expected: str, columns: str) -> list[
 
 
 def read_lines(path: Path, expected: str, columns: str, most: int = LARGEST_ROWS) -> list[Row]:
-    """Read all lines of a text file in any encoding, including empty ones and comments. Raises ``InputError``
-    as ``read_file`` does.
+    """Read all lines of a text file in any encoding, including empty ones and comments.
+
+    Raises ``InputError`` as ``read_file`` does.
     """
     lines = read_file(path, expected, most).decode("utf-8-sig", "replace").split("\n")
     return [Row(path, number, line.strip(), columns) for number, line in enumerate(lines, start=1)]

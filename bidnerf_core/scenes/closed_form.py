@@ -75,7 +75,7 @@ class ClosedFormScene:
         distance = torch.full_like(rays[0], torch.inf)
         owner = torch.full_like(rays[0], -1, dtype=torch.int16)
         for i, primitive in enumerate(self.primitives):
-            # From a single origin, rays may only meet the primitive in the cone around its ball.
+            # Of rays from a single origin, only those in the cone around the primitive's ball may meet it.
             towards = primitive.T_world_shape.translation.to(rays) - origins[:, 0]
             beyond = float(towards @ towards) - (primitive.shape.reach * 1.01 + 1e-3) ** 2
             candidates = torch.arange(rays.shape[1])

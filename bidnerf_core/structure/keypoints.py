@@ -60,8 +60,9 @@ class Described:
 
 
 def described(images: Sequence[SourceImage], given: Intrinsics | str | Path | None) -> Described:
-    """Read the headers of photos, and group the photos by camera. Raises ``InputError`` for a ``given``
-    camera that does not fit.
+    """Read the headers of photos, and group the photos by camera.
+
+    Raises ``InputError`` for a ``given`` camera that does not fit.
     """
     photos, unusable = list[ListedPhoto](), dict[str, str]()
     for number, image in enumerate(images, start=1):

@@ -22,13 +22,7 @@ from bidnerf_core.progress import Cancel, ProgressCallback, job_context
 from bidnerf_core.structure.agreement import agreement
 from bidnerf_core.structure.keypoints import Described, described, write_cameras, write_keypoints
 from bidnerf_core.structure.library import pycolmap_for
-from bidnerf_core.structure.mapping import (
-    LEAST_PHOTOS,
-    full_size,
-    left_out,
-    reconstructed,
-    turn_upright,
-)
+from bidnerf_core.structure.mapping import LEAST_PHOTOS, full_size, left_out, reconstructed, turn_upright
 from bidnerf_core.structure.matching import Overlaps, match
 from bidnerf_core.structure.pairs import Pairs, chosen_pairs, few
 from bidnerf_core.structure.record import (

@@ -162,8 +162,10 @@ def stored_rows(file: Path, kind: type[Row]) -> list[Row] | None:
 
 
 def begun(folder: Path) -> dict[str, Any]:
-    """Return the state of interrupted work in a folder: the digest of its ``inputs``, whether they are a ``video``, and whether it
-    ``failed``, so that work on other photos may replace it.
+    """Return the state of interrupted work in a folder.
+
+    It is the digest of its ``inputs``, whether they are a ``video``, and whether it ``failed``, so that work on other photos may
+    replace it.
     """
     try:
         found = read_json(folder / WORK / "begun.json", "the state of interrupted work")
@@ -198,8 +200,9 @@ def is_ours(file: Path) -> bool:
 
 
 def clear(folder: Path) -> None:
-    """Remove everything that this module wrote; other files stay, such as photos in a folder with the same
-    name as the frames folder.
+    """Remove everything that this module wrote.
+
+    Other files stay, such as photos in a folder with the same name as the frames folder.
     """
     (folder / TRANSFORMS).unlink(missing_ok=True)  # first: without it, the record counts as incomplete
     record: Any = {}

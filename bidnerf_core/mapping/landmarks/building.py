@@ -16,20 +16,8 @@ from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.frames import SeenLandmarks, View
 from bidnerf_core.geometry import SE3, chi_squared_quantile, inlier_weight
 from bidnerf_core.mapping.geometry.observations import Sightings, summed
-from bidnerf_core.mapping.geometry.triangulation import (
-    fitting,
-    intersected,
-    noise,
-    parallax,
-    refined_points,
-)
-from bidnerf_core.mapping.landmarks.features import (
-    USUAL_FEATURES,
-    Features,
-    FoundOnce,
-    Sift,
-    find_features,
-)
+from bidnerf_core.mapping.geometry.triangulation import fitting, intersected, noise, parallax, refined_points
+from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES, Features, FoundOnce, Sift, find_features
 from bidnerf_core.mapping.landmarks.image_keypoints import ImageKeypoints, image_keypoints
 from bidnerf_core.mapping.landmarks.keypoint_depth import keypoint_depth_noise, placed
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, concatenated

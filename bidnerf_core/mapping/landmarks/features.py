@@ -132,11 +132,7 @@ def detected(features: Features, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
     parts = (found.pixels, found.sizes, found.descriptors)
     kinds = [f"{p.dtype} {list(p.shape)}" if isinstance(p, Tensor) else type(p).__name__ for p in parts]
     fits = all(isinstance(part, Tensor) for part in parts) and found.descriptors.dtype == torch.uint8
-    if not fits or [list(p.shape) for p in parts] != [
-        [n := len(parts[2]), 2],
-        [n],
-        [n, parts[2].shape[-1]],
-    ]:
+    if not fits or [list(p.shape) for p in parts] != [[n := len(parts[2]), 2], [n], [n, parts[2].shape[-1]]]:
         raise PluginError(
             f"pixels, sizes and descriptors are {enumeration(kinds)}",
             where=who,
@@ -224,10 +220,7 @@ def squared_distances(
 
 
 def paired_squared_distances(
-    a: UInt8[Tensor, "n d"],
-    b: UInt8[Tensor, "m d"],
-    rows: Int[Tensor, "p"],
-    columns: Int[Tensor, "p"],
+    a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"], rows: Int[Tensor, "p"], columns: Int[Tensor, "p"]
 ) -> Float[Tensor, "p"]:
     """Return the squared Euclidean distance of each pair ``a[rows]``, ``b[columns]``."""
     return (a[rows].float() - b[columns].float()).square_().sum(-1)
@@ -235,7 +228,7 @@ def paired_squared_distances(
 
 def grey_image(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
     """Return the brightness of an image as bytes (h, w)."""
-    # Copying a whole phone photo takes a gigabyte.
+    # Strips of the image are copied one by one, since copying a whole phone photo takes a gigabyte.
     strips = rgb.detach().cpu().split(max(1, 2**22 // rgb.shape[1]))
     clean = (part.float().nan_to_num(0.0).clamp_(0, 1).mul_(255).round_().to(torch.uint8) for part in strips)
     return np.concatenate([cv2.cvtColor(part.contiguous().numpy(), cv2.COLOR_RGB2GRAY) for part in clean])

@@ -94,8 +94,9 @@ class Landmarks:
         return replace(self, **{name: getattr(self, name)[g] for name in names})
 
     def evidence(self, states: States) -> Float[Tensor, "h"]:
-        """Return the log likelihood relative to that of outliers alone, by the largest noise of any state and without weights, so
-        that it counts matches.
+        """Return the log likelihood relative to that of outliers alone.
+
+        It is that by the largest noise of any state and without weights, so that it counts matches.
         """
         states = replace(states, noise=states.noise.amax().expand_as(states.noise))
         own = self._of(states)
@@ -135,8 +136,9 @@ class Landmarks:
         return float(away[self.valid[g] > 0].median())
 
     def residuals(self, states: States) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the squared residuals in units of their variance (h m), projection minus observation (h m 2) and its variance (h m),
-        pixels.
+        """Return squared residuals in units of their variance (h m).
+
+        Also returns projection minus observation (h m 2, pixels) and its variance (h m, pixels squared).
         """
         return self._of(states)._residuals(states)
 

@@ -66,8 +66,9 @@ def cast(
 def trace(
     surface: SurfaceMap, origins: Float[Tensor, "*r 3"], directions: Float[Tensor, "*r 3"], steps: int = 48
 ) -> Float[Tensor, "*r"]:
-    """Return the distance (metres) at which each ray comes within a cell of the surface inside the grid; infinite if it
-    never does. ``directions`` are unit vectors.
+    """Return the distance (metres) at which each ray comes within a cell of the surface inside the grid.
+
+    It is infinite if the ray never does. ``directions`` are unit vectors.
     """
     shape, (origins, directions) = directions.shape[:-1], (x.reshape(-1, 3) for x in (origins, directions))
     found = cast(surface, origins, directions, steps, surface.grid.cell)

@@ -107,8 +107,9 @@ def agreed(
     tolerance: float,
     needed: int,
 ) -> Bool[Tensor, "p"]:
-    """Return a mask of the points of image ``number`` that at least ``needed`` other images confirm, to within ``tolerance``
-    (metres), and that no more images see through.
+    """Return a mask of the points of image ``number`` that other images confirm to within ``tolerance`` (metres).
+
+    At least ``needed`` images must confirm a point, and no more than confirm it may see through it.
     """
     agree, against = (torch.zeros(len(points), dtype=torch.int32) for _ in range(2))
     others = witnesses(number, images)

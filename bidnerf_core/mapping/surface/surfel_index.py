@@ -82,9 +82,10 @@ class SurfelIndex:
     def _numbering(
         self,
     ) -> tuple[Float[Tensor, "3 1"], Float[Tensor, "3 3"], Int[Tensor, "c"], Int[Tensor, "3 1"]]:
-        """Tables that convert points to cell numbers: ``offset + rate point`` is a position in each axis' part (starting at
-        ``base``) of a table of terms whose sum is the number. Each part has an extra cell at either end, which repeats the
-        border.
+        """Tables that convert points to cell numbers.
+
+        ``offset + rate point`` is a position in each axis' part (starting at ``base``) of a table of terms whose sum is the
+        number. Each part has an extra cell at either end, which repeats the border.
         """
         longest = max(self.grid.shape) + 2
         _, y, z = block_shape(self.grid)
