@@ -210,10 +210,11 @@ def served(place: Place) -> Iterator[Served]:
     options: Any = {"port": 0, "limits": LIMITS, "method": "bid", "config": QUICK}
     options |= {"ready": tell, "stop": stop}
     running = threading.Thread(target=serve, args=[maps], kwargs=options)
+    lasting = pytest.MonkeyPatch()  # for the processes that take the place of those that tests kill, too
+    lasting.syspath_prepend(str(site))
+    lasting.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")])))
+    _declared.cache_clear()
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(site))
-        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")])))
-        _declared.cache_clear()
         patch.setattr(tempfile, "tempdir", str(place.folder / "uploads"))
         patch.setattr("bidnerf_core.service.server.service_app", kept)
         running.start()
@@ -226,6 +227,7 @@ def served(place: Place) -> Iterator[Served]:
     finally:
         stop.set()
         running.join(30)
+        lasting.undo()
         _declared.cache_clear()
     with pytest.raises(ServiceError, match="refused"):
         ServiceClient(told[0]).ask("/maps")
