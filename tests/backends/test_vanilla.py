@@ -224,3 +224,13 @@ def test_a_step_takes_more_rays_where_there_is_little_room() -> None:
 def test_an_encoding_of_nothing_is_refused() -> None:
     with pytest.raises(InputError, match="expected one of them"):
         VanillaConfig(position_frequencies=0, include_input=False)
+
+
+def test_carving_leaves_what_is_seen() -> None:
+    """Each pixel that shows matter has room on its ray where its depth was measured."""
+    field = built(room_resolution=32)
+    carve(field, rgbd_views())
+    batch = RayBank(rgbd_views(), BOUNDS).draw(2000, torch.Generator().manual_seed(1))
+    hit = batch.observed.distance > 0
+    places = batch.rays.at(batch.observed.distance[:, None])[:, 0]
+    assert float(field.room.holds(places[hit]).float().mean()) > 0.99

@@ -299,3 +299,7 @@ def test_files_that_hold_no_camera(
     path.write_text(content)
     with refused(where=f"{path}{where}", found=why, expected=expected):
         found(camera=path)
+
+
+def test_what_the_user_gives_goes_before_exif() -> None:
+    assert found(Exif(equivalent_mm=26), focal=1234.0).fx == 1234

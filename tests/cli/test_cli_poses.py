@@ -159,3 +159,21 @@ def test_datasets_tell_the_unit_of_their_depth(shared: Path) -> None:
     assert read_views(shared / "data").depth_unit == 0.001
     centimetres = DatasetOptions(split="all", depth_unit=0.01)
     assert read_views(shared / "data", centimetres).depth_unit == 0.01
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_training_refuses_axes_of_other_software(bidnerf: Run, data_dir: Path, tmp_path: Path) -> None:
+    source = data_dir / "room_living"
+    described = json.loads((source / "transforms_train.json").read_text())
+    described["frames"] = described["frames"][:30]
+    for frame in described["frames"]:
+        frame["transform_matrix"] = [[a, -b, -c, d] for a, b, c, d in frame["transform_matrix"]]
+        for key in ("file_path", "depth_file_path"):
+            frame[key] = str(source / frame[key])
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data/transforms_train.json").write_text(json.dumps(described))
+    found = bidnerf("train", tmp_path / "data", "--out", tmp_path / "map", *tiny.options(2))
+    named = ("the poses contradict the photos", "diag(1, -1, -1, 1)")
+    assert_refused(found, 1, *named, after_remarks=True)
+    assert not (tmp_path / "map/map.json").exists()

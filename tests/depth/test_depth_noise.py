@@ -126,3 +126,9 @@ def test_real_sensors_have_the_noise_that_the_literature_states(
             <= relative(estimated_depth_noise(view.frame.depth, view.frame.intrinsics), distance)
             <= most
         )
+
+
+def test_noise_does_not_depend_on_the_unit_of_length(generator: Generator) -> None:
+    depth = noisy(corridor(), lambda z: 0.004 * z**2, generator)
+    metres, feet = estimated_depth_noise(depth, CAMERA), estimated_depth_noise(depth / 0.3048, CAMERA)
+    assert relative(feet, 2.0 / 0.3048) == pytest.approx(relative(metres, 2.0), rel=1e-3)

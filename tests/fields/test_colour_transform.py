@@ -76,3 +76,8 @@ def test_images_with_a_background_have_no_exposure_to_learn(alpha: bool) -> None
     assert (
         Supervision(views, demo_object().bounds, replace(SupervisionConfig(), exposure=False)).colours is None
     )
+
+
+def test_an_even_image_is_fitted_by_its_mean() -> None:
+    flat = torch.full((20, 3), 0.4)
+    torch.testing.assert_close(fitted_colours(flat, flat + 0.25), flat + 0.25)

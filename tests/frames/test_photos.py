@@ -220,3 +220,9 @@ def test_folders_that_are_none(tmp_path: Path, photo: Path) -> None:
         photos_in(tmp_path / "none")
     with refused(where=photo, found="not a directory", expected="a folder of photos"):
         photos_in(photo)
+
+
+@pytest.mark.parametrize(("depth", "unit"), [(np.uint16, "0.001"), (np.float32, "1")])
+def test_arrays_without_a_unit_are_warned_of(depth: type, unit: str) -> None:
+    with pytest.warns(InputWarning, match=f"frame image: depth_unit is not given, {unit} m per step"):
+        Frame.from_numpy(noise(HEIGHT, WIDTH), CAMERA, depth=np.ones((HEIGHT, WIDTH), dtype=depth))

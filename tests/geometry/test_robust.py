@@ -53,3 +53,14 @@ def test_barrons_general_form(name: RobustName, alpha: float) -> None:
 def test_a_scale_that_is_none_is_told(scale: float) -> None:
     with refused(found=f"is {scale}", expected="a positive number"):
         Robust("huber", scale)
+
+
+def test_far_residuals_pull_less_and_less() -> None:
+    """The order of the influence of an outlier is what the losses are chosen by."""
+    pull = {}
+    for name in NAMES:
+        far = torch.tensor([20 * SCALE], dtype=torch.float64, requires_grad=True)
+        (slope,) = torch.autograd.grad(Robust(name, SCALE)(far).sum(), far)
+        pull[name] = float(slope)
+    assert pull["l1"] == pytest.approx(pull["huber"])
+    assert pull["l2"] > pull["l1"] > pull["cauchy"] > pull["geman-mcclure"] > 0

@@ -17,12 +17,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, features
 
 from bidnerf_core.frames import as_floats, photos_in
 
 # Inside: the header of an image alone, and a system that refuses to open a file
 from bidnerf_core.io import (
+    IMAGE_SUFFIXES,
     decode,
     files,
     over,
@@ -346,3 +347,17 @@ def test_oddities_of_a_file_cause_no_warning(tmp_path: Path) -> None:
     code = f"from pathlib import Path; from bidnerf_core.io.images import read_header; read_header(Path({str(path)!r}))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr == ""
+
+
+@pytest.mark.parametrize("size", [(29, 17), (40, 30), (41, 1), (8, 6)])
+def test_reducing_is_opencvs_area_filter(size: tuple[int, int]) -> None:
+    image = noise(30, 41).astype(np.float32) / 255
+    expected = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    np.testing.assert_allclose(reduced(torch.from_numpy(image), *size).numpy(), expected, atol=1e-6)
+
+
+def test_the_formats_that_photos_have_are_decoded(tmp_path: Path) -> None:
+    for suffix in (*IMAGE_SUFFIXES, ".gif", *([".avif"] if features.check("avif") else [])):
+        path = tmp_path / f"a{suffix}"
+        Image.fromarray(noise(16, 24)).convert("L" if suffix == ".pgm" else "RGB").save(path)
+        assert read_image(path)[0].shape == (16, 24, 3)

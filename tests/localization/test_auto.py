@@ -228,3 +228,13 @@ def test_what_looks_the_same_from_two_sides_is_ambiguous() -> None:
     surface, (view,) = baked.baked(scene), baked.images(scene, 1, seed=5)
     found = found_for(baked.problem(view, surface=surface))
     assert found.outcome is Outcome.AMBIGUOUS, found.reason
+
+
+def test_the_same_seed_gives_the_same_answer() -> None:
+    problem = baked.problem(baked.unseen()[1])
+    first = found_for(problem, 3)
+    torch.manual_seed(99)
+    again = found_for(problem, 3)
+    assert torch.equal(first.T_world_camera.matrix(), again.T_world_camera.matrix())
+    assert torch.equal(first.losses, again.losses)
+    assert not torch.equal(first.T_world_camera.matrix(), found_for(problem, 4).T_world_camera.matrix())

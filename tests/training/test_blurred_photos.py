@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -94,3 +95,16 @@ def test_every_backend_weighs_blurred_photos_less(name: str) -> None:
 
     assert first_loss(3.0) < 0.99 * first_loss(3.0, sharpness=False)
     assert first_loss(0.0) == first_loss(0.0, sharpness=False)
+
+
+def test_the_more_a_photo_is_blurred_the_less_it_weighs() -> None:
+    weights = [float(detail_kept(photos(blur))[BLURRED]) for blur in (0.0, 1.5, 3.0)]
+    assert weights[0] == 1
+    assert weights[0] > weights[1] > weights[2]
+
+
+@pytest.mark.parametrize("views", [photos(), photos()[:1]])
+def test_captures_without_blurred_photos_have_no_weights(views: Sequence[View]) -> None:
+    assert Supervision(views, BOUNDS, SupervisionConfig()).image_weight is None
+    off = replace(SupervisionConfig(), sharpness=False)
+    assert Supervision(photos(3.0), BOUNDS, off).image_weight is None
