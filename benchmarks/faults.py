@@ -24,6 +24,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import asdict, dataclass
 from functools import lru_cache
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -131,9 +132,14 @@ def answer(query: Query) -> Row:
 
 
 def diagnostics_of(found: Localization) -> dict[str, Any]:
-    """Return the diagnostics of an answer, where it has any."""
-    names = ("confidence", "diagnostics")
-    return {name: to_plain(getattr(found, name)) for name in names if getattr(found, name, None) is not None}
+    """Return the diagnostics of an answer, where it has any; those that are unknown are left out."""
+    if found.diagnostics is None:
+        return {}
+    numbers = asdict(found.diagnostics)
+    known = {
+        name: value for name, value in numbers.items() if not isinstance(value, float) or isfinite(value)
+    }
+    return {"diagnostics": to_plain(known)}
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
