@@ -89,7 +89,7 @@ def test_transparent_pixels_show_the_background_of_the_map(grounds: list[Map], t
 
 
 def test_a_map_without_a_field_is_found_by_its_landmarks(grounds: list[Map]) -> None:
-    """As one imported from COLMAP, among maps with fields."""
+    """Among maps with fields, a map that is imported from COLMAP has none."""
     alone = Map(replace(grounds[1].info, data="alone"), NoField(), None, grounds[1].landmarks)
     found = bn.MapCollection([grounds[0], alone])(photo(SEEDS[1]).frame)
     assert (found.map, found.converged) == ("alone", True)
