@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import json
+import math
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -273,9 +274,17 @@ def test_rows_survive_a_kill_and_files_of_something_else_are_left_alone(
         assert path.read_bytes() == other
 
 
-def test_answers_keep_all_their_numbers(script: ModuleType) -> None:
+def test_unknown_diagnostics_are_left_out(script: ModuleType) -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Diagnostics:
+        inliers: int = 0
+        evidence: float = math.nan
+
     @dataclasses.dataclass(frozen=True)
     class Answer:
-        confidence: float = 0.75
+        diagnostics: Diagnostics | None = None
 
-    assert script.diagnostics_of(Answer()) == {"confidence": 0.75}
+    assert script.diagnostics_of(Answer()) == {}
+    assert script.diagnostics_of(Answer(Diagnostics())) == {"diagnostics": {"inliers": 0}}
+    known = {"inliers": 9, "evidence": 0.5}
+    assert script.diagnostics_of(Answer(Diagnostics(**known))) == {"diagnostics": known}
