@@ -1,5 +1,3 @@
-from .advice import sentences as sentences
-from .advice import summary as summary
 from .cameras import MatrixRows as MatrixRows
 from .cameras import MovedCamera as MovedCamera
 from .cameras import PoseRefinement as PoseRefinement
@@ -13,7 +11,10 @@ from .cameras import pose_updates as pose_updates
 from .cameras import poses_of as poses_of
 from .cameras import stored_cameras as stored_cameras
 from .cameras import with_wrong_pose as with_wrong_pose
+from .coverage import UpDirection as UpDirection
+from .coverage import given_up as given_up
 from .coverage import horizontal_axes as horizontal_axes
+from .coverage import up_direction as up_direction
 from .inria_cameras import cameras_beside as cameras_beside
 from .inria_cameras import write_inria_cameras as write_inria_cameras
 from .photos import detail_kept as detail_kept
@@ -24,12 +25,11 @@ from .report import CoverageRecord as CoverageRecord
 from .report import Gap as Gap
 from .report import PhotoProblem as PhotoProblem
 from .report import PhotoRecord as PhotoRecord
+from .report import sentences as sentences
+from .report import summary as summary
 from .survey import surveyed as surveyed
 from .training_poses import TrainingPoses as TrainingPoses
 from .training_views import RefinementChoice as RefinementChoice
 from .training_views import located as located
 from .training_views import prepared as prepared
 from .trial import tried_landmarks as tried_landmarks
-from .up_direction import UpDirection as UpDirection
-from .up_direction import given_up as given_up
-from .up_direction import up_direction as up_direction

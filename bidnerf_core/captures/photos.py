@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -39,7 +39,7 @@ def detail_kept(views: Sequence[View]) -> Float[Tensor, "v"]:
     It is 1 for all photos except outliers that are blurred.
     """
     found = torch.tensor([sharpness(_clean(v.frame.rgb).mean(-1), v.frame.hidden) for v in views])
-    lacking = -nearby(views).excess(found)
+    lacking = -excess(found, nearby(views))
     return torch.where(blurred(lacking), torch.exp2(-lacking), 1.0)
 
 
@@ -111,37 +111,29 @@ def _clean(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
     return image
 
 
-@dataclass(frozen=True, eq=False)
-class Nearby:
-    """Which photos were taken from nearby places in similar directions: pairs in both directions, each once."""
-
-    count: int  # of photos
-    photo: Int[Tensor, "p"]
-    other: Int[Tensor, "p"]
-
-    def __getitem__(self, kept: Bool[Tensor, "p"]) -> Nearby:
-        return Nearby(self.count, self.photo[kept], self.other[kept])
-
-    def within(self, group: Int[Tensor, "v"]) -> Nearby:
-        """Return the pairs within the same group; photos without a group keep all of their pairs."""
-        same = group[self.photo] == group[self.other]
-        alone = torch.bincount(self.photo[same], minlength=self.count) == 0
-        return self[same | alone[self.photo]]
-
-    def medians(self, values: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-        """Return the lower median of the values of the photos near each photo; NaN if there are none."""
-        there = torch.bincount(self.photo, minlength=self.count) > 0
-        return torch.where(there, _medians(values[self.other], self.photo, self.count), torch.nan)
-
-    def excess(self, values: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-        """Return how much each photo's value exceeds the median of those near it; 0 if there are none."""
-        return (values - self.medians(values)).nan_to_num(0.0)
+Nearby: TypeAlias = Int[Tensor, "p 2"]
+"""Pairs of photos, by index, that were taken from nearby places in similar directions; each in both orders."""
 
 
-def nearby(views: Sequence[View]) -> Nearby:
-    """Return which photos were taken from nearby places in similar directions: up to eight for each."""
-    i, j = likely_pairs([view.T_ref_camera for view in views], 8).unbind(-1)
-    return Nearby(len(views), torch.cat([i, j]), torch.cat([j, i]))
+def nearby(views: Sequence[View], group: Int[Tensor, "v"] | None = None) -> Nearby:
+    """Return which photos were taken from nearby places in similar directions: up to eight for each.
+
+    Of photos with any of them in their own ``group``, only those are returned.
+    """
+    pairs = likely_pairs([view.T_ref_camera for view in views], 8)
+    pairs = torch.cat([pairs, pairs.flip(1)])
+    if group is None:
+        return pairs
+    same = group[pairs[:, 0]] == group[pairs[:, 1]]
+    is_alone = torch.bincount(pairs[same, 0], minlength=len(views)) == 0
+    return pairs[same | is_alone[pairs[:, 0]]]
+
+
+def excess(values: Float[Tensor, "v"], near: Nearby) -> Float[Tensor, "v"]:
+    """Return how much each photo's value exceeds the median of those near it; 0 if there are none."""
+    photo, other = near.unbind(1)
+    found = torch.bincount(photo, minlength=len(values)) > 0
+    return torch.where(found, values - _medians(values[other], photo, len(values)), 0.0)
 
 
 def exposures(
@@ -150,8 +142,8 @@ def exposures(
     """Return the exposure of each photo (stops) relative to the median of all.
 
     The brightness of a landmark in a photo is the landmark's own brightness times the photo's exposure. Both
-    are estimated alternately, as medians. Photos that show fewer than ten landmarks are compared with their
-    neighbours as a whole.
+    are estimated alternately, as medians. Photos that show fewer than ten landmarks are compared with those
+    ``near`` them as a whole.
     """
     image, point, count = seen.image, seen.point, len(views)
     light = torch.zeros(len(image), dtype=torch.float64)  # log2 of the linear light around each keypoint
@@ -162,17 +154,12 @@ def exposures(
         rows, columns = v.clamp(0, smooth.shape[0] - 1).numpy(), u.clamp(0, smooth.shape[1] - 1).numpy()
         light[own] = torch.from_numpy(log_light(smooth[rows, columns])).double()
     enough = torch.bincount(image, minlength=count) >= 10
-    if not bool(enough.any()):
-        return brightness - near.medians(brightness).nan_to_num(float(brightness.median()))
     found = torch.zeros(count, dtype=torch.float64)
-    for _ in range(20):  # alternations
+    for _ in range(20 if bool(enough.any()) else 0):  # alternations
         of_points = _medians(light - found[image], point, seen.count)
-        found = torch.where(enough, _medians(light - of_points[point], image, count), 0.0)
-        found = found - found[enough].median()
-    own_light = brightness - found
-    around = near[enough[near.other]].medians(own_light)
-    whole = brightness - around.nan_to_num(float(own_light[enough].median()))
-    return torch.where(enough, found, whole)
+        own = _medians(light - of_points[point], image, count)
+        found = torch.where(enough, own - own[enough].median(), 0.0)
+    return torch.where(enough, found, excess(brightness - found, near))
 
 
 def _medians(values: Float[Tensor, "m"], index: Int[Tensor, "m"], count: int) -> Float[Tensor, "n"]:

@@ -3,24 +3,24 @@
 The keypoints of two images that show the same point are found from the images alone (RANSAC with an essential
 matrix, Nistér, PAMI 2004). Under correct poses these matches lie on their epipolar lines, and their points in
 front of both cameras; the lines alone do not determine the sign of a baseline (Hartley, Cheirality, IJCV
-1998). Poses are wrong if they disagree with most pairs of images, and each reading of ``pose_readings`` is
-tested in the same way.
+1998). Poses are wrong if they disagree with most pairs of images. Each reading of them, as another convention or
+after a common mistake, is a transformation of all poses of a capture, and is tested in the same way.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
+from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_matrix_to_quaternion
 from torch import Tensor
 
-from bidnerf_core.captures.pose_readings import AS_GIVEN, SWAP, Y_AND_Z_REVERSED, Reading, changed, readings
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import LEAST_BASELINE, ImageKeypoints, likely_pairs, squared_distances
 
@@ -37,6 +37,22 @@ downscaled ones."""
 AGREED = 0.7
 """Smallest fraction of a pair's matches near their epipolar lines, of those in front of both cameras, and of the pairs for a
 reading to be suggested."""
+
+
+AS_GIVEN = torch.eye(3, dtype=torch.float64)
+Y_AND_Z_REVERSED = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+REVERSED_TOO = ", and their cameras' y and z axes are reversed"
+SWAP = "multiply each from the right by diag(1, -1, -1, 1)"
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One interpretation of given poses, in words and as a transformation."""
+
+    clause: str  # completes "the poses would agree if ..."
+    remedy: str  # what to do about it
+    understand: Callable[[SE3], SE3]
+    """Maps the given poses (n) to the true T_world_camera; NaN for an image left without a pose."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +96,7 @@ def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | 
     as_given = sum(agrees)
     if as_given > 0.75 * len(pairs):
         return None
-    tried = [*readings(len(images)), *_fitted_positions(pairs, poses)]
+    tried = readings(len(images))
     understood = SE3.stack([reading.understand(poses) for reading in tried])
     agreeing = torch.stack([pair.agreeing(understood).double() for pair in pairs]).sum(0)
     best = int(agreeing.max())
@@ -142,79 +158,6 @@ class MatchedPair:
         shows = torch.linalg.vector_norm(normal, dim=-1) / lengths > 3 * self.pixel
         front = ((a > 0) & (b > 0) & shows).sum(-1)
         return near & ((shows.sum(-1) < 10) | (front >= AGREED * shows.sum(-1)) | at_rest)
-
-
-def _fitted_positions(pairs: Sequence[MatchedPair], poses: SE3) -> list[Reading]:
-    """Return readings whose positions are a linear function of the given ones, fitted to the epipolar lines of all pairs.
-
-    They cover positions scaled along one axis, and positions and rotations from different world frames.
-    """
-    found = []
-    swaps = (
-        (AS_GIVEN, "", ""),
-        (Y_AND_Z_REVERSED, ", and their cameras' y and z axes are reversed", f", and {SWAP}"),
-    )
-    for axes, also, swap in swaps:
-        for B in _fitted(pairs, changed(poses, axes)):
-            clause, remedy = (
-                "their positions are in a different frame from their rotations",
-                "take both from one source",
-            )
-            # Entries off the diagonal of up to 3 % of the largest are attributed to noise.
-            if bool(((B - torch.diag(B.diagonal())).abs() < 0.03 * B.abs().max()).all()):
-                scales = ", ".join(f"{value:.3g}" for value in (B.diagonal() / B[0, 0]).tolist())
-                clause = "the axes of their positions are scaled differently"
-                remedy = f"multiply the positions, not the rotations, by about diag({scales})"
-            found.append(Reading(clause + also, remedy + swap, partial(changed, axes=axes, positions=B)))
-    return found
-
-
-def _fitted(pairs: Sequence[MatchedPair], T: SE3) -> list[Float[Tensor, "3 3"]]:
-    """Return matrices that, multiplied with the positions, put matches on their epipolar lines.
-
-    The first and second are the least-squares solution with either sign, up to scale. The last stays near the
-    identity where the lines give no constraint, such as along a direction in which the cameras do not move.
-    """
-    rows, counts = [], []
-    for pair in pairs:
-        R, baseline = T.rotation[pair.second], T.translation[pair.first] - T.translation[pair.second]
-        if float(baseline.norm()) < LEAST_BASELINE:
-            continue
-        rays = pair.seen_by_first @ (R.mT @ T.rotation[pair.first]).mT
-        normal = torch.linalg.cross(rays, pair.seen_by_second)  # normal . R^T B baseline = 0
-        normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True).median().clamp(min=1e-9)
-        world = normal @ R.mT
-        rows.append((world[:, :, None] * (baseline / baseline.norm())).flatten(1))
-        counts.append(len(rays))
-    if len(rows) < ENOUGH_PAIRS:
-        return []
-    A = torch.cat(rows)
-    weight = torch.cat([torch.full((count,), 1 / count, dtype=torch.float64) for count in counts])
-    free = _reweighted(A, weight, lambda H: torch.linalg.eigh(H).eigenvectors[:, 0]).reshape(3, 3)
-    return [free, -free, _reweighted(A, weight, _near_identity).reshape(3, 3)]
-
-
-def _reweighted(
-    A: Float[Tensor, "n 9"], weight: Float[Tensor, "n"], solve: Callable[[Tensor], Tensor]
-) -> Float[Tensor, "9"]:
-    """Return a robust solution of ``A b = 0``; ``solve`` solves given normal equations (9x9)."""
-    share = weight
-    for _ in range(10):  # reweighting
-        solution = solve(A.mT @ (share[:, None] * A))
-        off = (A @ solution).abs()
-        share = weight / (1 + (off / off.median().clamp(min=1e-9)) ** 2)
-    return solution
-
-
-def _near_identity(H: Float[Tensor, "9 9"]) -> Float[Tensor, "9"]:
-    """Minimize ``b H b + prior |b - 1|^2`` over matrices b of trace 3."""
-    identity = torch.eye(3, dtype=H.dtype).flatten()
-    prior = 1e-4 * H.diagonal().mean()  # the identity's weight, relative to that of the matches
-    system = torch.zeros((10, 10), dtype=H.dtype)
-    system[:9, :9] = H + prior * torch.eye(9, dtype=H.dtype)
-    system[:9, 9] = system[9, :9] = identity
-    right = torch.cat([prior * identity, identity.new_tensor([3.0])])
-    return torch.linalg.solve(system, right)[:9]
 
 
 def _pairs(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
@@ -279,3 +222,166 @@ def matched_pair(images: Sequence[ImageKeypoints], i: int, j: int) -> MatchedPai
     if int(kept.sum()) < ENOUGH_MATCHES:
         return None
     return MatchedPair(i, j, first[kept], second[kept], pixel)
+
+
+@cache
+def readings(count: int) -> tuple[Reading, ...]:
+    """Return the readings of ``count`` poses, common ones first: among those that fit equally well, the first is preferred."""
+    kinds = _of_axes(), _of_parts(), _of_quaternions(), _of_worlds(), _of_positions(), _of_orders(count)
+    return tuple(itertools.chain(*kinds))
+
+
+def changed(
+    T: SE3,
+    axes: Float[Tensor, "3 3"] = AS_GIVEN,
+    positions: Float[Tensor, "3 3"] = AS_GIVEN,
+    mirror: Float[Tensor, "3 3"] = AS_GIVEN,
+    inverted: bool = False,
+) -> SE3:
+    """Return poses with rotations ``mirror R axes`` and translations ``positions t``; first inverted if ``inverted``.
+
+    The columns of ``axes`` are the true camera's axes in the given camera's frame.
+    """
+    T = T.inverse() if inverted else T
+    return SE3(mirror @ T.rotation @ axes, T.translation @ positions.mT)
+
+
+def _of_axes() -> Iterator[Reading]:
+    """Yield readings with other camera axes, starting with y and z reversed; then those as inverse matrices, too."""
+    yield Reading(
+        "their cameras' y and z axes are reversed (OpenCV's and COLMAP's axes where OpenGL's and Blender's are expected, or the"
+        " other way round)",
+        SWAP, partial(changed, axes=Y_AND_Z_REVERSED),
+    )  # fmt: skip
+    rotations = signed_permutations(1)  # as given first, then with y and z reversed
+    for axes in rotations[2:]:
+        yield Reading(
+            f"their cameras have other axes: {_named(axes)}",
+            "permute and reverse the first three columns of each accordingly",
+            partial(changed, axes=axes),
+        )
+    for number, axes in enumerate(rotations):
+        yield Reading(
+            f"they are inverses (world to camera){'' if number < 2 else f', of cameras whose {_named(axes)}'}",
+            f"invert each, and if they are then rejected again, {SWAP}",
+            partial(changed, axes=axes, inverted=True),
+        )
+
+
+Part = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+PARTS: tuple[tuple[Part, str, str], ...] = (
+    (lambda R, t: (R.mT, t), "their rotations are transposed, while their positions are right", "transpose the upper left 3x3 of each"),
+    (lambda R, t: (R, -t), "their positions are negated", "multiply the first three numbers of the fourth column of each by -1"),
+    (lambda R, t: (R, -R @ t), "their translations are those of inverses, while their rotations are not", "replace each translation t by -R t"),
+    (lambda R, t: (R.mT, -t), "their rotations are transposed and their positions negated", "transpose the upper left 3x3 of each, and negate the fourth column"),
+    (lambda R, t: (R.mT, R.mT @ t), "they are inverses whose translations lack the minus sign", "transpose each rotation R, and replace t by R^T t"),
+    (lambda R, t: (R, -R.mT @ t), "their translations are -R times the positions", "replace each translation t by -R^T t"),
+    (lambda R, t: (R, R @ t), "their translations are those of inverses without the minus sign, while their rotations are"
+                " not", "replace each translation t by R t"),
+    (lambda R, t: (R, R.mT @ t), "their translations are R times the positions", "replace each translation t by R^T t"),
+    (lambda R, t: (R.mT, R @ t), "their rotations are transposed, and their translations rotated", "transpose each rotation R, and replace t by R t"),
+    (lambda R, t: (R.mT, -R @ t), "their rotations are transposed, and their translations rotated and negated", "transpose each rotation R, and replace t by -R t"),
+)  # fmt: skip
+"""The true rotation and position (a column) as functions of the given ones, and what is wrong then."""
+
+
+def _of_parts() -> Iterator[Reading]:
+    def understand(T: SE3, part: Part) -> SE3:
+        rotation, position = part(T.rotation, T.translation[..., None])
+        return SE3(rotation, position[..., 0])
+
+    for part, clause, remedy in PARTS:
+        yield from _in_file_axes(clause, remedy, partial(understand, part=part))
+
+
+def _of_quaternions() -> Iterator[Reading]:
+    """Yield readings of quaternions with w taken from the wrong end, for poses and for their inverses."""
+
+    def understand(T: SE3, order: list[int], of_inverse: bool, then_invert: bool) -> SE3:
+        T = T.inverse() if of_inverse else T
+        quaternion = rotation_matrix_to_quaternion(T.rotation.contiguous())  # w x y z
+        T = SE3(quaternion_to_rotation_matrix(quaternion[..., order]), T.translation)
+        return T.inverse() if of_inverse != then_invert else T
+
+    orders = (([3, 0, 1, 2], "x y z w", "w x y z"), ([1, 2, 3, 0], "w x y z", "x y z w"))
+    both = (False, True)
+    for (order, found, expected), of_inverse, then_invert in itertools.product(orders, both, both):
+        also = ", and the poses are inverses (world to camera)" if then_invert else ""
+        yield from _in_file_axes(
+            f"their quaternions are in the order {found}, but {expected} is expected{also}",
+            f"write the quaternions as {expected}{', and invert the poses' if then_invert else ''}",
+            partial(understand, order=order, of_inverse=of_inverse, then_invert=then_invert),
+        )
+
+
+def _of_worlds() -> Iterator[Reading]:
+    """Yield readings of left-handed worlds, as in Unity and Unreal. Mirrored along another axis, a world is merely turned."""
+    mirror = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
+    for axes in sorted(signed_permutations(-1), key=lambda axes: not torch.equal(axes, mirror)):
+        yield Reading(
+            "their axes are left-handed, as in Unity",
+            f"multiply each from the left by diag(1, 1, -1, 1); {_named(axes)} then",
+            partial(changed, axes=axes, positions=mirror, mirror=mirror),
+        )
+
+
+def _of_positions() -> Iterator[Reading]:
+    """Yield readings in which positions have different axes from the rotations."""
+    for D in (*signed_permutations(-1), *signed_permutations(1)[1:]):
+        order = ", ".join(("-" if row.sum() < 0 else "") + "xyz"[int(row.abs().argmax())] for row in D)
+        clause = f"x, y and z of their positions are the given ones' {order}"
+        remedy = "correct the fourth column of each, not the rotations"
+        for axes, also, swap in ((AS_GIVEN, "", ""), (Y_AND_Z_REVERSED, REVERSED_TOO, f", and {SWAP}")):
+            yield Reading(clause + also, remedy + swap, partial(changed, axes=axes, positions=D))
+
+
+def _of_orders(count: int) -> Iterator[Reading]:
+    """Yield readings in which poses belong to other images."""
+
+    def understand(T: SE3, order: Sequence[int]) -> SE3:
+        index = torch.tensor([i if 0 <= i < count else -1 for i in order])
+        unknown = torch.where(index >= 0, 0.0, torch.nan).to(T.translation)
+        return SE3(T.rotation[index], T.translation[index] + unknown[:, None])
+
+    shifts = {1: "the next image", -1: "the image before", 2: "the image after next", -2: "the image before the previous one"}  # fmt: skip
+    orders = list[tuple[str, Sequence[int]]](
+        (f"each is that of {words}", range(-by, count - by)) for by, words in shifts.items()
+    )
+    orders.append(("they are in the reverse order of the images", range(count)[::-1]))
+    for first in (0, 1):
+        by_text = sorted(range(count), key=lambda i, first=first: str(i + first))  # type: ignore[misc]
+        text, numeric = "in text order (1, 10, 11, 2)", "in numeric order"
+        inverse = sorted(range(count), key=by_text.__getitem__)
+        orders.append((f"they are {text}, while the images are {numeric}", inverse))
+        orders.append((f"they are {numeric}, while the images are {text}", by_text))
+    for clause, order in orders:
+        yield from _in_file_axes(clause, "reassign the poses to the images", partial(understand, order=order))
+
+
+def _in_file_axes(clause: str, remedy: str, understand: Callable[[SE3], SE3]) -> Iterator[Reading]:
+    """Yield a reading of matrices as they are here, and as they were in a file that had the y and z axes reversed."""
+
+    def whole(T: SE3, before: Tensor, after: Tensor) -> SE3:
+        return changed(understand(changed(T, before)), after)
+
+    # A reader has reversed y and z of correct poses as well, so this needs no remedy; a reversal on one side only does.
+    both = (AS_GIVEN, Y_AND_Z_REVERSED)
+    for axes in both:
+        yield Reading(clause, remedy, partial(whole, before=axes, after=axes))
+    for before, after in (both, both[::-1]):
+        understood = partial(whole, before=before, after=after)
+        yield Reading(clause + REVERSED_TOO, f"{remedy}, then {SWAP}", understood)
+
+
+def signed_permutations(determinant: int) -> list[Float[Tensor, "3 3"]]:
+    """Return the 24 signed permutation matrices with a determinant of 1 or -1, starting with the identity if included."""
+    orders, signs = itertools.permutations(range(3)), list(itertools.product((1.0, -1.0), repeat=3))
+    found = (AS_GIVEN[list(order)] * torch.tensor([s]).mT for order in orders for s in signs)
+    return [A for A in found if round(float(torch.linalg.det(A))) == determinant]
+
+
+def _named(axes: Float[Tensor, "3 3"]) -> str:
+    """Describe where the true camera's axes point, in terms of the given camera's."""
+    names = ("right", "down", "forward"), ("left", "up", "backward")
+    words = [names[int(column.sum() < 0)][int(column.abs().argmax())] for column in axes.mT]
+    return "right, down and forward are the given ones' {}, {} and {}".format(*words)

@@ -1,6 +1,6 @@
-"""Report on a capture: how usable its photos are, and how well they cover the scene.
+"""Report on a capture: how usable its photos are, how well they cover the scene, and what to photograph next.
 
-The records are plain JSON-serializable data; ``captures.advice`` puts them into words.
+The records are plain JSON-serializable data; ``sentences`` puts them into words.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from bidnerf_core.errors import amount
 from bidnerf_core.geometry import multiplied
 from bidnerf_core.mapping import HeldOutTrial
 
@@ -18,6 +19,35 @@ as are photos of a second place.
 Arrangement = Literal["around", "inside", "one side", "one place", "unknown"]
 """How the cameras are arranged: around what they look at, inside it, all on one side of it, or all in one
 place."""
+
+SUMMARY_LINES = 5
+"""Largest number of lines of a summary."""
+ARRANGEMENTS: dict[Arrangement, str] = {
+    "around": "taken all around the scene",
+    "inside": "taken from inside the scene",
+    "one side": "taken from one side of the scene",
+    "one place": "taken from one place",
+    "unknown": "too few to tell how they are arranged",
+}
+PROBLEMS: dict[PhotoProblem, tuple[str, str]] = {
+    "mirrored": ("mirrored", "flip the image back, and turn off the mirroring of selfies"),
+    "turned": (
+        "rotated against the pose",
+        "rotate the image, or the pose, so that both agree on what is up",
+    ),
+    "badly posed": ("not where the given pose says, according to the landmarks of other photos", "re-estimate such poses, or leave the photos out"),
+    "apart": (
+        "not linked to the rest by any landmark",
+        "photos of another place need a map of their own; otherwise take more in between",
+    ),
+    "isolated": (
+        "short of landmarks in common with others",
+        "leave such photos out, or take more between them and the rest",
+    ),
+    "blurred": ("blurred compared with nearby photos", "retake such photos with more light or a steadier camera"),
+    "badly exposed": ("exposed differently from the rest", "retake such photos with locked exposure"),
+}  # fmt: skip
+"""How each problem reads after "is" or "are", and what helps."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +79,9 @@ class Gap:
     degrees: float
     after: str  # names of the photos on either side
     before: str
+
+    def __str__(self) -> str:
+        return f"in the {self.degrees:.0f}° between {self.after} and {self.before}"
 
 
 @dataclass(frozen=True)
@@ -96,3 +129,51 @@ class CaptureReport:
     def with_problem(self, *problems: PhotoProblem) -> list[PhotoRecord]:
         """Return the photos that have any of the problems, in capture order."""
         return [photo for photo in self.photos if set(photo.problems) & set(problems)]
+
+
+def summary(report: CaptureReport) -> list[str]:
+    """Return at most ``SUMMARY_LINES`` lines; the last one says how many were left out, if any."""
+    lines = sentences(report)
+    left = len(lines) - SUMMARY_LINES + 1
+    more = f"{left} more remarks: 'bidnerf info' prints them all, and --draw plots the capture"
+    return lines if left <= 1 else [*lines[: SUMMARY_LINES - 1], more]
+
+
+def sentences(report: CaptureReport) -> list[str]:
+    """Return all remarks on a capture, one or two sentences per line, the most serious problems first."""
+    covered, trial, photos = report.coverage, report.trial, amount(len(report.photos), "photo")
+    low, high = covered.heights_deg
+    is_outside, few = covered.arrangement in ("around", "one side"), len(report.photos) < 8
+    heights = f", {low:.0f}° to {high:.0f}° above the horizon" if is_outside else ""
+    if covered.arrangement == "inside":
+        heights = f", looking {low:.0f}° to {high:.0f}° up"
+    landmarks = "no landmark seen by several of them could be triangulated"
+    if covered.landmarks:
+        landmarks = (
+            f"{covered.landmarks} triangulated landmarks, typically seen in {covered.seen_by:.0f}"
+            f" photos within {covered.seen_within_deg:.0f}°"
+        )
+    errors = f", median error {trial.translation:.3g} and {trial.rotation_deg:.2g}°" if trial.found else ""
+    remarks = [
+        (True, f"{photos}, {ARRANGEMENTS[covered.arrangement]}{heights}; {landmarks}"),
+        (trial.images > 0, f"with the landmarks of the others alone, {trial.found} of {amount(trial.images, 'photo')} of the map"
+         f" {'was' if trial.found == 1 else 'were'} localized{errors}; expect similar results for new photos taken the same way"),
+        (covered.arrangement == "one place", f"rays to the same point differ by {covered.parallax_deg:.1f}°: photos from one place"
+         " do not determine distances; move by at least a tenth of the distance to the scene between photos"),
+    ]  # fmt: skip
+    for problem, (what, advice) in PROBLEMS.items():
+        names = [photo.name for photo in report.with_problem(problem)]
+        more = f" and {len(names) - 6} more" if len(names) > 6 else ""
+        are = "is" if len(names) == 1 else "are"
+        remarks.append((bool(names), f"{', '.join(names[:6])}{more} {are} {what}: {advice}"))
+    remarks.append((few, f"{photos}: hardly enough for a map; take twenty or more, with much overlap"))
+    remarks += [
+        *((True, f"there are no photos {gap}: take some there, every 10 to 15°") for gap in covered.gaps),
+        (covered.open_side is not None, f"there are no photos {covered.open_side}: take some there if you expect queries from that"
+         " side"),
+        (is_outside and high - low < 10, "all photos were taken at the same height: add some from higher and lower"),  # degrees
+        (not few and covered.seen_by_two > 0.6, f"{covered.seen_by_two:.0%} of the landmarks are seen in only two photos: photos"
+         " in between would constrain them better"),
+        (report.exposure_range > 1, f"exposure varies by {report.exposure_range:.1f} stops: lock it if the camera allows"),
+    ]  # fmt: skip
+    return [text for holds, text in remarks if holds]

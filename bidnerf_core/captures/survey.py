@@ -1,38 +1,44 @@
-"""Survey of a capture: measure its photos, find those with problems, and localize the suspects among them."""
+"""Survey of a capture: measure its photos, find those with problems, and localize the suspects among them.
+
+Photos are linked if they show the same things. Those whose poses no group of linked photos supports are localized with the
+landmarks of the others.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from bidnerf_core.captures.coverage import coverage
-from bidnerf_core.captures.photos import blurred, exposures, nearby, photo_measures, standing_out
-from bidnerf_core.captures.relocated_photos import (
-    Relocation,
-    groups,
-    image_motion,
-    linked,
-    relocated,
-    suspects,
-)
+from bidnerf_core.captures.coverage import UpDirection, coverage
+from bidnerf_core.captures.photos import blurred, excess, exposures, nearby, photo_measures, standing_out
+from bidnerf_core.captures.pose_conventions import matched_pair
 from bidnerf_core.captures.report import CaptureReport, PhotoProblem, PhotoRecord
-from bidnerf_core.captures.up_direction import UpDirection
+from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import MIRROR, LandmarkMatcher, Loop, Outcome
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
     ENOUGH_IMAGES,
     HeldOutTrial,
+    ImageKeypoints,
     LandmarkConfig,
     TrackedKeypoints,
     TrackedViews,
     pose_updates,
     robust_covariance,
 )
+
+LEAST_GROUP = 3
+"""Smallest number of linked photos that form a group."""
 
 
 def surveyed(
@@ -52,43 +58,48 @@ def surveyed(
     links = linked(seen)
     sharp, brightness, overexposed, underexposed = photo_measures(views)
     group = groups(links)
-    near = nearby(views).within(group)
+    near = nearby(views, group)
     count = torch.bincount(seen.image, minlength=len(views))
     doubtful = suspects(seen, links)
     posed: dict[int, Relocation | None] = dict(_by_own_landmarks(seen, positions, views))
     posed |= dict.fromkeys(doubtful) | relocated(tracked, views, doubtful, config)
-    exposure, sharpness = exposures(views, seen, brightness, near), near.excess(sharp)
-    clipped = torch.maximum(near.excess(overexposed), near.excess(underexposed))
-    is_blurred = blurred(-sharpness)
+    exposure, sharpness = exposures(views, seen, brightness, near), excess(sharp, near)
+    clipped = torch.maximum(excess(overexposed, near), excess(underexposed, near))
     # Training corrects differences of less than a stop.
     is_badly_exposed = standing_out(exposure.abs(), 1.0) | (clipped > 0.25)
+    defects: dict[PhotoProblem, Tensor] = {"blurred": blurred(-sharpness), "badly exposed": is_badly_exposed}
     grouped = bool((group >= 0).any())  # if no photos are linked at all, no photo is reported as unlinked
     photos = []
     for i, (view, image) in enumerate(zip(views, seen.images, strict=True)):
-        found, pose, problems = posed.get(i), view.T_ref_camera.to("cpu", torch.float64), list[PhotoProblem]()
-        if found and found.problem:
-            problems.append(found.problem)
+        found, pose = posed.get(i), view.T_ref_camera.to("cpu", torch.float64)
+        problem = found.problem if found else None
         # A photo of another group fits its own landmarks; an isolated one may have been localized all the same.
-        elif grouped and (group[i] > 0 or (group[i] < 0 and not found)):
-            problems.append("apart" if group[i] > 0 else "isolated")
-        if is_blurred[i]:
-            problems.append("blurred")
-        if is_badly_exposed[i]:
-            problems.append("badly exposed")
-        record = PhotoRecord(
-            view.frame.name, (*pose.translation.tolist(),), (*pose.rotation[:, 2].tolist(),),
-            float(sharpness[i]), float(exposure[i]), float(overexposed[i]), float(underexposed[i]),
-            len(image.keypoints), int(count[i]), int(links.indptr[i + 1] - links.indptr[i]), int(group[i]), problems=(*problems,),
-        )  # fmt: skip
-        if found and not found.mirrored:  # a mirrored photo's pose cannot be compared
-            metres, radians = torch.linalg.vector_norm(found.update.view(2, 3), dim=-1).tolist()
-            record = replace(
-                record,
+        if problem is None and grouped and (group[i] > 0 or (group[i] < 0 and not found)):
+            problem = "apart" if group[i] > 0 else "isolated"
+        known = found if found and not found.mirrored else None  # a mirrored photo's pose cannot be compared
+        metres, radians = (None, None) if known is None else known.update.view(2, 3).norm(dim=-1).tolist()
+        photos.append(
+            PhotoRecord(
+                name=view.frame.name,
+                position=(*pose.translation.tolist(),),
+                direction=(*pose.rotation[:, 2].tolist(),),
+                sharpness=float(sharpness[i]),
+                exposure=float(exposure[i]),
+                overexposed=float(overexposed[i]),
+                underexposed=float(underexposed[i]),
+                keypoints=len(image.keypoints),
+                landmarks=int(count[i]),
+                linked=int(links.indptr[i + 1] - links.indptr[i]),
+                group=int(group[i]),
                 pose_translation=metres,
-                pose_rotation_deg=math.degrees(radians),
-                pose_deviations=found.deviations,
+                pose_rotation_deg=None if radians is None else math.degrees(radians),
+                pose_deviations=None if known is None else known.deviations,
+                problems=(
+                    *([problem] if problem else []),
+                    *(name for name, has in defects.items() if has[i]),
+                ),
             )
-        photos.append(record)
+        )
     wrong = {"mirrored", "turned", "badly posed", "apart"}
     sound = [v for v, photo in zip(views, photos, strict=True) if not wrong & set(photo.problems)] or views
     covered = coverage(sound, tracked.matched, seen, positions, config.parallax, up)
@@ -117,3 +128,128 @@ def _by_own_landmarks(
         pixels = image_motion(update, views[number], float(depth[image == number].median()))
         found[number] = Relocation(update, deviations, pixels)
     return found
+
+
+def linked(seen: TrackedKeypoints) -> csr_array:
+    """Return the pairs of images that share enough landmarks, in both directions, as a sparse matrix (v, v).
+
+    ``seen`` are the keypoints consistent with their points. Five landmarks link two photos: photos of different places share
+    one by chance, seldom two, as a match has to lie on the epipolar line, stand out from all others, and agree on a point
+    in front of both cameras.
+    """
+    shape = (len(seen.images), max(1, seen.count))
+    ones = np.ones(len(seen.point), np.int32)
+    shows = csr_array((ones, (seen.image.numpy(), seen.point.numpy())), shape=shape)
+    shared = (shows @ shows.T).tocoo()
+    row, column = shared.coords
+    enough = (shared.data >= 5) & (row != column)
+    links = np.ones(int(enough.sum()), bool), (row[enough], column[enough])
+    return csr_array(links, shape=(len(seen.images),) * 2)
+
+
+def groups(links: csr_array) -> Int[Tensor, "v"]:
+    """Return the group of each image, 0 for the largest; -1 if too few images are linked to form one."""
+    label = torch.from_numpy(connected_components(links, directed=False)[1]).long()
+    sizes = torch.bincount(label)
+    rank = sizes.argsort(descending=True, stable=True).argsort()
+    return torch.where(sizes >= LEAST_GROUP, rank, -1)[label]
+
+
+@dataclass(frozen=True, eq=False)
+class Relocation:
+    """A photo's pose from other photos' landmarks, compared with the given one."""
+
+    update: Float[Tensor, "6"]  # right update from the given pose, translation (metres) first
+    deviations: float  # length of the update, in standard deviations
+    pixels: float  # how far the image moves with the update
+    mirrored: bool = False
+
+    @property
+    def problem(self) -> PhotoProblem | None:
+        """What is wrong with the given pose, or None.
+
+        It is right if the photo is not mirrored and it is off by less than six standard deviations, or by less than four pixels,
+        which is twice as far as a match may lie from its epipolar line.
+        """
+        angle = float(torch.linalg.vector_norm(self.update[3:]))
+        if self.mirrored:
+            return "mirrored"
+        if self.deviations < 6 or self.pixels < 4:
+            return None
+        # 0.9 is the smallest cosine between the axis of the rotation and the optical axis.
+        about_axis = abs(float(self.update[5])) >= 0.9 * angle
+        return "turned" if about_axis and math.degrees(angle) >= 60 else "badly posed"
+
+
+def suspects(seen: TrackedKeypoints, links: csr_array) -> list[int]:
+    """Return the photos whose given poses the others do not support, 32 at most; ``links`` are those of ``linked``.
+
+    A photo is suspect if it belongs to no group, or fewer of its keypoints are landmarks than half the fraction that is usual
+    in its group, unless enough photos agree with its pose. Photos that agree among themselves are not suspect even if they
+    are linked to none of the others: a place that looks like another is more likely than the same error in
+    all of them.
+    """
+    group = groups(links)
+    if not bool((group >= 0).any()):
+        return []
+    keypoints = torch.tensor([len(image.keypoints) for image in seen.images])
+    share = torch.bincount(seen.image, minlength=len(group)) / keypoints.clamp(min=1)
+    doubtful = group < 0
+    for number in range(int(group.max()) + 1):
+        own = group == number
+        doubtful |= own & (share < 0.5 * share[own].median())
+    found = [i for i in doubtful.nonzero()[:, 0].tolist() if not _has_support(seen.images, links, i)]
+    return [found[int(i * max(1.0, len(found) / 32))] for i in range(min(len(found), 32))]
+
+
+def _has_support(images: Sequence[ImageKeypoints], links: csr_array, number: int) -> bool:
+    """Return whether a photo's given pose agrees with as many linked photos as make a group with it.
+
+    Their matches are found without the poses, so that wrong ones agree with none of them.
+    """
+    poses, needed = SE3.stack([image.T_ref_camera for image in images]), LEAST_GROUP - 1
+    for other in links.indices[links.indptr[number] : links.indptr[number + 1]].tolist():
+        pair = matched_pair(images, number, other)
+        needed -= pair is not None and bool(pair.agreeing(poses[None])[0])
+        if not needed:
+            return True
+    return False
+
+
+def relocated(
+    tracked: TrackedViews, views: Sequence[View], numbers: Sequence[int], config: LandmarkConfig
+) -> dict[int, Relocation]:
+    """Localize the suspects with landmarks built without them.
+
+    Of several poses that explain a photo, as in a building with identical rooms, the one nearest to the given
+    pose is taken.
+    """
+    if not numbers:
+        return {}
+    try:
+        matcher = LandmarkMatcher(tracked.without(numbers).landmarks(config))
+    except InputError:  # the rest has no overlap
+        return {}
+    answers: dict[int, Relocation] = {}
+    for number in numbers:
+        view, features = views[number], tracked.detector_of(views[number], number)
+        found = Loop([View(view.frame, SE3.identity())], matcher, features=features)()
+        # Only these outcomes tell the pose, or which poses look the same.
+        telling = (Outcome.CONVERGED, Outcome.AMBIGUOUS, Outcome.MIRRORED)
+        if found is None or found.verdict.outcome not in telling:
+            continue
+        mirrored = found.verdict.outcome is Outcome.MIRRORED
+        others = [found.posterior.place(g) for g, mode in enumerate(found.modes) if mode.name != MIRROR]
+        given = view.T_ref_camera.to("cpu", torch.float64).inverse()
+        updates = [(given @ T).log() for T in (found.T_world_rig, *([] if mirrored else others))]
+        update = min(updates, key=lambda each: float(each[:3].norm()))
+        deviations = float((update @ torch.linalg.solve(found.covariance, update)).clamp(min=0).sqrt())
+        pixels = image_motion(update, view, found.distance)
+        answers[number] = Relocation(update, deviations, pixels, mirrored)
+    return answers
+
+
+def image_motion(update: Float[Tensor, "6"], view: View, distance: float) -> float:
+    """Return how far (pixels, at most) an update of the pose moves the image of a point at ``distance`` (metres)."""
+    translation, rotation = (float(torch.linalg.vector_norm(part)) for part in update.split(3))
+    return view.frame.intrinsics.fx * (rotation + translation / max(distance, 1e-9))

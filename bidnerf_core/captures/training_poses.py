@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bidnerf_core.captures.cameras import PoseRefinement
 from bidnerf_core.captures.pose_refinement import adjusted_poses
-from bidnerf_core.captures.relocated_photos import linked, relocated, suspects
+from bidnerf_core.captures.survey import linked, relocated, suspects
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, LandmarkConfig, TrackedViews
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, TypeAlias, overload, runtime_checkable
+from typing import Any, Protocol, TypeAlias, overload, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Shaped
@@ -22,13 +23,11 @@ from bidnerf_core.camera import (
     PANORAMA_FACES,
     Camera,
     CameraSource,
-    Intrinsics,
     Lens,
     PanoramaFace,
     Raster,
     same_aspect,
 )
-from bidnerf_core.datasets.names import in_other_split, unique_names
 from bidnerf_core.depth import DepthCamera, DepthImage
 from bidnerf_core.errors import InputError, InputWarning, amount, refuse_text, spelling_hint
 from bidnerf_core.frames import (
@@ -61,11 +60,6 @@ class BreaksOff(InputError):
 @runtime_checkable
 class Picture(Protocol):
     """An image that is not a file of its own, such as a frame of a video."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height."""
-        ...
 
     def pixels(self) -> Shaped[Tensor, "h w 3"]:
         """Decode it. Raises ``InputError`` if that is impossible."""
@@ -107,9 +101,10 @@ class Shot:
     name: str = ""  # unique in its capture, which assigns it
     stem: str = ""  # by default the image file's name without its suffix
     folders: tuple[str, ...] | None = None  # those in front of the stem, by default the image file's
-    usual_side: int | None = (
-        None  # to which the format's images are downscaled unless the user gives another size
-    )
+    usual_side: int | None = None
+    """Longer side to which the format's images are downscaled unless the user gives another size."""
+    tells_camera: bool = False
+    """Whether its frames state where their camera is from, as photos do whose camera is looked for."""
 
     def __post_init__(self) -> None:
         file = self.file
@@ -131,41 +126,42 @@ class Shot:
     def frame(self, background: Colour = BLACK, side: int | None = None) -> Frame:
         """Read the image, composited over ``background`` (rgb) if it has an alpha channel, and its depth.
 
-        An image with more than ``side`` pixels along the longer side is downscaled to that, unless it is taken
-        through a ``Lens``: those are resampled to the pinhole camera of the lens. The camera is checked before a
-        pixel is decoded. Registered depth may be of any size: each pixel has the depth of the nearest measurement.
+        An image with more than ``side`` pixels along the longer side is downscaled to that. The camera of a file is checked
+        before a pixel is decoded. Registered depth may be of any size: each pixel has the depth of the nearest measurement.
         Raises ``InputError`` for an unreadable file, and for a camera or registered depth of another aspect ratio.
         """
         assert self.image is not None  # else a subclass reads it
+        pixels = None
         if isinstance(self.image, ImageSource):
             header = read_header(self.image)
-            stored = header.width, header.height
-        else:
-            stored = self.image.size
-        source = self.camera if isinstance(self.camera, CameraSource) else CameraSource(self.camera)
-        camera, size = source.find(str(self.image), Raster(*stored)).camera, stored
-        if side is not None and isinstance(camera, Intrinsics) and max(stored) > side:
-            camera = camera.scaled(side / max(stored))
-            size = camera.width, camera.height
-        if isinstance(self.image, ImageSource):
-            rgb, alpha = read_compact_image(self.image, background, None if size == stored else size)
+            raster = Raster(header.width, header.height)
         else:
             pixels = self.image.pixels()
-            rgb, alpha = pixels if size == stored else reduced(pixels, *size), None
-        metres, hidden = None, None
+            raster = Raster(pixels.shape[1], pixels.shape[0])
+        source = self.camera if isinstance(self.camera, CameraSource) else CameraSource(self.camera)
+        found = source.find(str(self.image), raster).at_most(side)
+        camera, size = found.camera, (found.camera.width, found.camera.height)
+        if pixels is not None:
+            rgb, alpha = pixels if size == raster.size else reduced(pixels, *size), None
+        else:
+            assert isinstance(self.image, ImageSource)
+            rgb, alpha = read_compact_image(self.image, background, None if size == raster.size else size)
+        metres, hidden, about = None, None, dict[str, Any]()
         if self.depth is not None:
             measured, where = self.depth.read(), Path(self.depth.path)
             metres = (
-                fit_depth(measured, Raster(*stored), size, f"{where}: depth")
+                fit_depth(measured, raster, size, f"{where}: depth")
                 if self.depth.sensor is None
                 else self.depth.sensor.registered(measured.metres, pinhole_of(camera, where), where)
             )
         if self.border:
-            width = max(1, round(self.border * size[0] / stored[0]))
+            width = max(1, round(self.border * size[0] / raster.width))
             hidden = torch.ones(rgb.shape[:2], dtype=torch.bool)
             hidden[width:-width, width:-width] = False
             hidden = None if bool(hidden.all()) else hidden
-        return Frame.taken(self.name, camera, rgb, metres, alpha, hidden)
+        if self.tells_camera:
+            about = {"camera_source": found.description, "focal_is_approximate": found.approximate}
+        return Frame.taken(self.name, camera, rgb, metres, alpha, hidden, **about)
 
     def read(self, background: Colour = BLACK, side: int | None = None) -> Frame:
         """Read the frame and apply its masks. Raises ``WhollyHidden`` if they hide every pixel."""
@@ -386,11 +382,8 @@ class Capture:
 
     def require_poses(self) -> Capture:
         """Return the capture; a remark counts frames without a pose. Raises ``InputError`` if no frame has one."""
-        posed, where = (
-            sum(shot.T_world_camera is not None for shot in self.shots),
-            self.pose_file or self.path,
-        )
-        images = amount(len(self), "image")
+        posed = sum(shot.T_world_camera is not None for shot in self.shots)
+        where, images = self.pose_file or self.path, amount(len(self), "image")
         if not posed:
             raise InputError(f"has no pose for any of {images}", where=where, expected=self.poses_expected)
         if posed < len(self):
@@ -406,6 +399,30 @@ class Capture:
     def _read(self, shot: Shot, limit: int | None = None) -> Frame:
         sides = self.largest or shot.usual_side, limit
         return shot.read(self.background, min((side for side in sides if side is not None), default=None))
+
+
+def unique_names(paths: Sequence[tuple[str, ...]]) -> list[str]:
+    """Return a name for each path (folders, then stem): its stem, prefixed with just enough folders to make it unique.
+
+    Names that are still the same, such as those of a/b.png and a_b.png, get the endings "-2" and so on.
+    """
+    names = [path[-1] for path in paths]
+    for depth in range(2, max(map(len, paths), default=0) + 1):
+        count = Counter(names)
+        names = ["_".join(p[-depth:]) if count[n] > 1 else n for n, p in zip(names, paths, strict=True)]
+    used, seen = set(names), dict[str, None]()
+    for name in names:
+        own, number = name, 2
+        while own in seen or (own != name and own in used):
+            own, number = f"{name}-{number}", number + 1
+        seen[own] = None
+    return list(seen)
+
+
+def in_other_split(name: str, splits: Mapping[str, Sequence[str]]) -> str | None:
+    """Return a clause that names the split of a frame, given the names in each, or None if it is in no split."""
+    found = next((split for split, names in splits.items() if name in names), None)
+    return found and f"no frame {name!r}, which is in split {found!r}; choose that split"
 
 
 def _named(shots: Sequence[Shot], one_split: bool = False) -> list[Shot]:
@@ -424,25 +441,18 @@ def hold_out(
     chronological order, nor are those beyond ``rate`` per second, where times may be early by 5 ms as a result of
     rounding.
     """
-    chosen, due = set[int](), -math.inf
-    if any(shot.time is None for shot in shots):
-        rate = math.inf
+    chosen, due = list[int](), -math.inf
+    step = 0.0 if any(shot.time is None for shot in shots) else 1 / rate
     for number, shot in enumerate(shots):
-        if (
-            shot.T_world_camera is not None
-            and where(shot)
-            and (rate == math.inf or (shot.time or 0.0) >= due)
-        ):
-            chosen.add(number)
-            due = (shot.time or 0.0) + 1 / rate - 0.005
-    place = {number: place for place, number in enumerate(sorted(chosen))}
-    held_out = ("train", "test") if len(chosen) == 1 else ("test",)
-    return [
-        replace(shot, splits=held_out if place[number] % HOLD_OUT_EVERY == 0 else ("train",))
-        if number in chosen
-        else replace(shot, splits=())
-        for number, shot in enumerate(shots)
-    ]
+        time = shot.time or 0.0
+        if shot.T_world_camera is not None and where(shot) and (not step or time >= due):
+            chosen.append(number)
+            due = time + step - 0.005
+    splits: dict[int, tuple[str, ...]] = dict.fromkeys(chosen, ("train",))
+    splits |= dict.fromkeys(chosen[::HOLD_OUT_EVERY], ("test",))
+    if len(chosen) == 1:
+        splits[chosen[0]] = "train", "test"
+    return [replace(shot, splits=splits.get(number, ())) for number, shot in enumerate(shots)]
 
 
 def of_views(views: Sequence[View], path: Path, splits: tuple[str, ...] = SPLITS) -> Capture:

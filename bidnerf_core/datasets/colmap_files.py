@@ -1,19 +1,28 @@
-"""The files of a COLMAP sparse model: ``cameras``, ``images`` and ``points3D``, as .bin or .txt; and depth maps.
+"""The files of a COLMAP sparse model: ``cameras``, ``images`` and ``points3D``, as .bin or .txt; depth maps; and keypoints.
 
 Formats: https://colmap.github.io/format.html. Poses are ``cam_from_world`` with OpenCV's camera axes. The
 files ``rigs`` and ``frames`` of newer versions are not needed, since these versions still write each image's
 pose to ``images``. pycolmap is not used because it hangs on a truncated ``points3D.bin``. A depth map is the text
 ``width&height&channels&``, then 32-bit floats, row by row: planar z of the undistorted image in units of the model, 0
 where nothing was reconstructed.
+
+Keypoints with descriptors are in COLMAP's database or the features of hloc (.h5), in the order in which the model lists an
+image's observations. COLMAP's SIFT descriptors have the root normalisation and the layout of ours, so that they match; its
+scale is half of our diameter. hloc's keypoints are the first pixel's centre (0, 0), COLMAP's (0.5, 0.5).
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
+import sqlite3
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, TypeVar
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import Any, TypeAlias
+from urllib.parse import quote
 
 import numpy as np
 import torch
@@ -25,14 +34,13 @@ from bidnerf_core.camera import MODELS, Camera, colmap_camera, read_text_cameras
 from bidnerf_core.depth import DepthImage, depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import Row, is_file, read_file, read_lines
-
-_Item = TypeVar("_Item")
-_Point = tuple[int, tuple[float, float, float], float, int]
-"""The id of a point, its position, its error and the number of its observations."""
+from bidnerf_core.io import is_file, read_file, read_lines
+from bidnerf_core.mapping import FIRST_CENTRE, Keypoints, quantized
 
 MODEL_FILE = "a file of a COLMAP sparse model"
 LARGEST_MODEL = 2**30  # bytes of one file of a model
+UNKNOWN_SCALE = 4.0
+"""Scale (pixels) of keypoints that state none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +77,7 @@ def read_model(folder: Path) -> tuple[list[ModelImage], ModelPoints]:
         hint = "" if inside is None else f"; did you mean {inside}?"
         wanted = "images.bin and points3D.bin, or the same as .txt"
         raise InputError("no COLMAP sparse model in it", where=folder, expected=f"{wanted}{hint}")
-    found = _binary(points, _binary_point) if points.suffix == ".bin" else list(_text_points(points))
-    found.sort()
+    found = sorted((n[0], n[1:4], n[7], len(track)) for _, n, _, track in _entries(points, POINTS))
     ids, positions, errors, tracks = zip(*found, strict=True) if found else ((), (), (), ())
     if len(set(ids)) < len(ids):
         raise InputError("two points have the same id", where=points, expected="unique ids")
@@ -85,8 +92,7 @@ def read_model(folder: Path) -> tuple[list[ModelImage], ModelPoints]:
 def read_posed_images(folder: Path) -> tuple[list[ModelImage], dict[int, Camera]]:
     """Read the images of the model in ``folder``, and their cameras by id; its points may be missing.
 
-    Raises ``InputError`` if there is no model, if a file is damaged, and for a camera that is not
-    perspective.
+    Raises ``InputError`` if there is no model, if a file is damaged, and for a camera of an unknown model.
     """
     files = files_of(folder, "cameras", "images")
     if files is None:
@@ -95,16 +101,11 @@ def read_posed_images(folder: Path) -> tuple[list[ModelImage], dict[int, Camera]
     cameras, images = files
     if cameras.suffix == ".txt":
         return _images(images), read_text_cameras(cameras)
-    return _images(images), dict(_binary(cameras, _binary_camera))
-
-
-def count_posed_images(folder: Path) -> int:
-    """Return the number of images that the model in ``folder`` declares.
-
-    Raises ``InputError`` as ``read_posed_images`` does.
-    """
-    _, images = files_of(folder, "cameras", "images") or (folder, folder / "images.bin")
-    return int(_Bytes(images).take("<Q")[0]) if images.suffix == ".bin" else len(_images(images))
+    found = dict[int, Camera]()
+    for where, (number, model, width, height), _, parameters in _entries(cameras, CAMERAS):
+        name = next(name for name, (known, _, _) in MODELS.items() if known == model)
+        found[number] = colmap_camera(f"{where}: camera {number}", name, width, height, parameters.tolist())
+    return _images(images), found
 
 
 def files_of(folder: Path, *names: str) -> list[Path] | None:
@@ -119,22 +120,6 @@ def depth_map_of(model: Path, name: str) -> Path | None:
     kinds = ("geometric", "photometric")  # the more reliable one first
     files = (folder / f"{name}.{kind}.bin" for folder in folders for kind in kinds)
     return next(filter(is_file, files), None)
-
-
-def _binary_camera(file: _Bytes) -> tuple[int, Camera]:
-    number, model, width, height = file.take("<IiQQ")
-    name = next((name for name, (found, _, _) in MODELS.items() if found == model), None)
-    if name is None:
-        expected = ", ".join(MODELS)
-        raise InputError(
-            f"camera {number} has the model {model}",
-            where=file.path,
-            expected=f"one of {expected}; undistort the images with COLMAP",
-        )
-    parameters = file.array(np.dtype("<f8"), max(MODELS[name][2]) + 1).tolist()
-    return int(number), colmap_camera(
-        f"{file.path}: camera {number}", name, int(width), int(height), parameters
-    )
 
 
 def read_colmap_depth(path: Path) -> DepthImage:
@@ -157,99 +142,179 @@ def read_colmap_depth(path: Path) -> DepthImage:
 
 
 def _images(file: Path) -> list[ModelImage]:
-    return _binary(file, _binary_image) if file.suffix == ".bin" else list(_text_images(file))
+    images = list[ModelImage]()
+    for where, (_, *pose, camera), name, observed in _entries(file, IMAGES):
+        quaternion, translation = pose[:4], pose[4:]
+        if not (np.isfinite(pose).all() and 0.5 < np.linalg.norm(quaternion) < 2):
+            raise InputError(f"image {name!r} has an invalid pose", where=where, expected="a unit quaternion")
+        rotation = torch.from_numpy(Rotation.from_quat(quaternion, scalar_first=True).as_matrix())
+        T = SE3(rotation, torch.tensor(translation, dtype=torch.float64))
+        images.append(ModelImage(name, camera, T, torch.from_numpy(observed.astype(np.int64))))
+    return images
 
 
-class _Bytes:
-    """A binary file that is parsed from its beginning to its end."""
+@dataclass(frozen=True)
+class _Columns:
+    """What each entry of a file consists of: numbers, the name of an image, and a list, of which the last column is used."""
 
-    def __init__(self, path: Path) -> None:
-        self.path, self._content, self._place = path, read_file(path, MODEL_FILE, LARGEST_MODEL), 0
-
-    def take(self, layout: str) -> tuple[Any, ...]:
-        return struct.unpack_from(layout, self._content, self.skip(struct.calcsize(layout)))
-
-    def array(self, kind: np.dtype, count: int) -> np.ndarray:
-        return np.frombuffer(self._content, kind, count, self.skip(kind.itemsize * count))
-
-    def text(self) -> str:
-        end = self._content.find(b"\0", self._place)
-        start = self.skip((len(self._content) if end < 0 else end + 1) - self._place)
-        return self._content[start : self._place - 1].decode("utf-8", "replace")
-
-    @property
-    def left(self) -> int:
-        return len(self._content) - self._place
-
-    def skip(self, size: int) -> int:
-        """Skip ``size`` bytes, and return where they began. Raises ``InputError`` if there are fewer."""
-        if size > self.left:
-            length = len(self._content)
-            raise InputError(
-                f"ends too early, at byte {length};", where=self.path, expected="a complete COLMAP file"
-            )
-        self._place += size
-        return self._place - size
+    numbers: str  # as ``struct`` names them
+    item: np.dtype  # of the list
+    text: str  # the columns, for messages
+    item_text: str = ""  # of the list if it has a line of its own in text files, which then follows a name
+    length: Callable[[Path, Sequence[Any]], int] | None = None
+    """Returns the length of the list for the numbers; by default it precedes the list."""
 
 
-def _binary(path: Path, one: Callable[[_Bytes], _Item]) -> list[_Item]:
-    """Read a count, then that many items, each with ``one``."""
-    file = _Bytes(path)
-    (count,) = file.take("<Q")
-    if count > file.left:  # a false count must not allocate memory
-        raise InputError(f"declares {count} entries in {file.left} bytes; is the file damaged?", where=path)
-    found = [one(file) for _ in range(int(count))]
-    if file.left:
-        raise InputError(f"{file.left} bytes after its {count} entries", where=path, expected="a COLMAP file")
-    return found
+def _parameters(path: Path, numbers: Sequence[Any]) -> int:
+    """Return how many parameters a camera has. Raises ``InputError`` for an unknown model."""
+    number, model, *_ = numbers
+    for known, _, places in MODELS.values():
+        if known == model:
+            return max(places) + 1
+    expected = f"one of {', '.join(MODELS)}; undistort the images with COLMAP"
+    raise InputError(f"camera {number} has the model {model}", where=path, expected=expected)
 
 
-def _binary_image(file: _Bytes) -> ModelImage:
-    _, *pose, camera = file.take("<I7dI")
-    name = file.text()
-    keypoint = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
-    observed = file.array(keypoint, int(file.take("<Q")[0]))["point"]
-    return _image(str(file.path), name, int(camera), pose, observed)
+CAMERAS = _Columns("IiQQ", np.dtype([("parameter", "<f8")]), "", length=_parameters)
+IMAGES = _Columns(
+    "IdddddddI", np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")]),
+    "id, pose, camera and name of an image", "x, y, id of points",
+)  # fmt: skip
+POINTS = _Columns(
+    "qdddBBBd", np.dtype([("image", "<u4"), ("keypoint", "<u4")]), "id, x y z, r g b, error and a track"
+)
+_Entry: TypeAlias = tuple[str, list[Any], str, np.ndarray]
+"""Where an entry is, its numbers, the name of the image, and the last column of its list."""
 
 
-def _binary_point(file: _Bytes) -> _Point:
-    number, x, y, z, *_, error, track = file.take("<q3d3BdQ")
-    file.skip(8 * int(track))  # an image and one of its keypoints, 4 bytes each
-    return int(number), (x, y, z), error, int(track)
+def _entries(path: Path, columns: _Columns) -> Iterator[_Entry]:
+    return (_binary if path.suffix == ".bin" else _text)(path, columns)
 
 
-def _text_images(path: Path) -> Iterator[ModelImage]:
-    """Yield the images of pairs of lines; the second is empty if nothing was observed."""
-    rows = iter(read_lines(path, MODEL_FILE, "id, pose, camera and name of an image", LARGEST_MODEL))
+def _binary(path: Path, columns: _Columns) -> Iterator[_Entry]:
+    content = read_file(path, MODEL_FILE, LARGEST_MODEL)
+    file = io.BytesIO(content)
+
+    def take(size: int) -> bytes:
+        if len(found := file.read(size)) < size:
+            found_end = f"ends too early, at byte {len(content)};"
+            raise InputError(found_end, where=path, expected="a complete COLMAP file")
+        return found
+
+    def unpack(layout: str) -> tuple[Any, ...]:
+        return struct.unpack(f"<{layout}", take(struct.calcsize(f"<{layout}")))
+
+    (count,) = unpack("Q")
+    if count > len(content) - 8:
+        found = f"declares {count} entries in {len(content) - 8} bytes; is the file damaged?"
+        raise InputError(found, where=path)
+    for _ in range(count):
+        numbers, name = list(unpack(columns.numbers)), b""
+        if columns.item_text:
+            name = b"".join(iter(partial(take, 1), b"\0"))
+        length = unpack("Q")[0] if columns.length is None else columns.length(path, numbers)
+        items = np.frombuffer(take(length * columns.item.itemsize), columns.item)
+        yield str(path), numbers, name.decode("utf-8", "replace"), items[columns.item.names[-1]]  # type: ignore[index]
+    if left := len(content) - file.tell():
+        raise InputError(f"{left} bytes after its {count} entries", where=path, expected="a COLMAP file")
+
+
+def _text(path: Path, columns: _Columns) -> Iterator[_Entry]:
+    count, step = len(columns.numbers), len(columns.item.names or ())
+    rows = iter(read_lines(path, MODEL_FILE, columns.text, LARGEST_MODEL))
     for row in rows:
         if not row.text or row.text.startswith("#"):
             continue
-        words = row.text.split(maxsplit=9)  # a name may contain spaces
-        if len(words) < 10:
+        last, name, words = row, "", row.words
+        if columns.item_text:  # the list is empty if nothing was observed; a name may contain spaces
+            words = row.text.split(maxsplit=count)
+            name = words[-1]
+            last = replace(next(rows, replace(row, text="")), columns=columns.item_text)
+        if len(words) < count + bool(columns.item_text):
             raise row.error(f" has {len(words)} entries")
-        following: Row = replace(next(rows, replace(row, text="")), columns="x, y, id of points")
-        observed = following.words
-        if len(observed) % 3:
-            raise following.error(f" has {len(observed)} entries")
-        points = np.array([following.integer(word) for word in observed[2::3]], dtype=np.int64)
-        yield _image(row.where, words[9], row.integer(words[8]), row.numbers(words[1:8]), points)
+        items = last.words if columns.item_text else words[count:]
+        if len(items) % step:
+            raise last.error(f" has {len(last.words)} entries")
+        kinds = list(zip(columns.numbers, words, strict=False))
+        reals = iter(row.numbers([word for kind, word in kinds if kind == "d"]))
+        numbers = [next(reals) if kind == "d" else row.integer(word) for kind, word in kinds]
+        column = np.array([last.integer(word) for word in items[step - 1 :: step]], dtype=np.int64)
+        yield row.where, numbers, name, column
 
 
-def _text_points(path: Path) -> Iterator[_Point]:
-    for row in read_lines(path, MODEL_FILE, "id, x y z, r g b, error and a track", LARGEST_MODEL):
-        if not row.text or row.text.startswith("#"):
-            continue
-        words = row.words
-        if len(words) < 8 or len(words) % 2:
-            raise row.error(f" has {len(words)} entries")
-        x, y, z, error = row.numbers([*words[1:4], words[7]])
-        yield row.integer(words[0]), (x, y, z), error, (len(words) - 8) // 2
+def stored_keypoints(path: Path) -> Iterator[tuple[str, Keypoints]]:
+    """Yield the name and the keypoints of each image in a database or a file of features, by its ending.
+
+    Raises ``InputError`` for a file that cannot be read, and if h5py, which features of hloc need, is not installed.
+    """
+    read = _of_features if path.suffix == ".h5" else _of_database
+    for name, pixels, scales, descriptors in read(path):
+        count = len(pixels)
+        if not (
+            len(scales) == len(descriptors) == count and np.isfinite(pixels).all() and (scales > 0).all()
+        ):
+            raise InputError(
+                f"image {name!r} has {count} keypoints, {len(scales)} scales and {len(descriptors)} descriptors",
+                where=path,
+                expected="finite numbers for each keypoint",
+            )
+        # OpenCV's diameter of a keypoint is twice the scale of the Gaussian at which it was found.
+        sizes = torch.from_numpy(2 * np.asarray(scales, dtype=np.float32))
+        numbers = torch.from_numpy(np.array(descriptors))
+        if numbers.dtype != torch.uint8:
+            numbers = quantized(numbers.float())
+        yield name, Keypoints(torch.from_numpy(np.array(pixels, dtype=np.float32)), sizes, numbers)
 
 
-def _image(where: str, name: str, camera: int, pose: Sequence[float], points: np.ndarray) -> ModelImage:
-    """Build an image from a ``pose``, which is a quaternion w x y z followed by a translation."""
-    if not (np.isfinite(pose).all() and 0.5 < np.linalg.norm(pose[:4]) < 2):
-        raise InputError(f"image {name!r} has an invalid pose", where=where, expected="a unit quaternion")
-    rotation = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix()
-    T = SE3(torch.from_numpy(rotation), torch.tensor(pose[4:], dtype=torch.float64))
-    return ModelImage(name, camera, T, torch.from_numpy(points.astype(np.int64)))
+def _of_database(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+    query = (
+        "SELECT name, k.rows, k.cols, k.data, d.rows, d.cols, d.data FROM images"
+        " JOIN keypoints AS k ON k.image_id = images.image_id JOIN descriptors AS d ON d.image_id = images.image_id"
+    )
+    try:  # immutable: nothing is written beside it
+        address = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
+        with contextlib.closing(sqlite3.connect(address, uri=True)) as opened:
+            for name, *found in opened.execute(query):
+                keypoints, descriptors = (
+                    np.frombuffer(data or b"", kind).reshape(rows, columns)
+                    for (rows, columns, data), kind in zip((found[:3], found[3:]), ("<f4", "u1"), strict=True)
+                )
+                yield str(name), keypoints[:, :2], _scales(keypoints), descriptors
+    except (sqlite3.Error, ValueError, TypeError) as error:
+        raise InputError(f"cannot be read: {error}", where=path, expected="a database of COLMAP") from error
+
+
+def _scales(keypoints: np.ndarray) -> np.ndarray:
+    """Return the scales of keypoints stored as (x, y), (x, y, scale, orientation) or (x, y, 2x2 affine shape)."""
+    if keypoints.shape[1] == 6:
+        a, b, c, d = keypoints[:, 2:].T
+        return np.sqrt(np.abs(a * d - b * c)).clip(1e-3)
+    if keypoints.shape[1] == 4:
+        return keypoints[:, 2].clip(1e-3)
+    return np.full(len(keypoints), UNKNOWN_SCALE, dtype=np.float32)
+
+
+def _of_features(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+    try:
+        import h5py
+    except ImportError as error:
+        raise InputError("features of hloc need h5py (pip install h5py)", where=path) from error
+
+    def images(group: Any, parents: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
+        """Yield the groups that hold keypoints; the folders of an image's name are nested groups."""
+        if "keypoints" in group:
+            yield str(PurePosixPath(*parents)), group
+            return
+        for name in group:
+            yield from images(group[name], (*parents, name))
+
+    try:
+        with h5py.File(path, "r") as opened:
+            for name, group in images(opened, ()):
+                pixels = np.asarray(group["keypoints"], dtype=np.float32)[:, :2] + FIRST_CENTRE
+                scales = (
+                    np.asarray(group["scales"]) if "scales" in group else np.full(len(pixels), UNKNOWN_SCALE)
+                )
+                yield name, pixels, scales, np.asarray(group["descriptors"], dtype=np.float32).T
+    except (OSError, KeyError, ValueError, IndexError, TypeError) as error:
+        raise InputError(f"cannot be read: {error}", where=path, expected="features of hloc") from error

@@ -19,13 +19,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Integer
-from scipy.spatial.transform import Rotation
 
 from bidnerf_core.datasets.capture import remark
-from bidnerf_core.datasets.trajectories import pose_numbers
 from bidnerf_core.depth import MILLIMETRE, DepthImage, read_depth_image
 from bidnerf_core.errors import InputError, enumeration
-from bidnerf_core.geometry import SE3
 from bidnerf_core.io import decode
 
 LARGEST_SIDE = 640
@@ -92,17 +89,3 @@ class LidarDepth:
                 " of this image is left out, and so it is in such images that follow",
             )
         return replace(measured, metres=sure)
-
-
-def pose_of_numbers(where: str, numbers: Sequence[float], opengl: bool) -> SE3 | None:
-    """Return ``T_world_camera`` (OpenCV axes) from a position and a quaternion x y z w, or None if they hold no pose.
-
-    The camera axes are OpenGL's or OpenCV's. Raises ``InputError`` for a quaternion whose length is not 1.
-    """
-    found = pose_numbers(where, numbers)
-    if found is None:
-        return None
-    rotation = torch.from_numpy(Rotation.from_quat(found[3:]).as_matrix())
-    if opengl:
-        rotation = rotation * rotation.new_tensor([1.0, -1.0, -1.0])
-    return SE3(rotation, torch.tensor(found[:3], dtype=torch.float64))

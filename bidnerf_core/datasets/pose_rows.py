@@ -5,7 +5,6 @@ NeRF's and nerfstudio's JSON and ARKit's exports hold camera-to-world matrices w
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import torch
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import RIGID_TO, SE3, rigid_pose
-from bidnerf_core.io import Record, is_file, read_rows
+from bidnerf_core.io import Record
 
 
 def camera_of(
@@ -68,25 +67,3 @@ def _from_opengl(record: Record, key: str, rows: list[list[float]]) -> SE3:
     """Convert a pose from OpenGL to OpenCV axes: y up becomes y down, z backward becomes z forward."""
     matrix = torch.tensor(rows, dtype=torch.float64) * torch.tensor([1.0, -1.0, -1.0, 1.0])
     return rigid_pose(matrix, record.where, f"the rotation of {key}")
-
-
-def read_pose_matrix(path: Path) -> SE3 | None:
-    """Read ``T_world_camera`` (metres, OpenCV axes, float64) from a text file with one 4x4 matrix.
-
-    Returns None if there is no file, or if it holds numbers that are not finite, since tracking failed.
-
-    Raises ``InputError``, which names the offending line.
-    """
-    if not is_file(path):
-        return None
-    expected = "4 rows of 4 numbers, the last of them 0 0 0 1"
-    lines = read_rows(path, "a file of a pose", expected, most=4096)
-    rows = [row.plain_numbers(row.words) for row in lines]
-    if not all(map(math.isfinite, (number for row in rows for number in row))):
-        return None
-    rows = [row.numbers(count=4) for row in lines]
-    if len(rows) != 4:
-        raise InputError(f"has {len(rows)} rows", where=path, expected=expected)
-    if max(abs(x - y) for x, y in zip(rows[3], (0, 0, 0, 1), strict=True)) > 1e-6:
-        raise InputError(f"the last row is {rows[3]}", where=path, expected=expected)
-    return rigid_pose(torch.tensor(rows[:3], dtype=torch.float64), path)

@@ -33,7 +33,7 @@ def read_dataset(
         raise InputError("no such folder", where=folder)
     reader = _reader_of(folder, readers)
     if reader is None:
-        raise _without_dataset(folder, readers) if folder.is_dir() else _not_a_dataset(folder)
+        raise no_dataset(folder, readers)
     return _read(options, reader, folder).require_poses()
 
 
@@ -43,16 +43,16 @@ def read_sequence(
     """Read frames in chronological order, see ``DatasetOptions.open_sequence``."""
     # The readers of photos and videos are not registered: they find no poses.
     from bidnerf_core.datasets.formats.photos import reader as photos
-    from bidnerf_core.datasets.formats.video import reader as video
+    from bidnerf_core.datasets.formats.photos import video_reader as video
 
     place = Path(path)
     if not place.exists():
         raise InputError("no such file or folder", where=place)
     reader = _reader_of(place, readers) or next((r for r in (photos, video) if r.recognises(place)), None)
+    if reader is None and place.is_dir():
+        raise InputError("no images in it", where=place, expected="image files or a dataset")
     if reader is None:
-        if place.is_dir():
-            raise InputError("no images in it", where=place, expected="image files or a dataset")
-        raise _not_a_dataset(place, f", or {video.expected}")
+        raise no_dataset(place, or_else=f", or {video.expected}")
     return _read(options, reader, place).in_time_order()
 
 
@@ -61,21 +61,19 @@ def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
 
     Raises ``InputError`` for options that the format does not accept, and if a third-party reader fails.
     """
-    source, accepts = options.camera_source, reader.accepts
-    refused = {
-        "is a dataset with its own cameras; leave out the camera": source.is_given
-        and "camera" not in accepts,
-        "has no depth, or its depth is already registered to its images; leave out register_depth": (
-            options.registration not in (None, False) and "register_depth" not in accepts
-        ),
-        "has no depth images, or depth in a fixed unit; leave out depth_unit": (
-            options.depth_unit is not None and "depth_unit" not in accepts
-        ),
-    }
-    for problem in (text for text, is_refused in refused.items() if is_refused):
-        raise InputError(problem, where=path)
-    if source.is_given and source.camera is None and "focal" not in accepts:
-        raise InputError("is a dataset", where=path, expected="a camera with all intrinsics (camera=)")
+    source = options.camera_source
+    own_camera = "is a dataset with its own cameras; leave out the camera"
+    registered = "has no depth, or its depth is already registered to its images; leave out register_depth"
+    fixed_unit = "has no depth images, or depth in a fixed unit; leave out depth_unit"
+    given: list[tuple[OpenQuestion, bool, str]] = [
+        ("camera", source.is_given, own_camera),
+        ("register_depth", options.registration not in (None, False), registered),
+        ("depth_unit", options.depth_unit is not None, fixed_unit),
+        ("focal", source.is_given and source.camera is None, "is a dataset; give a camera with all intrinsics (camera=)"),
+    ]  # fmt: skip
+    for option, is_given, problem in given:
+        if is_given and option not in reader.accepts:
+            raise InputError(problem, where=path)
     try:
         found: Any = reader.read(path, options)
     except (InputError, OSError, MemoryError):
@@ -101,13 +99,10 @@ def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
             )
     if not found.splits:
         shots = hold_out(shots, rate=found.rate)
-        posed, chosen = (
-            [shot for shot in shots if shot.T_world_camera is not None],
-            [s for s in shots if s.splits],
-        )
-        if len(chosen) < len(posed):
+        posed = [bool(shot.splits) for shot in shots if shot.T_world_camera is not None]
+        if not all(posed):
             rate = f"{found.rate:g} per second; the sequence has all"
-            remark(path, f"the dataset has {len(chosen)} of {amount(len(posed), 'frame')}, {rate}")
+            remark(path, f"the dataset has {sum(posed)} of {amount(len(posed), 'frame')}, {rate}")
     faces = [replace(face, name="") for shot in shots for face in shot.faces()]
     found = replace(found, shots=faces, largest=options.largest)
     return found if (masks := options.mask_folder) is None else found.masked(masks)
@@ -259,6 +254,13 @@ def may_hold(reader: Reader, path: Path) -> bool:
     return path.is_dir() or path.suffix.lower() in getattr(reader, "suffixes", ())
 
 
+def _reader_of(folder: Path, readers: Sequence[Reader] | None) -> Reader | None:
+    """Return the first of ``readers``, by default of all, that recognizes a folder, or None."""
+    if readers is None:
+        return find_reader(folder)
+    return next((each for each in readers if may_hold(each, folder) and each.recognises(folder)), None)
+
+
 def file_of_dataset(path: Path) -> str | None:
     """Return a clause that names the folder to give instead of a file in it that describes a dataset, or None."""
     if path.suffix.lower() in IMAGE_SUFFIXES or not path.is_file() or find_reader(path.parent) is None:
@@ -266,51 +268,30 @@ def file_of_dataset(path: Path) -> str | None:
     return f"is a file of a dataset; give its folder, {path.parent}"
 
 
-def no_dataset(folder: Path) -> InputError:
-    """Return the error for a folder with neither photos nor a dataset, which refers to the list of formats."""
-    if (folder / "cameras.json").is_file() and (folder / "point_cloud").is_dir():
+def no_dataset(path: Path, readers: Sequence[Reader] | None = None, or_else: str = "") -> InputError:
+    """Return the error for a folder that is no dataset, or a file in place of one, and what to do.
+
+    ``or_else`` names what else than the folder of a dataset could be given.
+    """
+    if not path.is_dir():
+        if (instead := file_of_dataset(path)) is not None:
+            return InputError(f"{instead}{or_else}", where=path)
+        expected = f"the folder of a dataset{or_else}; unpack an archive first"
+        return InputError("is a file", where=path, expected=expected)
+    if (path / "cameras.json").is_file() and (path / "point_cloud").is_dir():
         splat = "'bidnerf import' with its point_cloud.ply, or the capture that it was trained on"
-        return InputError("is the output of 3D Gaussian Splatting", where=folder, expected=splat)
-    found = "contains no photos and is no dataset" if any(folder.iterdir()) else "the folder is empty"
-    return InputError(f"{found};", where=folder, expected=_expected_formats())
-
-
-def _expected_formats(readers: Sequence[Reader] | None = None) -> str:
-    """Return the formats that can be read, for messages: all by name, or the files that some readers expect."""
-    if readers is not None:
-        return "; or ".join(reader.expected for reader in readers)
-    return f"photos or a dataset in one of the formats of docs/datasets.md: {', '.join(READERS)}"
-
-
-def _not_a_dataset(file: Path, or_else: str = "") -> InputError:
-    """Return the error for a file in place of a dataset; ``or_else`` names what else could be given."""
-    if (instead := file_of_dataset(file)) is not None:
-        return InputError(f"{instead}{or_else}", where=file)
-    packed = file.suffix.lower() in (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
-    unpack = "; unpack the archive first" if packed else ""
-    return InputError("is a file", where=file, expected=f"the folder of a dataset{unpack}{or_else}")
-
-
-def _without_dataset(folder: Path, readers: Sequence[Reader] | None) -> InputError:
-    """Return the error for a folder that is no dataset, and what to do."""
-    children = (child for child in sorted(folder.iterdir()) if child.is_dir())
+        return InputError("is the output of 3D Gaussian Splatting", where=path, expected=splat)
+    children = (child for child in sorted(path.iterdir()) if child.is_dir())
     if (inside := next((child for child in children if _reader_of(child, readers)), None)) is not None:
         expected = f"one of the folders in it, such as {inside.name}"
-        return InputError("no dataset found", where=folder, expected=expected)
-    photos, _ = photos_in(folder)
-    if not photos and readers is None:
-        return no_dataset(folder)
-    found = "no dataset found"
-    if photos:
-        found += (
-            f": {amount(len(photos), 'photo')} without poses; 'bidnerf poses' finds them, or give those of an AR"
-            " framework or a robot;"
+        return InputError("no dataset found", where=path, expected=expected)
+    found = "contains no photos and is no dataset;" if any(path.iterdir()) else "the folder is empty;"
+    if photos := photos_in(path)[0]:
+        found = (
+            f"no dataset found: {amount(len(photos), 'photo')} without poses; 'bidnerf poses' finds them, or give"
+            " those of an AR framework or a robot;"
         )
-    return InputError(found, where=folder, expected=_expected_formats(readers))
-
-
-def _reader_of(folder: Path, readers: Sequence[Reader] | None) -> Reader | None:
-    """Return the first of ``readers``, by default of all, that recognizes a folder, or None."""
-    if readers is None:
-        return find_reader(folder)
-    return next((each for each in readers if may_hold(each, folder) and each.recognises(folder)), None)
+    expected = f"photos or a dataset in one of the formats of docs/datasets.md: {', '.join(READERS)}"
+    if readers is not None:
+        expected = "; or ".join(reader.expected for reader in readers)
+    return InputError(found, where=path, expected=expected)

@@ -29,7 +29,7 @@ from torch import Tensor
 from bidnerf_core.datasets.capture import remark
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.geometry import SE3, rigid_pose
-from bidnerf_core.io import LARGEST_ROWS, Row, parse_rows, read_file, read_lines, read_rows
+from bidnerf_core.io import LARGEST_ROWS, Row, is_file, parse_rows, read_file, read_lines, read_rows
 
 POSE = "tx ty tz qx qy qz qw"
 LARGEST_GAP = 0.1
@@ -74,14 +74,11 @@ def read_table(path: Path, expected: str, columns: str, needed: set[str]) -> lis
     rows = list[tuple[Row, list[str]]]()
     for line in (line for line in lines if line.text):
         try:
-            (cells,) = csv.reader([line.text])
+            rows.append((line, [cell.strip() for cell in next(csv.reader([line.text]))]))
         except csv.Error as error:  # such as a carriage return inside a field
             raise line.error(f" is no row of comma-separated values ({error})") from error
-        rows.append((line, [cell.strip() for cell in cells]))
-    return [
-        (row, dict(zip(names, cells, strict=False)))
-        for row, cells in _complete(path, rows, len(names), columns)
-    ]
+    complete = _complete(path, rows, len(names), columns)
+    return [(row, dict(zip(names, cells, strict=False))) for row, cells in complete]
 
 
 def _complete(
@@ -186,30 +183,35 @@ def read_trajectory(path: Path, times: Sequence[float] | None = None) -> Traject
     content = read_file(path, "a trajectory", LARGEST_ROWS)
     rows = parse_rows(content, path, "a trajectory", f"timestamp {POSE}")
     if rows and all(len(_words(row)) == KITTI_ROW for row in rows):
-        return _kitti(path, rows, times)
+        kind = f"rows of {KITTI_ROW} numbers, KITTI's 3x4 camera-to-world poses"
+        if times is None or len(times) != len(rows):
+            images = "images with known times" if times is None else amount(len(times), "image")
+            found = f"has {kind}, which have no times; there are {len(rows)} for {images}"
+            raise InputError(found, where=path, expected="one for each image")
+        remark(path, f"is read as {kind}, one for each image")
+        poses = SE3.stack(read_matrices(path))
+        return Trajectory(torch.tensor(times, dtype=torch.float64), poses.rotation, poses.translation)
     lines = content.decode("utf-8-sig", "replace").splitlines()
     comments = [line for line in lines if line.lstrip().startswith("#")]
     timed = _timed_rows(rows, path, POSE, any("[ns]" in line for line in comments))
-    order = _quaternion_order(comments, rows[0])
-    numbers = [pose_numbers(r.row.where, r.row.plain_numbers(r.words[:7]), order) for r in timed]
-    known = [place for place, found in enumerate(numbers) if found is not None]
+    order, known = _quaternion_order(comments, rows[0]), list[tuple[TimedRow, list[float]]]()
+    for row in timed:
+        numbers = pose_numbers(row.row.where, row.row.plain_numbers(row.words[:7]), order)
+        if numbers is not None:
+            known.append((row, numbers))
     if not known:
         raise InputError("has no finite pose", where=path, expected=f"lines of timestamp {POSE}")
     if len(known) < len(timed):
         left = amount(len(timed) - len(known), "pose")
-        first = timed[numbers.index(None)].row.line
-        remark(path, f"{left} of {len(timed)} not finite or zero, left out (first: line {first})")
-    distinct = list[int]()
-    for place in known:
-        if not distinct or timed[distinct[-1]].time != timed[place].time:
-            distinct.append(place)
-        elif numbers[distinct[-1]] != numbers[place]:
-            found = f"another pose at the time {timed[place].time:.6f}"
-            raise InputError(found, where=timed[place].row.where, expected="one pose per time")
-    values = torch.tensor([numbers[place] for place in distinct], dtype=torch.float64)
+        remark(path, f"{left} of {len(timed)} not finite or zero, left out")
+    for (one, pose), (other, others) in pairwise(known):
+        if one.time == other.time and pose != others:
+            found = f"another pose at the time {other.time:.6f}"
+            raise InputError(found, where=other.row.where, expected="one pose per time")
+    stamps, first = np.unique([row.time for row, _ in known], return_index=True)
+    values = torch.tensor([numbers for _, numbers in known], dtype=torch.float64)[torch.from_numpy(first)]
     rotations = torch.from_numpy(Rotation.from_quat(values[:, 3:].numpy()).as_matrix())
-    stamps = torch.tensor([timed[place].time for place in distinct], dtype=torch.float64)
-    return Trajectory(stamps, rotations, values[:, :3])
+    return Trajectory(torch.from_numpy(stamps), rotations, values[:, :3])
 
 
 def _quaternion_order(comments: Sequence[str], first: Row) -> str:
@@ -237,24 +239,26 @@ def pose_numbers(where: str, numbers: Sequence[float], order: str = "xyzw") -> l
     return [*numbers[:3], *(quaternion[letter] for letter in "xyzw")]
 
 
-def _kitti(path: Path, rows: Sequence[Row], times: Sequence[float] | None) -> Trajectory:
-    """Return the poses in rows of 3x4 matrices, one for each of ``times``."""
-    if times is None or len(times) != len(rows):
-        images = "images with known times" if times is None else amount(len(times), "image")
-        kind = f"has rows of {KITTI_ROW} numbers, KITTI's 3x4 poses, which have no times"
-        raise InputError(
-            f"{kind}; there are {len(rows)} for {images}", where=path, expected="one for each image"
-        )
-    remark(
-        path, f"rows of {KITTI_ROW} numbers are read as KITTI's 3x4 camera-to-world poses, one for each image"
-    )
-    poses = SE3.stack([_kitti_pose(row) for row in rows])
-    return Trajectory(torch.tensor(times, dtype=torch.float64), poses.rotation, poses.translation)
+def pose_of_numbers(where: str, numbers: Sequence[float], opengl: bool) -> SE3 | None:
+    """Return ``T_world_camera`` (OpenCV axes) from a position and a quaternion x y z w, or None if they hold no pose.
+
+    The camera axes are OpenGL's or OpenCV's. Raises ``InputError`` for a quaternion whose length is not 1.
+    """
+    found = pose_numbers(where, numbers)
+    if found is None:
+        return None
+    rotation = torch.from_numpy(Rotation.from_quat(found[3:]).as_matrix())
+    if opengl:
+        rotation = rotation * rotation.new_tensor([1.0, -1.0, -1.0])
+    return SE3(rotation, torch.tensor(found[:3], dtype=torch.float64))
 
 
-def _kitti_pose(row: Row) -> SE3:
-    numbers = row.numbers(_words(row), KITTI_ROW)
-    return rigid_pose(torch.tensor(numbers, dtype=torch.float64).reshape(3, 4), row.where)
+def pose_of_matrix(where: object, numbers: Sequence[float], what: str = "the rotation") -> SE3:
+    """Return the pose in the first three rows of a matrix of four columns, given row by row.
+
+    Raises ``InputError``, whose message begins with ``where``, if its rotation, called ``what``, is none.
+    """
+    return rigid_pose(torch.tensor(numbers, dtype=torch.float64).reshape(-1, 4)[:3], where, what)
 
 
 def read_matrices(path: Path) -> list[SE3]:
@@ -264,4 +268,26 @@ def read_matrices(path: Path) -> list[SE3]:
     """
     columns = f"{KITTI_ROW} numbers, a 3x4 matrix"
     rows = [(row, _words(row)) for row in read_rows(path, "a file of KITTI poses", columns)]
-    return [_kitti_pose(row) for row, _ in _complete(path, rows, KITTI_ROW, columns)]
+    complete = _complete(path, rows, KITTI_ROW, columns)
+    return [pose_of_matrix(row.where, row.numbers(words, KITTI_ROW)) for row, words in complete]
+
+
+def read_pose_matrix(path: Path) -> SE3 | None:
+    """Read ``T_world_camera`` (metres, OpenCV axes, float64) from a text file with one 4x4 matrix.
+
+    Returns None if there is no file, or if it holds numbers that are not finite, since tracking failed.
+
+    Raises ``InputError``, which names the offending line.
+    """
+    if not is_file(path):
+        return None
+    expected = "4 rows of 4 numbers, the last of them 0 0 0 1"
+    lines = read_rows(path, "a file of a pose", expected, most=4096)
+    if not np.isfinite([number for row in lines for number in row.plain_numbers(row.words)]).all():
+        return None
+    rows = [row.numbers(count=4) for row in lines]
+    if len(rows) != 4:
+        raise InputError(f"has {len(rows)} rows", where=path, expected=expected)
+    if not np.allclose(rows[3], (0, 0, 0, 1), rtol=0, atol=1e-6):
+        raise InputError(f"the last row is {rows[3]}", where=path, expected=expected)
+    return pose_of_matrix(path, [number for row in rows for number in row])

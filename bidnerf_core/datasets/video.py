@@ -32,8 +32,7 @@ FORWARD = 90
 class Video:
     """The frames of a video file by number, in chronological order, and their ``times`` (seconds).
 
-    Frames are as stored: a rotation in the metadata is applied by ``upright`` alone. Raises ``InputError`` if the file
-    is not a video, and if the extra ``video`` is missing.
+    Raises ``InputError`` if the file is not a video, and if the extra ``video`` is missing.
     """
 
     def __init__(self, path: Path) -> None:
@@ -63,16 +62,22 @@ class Video:
 
     def __iter__(self) -> Iterator[tuple[float, UInt8[np.ndarray, "h w 3"]]]:
         """Yield the time (seconds) and the upright pixels of each frame. Raises ``InputError`` if the file is truncated."""
-        return ((time, self.upright(number)) for number, time in enumerate(self.times))
+        return ((time, self.pixels(number, is_upright=True)) for number, time in enumerate(self.times))
 
-    def stored(self, number: int) -> UInt8[Tensor, "h w 3"]:
-        """Return the pixels of a frame as stored. Raises ``InputError`` if the file ends before it."""
-        return torch.from_numpy(_pixels(self._picture(number)))
+    def pixels(self, number: int, is_upright: bool = False) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the pixels of a frame as stored, or turned by the rotation in the metadata.
 
-    def upright(self, number: int) -> UInt8[np.ndarray, "h w 3"]:
-        """Return the pixels of a frame, turned by the rotation in the metadata. Raises ``InputError`` as ``stored`` does."""
+        HDR colours are kept as coded, without tone mapping. Raises ``InputError`` if the file ends before the frame.
+        """
         picture = self._picture(number)
-        return np.ascontiguousarray(np.rot90(_pixels(picture), round(picture.rotation / 90)))
+        try:
+            pixels: np.ndarray = picture.to_ndarray(format="rgb24")
+        except (
+            OSError
+        ):  # FFmpeg lacks the colour space that the file names, such as BT.2020 with constant luminance
+            picture.colorspace = 9  # BT.2020's YCbCr-to-RGB matrix (ITU-T H.273)
+            pixels = picture.to_ndarray(format="rgb24")
+        return np.ascontiguousarray(np.rot90(pixels, round(picture.rotation / 90))) if is_upright else pixels
 
     def close(self) -> None:
         """Close the file; reading another frame reopens it."""
@@ -113,19 +118,15 @@ class Video:
 
 @dataclass(frozen=True)
 class VideoPicture:
-    """A frame of a video as stored, which is the image of a shot."""
+    """A frame of a video, which is the image of a shot: as stored, or turned by the rotation in the metadata."""
 
     video: Video
     number: int
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height."""
-        return self.video.size
+    is_upright: bool = False
 
     def pixels(self) -> UInt8[Tensor, "h w 3"]:
         """Decode it. Raises ``InputError`` if the file ends before it."""
-        return self.video.stored(self.number)
+        return torch.from_numpy(self.video.pixels(self.number, self.is_upright))
 
     def __str__(self) -> str:
         return f"{self.video.path}: frame {self.number}"
@@ -176,15 +177,3 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
 
 def _no_video(path: Path, why: str) -> InputError:
     return InputError(f"not readable as a video ({why})", where=path, expected="a video file")
-
-
-def _pixels(picture: Any) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the pixels of a picture of any bit depth; HDR colours are kept as coded, without tone mapping."""
-    try:
-        pixels: np.ndarray = picture.to_ndarray(format="rgb24")
-    except OSError:  # FFmpeg does not support the colour space that the file names, such as BT.2020 with constant luminance
-        picture.colorspace = (
-            9  # BT.2020's YCbCr-to-RGB matrix (ITU-T H.273), in place of those that FFmpeg lacks
-        )
-        pixels = picture.to_ndarray(format="rgb24")
-    return pixels

@@ -22,11 +22,11 @@ from bidnerf_core.captures import (
     summary,
     surveyed,
 )
+from bidnerf_core.captures.photos import exposures, nearby, photo_measures
 
 # Inside: the measures of single photos and pairs, of which a report gives only the remarks
-from bidnerf_core.captures.advice import SUMMARY_LINES
-from bidnerf_core.captures.photos import exposures, nearby, photo_measures
-from bidnerf_core.captures.relocated_photos import groups
+from bidnerf_core.captures.report import SUMMARY_LINES
+from bidnerf_core.captures.survey import groups
 from bidnerf_core.fields import render_image
 from bidnerf_core.geometry import look_at
 from bidnerf_core.mapping import LandmarkConfig, tracked_views
@@ -156,7 +156,7 @@ def test_photos_from_inside_a_room_have_no_open_side() -> None:
     assert report.coverage.arrangement == "inside"
     assert (report.coverage.open_side, report.coverage.gaps) == (None, ())
     words = sentences(report)
-    assert any("taken from inside the scene, looking 22° to 22° down" in sentence for sentence in words)
+    assert any("taken from inside the scene, looking -22° to -22° up" in sentence for sentence in words)
     assert not any("no photos" in sentence for sentence in words)
 
 

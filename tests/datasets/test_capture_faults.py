@@ -275,7 +275,7 @@ def test_a_folder_that_is_no_dataset(tmp_path: Path) -> None:
     for name, found, expected in (
         ("none", "no such folder", None),
         (f"sound/{JSON}", f"is a file of a dataset; give its folder, {folder}", None),
-        ("scan.zip", "is a file", "the folder of a dataset; unpack the archive first"),
+        ("scan.zip", "is a file", "the folder of a dataset; unpack an archive first"),
         ("empty", "the folder is empty", "photos or a dataset in one of"),
         ("notes", "contains no photos and is no dataset", "photos or a dataset in one of"),
     ):

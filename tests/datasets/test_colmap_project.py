@@ -116,7 +116,7 @@ def test_the_largest_of_several_models_is_used(binary: bool, project: Path) -> N
         for model in (project / "sparse").iterdir():
             to_binary(model)
     (said,) = remarks_of(project)
-    assert "has 2 models, of which sparse/1 with 10 images is used, not sparse/0 (2)" in said
+    assert "has 2 models, of which sparse/1 with 10 images is used, not sparse/0 with 2 images" in said
     assert len(open_sequence(project)) == 10
 
 

@@ -17,7 +17,7 @@ import tiny
 from bidnerf_core.camera import CameraBatch, Intrinsics, checked_side
 
 # Inside: blocks are made so small that the images of a test fill several
-from bidnerf_core.captures.photos import nearby
+from bidnerf_core.captures.photos import excess, nearby
 from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds
@@ -164,8 +164,9 @@ def test_neighbours_are_the_same_block_by_block(monkeypatch: pytest.MonkeyPatch)
     near, values = nearby(views), torch.arange(40.0)
     for photo in range(40):
         others = {j if i == photo else i for i, j in whole.tolist() if photo in (i, j)}
-        assert set(near.other[near.photo == photo].tolist()) == others
-        assert float(near.medians(values)[photo]) == sorted(others)[(len(others) - 1) // 2]
+        assert set(near[near[:, 0] == photo, 1].tolist()) == others
+        median = sorted(others)[(len(others) - 1) // 2]
+        assert float(excess(values, near)[photo]) == photo - median
 
 
 def test_large_images_are_read_at_the_size_that_is_of_use(

@@ -26,7 +26,6 @@ from bidnerf_core.camera import Camera
 from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, remark
 from bidnerf_core.datasets.colmap_files import (
     ModelImage,
-    count_posed_images,
     depth_map_of,
     files_of,
     read_colmap_depth,
@@ -72,16 +71,14 @@ def colmap_project(path: Path) -> tuple[Path, Path, list[ModelImage], dict[int, 
     The images are in the natural order of their names, the cameras by id, and the files that exist by the images' names.
     Raises ``InputError`` if the model is damaged or has no registered image.
     """
-    model = _largest(path, colmap_models(path))
-    images, cameras = read_posed_images(model)
+    model, images, cameras = _largest(path, colmap_models(path))
     folder, files = _image_folder(path, model, images)
     others = _models_at(folder.parent / "sparse") if files else []
     if others and model.resolve() not in [each.resolve() for each in others]:
         # Such a folder is dense/0, whose images are undistorted, while those of sparse/0 lie elsewhere.
         text = f"{folder.relative_to(path)} has a model of its own, which is used instead of {model.relative_to(path)}"
         remark(path, text)
-        model = _largest(path, others)
-        images, cameras = read_posed_images(model)
+        model, images, cameras = _largest(path, others)
         folder, files = _image_folder(path, model, images)
     if not images:
         raise InputError("has no registered image", where=model, expected="at least one")
@@ -108,19 +105,19 @@ def _models_at(folder: Path) -> list[Path]:
     return complete or [place for place in places if files_of(place, "cameras", "points3D")][:1]
 
 
-def _largest(path: Path, models: Sequence[Path]) -> Path:
-    """Return the model with the most images; a remark names the others."""
-    if len(models) == 1:
-        return models[0]
-    sizes = {model: count_posed_images(model) for model in models}
-    chosen = max(models, key=lambda model: sizes[model])
-    others = ", ".join(f"{model.relative_to(path)} ({sizes[model]})" for model in models if model != chosen)
-    remark(
-        path,
-        f"has {len(models)} models, of which {chosen.relative_to(path)} with"
-        f" {amount(sizes[chosen], 'image')} is used, not {others}; each model has its own world frame",
-    )
-    return chosen
+def _largest(path: Path, models: Sequence[Path]) -> tuple[Path, list[ModelImage], dict[int, Camera]]:
+    """Return the model with the most images, these and their cameras; a remark names the others."""
+    read = {model: read_posed_images(model) for model in models}
+    chosen = max(models, key=lambda model: len(read[model][0]))
+    if len(models) > 1:
+        sizes = {
+            model: f"{model.relative_to(path)} with {amount(len(read[model][0]), 'image')}"
+            for model in models
+        }
+        used = sizes.pop(chosen)
+        text = f"has {len(models)} models, of which {used} is used, not {', '.join(sizes.values())}"
+        remark(path, f"{text}; each model has its own world frame")
+    return chosen, *read[chosen]
 
 
 def _image_folder(path: Path, model: Path, images: Sequence[ModelImage]) -> tuple[Path, dict[str, Path]]:

@@ -15,15 +15,13 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import torch
-
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets.capture import Capture, Shot
 from bidnerf_core.datasets.pose_rows import camera_of
 from bidnerf_core.datasets.reader import DatasetOptions, Format
-from bidnerf_core.datasets.trajectories import read_timed_files, read_trajectory
+from bidnerf_core.datasets.trajectories import pose_of_matrix, read_timed_files, read_trajectory
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry import SE3, rigid_pose
+from bidnerf_core.geometry import SE3
 from bidnerf_core.io import is_file, read_file
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0", "gt0")
@@ -52,8 +50,7 @@ def _find(path: Path) -> Path | None:
 def _sensor(file: Path, options: DatasetOptions) -> tuple[CameraSource, SE3]:
     """Return the camera, given or calibrated, and its pose in the body frame. Raises ``InputError``."""
     text = read_file(file, "EuRoC's sensor.yaml").decode("utf-8", "replace")
-    matrix = torch.tensor(_numbers(file, text, "T_BS", 16), dtype=torch.float64).reshape(4, 4)
-    T_body_camera = rigid_pose(matrix[:3], file, "the rotation of T_BS")
+    T_body_camera = pose_of_matrix(file, _numbers(file, text, "T_BS", 16), "the rotation of T_BS")
     if options.given_camera is not None:
         return CameraSource(options.given_camera), T_body_camera
     width, height = _numbers(file, text, "resolution", 2)

@@ -12,16 +12,15 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree import ElementTree
 
-import torch
-
 from bidnerf_core.camera import Camera, PanoramaFace, colmap_camera
 from bidnerf_core.datasets.capture import Capture, Shot
 from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames
 from bidnerf_core.datasets.pose_rows import camera_of
 from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.datasets.trajectories import pose_of_matrix
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order
-from bidnerf_core.geometry import SE3, rigid_pose
+from bidnerf_core.geometry import SE3
 from bidnerf_core.io import is_file, open_binary, read_file
 
 
@@ -49,8 +48,7 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
         if sensor is None:
             raise InputError("has no calibrated sensor", where=where, expected="the id of one")
         if transform is not None:
-            matrix = torch.tensor(_numbers(transform, where, 16), dtype=torch.float64).reshape(4, 4)
-            pose = rigid_pose(matrix[:3], where)
+            pose = pose_of_matrix(where, _numbers(transform, where, 16))
             pose = SE3(pose.rotation, pose.translation * scale)
         shots.append(Shot(image=image, camera=sensor, T_world_camera=pose))
     return Capture(

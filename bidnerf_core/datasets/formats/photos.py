@@ -1,8 +1,11 @@
-"""Folders of images without poses.
+"""Folders of images, and videos, without poses.
 
 Images are ordered by timestamp if every name is one (``12.345.png``), else in natural name order. The depth of ``NAME.png``, if
 any, is ``NAME.depth.png``, as written by ``bidnerf render``. Unlike the images of datasets, photos are turned upright
 according to their EXIF orientation, and their camera comes from EXIF where none is given, as in ``Frame.open``.
+
+A video is turned by the rotation in its metadata, so its camera is that of the upright image. It does not record its focal
+length, so the camera has to be given or assumed.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from pathlib import Path
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets.capture import Capture, Colour, Shot
 from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.datasets.video import VIDEO_SUFFIXES, Video, VideoPicture, is_video
 from bidnerf_core.depth import MILLIMETRE, DepthCamera
 from bidnerf_core.frames import BLACK, DEPTH_STEM, Frame, photos_in
 
@@ -68,4 +72,18 @@ def timestamp(stem: str) -> float | None:
     return float(stem) if re.fullmatch(r"\d+\.\d+", stem) else None
 
 
+def _read_video(path: Path, found: bool, options: DatasetOptions) -> Capture:
+    """List the frames. Raises ``InputError`` if it is not a video, and if there is no camera."""
+    source, video = options.camera_source, Video(path)
+    source.require(path, "a video does not record its focal length")
+    shots = [
+        Shot(image=VideoPicture(video, number, is_upright=True), camera=source, time=time, stem=f"{number:06d}", tells_camera=True)
+        for number, time in enumerate(video.times)
+    ]  # fmt: skip
+    return Capture(path, shots)
+
+
 reader = Format("image files", _find, _read, ("camera", "focal", "register_depth", "depth_unit"))
+video_reader = Format(
+    f"a video ({', '.join(VIDEO_SUFFIXES)})", is_video, _read_video, ("camera", "focal"), VIDEO_SUFFIXES
+)

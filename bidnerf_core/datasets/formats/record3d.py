@@ -27,6 +27,7 @@ from bidnerf_core.datasets import lidar
 from bidnerf_core.datasets.capture import Capture, DepthFile, Shot
 from bidnerf_core.datasets.pose_rows import camera_of
 from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.datasets.trajectories import pose_of_numbers
 from bidnerf_core.depth import DepthImage, depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import Archive, ImageSource, Record, is_file, parse_record, read_file
@@ -110,7 +111,7 @@ def _read(path: Path, metadata_file: Path, options: DatasetOptions) -> Capture:
             Shot(
                 image=files.file(f"rgbd/{number}.jpg"),
                 camera=camera_of(metadata.where, cameras[number], (width, height)),
-                T_world_camera=lidar.pose_of_numbers(where, [*pose[4:], *pose[:4]], opengl=True),
+                T_world_camera=pose_of_numbers(where, [*pose[4:], *pose[:4]], opengl=True),
                 time=times[number],
                 depth=DepthFile(file, partial(files.depth, number, size)) if has_depth else None,
                 stem=str(number),

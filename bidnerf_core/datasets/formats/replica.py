@@ -12,16 +12,14 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-import torch
-
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.capture import Capture, DepthFile, Shot
 from bidnerf_core.datasets.pose_rows import camera_of
 from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.datasets.trajectories import pose_of_matrix
 from bidnerf_core.depth import DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order
-from bidnerf_core.geometry import rigid_pose
 from bidnerf_core.io import Record, is_file, read_record, read_rows
 
 KEYS = ("fx", "fy", "cx", "cy", "scale")
@@ -37,13 +35,12 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     camera, step = _camera(path)
     unit, read, shots = options.depth_unit or step, DepthReader(), list[Shot]()
     for row, image in zip(rows, images, strict=False):
-        matrix = torch.tensor(row.numbers(count=16), dtype=torch.float64).reshape(4, 4)
         depth = image.with_name(f"{image.stem.replace('frame', 'depth')}.png")
         shots.append(
             Shot(
                 image=image,
                 camera=camera,
-                T_world_camera=rigid_pose(matrix[:3], row.where),
+                T_world_camera=pose_of_matrix(row.where, row.numbers(count=16)),
                 depth=DepthFile(depth, partial(read, depth, unit)) if is_file(depth) else None,
             )
         )

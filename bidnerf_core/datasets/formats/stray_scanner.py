@@ -18,7 +18,7 @@ from bidnerf_core.datasets import lidar
 from bidnerf_core.datasets.capture import Capture, DepthFile, Shot
 from bidnerf_core.datasets.pose_rows import camera_of
 from bidnerf_core.datasets.reader import DatasetOptions, Format
-from bidnerf_core.datasets.trajectories import read_table
+from bidnerf_core.datasets.trajectories import pose_of_numbers, read_table
 from bidnerf_core.datasets.video import Video, VideoPicture
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import is_file, read_rows
@@ -54,7 +54,7 @@ def _read(path: Path, odometry: Path, options: DatasetOptions) -> Capture:
             Shot(
                 image=VideoPicture(video, number) if number < len(video) else video.path / stem,
                 camera=camera_of(where, own or of_all, video.size),
-                T_world_camera=lidar.pose_of_numbers(row.where, pose, opengl=False),
+                T_world_camera=pose_of_numbers(row.where, pose, opengl=False),
                 time=row.plain_numbers([words["timestamp"]])[0],
                 depth=None if depth is None else DepthFile(depth, partial(read, depth, confidence)),
                 stem=stem,
