@@ -4,13 +4,16 @@ from .answers import Answers as Answers
 from .answers import Failure as Failure
 from .answers import localize_each as localize_each
 from .answers import plain_localization as plain_localization
+from .answers import track as track
 from .colmap_poses import check_pose_file as check_pose_file
 from .errors import CRITERIA as CRITERIA
 from .errors import PoseError as PoseError
 from .errors import Rate as Rate
 from .errors import Reduced as Reduced
+from .errors import TrajectoryErrors as TrajectoryErrors
 from .errors import normalized_error_squared as normalized_error_squared
 from .errors import pose_error as pose_error
+from .errors import spans as spans
 from .errors import standard_deviations as standard_deviations
 from .errors import steps_to_success as steps_to_success
 from .errors import success_rate as success_rate
@@ -20,8 +23,10 @@ from .export import export_map as export_map
 from .export import head as head
 from .export import ply as ply
 from .overlays import Painter as Painter
+from .overlays import TrackingVideo as TrackingVideo
 from .overlays import as_array as as_array
 from .overlays import as_picture as as_picture
+from .overlays import check_video as check_video
 from .overlays import overlay as overlay
 from .overlays import save_gif as save_gif
 from .overlays import tile as tile
@@ -44,9 +49,3 @@ from .pose_files import read_pose as read_pose
 from .pose_files import read_poses as read_poses
 from .pose_files import read_positions as read_positions
 from .pose_files import write_poses as write_poses
-from .tracking import opened_for as opened_for
-from .tracking import track as track
-from .tracking_video import TrackingVideo as TrackingVideo
-from .tracking_video import check_video as check_video
-from .trajectory import TrajectoryErrors as TrajectoryErrors
-from .trajectory import spans as spans

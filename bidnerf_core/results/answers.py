@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,19 +16,19 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import UpDirection, as_given
-from bidnerf_core.datasets import Query, QuerySource
+from bidnerf_core.datasets import BreaksOff, Capture, Query, QuerySource, open_sequence
 from bidnerf_core.depth import noise_remark
-from bidnerf_core.errors import InputError, UsageError, amount
+from bidnerf_core.errors import InputError, InputWarning, UsageError, amount
 from bidnerf_core.frames import Frame
-from bidnerf_core.geometry import SE3, LengthUnit, symbol
+from bidnerf_core.geometry import SE3, LengthUnit, fit_similarity, symbol
 from bidnerf_core.io import write_file
 from bidnerf_core.localization import (
-    LANDMARK_BOUNDS,
-    Evidence,
     Localization,
     Localizer,
     Outcome,
     SceneMap,
+    Tracker,
+    landmark_cameras,
     unit_of,
 )
 from bidnerf_core.mapping import SurfaceMap
@@ -35,14 +36,15 @@ from bidnerf_core.maps import MapCollection, Placement
 from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context
 from bidnerf_core.results.errors import (
     PoseError,
+    TrajectoryErrors,
     pose_error,
     rotation_angle,
+    spans,
     standard_deviations,
     within,
 )
 from bidnerf_core.results.plots import draw_path
 from bidnerf_core.results.pose_files import PosedImage, pose_format, write_poses
-from bidnerf_core.results.trajectory import TrajectoryErrors, spans, world_of_truth
 
 log = logging.getLogger("bidnerf")
 
@@ -212,34 +214,34 @@ class Answers:
     def question(self) -> str:
         """A question to append to a summary if none of several images shows the scene of the map, else empty."""
         recognised = {
-            Outcome.CONVERGED, Outcome.IMPRECISE, Outcome.MIRRORED, Outcome.MISCALIBRATED, Outcome.UNCERTAIN
+            Outcome.CONVERGED, Outcome.IMPRECISE, Outcome.MIRRORED, Outcome.MISCALIBRATED, Outcome.UNCERTAIN,
+            Outcome.AMBIGUOUS,
         }  # fmt: skip
-        found = [answer.found for answer in self.answers]
-        for each in found:
-            evidence = each.diagnostics
-            shows_scene = each.outcome in recognised
-            if each.outcome is Outcome.AMBIGUOUS and isinstance(evidence, Evidence):
-                # An ambiguous image shows the scene if far more landmarks fit its pose than would by chance.
-                bounds = [bound for bound in LANDMARK_BOUNDS if bound.measure == "above_chance"]
-                shows_scene = all(evidence.above_chance >= bound.limit for bound in bounds)
-            if shows_scene:
-                return ""
+        outcomes = [answer.found.outcome for answer in self.answers]
         # One or two rejected images are no reason to doubt that the map is the right one.
-        return "; do they show the scene of this map?" if len(found) >= 3 else ""
+        is_other = len(outcomes) >= 3 and recognised.isdisjoint(outcomes)
+        return "; do they show the scene of this map?" if is_other else ""
 
     @property
     def remark(self) -> str | None:
         """A remark on all errors together: the true poses may be those of another world; None if there is none."""
-        known = [(answer.found.T_world_camera, answer.truth) for answer in self.accepted if answer.truth]
-        if not known:
+        known = self._known
+        if (
+            known is None or len(known[0].translation) < 4
+        ):  # a similarity fits nearly any three pairs of positions
             return None
-        worlds = world_of_truth(*(SE3.stack(list(poses)) for poses in zip(*known, strict=True)))
-        if worlds is None:
+        found, true = known[0].translation.double(), known[1].translation.double()
+        try:
+            worlds = fit_similarity(true, found)
+        except InputError:
+            return None
+        left, error = (torch.linalg.vector_norm(found - of, dim=-1) for of in (worlds.apply(true), true))
+        if not bool(left.max() < 0.1 * error.median()):  # it is to explain the errors of all poses
             return None
         T = worlds.T_target_source
         turn, shift = float(rotation_angle(T.rotation)), float(torch.linalg.vector_norm(T.translation))
         return (
-            f"all {len(known)} accepted poses differ from the dataset's by one transformation (a rotation by"
+            f"all {len(found)} accepted poses differ from the dataset's by one transformation (a rotation by"
             f" {math.degrees(turn):.3g}°, a scale of {worlds.scale:.4g} and a shift of {shift:.3g} {symbol(self.unit)}): the"
             " dataset's world is not that of the map"
         )
@@ -262,37 +264,6 @@ class Answers:
             poses = amount(len(accepted), "pose")
             log.info("%s: %s; %d without an accepted pose are left out", path, poses, left_out)
 
-    def to_pandas(self) -> Any:
-        """Return the answers as a table (a pandas ``DataFrame``): a row for each image, in order.
-
-        Its columns are those of ``plain`` that hold one value, the camera's position (``x``, ``y``, ``z``) and its unit quaternion
-        (``qx`` ...), the standard deviations ``sigma_translation`` and ``sigma_rotation_deg``, and, where the truth is known, the
-        errors ``error_translation`` and ``error_rotation_deg``. Raises ``InputError`` if pandas is not installed.
-        """
-        try:
-            import pandas
-        except ImportError as error:
-            raise InputError("a table needs pandas (pip install pandas)") from error
-        rows = [
-            {k: v for k, v in self.plain(each).items() if not isinstance(v, list | dict)}
-            for each in self.given
-        ]
-        for row, answer in (
-            (row, each) for row, each in zip(rows, self.given, strict=True) if isinstance(each, Answer)
-        ):
-            T, found = answer.found.T_world_camera.to("cpu", torch.float64), answer.found
-            row |= zip(("x", "y", "z"), T.translation.tolist(), strict=True)
-            row |= zip(("qx", "qy", "qz", "qw"), T.quaternion("xyzw").tolist(), strict=True)
-            if found.covariance is not None:
-                position, rotation = standard_deviations(found.covariance)
-                row |= {"sigma_translation": position, "sigma_rotation_deg": math.degrees(rotation)}
-            if (off := answer.error) is not None:
-                row |= {
-                    "error_translation": float(off.translation),
-                    "error_rotation_deg": float(off.rotation_deg),
-                }
-        return pandas.DataFrame(rows)
-
     @property
     def lost(self) -> list[tuple[int, int]]:
         """The first and the last index of each run of frames without an accepted pose."""
@@ -300,20 +271,17 @@ class Answers:
 
     def errors(self) -> TrajectoryErrors | None:
         """Return the errors of the accepted poses whose truth is known, or None if there are none."""
-        known = [(a.found.T_world_camera, a.truth) for a in self.accepted if a.truth is not None]
+        known = self._known
+        return None if known is None else TrajectoryErrors.of(*known, self.unit)
+
+    @property
+    def _known(self) -> tuple[SE3, SE3] | None:
+        """The accepted poses whose truth is known, and the true ones; None without any."""
+        known = [(answer.found.T_world_camera, answer.truth) for answer in self.accepted if answer.truth]
         if not known:
             return None
         found, true = (SE3.stack(list(poses)) for poses in zip(*known, strict=True))
-        return TrajectoryErrors.of(found, true, self.unit)
-
-    def consistency(self) -> float | None:
-        """Return the share of accepted poses whose errors are inside their 95 % bounds, or None if unknown."""
-        inside = [
-            bool(within(answer.found.T_world_camera, answer.truth, answer.found.covariance))
-            for answer in self.accepted
-            if answer.truth is not None and answer.found.covariance is not None
-        ]
-        return sum(inside) / len(inside) if inside else None
+        return found, true
 
     @property
     def _origin(self) -> Tensor:
@@ -361,7 +329,13 @@ class Answers:
                 rows.append(("ATE", f"{errors.ate:.4f} {unit} (root mean square, rigidly aligned)"))
             if errors.rpe is not None:
                 rows.append(("RPE per frame", str(errors.rpe)))
-        if (share := self.consistency()) is not None:
+        inside = [
+            bool(within(answer.found.T_world_camera, answer.truth, answer.found.covariance))
+            for answer in self.accepted
+            if answer.truth is not None and answer.found.covariance is not None
+        ]
+        if inside:
+            share = sum(inside) / len(inside)
             rows.append(("inside 95 % bound", f"{share:.1%} (by the poses' covariances)"))
         # Frames are training images of the map if their names and true poses are the same, up to rounding in files.
         info = getattr(self.scene, "info", None)
@@ -403,10 +377,8 @@ def localize_each(
     query and its answer; for a failure the query has only a name. Raises ``InputError``, and ``Cancelled`` once
     ``cancel`` returns True.
     """
-    several = isinstance(localizer, MapCollection)
     if answers is None:
         answers = Answers(localizer if isinstance(localizer, MapCollection) else localizer.scene)
-    bare_before = False
     with job_context(progress, cancel):
         count, total = counter("localizing", "images"), len(queries.names)
         for number, name in enumerate(queries.names):
@@ -414,31 +386,24 @@ def localize_each(
             query, placement = Query(name, ()), None
             try:
                 query = queries.read(number)
+                truth = query.truth
                 if isinstance(localizer, MapCollection):
                     if len(query.views) != 1 or query.depth_rays is not None:
-                        found_rig, expected = (
+                        rig, expected = (
                             "is a rig or has points from a sensor",
                             "single images for several maps",
                         )
-                        raise InputError(found_rig, where=query.name, expected=expected)
+                        raise InputError(rig, where=name, expected=expected)
                     placement = localizer(query.views[0].frame, seed)
-                    found = placement.found
+                    found, truth = placement.found, None
                 else:
-                    bare = [view.frame.name for view in query.views if not view.frame.has_depth]
-                    if bare and query.truth is not None and query.depth_rays is None and not bare_before:
-                        bare_before = True
-                        log.info("%s: no measured depth; colour only", ", ".join(bare))
-                    sensor, shown = localizer.shared.depth_sensor, query.frame
-                    if number == 0 and sensor != "unknown" and shown.depth is not None and shown.has_depth:
-                        remark = noise_remark(shown.depth, shown.intrinsics, sensor)
-                        if remark is not None:
-                            log.info("%s: %s", query.name, remark)
+                    if number == 0:
+                        _log_depth(query, localizer.shared.depth_sensor)
                     begin = None if start is None else start(query)
                     found = localizer(query.views, begin, query.depth_rays, seed)
                 frame = query.frame.replace(name=query.name)
-                truth = None if several else query.truth
                 answer = Answer.of(frame, number, found, truth=truth, file=query.file, placement=placement)
-                if not (several or answer.is_finite):
+                if placement is None and not answer.is_finite:
                     raise InputError(
                         f"{found.method} diverged to a pose that is not finite; is the map valid?", where=name
                     )
@@ -451,5 +416,80 @@ def localize_each(
             answers.append(answer)
             if each is not None:
                 each(query, answer)
+            count(number + 1, total)
+    return answers
+
+
+def _log_depth(query: Query, sensor: str) -> None:
+    """Log that the images of a dataset have no measured depth, or that its noise is not that of the sensor."""
+    bare = [view.frame.name for view in query.views if not view.frame.has_depth]
+    if bare and query.truth is not None and query.depth_rays is None:
+        log.info("%s: no measured depth; colour only", ", ".join(bare))
+    shown = query.frame
+    if sensor != "unknown" and shown.depth is not None and shown.has_depth:
+        remark = noise_remark(shown.depth, shown.intrinsics, sensor)
+        if remark is not None:
+            log.info("%s: %s", query.name, remark)
+
+
+def track(
+    scene: SceneMap | Localizer | Tracker,
+    sequence: Capture | str | Path,
+    *,
+    every: int = 1,
+    depth: bool = True,
+    answers: Answers | None = None,
+    each: Callable[[Frame, Answer], None] | None = None,
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+) -> Answers:
+    """Find the poses of a sequence's frames in a map, in chronological order.
+
+    ``scene``: a map, a localizer with its own settings, or a tracker with its own settings and start. ``sequence``: the
+    result of ``open_sequence``, or the path of a dataset, a folder of images or a video, whose images use the map's
+    cameras if they have none of their own. ``every``: use only every n-th frame. ``depth``: whether measured depth is
+    used. ``answers``: collects the answers, by default a new object; it holds those so far if an error ends the
+    tracking. ``each`` is called with each frame and its answer, ``progress`` after each frame.
+
+    A frame whose files cannot be read is left out with an ``InputWarning`` and counted in ``unread``. Raises
+    ``InputError`` if none of the first frames can be read, and ``Cancelled`` once ``cancel`` returns True.
+    """
+    if every < 1:
+        raise InputError(f"every is {every}", expected="1 or more")
+    tracker = scene
+    if not isinstance(tracker, Tracker):
+        tracker = Tracker(tracker if isinstance(tracker, Localizer) else Localizer(tracker))
+    if not isinstance(sequence, Capture):
+        stored = tracker.localizer.scene
+        sequence = open_sequence(
+            sequence, assumed=landmark_cameras(stored), background=stored.bounds.background
+        )
+    if answers is None:
+        answers = Answers(tracker.localizer.scene, is_sequence=True)
+    total = -(-len(sequence) // every)
+    with job_context(progress, cancel):
+        count = counter("tracking", "frames")
+        for number, place in enumerate(range(0, len(sequence), every)):
+            try:
+                timed = sequence[place]
+            except BreaksOff:
+                raise
+            except InputError as error:
+                # If none of the first three frames can be read, probably none can.
+                if not answers.answers and number + 1 >= min(3, total):
+                    many = (
+                        "the first frame cannot"
+                        if number == 0
+                        else f"none of the first {number + 1} frames can"
+                    )
+                    raise InputError(f"{many} be read: {error}") from error
+                warnings.warn(f"{error}; left out", InputWarning, stacklevel=2)
+                answers.unread += 1
+            else:
+                frame = timed.frame if depth else timed.frame.replace(depth=None)
+                found = tracker(frame, timed.time)
+                answer = answers.add(frame, found, timed.time, timed.truth, every * number)
+                if each is not None:
+                    each(timed.frame, answer)
             count(number + 1, total)
     return answers

@@ -1,4 +1,9 @@
-"""Errors of poses (``T_world_camera``), and criteria for success."""
+"""Errors of poses (``T_world_camera``) and of trajectories, and criteria for success.
+
+The errors of trajectories are raw, after alignment (ATE), and of the motion between frames (RPE), as in Sturm et al. 2012, "A
+benchmark for the evaluation of RGB-D SLAM systems". Poses in a map need no alignment, so their raw error is what counts; the
+others make them comparable with odometry.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +11,14 @@ import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, TypeAlias
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry import SE3, LengthUnit, chi_squared_quantile, symbol
+from bidnerf_core.geometry import SE3, LengthUnit, chi_squared_quantile, fit_similarity, symbol
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,16 +96,12 @@ def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
     return torch.atan2(torch.linalg.vector_norm(twice_axis, dim=-1), trace - 1)  # twice sine and cosine
 
 
-@runtime_checkable
-class Criterion(Protocol):
-    """Decides whether an error counts as success, given the error of the start. A pose that is not finite never succeeds."""
-
-    def __call__(self, error: PoseError, start: PoseError) -> Bool[Tensor, "*b"]: ...
-
-
 @dataclass(frozen=True)
 class Reduced:
-    """Success if the translation error is at most ``fraction`` of the start's (BID-NeRF, section IV)."""
+    """Success if the translation error is at most ``fraction`` of the start's (BID-NeRF, section IV).
+
+    A pose that is not finite never succeeds.
+    """
 
     fraction: float
 
@@ -118,6 +119,9 @@ class Within:
     def __call__(self, error: PoseError, start: PoseError) -> Bool[Tensor, "*b"]:
         return (error.rotation_deg < self.rotation_deg) & (error.translation < self.translation)
 
+
+Criterion: TypeAlias = Reduced | Within
+"""Decides whether an error counts as success, given the error of the start."""
 
 CRITERIA: dict[str, Criterion] = {
     "10%": Reduced(0.1),
@@ -142,6 +146,10 @@ def steps_to_success(trace: PoseError, criterion: Criterion) -> int | None:
     return first if first < len(trace.translation) else None
 
 
+CONFIDENCE = 0.95
+"""Probability with which the interval of a rate contains the true one."""
+
+
 @dataclass(frozen=True)
 class Rate:
     """A success rate with the ends of its Wilson interval, which accounts for repeated trials of a frame."""
@@ -162,20 +170,17 @@ class Rate:
         return f"{self.rate:.1%} ({count}{on}; {self.low:.1%} to {self.high:.1%})"
 
 
-def success_rate(successes: int, trials: int, confidence: float = 0.95) -> Rate:
-    """Return the success rate of independent trials with Wilson's interval (Wilson 1927)."""
+def success_rate(successes: int, trials: int) -> Rate:
+    """Return the success rate of independent trials with Wilson's 95 % interval (Wilson 1927)."""
     if not (trials >= 1 and 0 <= successes <= trials):
         raise InputError(
             f"{successes} of {trials}", where="success rate", expected="0 to n of at least one trial"
         )
-    low, high = wilson_interval(successes / trials, trials, confidence)
-    return Rate(successes, trials, low, high)
+    return _with_interval(successes, trials, trials)
 
 
-def success_rate_by_frame(
-    outcomes: Sequence[bool], frames: Sequence[Hashable], confidence: float = 0.95
-) -> Rate:
-    """Return the success rate of trials that repeat some frames, with an interval that accounts for it.
+def success_rate_by_frame(outcomes: Sequence[bool], frames: Sequence[Hashable]) -> Rate:
+    """Return the success rate of trials that repeat some frames, with a 95 % interval that accounts for it.
 
     Trials of one frame share its difficulty. Wilson's interval is that of the effective number of trials: the
     number of independent ones whose rate would vary as much as this rate does from frame to frame (Korn and
@@ -189,26 +194,117 @@ def success_rate_by_frame(
         grouped.setdefault(frame, []).append(bool(outcome))
     count = len(grouped)
     if count in (0, trials):
-        return success_rate(successes, trials, confidence)
-    share = successes / trials
-    effective = float(count)
+        return success_rate(successes, trials)
+    share, effective = successes / trials, float(count)
     if count > 1 and 0 < successes < trials:
         from scipy.stats import t  # imported here, because it takes longer than any help page should
 
         squares = sum((sum(own) - share * len(own)) ** 2 for own in grouped.values())
         variance = count / (count - 1) * squares / trials**2
-        quantiles = [float(t.ppf(0.5 + confidence / 2, n - 1)) for n in (trials, count)]
-        correction = (quantiles[0] / quantiles[1]) ** 2
+        quantiles = t.ppf(1 - (1 - CONFIDENCE) / 2, [trials - 1, count - 1])
+        correction = float(quantiles[0] / quantiles[1]) ** 2
         found = correction * share * (1 - share) / variance if variance > 0 else math.inf
         effective = min(max(found, 1.0), float(trials))
-    low, high = wilson_interval(share, effective, confidence)
-    return Rate(successes, trials, low, high, count)
+    return _with_interval(successes, trials, effective, count)
 
 
-def wilson_interval(share: float, trials: float, confidence: float = 0.95) -> tuple[float, float]:
-    """Return the ends of Wilson's interval for a rate of ``trials``, which need not be an integer."""
-    z = NormalDist().inv_cdf(0.5 + confidence / 2)
-    middle = (share + z * z / (2 * trials)) / (1 + z * z / trials)
-    half = z / (1 + z * z / trials) * math.sqrt(share * (1 - share) / trials + (z / (2 * trials)) ** 2)
+def _with_interval(successes: int, trials: int, effective: float, frames: int | None = None) -> Rate:
+    """Return a rate with Wilson's interval for ``effective`` independent trials, which need not be an integer."""
+    share, z = successes / trials, NormalDist().inv_cdf(1 - (1 - CONFIDENCE) / 2)
+    middle = (share + z * z / (2 * effective)) / (1 + z * z / effective)
+    half = (
+        z / (1 + z * z / effective) * math.sqrt(share * (1 - share) / effective + (z / (2 * effective)) ** 2)
+    )
     low, high = min(middle - half, share), max(middle + half, share)  # up to rounding
-    return max(low, 0.0), min(high, 1.0)
+    return Rate(successes, trials, max(low, 0.0), min(high, 1.0), frames)
+
+
+@dataclass(frozen=True)
+class ErrorSummary:
+    """Median, 95th percentile and root mean square of translation and rotation errors."""
+
+    translation_median: float  # in ``unit``
+    translation_p95: float
+    translation_rmse: float
+    rotation_deg_median: float
+    rotation_deg_p95: float
+    rotation_deg_rmse: float
+    unit: LengthUnit = "units"  # of the translations
+
+    @staticmethod
+    def of(errors: PoseError) -> ErrorSummary:
+        """Return the summary of a batch of errors. Raises ``InputError`` for an empty one."""
+        if not errors.translation.numel():
+            raise InputError("no errors to summarize", expected="those of at least one pose")
+        t, r = (
+            (*values.quantile(values.new_tensor([0.5, 0.95])).tolist(), float(values.square().mean().sqrt()))
+            for values in (errors.translation.double(), errors.rotation_deg.double())
+        )
+        return ErrorSummary(t[0], t[1], t[2], r[0], r[1], r[2], errors.unit)
+
+    def __str__(self) -> str:
+        unit = symbol(self.unit)
+        return (
+            f"median {self.translation_median:.4f} {unit}, {self.rotation_deg_median:.3f} deg;"
+            f" 95 % within {self.translation_p95:.4f} {unit}, {self.rotation_deg_p95:.3f} deg"
+        )
+
+
+@dataclass(frozen=True)
+class TrajectoryErrors:
+    """The errors of a trajectory; a measure is None if there are too few poses for it."""
+
+    poses: int
+    raw: ErrorSummary
+    ate: float | None  # in the unit of ``raw``: root mean square distance after a rigid alignment
+    rpe: ErrorSummary | None  # of the motion between consecutive poses
+
+    @staticmethod
+    def of(found: SE3, true: SE3, unit: LengthUnit = "units") -> TrajectoryErrors:
+        """Compare poses ``T_world_camera`` (n, in ``unit``), in chronological order.
+
+        Raises ``InputError`` if there are none.
+        """
+        count = len(found.translation)
+        # Fewer than three poses do not determine an alignment.
+        distances = alignment_errors(found, true) if count >= 3 else None
+        return TrajectoryErrors(
+            count,
+            ErrorSummary.of(pose_error(found, true, unit)),
+            None if distances is None else float(distances.square().mean().sqrt()),
+            ErrorSummary.of(replace(relative_errors(found, true), unit=unit)) if count > 1 else None,
+        )
+
+
+def alignment_errors(found: SE3, true: SE3) -> Float[Tensor, "n"] | None:
+    """Return the absolute trajectory error of each pose: its distance (metres) from the truth after a rigid alignment.
+
+    The alignment brings the camera centres nearest to the true ones, without scaling. Returns None if the camera did not move,
+    since the rotation is then undetermined.
+    """
+    source, target = found.translation.double(), true.translation.double()
+    try:
+        rotation = fit_similarity(source, target).T_target_source.rotation
+    except InputError:
+        return None
+    return torch.linalg.vector_norm(
+        (source - source.mean(0)) @ rotation.mT - (target - target.mean(0)), dim=-1
+    )
+
+
+def relative_errors(found: SE3, true: SE3) -> PoseError:
+    """Return the relative pose errors (n - 1), of the motion from each pose to the next (Sturm et al. 2012, eq. 2)."""
+    found, true = found.to(torch.float64), true.to(torch.float64)
+    moved = [T[:-1].inverse() @ T[1:] for T in (found, true)]
+    return pose_error(moved[0], moved[1])
+
+
+def spans(flags: Sequence[bool]) -> list[tuple[int, int]]:
+    """Return the runs of true flags as (first, last), both included."""
+    found: list[tuple[int, int]] = []
+    for place, flag in enumerate(flags):
+        if flag and found and found[-1][1] == place - 1:
+            found[-1] = (found[-1][0], place)
+        elif flag:
+            found.append((place, place))
+    return found

@@ -1,12 +1,14 @@
-"""Pictures of a localization: the photo next to the map rendered from the pose found, as 8-bit images."""
+"""Pictures of localizations, as 8-bit images and videos: the photo next to the map rendered from the pose found."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
@@ -18,6 +20,7 @@ from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import reduced, write_file
 from bidnerf_core.localization import Localization, SceneMap, Start, checked_map, origin_of, start_pose
+from bidnerf_core.results.answers import Answer
 
 SIDE = 240
 """Pixels on the longer side of each of many pictures, since each rendered pixel takes time, and the width to which smaller
@@ -43,9 +46,10 @@ def overlay(
     if isinstance(found, Localization):
         frame, found = found.frame_as_taken(frame), found.T_world_camera
     painter, pose = Painter(scene, frame, 640), start_pose(found, "found")
+    rows = [painter.row(painter.observed, "observed", pose, "rendered at the pose found")]
     if start is not None:
-        return comparison(painter.observed, painter.rendered(start_pose(start)), painter.rendered(pose))
-    return painter.row(painter.observed, "observed", pose, "rendered at the pose found")
+        rows.append(painter.row(painter.observed, "observed", start_pose(start), "rendered at the start"))
+    return np.concatenate(rows, axis=0)
 
 
 class Painter:
@@ -73,29 +77,8 @@ class Painter:
         """Return an image, the rendering at the pose found, and its blend with the photo, side by side."""
         rendered = self.rendered(found)
         blended = blend(self.observed, rendered)
-        return _grid([(left, left_caption), (rendered, caption), (blended, "edges: photo green, map pink")])
-
-
-def comparison(
-    observed: ArrayLike | Tensor, start: ArrayLike | Tensor, found: ArrayLike | Tensor
-) -> UInt8[np.ndarray, "H W 3"]:
-    """Return one picture of the observed image, the rendering at the start and the rendering at the pose found.
-
-    Below each image is its comparison with the observed one. Images (h w 3) of one size are as for ``as_picture``.
-    """
-    return _grid(
-        [(observed, "observed"), (start, "rendered at the start"), (found, "rendered at the pose found")],
-        [
-            (chequered(observed, found), "observed / found, chequered"),
-            (blend(observed, start), "edges: photo green, start pink"),
-            (blend(observed, found), "edges: photo green, map pink"),
-        ],
-    )
-
-
-def _grid(*rows: Sequence[tuple[ArrayLike | Tensor, str]]) -> UInt8[np.ndarray, "H W 3"]:
-    """Return rows of images with their captions as one picture."""
-    return np.concatenate([np.concatenate([tile(*image) for image in row], axis=1) for row in rows], axis=0)
+        tiles = ((left, left_caption), (rendered, caption), (blended, "edges: photo green, map pink"))
+        return np.concatenate([tile(*each) for each in tiles], axis=1)
 
 
 def as_picture(image: ArrayLike | Tensor, what: str = "image") -> UInt8[np.ndarray, "h w 3"]:
@@ -121,22 +104,11 @@ def blend(observed: ArrayLike | Tensor, rendered: ArrayLike | Tensor) -> UInt8[n
     return mixed.clip(0, 255).astype(np.uint8)
 
 
-def chequered(
-    first: ArrayLike | Tensor, second: ArrayLike | Tensor, squares: int = 6
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Return a chequerboard of two images; contours continue across its squares at the true pose."""
-    a, b = as_picture(first, "first"), as_picture(second, "second")
-    side = max(1, math.ceil(max(a.shape[:2]) / squares))
-    rows, columns = np.indices(a.shape[:2]) // side
-    return np.where(((rows + columns) % 2 == 0)[..., None], a, b)
-
-
 def edges(image: ArrayLike | Tensor) -> Float[np.ndarray, "h w"]:
     """Return the strength of edges, 0 to 1, scaled so that the strongest tenth stands out."""
     grey = as_picture(image).astype(np.float64).mean(-1) / 255
     padded = np.pad(grey, 1, mode="edge")
-    across, down = padded[1:-1, 2:] - padded[1:-1, :-2], padded[2:, 1:-1] - padded[:-2, 1:-1]
-    slope = np.hypot(across, down)
+    slope = np.hypot(padded[1:-1, 2:] - padded[1:-1, :-2], padded[2:, 1:-1] - padded[:-2, 1:-1])
     bar = max(np.quantile(slope, 0.9), 0.05)
     return ((slope - 0.7 * bar) / (0.6 * bar)).clip(0, 1)
 
@@ -159,20 +131,81 @@ def as_array(values: ArrayLike | Tensor) -> np.ndarray:
 
 
 def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float = 8.0) -> None:
-    """Write a looping animation of images (h w 3) of the same size."""
-    if not (math.isfinite(fps) and fps > 0):
-        raise InputError(f"{fps} frames a second", where=path, expected="a positive number")
-    pictures = [as_picture(frame, f"frame {i}") for i, frame in enumerate(frames)]
-    if not pictures:
-        raise InputError("the animation has no frames", where=path)
-    for number, shape in enumerate(picture.shape for picture in pictures):
-        if shape != pictures[0].shape:
-            found, expected = (f"{width}x{height}" for height, width, _ in (shape, pictures[0].shape))
-            raise InputError(
-                f"frame {number} is {found} pixels", where=path, expected=f"{expected} like the first"
-            )
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    """Write a looping animation of one or more images (h w 3) of the same size."""
     import imageio.v3 as iio  # imported here, since few commands draw
 
-    content = iio.imwrite("<bytes>", np.stack(pictures), extension=".gif", duration=1000 / fps, loop=0)
+    pictures = np.stack([as_picture(frame, f"frame {number}") for number, frame in enumerate(frames)])
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    content = iio.imwrite("<bytes>", pictures, extension=".gif", duration=1000 / fps, loop=0)
     write_file(Path(path), bytes(content))
+
+
+def check_video(file: Path) -> None:
+    """Raise ``InputError``, before any work is done, if a video cannot be written."""
+    try:
+        import av  # noqa: F401
+    except ImportError as error:
+        raise InputError(
+            "writing a video needs the extra 'video' (pip install 'bidnerf[video]')", where=file
+        ) from error
+    if file.suffix.lower() not in CODECS or not file.parent.is_dir():
+        raise InputError(
+            where=file, expected=f"a name that ends with {', '.join(CODECS)}, in an existing folder"
+        )
+
+
+CODECS = {".mp4": "libx264", ".mkv": "libx264", ".webm": "libvpx-vp9"}
+USUAL_RATE = 30.0
+"""Frames per second of sequences without time stamps."""
+
+
+class TrackingVideo:
+    """A video of a tracked sequence: a picture for each frame, shown at the time of the frame."""
+
+    def __init__(self, file: Path, scene: SceneMap) -> None:
+        self._file, self._scene = file, scene
+        self._partial = file.with_name(f".{file.stem}.partial{file.suffix}")
+        self._output: Any = None
+        self._stream: Any = None
+        self._began, self._latest = 0.0, -1
+
+    def __enter__(self) -> TrackingVideo:
+        return self
+
+    def __exit__(self, *about: object) -> None:
+        """Finish the file, which gets its final name only then."""
+        if self._stream is not None:
+            self._output.mux(self._stream.encode())
+            self._output.close()
+            self._partial.replace(self._file)
+
+    def add(self, frame: Frame, answer: Answer) -> None:
+        """Draw a frame beside the map: its colours or, if none were recorded, its depth as grey values up to 5 m."""
+        import av
+
+        found = answer.found
+        painter = Painter(self._scene, found.frame_as_taken(frame))
+        observed = painter.observed
+        if frame.depth is not None and not frame.has_colour:
+            grey = (frame.depth.cpu() / 5.0).clamp(0, 1)[None, None]
+            size = (observed.shape[0], observed.shape[1])
+            observed = torch.nn.functional.interpolate(grey, size)[0].permute(1, 2, 0).expand(-1, -1, 3)
+        caption = "rendered at the pose found" if found.converged else f"not accepted: {found.outcome}"
+        tiles = (
+            tile(observed, f"observed: {frame.name}"),
+            tile(painter.rendered(found.T_world_camera), caption),
+        )
+        picture = Image.fromarray(np.concatenate(tiles, axis=1))
+        time = answer.number / USUAL_RATE if answer.time is None else answer.time
+        if self._stream is None:
+            self._output, self._began = av.open(str(self._partial), "w"), time
+            # The quality is almost without visible loss.
+            codec = CODECS[self._file.suffix.lower()]
+            self._stream = self._output.add_stream(codec, rate=1000, options={"crf": "20"})  # times in ms
+            self._stream.width, self._stream.height = picture.width // 2 * 2, picture.height // 2 * 2
+            self._stream.pix_fmt = "yuv420p"
+        picture = picture.resize((self._stream.width, self._stream.height))
+        shown = av.VideoFrame.from_image(picture)
+        self._latest = max(self._latest + 1, round(1000 * (time - self._began)))
+        shown.pts, shown.time_base = self._latest, Fraction(1, 1000)
+        self._output.mux(self._stream.encode(shown))

@@ -6,7 +6,7 @@ import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -15,7 +15,6 @@ from torch import Tensor
 
 from bidnerf_core.captures import (
     CaptureReport,
-    Gap,
     PhotoProblem,
     UpDirection,
     horizontal_axes,
@@ -120,107 +119,47 @@ def draw_capture(
     report: CaptureReport, points: Float[Tensor, "n 3"] | None, seen_by: Int[Tensor, "n"] | None, out: Path,
     unit: LengthUnit = "units",
 ) -> None:  # fmt: skip
-    """Draw a capture to ``out``, a PNG.
+    """Draw a capture from above to ``out``, a PNG: its cameras with their directions and problems, and its landmarks.
 
-    ``points`` (world, in ``unit``) are its landmarks, ``seen_by`` the number of photos that show each.
-
-    Raises ``InputError`` if matplotlib is not installed, or the file cannot be written.
+    ``points`` (world, in ``unit``) are the landmarks, ``seen_by`` the number of photos that show each. Raises ``InputError`` if
+    matplotlib is not installed, or the file cannot be written.
     """
+    up, centre = (torch.tensor(v, dtype=torch.float64) for v in (report.coverage.up, report.coverage.centre))
+    axes = torch.stack(horizontal_axes(up), dim=-1)
+    position, ahead = (
+        torch.tensor([getattr(photo, name) for photo in report.photos], dtype=torch.float64)
+        for name in ("position", "direction")
+    )
+    cameras, directions = ((position - centre) @ axes).numpy(), (ahead @ axes).numpy()
     with styled():
         figure = new_figure(7.6, 7.0)
         panel = figure.add_subplot()
-        cameras = _from_above([photo.position for photo in report.photos], report)
-        looks_inwards = report.coverage.arrangement in ("around", "one side")
-        # The plot shows the cameras, and the centre if they look at it, with a margin of half of their extent; landmarks
-        # farther away are left out.
-        shown = np.concatenate([cameras, np.zeros((1, 2))]) if looks_inwards else cameras
-        low, high = shown.min(0), shown.max(0)
-        middle, reach = (low + high) / 2, max(float((high - low).max()), 1e-6)
-        panel.set(xlim=(middle[0] - reach, middle[0] + reach), ylim=(middle[1] - reach, middle[1] + reach))
-        panel.set(aspect="equal", xlabel=f"{unit}, from the centre of the capture")
-        # Landmarks are the darker, the more photos show them.
+        # The plot shows the cameras and the centre with a margin; landmarks farther away are left out.
+        reach = 1.5 * max(float(np.abs(cameras).max()), 1e-6)
+        panel.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", title="The capture from above")
+        panel.set_xlabel(f"{unit}, from the centre of the capture")
         if points is not None and seen_by is not None and len(points):
-            step = max(1, math.ceil(len(points) / 20_000))
-            views, places = seen_by.numpy()[::step], _from_above(points[::step].double().tolist(), report)
-            order = np.argsort(views, kind="stable")
-            drawn = panel.scatter(
-                *places[order].T, c=views[order], s=2, cmap="Blues", vmin=0,
-                vmax=max(3.0, float(np.quantile(views, 0.98))), linewidths=0, zorder=1,
-            )  # fmt: skip
+            step = math.ceil(len(points) / 20_000)
+            places, views = ((points[::step].double() - centre) @ axes).numpy(), seen_by[::step].numpy()
+            drawn = panel.scatter(*places.T, c=views, s=2, cmap="Blues", vmin=0, linewidths=0, zorder=1)
             figure.colorbar(drawn, ax=panel, label="photos that show a landmark", shrink=0.7, pad=0.02)
-        gaps = [*report.coverage.gaps, *filter(None, [report.coverage.open_side])]
-        for gap in gaps if looks_inwards else ():
-            _draw_gap(panel, gap, cameras, report)
-        _draw_cameras(panel, cameras, report, {name for gap in gaps for name in (gap.after, gap.before)})
-        panel.set_title("The capture from above")
+        panel.quiver(*cameras.T, *directions.T, color="#555", scale=25, width=0.002, headwidth=1, zorder=2)
+        worst = [photo.problems[0] if photo.problems else "without a finding" for photo in report.photos]
+        for place, problem in enumerate(("without a finding", *get_args(PhotoProblem))):
+            here = [number for number, each in enumerate(worst) if each == problem]
+            look = {"color": COLOURS[(place + 2) % len(COLOURS)], "marker": "oPvXsDh*"[place % 8]}
+            if here:
+                label, size = f"{problem} ({len(here)})", 55 if place else 18
+                panel.scatter(*cameras[here].T, s=size, label=label, edgecolors="white", zorder=3, **look)
+        for photo, camera in zip(report.photos, cameras, strict=True):
+            if photo.problems:
+                panel.annotate(photo.name, camera, (4, 4), textcoords="offset points", fontsize=6)
         figure.legend(loc="outside lower center", ncols=4)
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
             write_figure(figure, out, dpi=150)
         except OSError as error:
             raise InputError(f"cannot be written ({error.strerror})", where=out) from error
-
-
-def _from_above(points: Any, report: CaptureReport) -> Float[np.ndarray, "n 2"]:
-    """Return points (world) projected to the horizontal plane, relative to the centre of the capture; metres."""
-    up, centre = (torch.tensor(v, dtype=torch.float64) for v in (report.coverage.up, report.coverage.centre))
-    away = torch.as_tensor(points, dtype=torch.float64).reshape(-1, 3) - centre
-    first, second = horizontal_axes(up)
-    return torch.stack([away @ first, away @ second], dim=-1).numpy()
-
-
-def _draw_cameras(
-    panel: Any, cameras: Float[np.ndarray, "v 2"], report: CaptureReport, ends: set[str]
-) -> None:
-    """Draw the cameras with their directions and problems.
-
-    The first ones with problems or at the ``ends`` of gaps are named.
-    """
-    looks: dict[PhotoProblem | None, tuple[str, str]] = {
-        None: (COLOURS[2], "o"), "mirrored": (COLOURS[3], "P"), "turned": (COLOURS[3], "v"), "badly posed": (COLOURS[1], "X"),
-        "apart": (COLOURS[7], "s"), "isolated": (COLOURS[6], "D"), "blurred": (COLOURS[4], "h"),
-        "badly exposed": (COLOURS[5], "*"),
-    }  # fmt: skip
-    ahead = [[p + d for p, d in zip(photo.position, photo.direction, strict=True)] for photo in report.photos]
-    length = 0.04 * (panel.get_xlim()[1] - panel.get_xlim()[0])
-    for start, step in zip(cameras, _from_above(ahead, report) - cameras, strict=True):
-        panel.plot(*np.stack([start, start + length * step]).T, color="#555", linewidth=0.7, zorder=2)
-    worst = [photo.problems[0] if photo.problems else None for photo in report.photos]
-    for problem, (colour, marker) in looks.items():
-        if not len(places := cameras[[each == problem for each in worst]]):
-            continue
-        panel.scatter(
-            *places.T,
-            color=colour,
-            marker=marker,
-            s=18 if problem is None else 55,
-            label=f"{problem or 'without a finding'} ({len(places)})",
-            zorder=3,
-            edgecolors="white",
-            linewidths=0.5,
-        )
-    named = [i for i, photo in enumerate(report.photos) if photo.problems or photo.name in ends]
-    for i in named[:16]:
-        panel.annotate(
-            report.photos[i].name, cameras[i], (4, 4), textcoords="offset points", fontsize=6, zorder=4
-        )
-
-
-def _draw_gap(panel: Any, gap: Gap, cameras: Float[np.ndarray, "v 2"], report: CaptureReport) -> None:
-    """Shade the directions from the centre without any camera."""
-    from matplotlib.patches import Wedge
-
-    (after,) = _from_above([photo.position for photo in report.photos if photo.name == gap.after], report)
-    begin = math.degrees(math.atan2(after[1], after[0]))
-    radius = float(np.median(np.linalg.norm(cameras, axis=1)))
-    panel.add_patch(
-        Wedge((0, 0), radius, begin, begin + gap.degrees, color=COLOURS[1], alpha=0.12, linewidth=0, zorder=0)
-    )
-    middle = math.radians(begin + gap.degrees / 2)
-    place = 0.7 * radius * np.array([math.cos(middle), math.sin(middle)])
-    panel.annotate(
-        f"{gap.degrees:.0f}°, no photo", place, ha="center", color=COLOURS[1], fontsize=8, zorder=4
-    )
 
 
 def draw_path(
@@ -241,13 +180,16 @@ def draw_path(
     """
     if up is None:
         up = up_direction(poses, None if surface is None else surface.surfels.normals)
-    axes, (scale, fine) = _axes(poses, up.tensor()), (1000.0, "mm") if unit == "metres" else (1.0, "units")
+    right, back = horizontal_axes(up.tensor())
+    scale, fine = (1000.0, "mm") if unit == "metres" else (1.0, "units")
     known = [T.translation.double().numpy() for T in truth if T is not None]
     with styled():
         figure = new_figure(9.6, 4.9)
         panels = figure.subplots(1, 2)
-        for panel, upward, title in zip(panels, (1, 2), ("from above", "from the side"), strict=True):
-            projection = np.stack([axes[0], axes[upward]], axis=-1)
+        for panel, upward, title in zip(
+            panels, (back, up.tensor()), ("from above", "from the side"), strict=True
+        ):
+            projection = torch.stack([right, upward], dim=-1).numpy()
             places = poses.translation.double().numpy() @ projection
             # A sample of the surfels around the path is drawn, as far as half of the scene's extent or more.
             if surface is not None:
@@ -264,28 +206,10 @@ def draw_path(
                 )
             found, colours = accepted.numpy(), scale * deviations.double().numpy()
             if not found.all():
-                panel.scatter(
-                    *places[~found].T, s=14, marker="x", linewidths=0.8, color=COLOURS[1], label="lost"
-                )
-            marks = panel.scatter(
-                *places[found].T, c=colours[found], s=9, cmap="viridis", label="tracked", zorder=3
-            )
+                panel.scatter(*places[~found].T, s=14, marker="x", color=COLOURS[1], label="lost")
+            marks = panel.scatter(*places[found].T, c=colours[found], s=9, label="tracked", zorder=3)
             panel.set(title=title, xlabel=unit, aspect="equal")
         label = f"standard deviation of the position ({fine})"
         figure.colorbar(marks, ax=list(panels), label=label, shrink=0.85)
-        handles, labels = panels[0].get_legend_handles_labels()
-        if labels:
-            figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
         write_figure(figure, out, dpi=150)
-
-
-def _axes(poses: SE3, up: Float[Tensor, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Return the axes of the plot (rows, world): the longest horizontal one, the other horizontal one, and up."""
-    centred = poses.translation.double() - poses.translation.double().mean(0)
-    level = centred - (centred @ up)[:, None] * up
-    right = torch.linalg.svd(level, full_matrices=True)[2][0]
-    right = right - (right @ up) * up
-    if float(right.norm()) < 1e-6:
-        right = torch.linalg.cross(up, torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())])
-    right = right / right.norm()
-    return torch.stack([right, torch.linalg.cross(up, right), up]).numpy()

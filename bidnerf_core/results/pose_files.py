@@ -226,18 +226,10 @@ def read_poses(path: str | Path) -> dict[str, SE3]:
             )
         if name in found:
             raise InputError(f"holds two poses of frame {name!r}", where=path, expected="one")
-        found[name] = _pose(str(path), rows, EXPECTED_POSE)
+        found[name] = pose_from_matrix(_numbers(str(path), rows, EXPECTED_POSE), "T_world_camera", str(path))
     if not found:
         raise InputError("holds no pose", where=path, expected=EXPECTED_POSE)
     return found
-
-
-def _pose(where: str, rows: Any, expected: str) -> SE3:
-    try:
-        matrix = torch.tensor(rows, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise InputError("contains no matrix of numbers", where=where, expected=expected) from error
-    return pose_from_matrix(matrix, "T_world_camera", where)
 
 
 def read_positions(path: str | Path) -> dict[str, Float[Tensor, "3"]]:
@@ -247,24 +239,25 @@ def read_positions(path: str | Path) -> dict[str, Float[Tensor, "3"]]:
     """
     path = Path(path)
     try:
-        found = parse_json(read_file(path, "a pose file"), str(path), EXPECTED_POSITIONS)
-    except InputError:
-        found = None  # unreadable, or one object per line
-    if not isinstance(found, dict) or not found or "T_world_camera" in found:
-        try:
+        entries = pose_entries(path, read_file(path, "a pose file"))
+        if len(entries) != 1 or not isinstance(entries[0], dict) or "T_world_camera" in entries[0]:
             return {name: pose.translation for name, pose in read_poses(path).items()}
-        except InputError as error:
-            raise InputError(error, expected=EXPECTED_POSITIONS) from error
-    return {name: _position(path, name, value) for name, value in found.items()}
+        found = dict[str, Float[Tensor, "3"]]()
+        for name, value in entries[0].items():
+            numbers = _numbers(str(path), value, EXPECTED_POSITIONS)
+            if numbers.shape != (3,):
+                numbers = pose_from_matrix(numbers, repr(name), path).translation
+            found[name] = numbers
+    except InputError as error:
+        raise InputError(error, expected=EXPECTED_POSITIONS) from error
+    return found
 
 
-def _position(path: Path, name: str, value: Any) -> Float[Tensor, "3"]:
-    """Return three coordinates, or those of a pose of 4x4 rows. Raises ``InputError`` for anything else."""
-    if isinstance(value, list) and len(value) == 4 and all(isinstance(row, list) for row in value):
-        return _pose(f"{path}: {name!r}", value, EXPECTED_POSITIONS).translation
-    if not isinstance(value, list) or len(value) != 3 or any(type(x) not in (int, float) for x in value):
-        raise InputError(f"{name!r} has no three coordinates", where=path, expected=EXPECTED_POSITIONS)
-    return torch.tensor(value, dtype=torch.float64)
+def _numbers(where: str, values: Any, expected: str) -> Tensor:
+    try:
+        return torch.tensor(values, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise InputError("contains no matrix of numbers", where=where, expected=expected) from error
 
 
 def pose_of(poses: dict[str, SE3], name: str, path: str | Path) -> SE3:

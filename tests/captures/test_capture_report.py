@@ -15,7 +15,6 @@ import torch
 from bidnerf_core import SE3, Frame, Intrinsics, View
 from bidnerf_core.captures import (
     CaptureReport,
-    Gap,
     UpDirection,
     given_up,
     sentences,
@@ -267,8 +266,6 @@ def test_a_summary_has_five_lines_and_the_gravest_first() -> None:
 @pytest.mark.slow
 def test_a_picture_is_drawn_of_cameras_gaps_and_landmarks(tmp_path: Path) -> None:
     report = damaged()
-    gap = Gap(40.0, report.photos[0].name, report.photos[1].name)
-    report = replace(report, coverage=replace(report.coverage, gaps=(gap,)))
     draw_capture(report, torch.rand(50, 3) - 0.5, torch.arange(50), tmp_path / "a" / "capture.png")
     image = cv2.imread(str(tmp_path / "a" / "capture.png"))
     assert image.shape[0] > 500

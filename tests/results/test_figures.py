@@ -14,7 +14,7 @@ from bidnerf_core.evaluation import convergence_plot
 from bidnerf_core.results import PoseError, as_picture, save_gif, tile
 
 # Inside: single tiles of an overlay, before they are put together
-from bidnerf_core.results.overlays import blend, chequered, comparison, edges
+from bidnerf_core.results.overlays import blend, edges
 from refusals import refused
 
 
@@ -38,7 +38,6 @@ def test_as_picture_takes_what_there_is() -> None:
 def test_what_is_not_finite_is_clipped() -> None:
     odd = torch.tensor([[[float("nan"), float("inf"), -float("inf")], [-1.0, 2.0, 0.5]]])
     assert as_picture(odd).tolist() == [[[0, 255, 0], [0, 255, 128]]]
-    assert comparison(*[torch.full((8, 8, 3), float("nan"))] * 3).dtype == np.uint8
 
 
 @pytest.mark.parametrize("shape", [(0, 4, 3), (4, 0, 3), (4, 4, 4), (4,), (2, 4, 4, 3), (0, 0)])
@@ -48,20 +47,6 @@ def test_what_is_no_image_is_refused(shape: tuple[int, ...]) -> None:
         as_picture(torch.zeros(shape))
 
 
-def test_a_comparison_is_six_tiles() -> None:
-    picture = comparison(disc(20), disc(10), disc(20))
-    one = tile(disc(20), "a")
-    assert picture.shape == (2 * one.shape[0], 3 * one.shape[1], 3)
-    assert np.array_equal(picture[: one.shape[0], : one.shape[1]][30:], one[30:])  # below the caption
-    left, right = np.split(picture[one.shape[0] + 30 :, one.shape[1] :], 2, axis=1)
-    assert not np.array_equal(left, right)
-
-
-def test_images_of_different_size_are_refused() -> None:
-    with refused(where="never.gif", found="frame 1 is 30x30 pixels", expected="40x40 like the first"):
-        save_gif("never.gif", [disc(20), disc(20, 30)])
-
-
 def test_blend_shows_one_contour_at_the_truth_and_two_elsewhere() -> None:
     def pink(image: np.ndarray) -> int:
         red, green, _ = np.moveaxis(image.astype(int), -1, 0)
@@ -69,15 +54,6 @@ def test_blend_shows_one_contour_at_the_truth_and_two_elsewhere() -> None:
 
     assert pink(blend(disc(20), disc(20))) == 0
     assert pink(blend(disc(20), disc(12))) > 20
-
-
-def test_chequered_takes_every_pixel_from_one_of_the_two() -> None:
-    a, b = np.zeros((31, 50, 3), np.uint8), np.full((31, 50, 3), 255, np.uint8)
-    mixed = chequered(a, b)
-    assert set(np.unique(mixed)) == {0, 255}
-    assert 0.3 < mixed.mean() / 255 < 0.7
-    assert np.array_equal(chequered(a, a), a)
-    assert chequered(a[:1, :1], b[:1, :1]).shape == (1, 1, 3)
 
 
 def test_edges_are_where_the_image_changes() -> None:
@@ -101,16 +77,6 @@ def test_gif_keeps_frames_and_speed(tmp_path: Path) -> None:
     assert iio.immeta(path)["duration"] == pytest.approx(200)
     assert iio.immeta(path)["loop"] == 0
     assert np.abs(frames[2].astype(int) - as_picture(disc(20))).mean() < 3
-
-
-@pytest.mark.parametrize("fps", [0, -1, float("nan"), float("inf")])
-def test_impossible_animations_are_refused(tmp_path: Path, fps: float) -> None:
-    file = tmp_path / "a.gif"
-    with refused(where=file, found=f"{fps} frames a second", expected="a positive number"):
-        save_gif(file, [disc(20)], fps)
-    with refused(where=file, found="no frames"):
-        save_gif(file, [])
-    assert not file.exists()
 
 
 def errors(*values: float) -> PoseError:

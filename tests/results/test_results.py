@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import math
-import sys
 import threading
-import types
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +22,6 @@ import drawn
 from bidnerf_core import SE3, Frame, InputError, InputWarning, Localization, Localizer, Outcome
 from bidnerf_core.datasets import Capture, DatasetOptions, Photos, Shot, write_transforms
 from bidnerf_core.frames import BLACK, View
-from bidnerf_core.localization import Evidence
 from bidnerf_core.progress import Progress
 from bidnerf_core.results import (
     Answer,
@@ -247,18 +244,6 @@ def test_a_query_that_fails_does_not_stop_the_others(tmp_path: Path, monkeypatch
         localize_each(Localizer(scene(), warm_up=False), Photos([files[1]], DatasetOptions(CAMERA)))
 
 
-@pytest.mark.parametrize(("by_chance", "asked"), [(4.0, False), (30.0, True)])
-def test_ambiguous_images_raise_the_question_if_hardly_more_matches_than_by_chance(
-    by_chance: float, asked: bool
-) -> None:
-    measured = {part.name: 0.5 for part in fields(Evidence)}
-    evidence = Evidence(**measured | {"inliers": 30, "by_chance": by_chance})  # type: ignore[arg-type]
-    answers = Answers()
-    for number in range(3):
-        answers.append(Answer(f"{number}", number, CAMERA, replace(FOUND, diagnostics=evidence)))
-    assert bool(answers.question) is asked
-
-
 def test_answers_in_a_format_of_poses_hold_the_accepted_ones(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -279,28 +264,6 @@ def answers_with(poses: list[SE3], truths: list[SE3]) -> Answers:
         moved = replace(found, T_world_camera=pose)
         answers.append(replace(Answer.of(frame, len(answers), moved), truth=truth))
     return answers
-
-
-def test_answers_become_a_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    """pandas itself is not needed for the test: a table is made of rows."""
-    moved = FOUND.T_world_camera.translated(torch.tensor([0.0, 3.0, 4.0], dtype=torch.float64))
-    answers = answers_with([FOUND.T_world_camera], [moved])
-    answers.append(Failure("b", "auto", "no such file"))
-    monkeypatch.setitem(sys.modules, "pandas", types.SimpleNamespace(DataFrame=lambda rows: rows))
-    known, failed = answers.to_pandas()
-    assert [known["x"], known["y"], known["z"]] == FOUND.T_world_camera.translation.tolist()
-    assert [known["qx"], known["qy"], known["qz"], known["qw"]] == FOUND.T_world_camera.quaternion(
-        "xyzw"
-    ).tolist()
-    assert (known["frame"], known["outcome"], known["confidence"]) == ("a", "converged", 0.25)
-    assert known["error_translation"] == pytest.approx(5.0)
-    assert known["sigma_translation"] == pytest.approx(3**0.5)
-    assert known["sigma_rotation_deg"] == pytest.approx(math.degrees(3**0.5))
-    assert not any(isinstance(value, list | dict) for value in known.values())
-    assert (failed["outcome"], failed["reason"]) == ("bad input", "no such file")
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with refused(found="a table needs pandas (pip install pandas)"):
-        answers.to_pandas()
 
 
 @pytest.mark.parametrize("line", [False, True])

@@ -11,10 +11,10 @@ import torch
 
 from bidnerf_core import SE3
 from bidnerf_core.results import TrajectoryErrors, spans
-from bidnerf_core.results.plots import draw_path
 
 # Inside: errors after each alignment, compared with evo's, and the paths that are drawn
-from bidnerf_core.results.trajectory import ErrorSummary, alignment_errors, relative_errors
+from bidnerf_core.results.errors import ErrorSummary, alignment_errors, relative_errors
+from bidnerf_core.results.plots import draw_path
 from refusals import refused
 
 
