@@ -14,13 +14,12 @@ import dataclasses
 import functools
 import inspect
 import re
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib.metadata import EntryPoint, distributions, entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Generic, TypeAlias, TypeVar
 
-from bidnerf_core.errors import InputError, InputWarning, spelling_hint, unknown_name
+from bidnerf_core.errors import InputError, spelling_hint, unknown_name
 
 GROUPS: Mapping[str, str] = {
     "backends": "backend",
@@ -144,11 +143,13 @@ def _declared(group: str) -> tuple[PluginInfo, ...]:
     Of several versions of one, the first on ``sys.path`` counts.
     """
     infos = list[PluginInfo]()
-    for p, source in _points(f"bidnerf.{group}"):
+    for p in entry_points(group=f"bidnerf.{group}"):
         try:
             names = p.load() if p.name == TABLE else [p.name]
         except Exception as error:
             raise PluginError(f"{p.value}: the table cannot be imported ({_described(error)})") from error
+        dist: Any = p.dist
+        source = dist.name, dist.version, dist.metadata.get("Summary", "")
         infos += [PluginInfo(group, name, p.value, *source) for name in names]
     found = []
     for info in infos:
@@ -161,60 +162,19 @@ def _declared(group: str) -> tuple[PluginInfo, ...]:
     return tuple(found)
 
 
-def _points(group: str) -> list[tuple[EntryPoint, tuple[str, str, str]]]:
-    """Return the entry points of a group, each with the name, version and summary of its distribution.
-
-    A package whose metadata is malformed is left out with a warning.
-    """
-    with contextlib.suppress(Exception):  # one such package makes the look-up fail for all
-        return [(point, _name_version_summary(point.dist)) for point in entry_points(group=group)]
-    found = dict[str, list[tuple[EntryPoint, tuple[str, str, str]]]]()
-    for dist in distributions():
-        try:
-            source = _name_version_summary(dist)
-            found.setdefault(source[0], [(p, source) for p in dist.entry_points.select(group=group)])
-        except Exception as error:
-            where = getattr(dist, "_path", "an installed package")  # its name may be what cannot be read
-            warnings.warn(
-                f"the plugins of {where} are left out, since its metadata cannot be read ({_described(error)});"
-                " reinstall or remove it",
-                InputWarning,
-                stacklevel=2,
-            )
-    return [point for points in found.values() for point in points]
-
-
-@functools.cache  # a look-up parses the metadata anew
-def _name_version_summary(dist: Any) -> tuple[str, str, str]:
-    return dist.name, dist.version, dist.metadata.get("Summary", "")
-
-
-def plugin_names(group: str, first: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the names of a group's plugins: those in ``first``, in that order, then the remaining bundled ones, then all others.
-
-    The last two parts are sorted alphabetically. Names in ``first`` that no plugin has are omitted.
-    """
-    ranks = {name: rank for rank, name in enumerate(first)}
-    infos = sorted(
-        list_plugins(group), key=lambda x: (ranks.get(x.name, len(ranks)), not x.is_bundled, x.name)
-    )
-    return tuple(dict.fromkeys(info.name for info in infos))
-
-
 def load_plugin(group: str, name: str, defects: Defects | None = None, wanted_by: str = "") -> Any:
     """Return the plugin of that name, imported and, if ``defects`` is given, checked with it.
 
     Raises ``PluginError``, which names the plugin and, if given, what needs it (``wanted_by``).
     """
-    infos = list_plugins(group)
-    info = next((info for info in infos if info.name == name), None)
-    if info is None:
-        noun, names = GROUPS[group], sorted({info.name for info in infos})
-        hint = spelling_hint(str(name).lower(), names)
-        why = f"no {noun} {name!r}{hint}; installed: {', '.join(names) or 'none'}"
+    infos = {info.name: info for info in reversed(list_plugins(group))}
+    if name not in infos:
+        hint = spelling_hint(str(name).lower(), infos)
+        why = f"no {GROUPS[group]} {name!r}{hint}; installed: {', '.join(sorted(infos)) or 'none'}"
         if not any(info.is_bundled for of in GROUPS for info in _declared(of)):
-            why = f"no {noun} {name!r}: the metadata of bidnerf lists no plugins at all; reinstall bidnerf"
+            why = f"no {GROUPS[group]} {name!r}: the metadata of bidnerf lists no plugins at all; reinstall bidnerf"
         raise PluginError(why, where=wanted_by)
+    info = infos[name]
     where = f"{wanted_by}: {info}" if wanted_by else info
     if info.fault is not None:
         raise PluginError(info.fault, where=where)
@@ -255,13 +215,16 @@ class Plugins(Mapping[str, Plugin], Generic[Plugin]):
         return found
 
     def __iter__(self) -> Iterator[str]:
-        return iter(plugin_names(self._group, self._first))
+        ranks = {name: rank for rank, name in enumerate(self._first)}
+        infos = list_plugins(self._group)
+        infos.sort(key=lambda x: (ranks.get(x.name, len(ranks)), not x.is_bundled, x.name))
+        return iter(dict.fromkeys(info.name for info in infos))
 
     def __len__(self) -> int:
-        return len(plugin_names(self._group))
+        return len(list(self))
 
     def __contains__(self, name: object) -> bool:
-        return name in plugin_names(self._group)
+        return any(info.name == name for info in list_plugins(self._group))
 
     def __getitem__(self, name: str) -> Plugin:
         if name not in self:
@@ -288,7 +251,13 @@ def interface_defects(
     if "summary" in attributes and not isinstance(plugin.summary, str):
         yield f"summary is {plugin.summary!r}, expected text"
     if "config_type" in attributes:
-        yield from _config_defects(plugin.config_type)
+        kind, nothing = plugin.config_type, dataclasses.MISSING
+        is_dataclass = isinstance(kind, type) and dataclasses.is_dataclass(kind)
+        fields = [f for f in dataclasses.fields(kind) if f.init] if is_dataclass else []
+        if not is_dataclass or not kind.__dataclass_params__.frozen:
+            yield f"config_type is {kind!r}, expected a frozen dataclass"
+        if bare := [f.name for f in fields if f.default is f.default_factory is nothing]:
+            yield f"config_type {kind.__name__} has no default for {', '.join(bare)}"
     for name, parameters in methods.items():
         method = plugin if name == "__call__" else getattr(plugin, name)
         try:
@@ -297,16 +266,3 @@ def interface_defects(
             yield f"{'it' if name == '__call__' else name} does not take ({', '.join(parameters)})"
         except ValueError:  # compiled code may have no signature
             pass
-
-
-def _config_defects(config_type: Any) -> Iterator[str]:
-    if not (isinstance(config_type, type) and dataclasses.is_dataclass(config_type)):
-        yield f"config_type is {config_type!r}, expected a frozen dataclass"
-        return
-    if not config_type.__dataclass_params__.frozen:  # type: ignore[attr-defined]
-        yield f"config_type {config_type.__name__} is a dataclass that is not frozen"
-    nothing = dataclasses.MISSING
-    fields = [field for field in dataclasses.fields(config_type) if field.init]
-    bare = [field.name for field in fields if field.default is field.default_factory is nothing]
-    if bare:
-        yield f"config_type {config_type.__name__} has no default for {', '.join(bare)}"

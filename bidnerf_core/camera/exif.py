@@ -75,19 +75,14 @@ def read_exif(path: Path) -> Exif:
         try:
             found = image.getexif()
             tags: dict[int, Any] = {**found, **found.get_ifd(IFD.Exif)}
-            code = tags.get(Base.Orientation, 1)
             # The length in millimetres of the resolution's unit: inch, centimetre, millimetre, micrometre.
             units = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
             unit = units.get(tags.get(Base.FocalPlaneResolutionUnit, 2))
-            keys = (
-                Base.ExifImageWidth,
-                Base.ExifImageHeight,
-                Base.FocalPlaneXResolution,
-                Base.FocalPlaneYResolution,
-            )
-            width, height, x, y = (_positive(tags.get(key)) for key in keys)
+            sides = (Base.ExifImageWidth, Base.ExifImageHeight)
+            width, height = (_positive(tags.get(key)) for key in sides)
+            x, y = (_positive(tags.get(k)) for k in (Base.FocalPlaneXResolution, Base.FocalPlaneYResolution))
             return Exif(
-                Orientation.from_exif(code) if isinstance(code, int) else UPRIGHT,
+                Orientation.from_exif(tags.get(Base.Orientation, 1)),
                 (int(width), int(height)) if width and height and min(width, height) >= 1 else None,
                 _positive(tags.get(Base.FocalLengthIn35mmFilm)),
                 _positive(tags.get(Base.FocalLength)),

@@ -34,9 +34,11 @@ KEYS = {
     "K": ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "K", "k", "M1", "M"),
     "coefficients": (
         "distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs", "distortion", "D", "d", "D1",
+        "distortion_coeffs",
     ),
     "width": ("image_width", "image_Width", "width", "Camera.width", "img_width"),
     "height": ("image_height", "image_Height", "height", "Camera.height", "img_height"),
+    "model": ("distortion_model", "Camera.type", "camera_model"),
     "size": ("image_size", "imageSize", "resolution", "size"),
 }  # fmt: skip
 """The keys of calibrations in YAML and JSON, by their meaning."""
@@ -236,47 +238,33 @@ def calibrated_camera(where: str, values: Mapping[str, Any], size: tuple[int, in
 
     If it gives no image size, ``size`` (width, height) is assumed. Raises ``InputError``, whose message begins with ``where``.
     """
-    inner = [value for key, value in values.items() if re.fullmatch(r"cam\d+", str(key))]
+    inner = [value for key, value in values.items() if re.fullmatch(r"cam\d+", str(key))]  # in Kalibr
     if len(inner) > 1:
         expected = "one; keep only the lines of this photo's camera"
         raise InputError(f"holds {len(inner)} cameras", where=where, expected=expected)
-    if isinstance(values.get("intrinsic"), Mapping):  # a view in Open3D
-        return calibrated_camera(where, values["intrinsic"], size)
-    orb_slam = next((name for name in ("Camera", "Camera1") if f"{name}.fx" in values), None)
-    numbers: list[float] = []  # fx, fy, cx, cy and, for ORB-SLAM, the coefficients
-    if inner and isinstance(inner[0], Mapping):  # Kalibr
-        values, kind = inner[0], str(inner[0].get("camera_model", "pinhole"))
-        numbers = _array(where, values.get("intrinsics", [])).ravel().tolist()
-        if kind != "pinhole" or len(numbers) != 4:
-            found = f"camera_model is {kind} with {len(numbers)} intrinsics"
-            raise InputError(found, where=where, expected="pinhole with 4")
-        lens = _array(where, values.get("distortion_coeffs", []))
-        model = str(values.get("distortion_model", "none"))
-    elif orb_slam is not None:
-        model = str(values.get("Camera.type", "pinhole"))
-        is_fisheye = model.lower() in DISTORTIONS[FISHEYE]
+    for inside in (*inner, values.get("intrinsic")):  # the latter in a view in Open3D
+        values = inside if isinstance(inside, Mapping) else values
+    if inner and (kind := values.get("camera_model", "pinhole")) != "pinhole":
+        raise InputError(f"camera_model is {kind}", where=where, expected="pinhole")
+    given, four, lens = _first(values, "K"), values.get("intrinsics"), _first(values, "coefficients")
+    model = str(next((values[key] for key in KEYS["model"] if key in values), ""))
+    if slam := next((name for name in ("Camera", "Camera1") if f"{name}.fx" in values), None):
         names = (
-            "fx",
-            "fy",
-            "cx",
-            "cy",
-            *(("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2", "k3")),
+            ("k1", "k2", "k3", "k4")
+            if model.lower() in DISTORTIONS[FISHEYE]
+            else ("k1", "k2", "p1", "p2", "k3")
         )
-        numbers = [float(_array(where, values.get(f"{orb_slam}.{name}", 0.0))) for name in names]
-        lens = np.array(numbers[4:])
-    else:
-        given = _first(values, "K")
-        if given is None:
-            raise InputError(
-                f"no camera matrix ({', '.join(KEYS['K'][:3])} or K)", where=where, expected=EXPECTED
-            )
-        K, lens = _array(where, given), _array(where, _first(values, "coefficients") or [])
-        if "intrinsic_matrix" in values and not isinstance(given, Mapping) and K.shape == (9,):  # by columns
-            K = K.reshape(3, 3).T
-        model = str(values.get("distortion_model", values.get("camera_model", "")))
-    if numbers:
-        fx, fy, cx, cy = numbers[:4]
-        K = np.array(((fx, 0, cx), (0, fy, cy), (0, 0, 1)))
+        four, lens = (
+            [values.get(f"{slam}.{x}", 0.0) for x in some] for some in (("fx", "fy", "cx", "cy"), names)
+        )
+    if given is None and four is None:
+        found = f"no camera matrix ({', '.join(KEYS['K'][:3])} or K)"
+        raise InputError(found, where=where, expected=EXPECTED)
+    K = _array(where, four if given is None else given)
+    if K.shape == (4,):
+        K = np.array(((K[0], 0, K[2]), (0, K[1], K[3]), (0, 0, 1)))
+    elif "intrinsic_matrix" in values and not isinstance(given, Mapping) and K.shape == (9,):  # by columns
+        K = K.reshape(3, 3).T
     pair = _first(values, "size")
     if pair is None:
         pair = [_first(values, key) or 0 for key in ("width", "height")]
@@ -285,7 +273,7 @@ def calibrated_camera(where: str, values: Mapping[str, Any], size: tuple[int, in
         raise InputError(f"size is {str(pair)[:60]!r}", where=where, expected="width and height in pixels")
     width, height = (int(value) for value in sides.ravel())
     known = (width, height) if width > 0 and height > 0 else size
-    return _opencv_camera(where, K, tuple(lens.ravel().tolist()), model, known)
+    return _opencv_camera(where, K, tuple(_array(where, lens or []).ravel().tolist()), model, known)
 
 
 def _opencv_camera(where: str, K: Any, lens: tuple[float, ...], model: str, size: tuple[int, int]) -> Camera:

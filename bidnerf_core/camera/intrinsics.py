@@ -68,15 +68,12 @@ class Intrinsics:
     @staticmethod
     def from_focal(focal: float, width: int, height: int) -> Intrinsics:
         """Return an undistorted camera; ``focal`` is in pixels, and the principal point is the image centre."""
-        kind, least, _, expected = LIMITS["focal length"]
-        check_number("fx", focal, kind, least, math.inf, expected)
-        check_number("width", width, *LIMITS["size"])
-        check_number("height", height, *LIMITS["size"])
+        camera = Intrinsics(focal, focal, 0.0, 0.0, width, height)
         question_focal(focal, width, height)
         if focal > 1000 * max(width, height):  # a field of view of 0.06 degrees, as of a telescope
             found = f"focal length is {focal} px for an image of {width}x{height}"
             raise InputError(found, expected="at most 1000 times its longer side")
-        return Intrinsics(focal, focal, width / 2, height / 2, width, height)
+        return replace(camera, cx=width / 2, cy=height / 2)
 
     @staticmethod
     def from_hfov(degrees: float, width: int, height: int) -> Intrinsics:

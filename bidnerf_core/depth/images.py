@@ -100,21 +100,16 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
 
 def _absent(values: np.ndarray, metres: np.ndarray) -> dict[str, np.ndarray]:
     """Return masks of the values that mean "not measured", by their names in messages; the masks are disjoint."""
-    if values.dtype.kind != "f":
-        largest = np.iinfo(values.dtype).max
-        saturated = values == largest
-        far = ~saturated & (metres > FARTHEST)
-        return {"negative": values < 0, str(largest): saturated, f"over {FARTHEST:g} m": far}
-    saturated = np.iinfo(np.uint16).max  # 16-bit sensors write it for "too far" or "nothing"
-    clipped = saturated * MILLIMETRE
-    absent = {
-        "NaN": np.isnan(values),
-        "infinite": np.isinf(values),
-        "negative": np.isfinite(values) & (values < 0),
-        str(saturated): values == saturated,
-        f"{clipped:g}": np.abs(values - clipped) < 1e-5,
-        f"{NOTHING:g} or more": np.isfinite(values) & (values >= NOTHING),
-    }
+    is_float = values.dtype.kind == "f"
+    largest = np.iinfo(
+        np.uint16 if is_float else values.dtype
+    ).max  # written for "too far" or "nothing", in 16 bits as a rule
+    absent = {"negative": values < 0, str(largest): values == largest}
+    if is_float:
+        finite, clipped = np.isfinite(values), largest * MILLIMETRE
+        absent = {"NaN": np.isnan(values), "infinite": np.isinf(values), "negative": finite & (values < 0)}
+        absent |= {str(largest): values == largest, f"{clipped:g}": np.abs(values - clipped) < 1e-5}
+        absent |= {f"{NOTHING:g} or more": finite & (values >= NOTHING)}
     known = np.logical_or.reduce(list(absent.values()))
     return absent | {f"over {FARTHEST:g} m": ~known & (metres > FARTHEST)}
 

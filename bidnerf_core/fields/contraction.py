@@ -20,12 +20,6 @@ def contract_points(points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
     return points * ((2 - 1 / norm) / norm)
 
 
-def expand(points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
-    """Return the points whose contractions are ``points``, the inverse of ``contract_points``."""
-    norm = points.abs().amax(-1, keepdim=True).clamp(min=1)
-    return points / (norm * (2 - norm))
-
-
 @dataclass(frozen=True, eq=False)
 class RaySpacing:
     """A coordinate along rays in which equal steps match the resolution of a contracted field (eq. 11).

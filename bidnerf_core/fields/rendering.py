@@ -106,10 +106,6 @@ class Observations:
         """Return these rays flattened to one axis."""
         return self._changed(lambda part: part.reshape(-1, *part.shape[self.distance.ndim :]))
 
-    def repeated(self, times: int) -> Observations:
-        """Repeat rays of shape (n) ``times`` times in sequence, for as many poses."""
-        return self._changed(lambda part: part.expand(times, *part.shape).flatten(0, 1))
-
     def drawn(
         self,
         count: int,

@@ -62,7 +62,11 @@ class PixelStore:
             return torch.empty(size, dtype=torch.uint8)
         try:
             with tempfile.TemporaryFile(dir=self._folder) as file:
-                _reserve(file.fileno(), size)
+                # Writing to a mapped page for which the disk has no room would end the process.
+                if hasattr(os, "posix_fallocate"):
+                    os.posix_fallocate(file.fileno(), 0, size)
+                else:
+                    os.truncate(file.fileno(), size)
                 return torch.from_numpy(np.memmap(file, np.uint8, "r+", shape=(size,)))
         except OSError as error:
             place = self._folder or tempfile.gettempdir()
@@ -71,14 +75,6 @@ class PixelStore:
                 " much, or read them smaller (--largest, largest=)",
                 where=place,
             ) from error
-
-
-def _reserve(file: int, size: int) -> None:
-    """Allocate disk space for a file: writing to a mapped page for which the disk has no room would end the process."""
-    if hasattr(os, "posix_fallocate"):
-        os.posix_fallocate(file, 0, size)
-    else:
-        os.truncate(file, size)
 
 
 def bytes_of(frame: Frame) -> int:

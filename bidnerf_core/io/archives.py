@@ -12,6 +12,8 @@ from bidnerf_core.io.files import PackedFile, open_binary
 
 LARGEST_MEMBER = 256 * 2**20
 """Bytes that an unpacked member has at most, unless stated otherwise. A small archive can hold members that unpack to any size."""
+DAMAGES = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, OSError)
+"""What the standard library raises for archives that are damaged or of an unknown kind."""
 
 
 class Archive:
@@ -27,15 +29,10 @@ class Archive:
         try:
             self._zip = zipfile.ZipFile(path)
             members = self._zip.infolist()
-        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, OSError) as error:
+        except DAMAGES as error:
             cut = begins == b"PK"
             why = "ends too early, probably an incomplete copy" if cut else f"is not a zip archive ({error})"
             raise InputError(why, where=path, expected=expected) from error
-        most = 1_000_000
-        if len(members) > most:
-            raise InputError(
-                f"holds {len(members)} files", where=path, expected=f"{expected} of at most {most}"
-            )
         self._members = {member.filename: member for member in members}
 
     @property
@@ -62,25 +59,12 @@ class Archive:
             raise InputError(
                 f"not found in the archive, which holds {amount(len(self._members), 'file')}", where=where
             )
-        if member.file_size > self._largest:
-            raise self._too_large(where, member.file_size)
         try:
             with self._zip.open(member) as file:
-                content = file.read(self._largest + 1)
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            EOFError,
-            OSError,
-            NotImplementedError,
-            RuntimeError,
-            ValueError,
-        ) as error:
+                content = file.read(min(member.file_size, self._largest) + 1)
+        except (*DAMAGES, RuntimeError) as error:
             raise InputError(f"cannot be unpacked ({error})", where=where, expected=self._expected) from error
-        if len(content) > self._largest:
-            raise self._too_large(where, len(content))
+        if max(member.file_size, len(content)) > self._largest:
+            found, most = (f"{size / 2**20:,.0f} MiB" for size in (member.file_size, self._largest))
+            raise InputError(f"unpacks to {found}", where=where, expected=f"at most {most}")
         return content
-
-    def _too_large(self, where: str, size: int) -> InputError:
-        found, most = (f"{count / 2**20:,.0f} MiB" for count in (size, self._largest))
-        return InputError(f"unpacks to {found}", where=where, expected=f"at most {most}")

@@ -62,10 +62,10 @@ def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"cannot be opened ({reason})", where=path, expected=expected) from error
     if file is None:
-        kinds = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket"}
-        kinds |= {stat.S_IFCHR: "a device", stat.S_IFBLK: "a device"}
-        kind = kinds.get(stat.S_IFMT(mode), "no regular file")
-        raise InputError(f"is {kind}", where=path, expected=expected)
+        kinds = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFCHR: "a device"}
+        raise InputError(
+            f"is {kinds.get(stat.S_IFMT(mode), 'no regular file')}", where=path, expected=expected
+        )
     if is_pointer:
         file.close()
         raise InputError("is a pointer of Git LFS, not the file", where=path, expected="git lfs pull")

@@ -72,22 +72,19 @@ def read_image(
 
     Grey becomes three channels, CMYK becomes RGB, and 16-bit values are scaled by the sensor's range: 10, 12
     or 14 bits if no value needs more. The raster is the stored one, whatever the EXIF orientation, downscaled
-    to ``size`` (width, height) as by ``reduced``: the image is read in strips, so that only its bytes and the
-    result are in memory. Raises ``InputError`` if the file is not a complete image with 1 to 4 channels of 8
-    or 16 bits, or is too large.
+    to ``size`` (width, height) as by ``reduced``: the image is converted in strips, so that only its bytes and
+    the result are in memory. Raises ``InputError`` if the file is not a complete image with 1 to 4 channels of
+    8 or 16 bits, or is too large.
     """
-    rgb, alpha = _Rows(), _Rows()
+    rgb, alpha = list[Tensor](), list[Tensor]()
     with open_image(path) as image:
-        height, width = image.height, image.width if size is None else size[0]
-        for strip, full in _strips(path, image):
-            colour, cover = channels(strip, f"{path}: image decodes to", full)
-            for rows, part in ((rgb, over(colour, cover, background)), (alpha, cover)):
-                if part is not None:
-                    rows.add(part if width == image.width else reduced(part, width, len(strip)), height)
-    found, mask = rgb.image, None if cover is None else alpha.image
-    if size is None or size[1] == height:
-        return found, mask
-    return reduced(found, *size), None if mask is None else reduced(mask, *size)
+        width, height = image.size if size is None else size
+        for strip, white in _strips(path, image):
+            colour, cover = channels(strip, f"{path}: image decodes to", white)
+            rgb.append(reduced(over(colour, cover, background), width, len(strip)))
+            if cover is not None:
+                alpha.append(reduced(cover, width, len(strip)))
+    return reduced(torch.cat(rgb), width, height), reduced(torch.cat(alpha), width, height) if alpha else None
 
 
 def read_compact_image(
@@ -98,39 +95,19 @@ def read_compact_image(
     Images downscaled to ``size`` (width, height) have bytes as well; a JPEG file is decoded no larger than
     needed.
     """
-    pixels = _Rows()
     with open_image(path) as image:
         if image.mode in ("L", "RGB", *CONVERTED) and not _is_deep(image):
             if size is not None and image.format == "JPEG":
                 # It decodes to a half, a quarter or an eighth along each side. Images whose sizes are not multiples are decoded
                 # whole, since their last column or row would be weighted too heavily.
-                sides = [
-                    (image.width // f, image.height // f)
-                    for f in (8, 4, 2)
-                    if image.width % f == image.height % f == 0
-                ]
-                fitting = [(w, h) for w, h in sides if w >= size[0] and h >= size[1]]
-                if fitting:
-                    image.draft(image.mode, fitting[0])
-            for strip, _ in _strips(path, image):
-                pixels.add(torch.from_numpy(strip), image.height)
-            found = pixels.image if size is None else reduced(pixels.image, *size)
+                sides = [tuple(side // f for side in image.size if side % f == 0) for f in (8, 4, 2)]
+                fitting = [s for s in sides if len(s) == 2 and s[0] >= size[0] and s[1] >= size[1]]
+                image.draft(image.mode, fitting[0] if fitting else image.size)
+            pixels = torch.from_numpy(_pixels(path, image))
+            found = pixels if size is None else reduced(pixels, *size)
             return (found if found.ndim == 3 else found[..., None].repeat(1, 1, 3)), None
     rgb, alpha = read_image(path, background, size)
     return rgb if size is None else (rgb * FULL_SCALE["uint8"]).round_().to(torch.uint8), alpha
-
-
-class _Rows:
-    """An image that is put together from strips, from top to bottom; its memory is allocated for the first one."""
-
-    def __init__(self) -> None:
-        self.image, self._count = torch.empty(0), 0
-
-    def add(self, strip: Shaped[Tensor, "n w *c"], height: int) -> None:
-        if self._count == 0:
-            self.image = strip.new_empty((height, *strip.shape[1:]))
-        self.image[self._count : self._count + len(strip)] = strip
-        self._count += len(strip)
 
 
 def channels(
@@ -165,26 +142,18 @@ def pixel_array(pixels: np.ndarray | Tensor, what: str) -> Float[Tensor, "h w c"
     message begins with ``what``, for other types and shapes, for NaN, and for floats outside [0, 1].
     """
     raw = to_numpy(pixels)
+    is_float = raw.dtype.kind == "f"
+    found, expected = "", "uint8 in [0, 255], uint16 or floats in [0, 1]"
     if raw.ndim not in (2, 3) or 0 in raw.shape or (raw.ndim == 3 and raw.shape[2] > 4):
         hint = "; move the channels last" if raw.ndim == 3 and raw.shape[0] <= 4 else ""
-        raise InputError(
-            f"{what} has shape {tuple(raw.shape)}",
-            expected=f"(height, width) or (height, width, 1 to 4){hint}",
-        )
-    if raw.dtype.kind != "f" and raw.dtype.name not in FULL_SCALE:
-        raise InputError(
-            f"{what} has dtype {raw.dtype.name}", expected="uint8 in [0, 255], uint16 or floats in [0, 1]"
-        )
-    if raw.dtype.kind == "f":
-        low, high = (float(x) for x in (raw.min(), raw.max()))
-        if not np.isfinite(raw).all():
-            count = int((~np.isfinite(raw)).sum())
-            raise InputError(
-                f"{what} has {count} values that are NaN or infinite", expected="floats in [0, 1]"
-            )
-        if low < -COLOUR_ROUNDING or high > 1 + COLOUR_ROUNDING:
-            hint = "; divide by 255, or give uint8" if 1 < high <= 255 and low >= 0 else ""
-            raise InputError(f"{what} has floats from {low:g} to {high:g}", expected=f"[0, 1]{hint}")
+        found, expected = f"shape {raw.shape}", f"(height, width) or (height, width, 1 to 4){hint}"
+    elif not is_float and raw.dtype.name not in FULL_SCALE:
+        found = f"dtype {raw.dtype.name}"
+    elif is_float and not (raw.min() >= -COLOUR_ROUNDING and raw.max() <= 1 + COLOUR_ROUNDING):  # also NaN
+        hint = "; divide by 255, or give uint8" if 1 < raw.max() <= 255 and raw.min() >= 0 else ""
+        found, expected = f"floats from {raw.min():g} to {raw.max():g}", f"[0, 1]{hint}"
+    if found:
+        raise InputError(f"{what} has {found}", expected=expected)
     scaled = raw.reshape(*raw.shape[:2], -1).astype(np.float32) / FULL_SCALE.get(raw.dtype.name, 1)
     return torch.from_numpy(scaled).clamp(0, 1)
 
@@ -226,9 +195,14 @@ def background_colour(background: Background) -> tuple[float, float, float]:
 
 
 def reduced(image: Shaped[Tensor, "h w *c"], width: int, height: int) -> Shaped[Tensor, "nh nw *c"]:
-    """Downscale an image of floats or bytes; each new pixel is the mean over the area that it covers."""
+    """Downscale an image of floats or bytes; each new pixel is the mean over the area that it covers.
+
+    An image that has the size already is returned as it is.
+    """
     import cv2  # imported here, since most images keep their size
 
+    if tuple(image.shape[:2]) == (height, width):
+        return image
     small = cv2.resize(image.numpy(), (width, height), interpolation=cv2.INTER_AREA)
     return torch.from_numpy(small.reshape(height, width, *image.shape[2:]))
 
@@ -251,19 +225,17 @@ def decode(path: ImageSource) -> np.ndarray:
 
 def _strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[np.ndarray, int | None]]:
     """Yield the pixels of strips of an open image, from top to bottom, and the value of white if it is not that of the type."""
-    whole = _pixels(path, image) if _is_deep(image) else None
-    full = None
-    if whole is not None and (whole.ndim == 2 or whole.shape[2] not in (2, 4)):
-        # Values of 10, 12 or 14 bits are stored in 16; the fewest bits that fit the largest value are assumed.
-        bits = next((bits for bits in (10, 12, 14) if whole.max(initial=0) < 2**bits), 16)
-        full = 2**bits - 1
     rows = max(1, STRIP // image.width)
-    for top in range(0, image.height, rows):
-        last = min(top + rows, image.height)
-        if whole is None:
-            yield _pixels(path, image.crop((0, top, image.width, last))), full
-        else:
-            yield whole[top:last], full
+    if not _is_deep(image):
+        for top in range(0, image.height, rows):
+            yield _pixels(path, image.crop((0, top, image.width, min(top + rows, image.height)))), None
+        return
+    whole = _pixels(path, image)
+    # Values of 10, 12 or 14 bits are stored in 16; the fewest bits that fit the largest value are assumed. Alpha has all of them.
+    has_alpha = whole.ndim == 3 and whole.shape[2] in (2, 4)
+    bits = next((bits for bits in (10, 12, 14) if whole.max(initial=0) < 2**bits and not has_alpha), 16)
+    for top in range(0, len(whole), rows):
+        yield whole[top : top + rows], 2**bits - 1
 
 
 def _is_deep(image: Image.Image) -> bool:
@@ -374,8 +346,8 @@ def _too_large(path: ImageSource, size: str) -> InputError:
 
 def is_heif(head: bytes) -> bool:
     """Return whether the first 12 bytes of a file, or more, identify it as HEIF, such as an iPhone's HEIC, whatever its name."""
-    brands = b"heic heix heim heis hevc hevx hevm hevs mif1 msf1".split()  # ISO/IEC 23008-12
-    return head[4:8] == b"ftyp" and head[8:12] in brands
+    # ISO/IEC 23008-12
+    return re.match(rb"(?s)....ftyp(hei[cxms]|hev[cxms]|mif1|msf1)", head) is not None
 
 
 def looks_like_image(path: Path) -> bool:
@@ -385,12 +357,8 @@ def looks_like_image(path: Path) -> bool:
             head = file.read(12)
     except InputError:
         return False
-    # PNG, JPEG, TIFF of both byte orders, GIF; the others are identified by later bytes.
-    first = (b"\x89PNG\r\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"GIF8")
-    webp = head[:4] == b"RIFF" and head[8:12] == b"WEBP"
-    bitmap = head[:2] == b"BM" and head[6:10] == bytes(4)
-    avif = head[4:12] in (b"ftypavif", b"ftypavis")
-    return head.startswith(first) or webp or bitmap or avif or is_heif(head)
+    first = rb"(?s)\x89PNG\r\n|\xff\xd8\xff|II\*\0|MM\0\*|GIF8|RIFF....WEBP|BM....\0\0\0\0|....ftypavi[fs]"
+    return re.match(first, head) is not None or is_heif(head)
 
 
 def reason(error: Exception) -> str:

@@ -11,12 +11,12 @@ import functools
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar, cast
 
-from bidnerf_core.errors import InputError, spelling_hint
+from bidnerf_core.errors import InputError
 from bidnerf_core.io.files import read_file
 
 if TYPE_CHECKING:
@@ -27,14 +27,17 @@ _T = TypeVar("_T")
 
 LARGEST_NUMBER = sys.float_info.max  # JSON can hold NaN, 1e999 and integers that no float can
 LARGEST_INTEGER = 2**63 - 1  # the largest that tensors and files can hold
-MEMBER = "(member)"
-"""The part of an error's path that stands for a member of a union, and is no key."""
 EXPECTED = {
     "bool_type": "bool", "int_type": "int", "float_type": "float", "finite_number": "float", "string_type": "str",
     "dict_type": "an object", "list_type": "a list", "tuple_type": "a list", "missing": "a longer list",
     "greater_than_equal": "an integer of at most 64 bits", "less_than_equal": "an integer of at most 64 bits",
 }  # fmt: skip
 """What messages expect, by the type of pydantic's error; pydantic's own text for others."""
+STRICT: dict[str, dict[str, Any]] = {
+    "bool": {"strict": True}, "str": {"strict": True}, "float": {"strict": True}, "list": {"fail_fast": True},
+    "int": {"strict": True, "ge": -LARGEST_INTEGER, "le": LARGEST_INTEGER}, "tuple": {"fail_fast": True},
+}  # fmt: skip
+"""What is added to the parts of pydantic's schemas, by their types: text is no number, but a list may stand for a tuple."""
 
 
 def read_json(path: Path, expected: str) -> Any:
@@ -97,15 +100,17 @@ class Record:
         return None if found is None else int(found)
 
     def text(self, key: str) -> str | None:
-        found = self.value(key)
-        if found is not None and not isinstance(found, str):
-            raise self.error(f"{key} is {_shown(found, as_json=True)}", expected="text")
+        found: str | None = self._of_type(key, str, "text")
         return found
 
     def items(self, key: str) -> list[Any] | None:
+        found: list[Any] | None = self._of_type(key, list, "a list")
+        return found
+
+    def _of_type(self, key: str, kind: type, expected: str) -> Any:
         found = self.value(key)
-        if found is not None and not isinstance(found, list):
-            raise self.error(f"{key} is {_shown(found, as_json=True)}", expected="a list")
+        if found is not None and not isinstance(found, kind):
+            raise self.error(f"{key} is {_shown(found, as_json=True)}", expected=expected)
         return found
 
     def checked_number(self, found: Any, what: str) -> float:
@@ -230,76 +235,31 @@ def _validator(kind: Any) -> SchemaValidator:
     from pydantic import ConfigDict, TypeAdapter
     from pydantic_core import SchemaValidator
 
-    config = ConfigDict(arbitrary_types_allowed=True)
+    config = ConfigDict(arbitrary_types_allowed=True, extra="forbid", allow_inf_nan=False)
     return SchemaValidator(_strict(TypeAdapter(list[kind], config=config).core_schema))
 
 
 def _strict(node: Any) -> Any:
-    """Return a schema of pydantic in which numbers and text are of their own type, and only lists may stand for tuples.
-
-    Integers have at most 64 bits, numbers are finite, and a dataclass checks its keys itself.
-    """
+    """Return a schema of pydantic with the additions of ``STRICT``."""
     if isinstance(node, list):
         return [_strict(part) for part in node]
     if not isinstance(node, dict):
         return node
     given = ("default", "expected", "metadata", "config")  # values of ours rather than parts of the schema
     found = {key: part if key in given else _strict(part) for key, part in node.items()}
-    match found.get("type"):
-        case "bool" | "str":
-            found["strict"] = True
-        case "float":
-            found |= {"strict": True, "allow_inf_nan": False}
-        case "int":
-            found |= {"strict": True, "ge": -LARGEST_INTEGER, "le": LARGEST_INTEGER}
-        case "list" | "tuple":
-            found["fail_fast"] = True
-        case "union":
-            found["choices"] = [(choice, MEMBER) for choice in found["choices"]]
-        case "literal":
-            found = {"type": "function-plain", "function": _function(_known, found["expected"])}
-        case "dataclass":
-            reference = {"ref": found.pop("ref")} if "ref" in found else {}
-            check = _function(_checked_keys, found["cls"])
-            found = {"type": "function-before", "schema": found, "function": check, **reference}
-    return found
-
-
-def _function(check: Callable[[Any, Any], Any], given: Any) -> dict[str, Any]:
-    return {"type": "no-info", "function": functools.partial(check, given)}
-
-
-def _known(known: Sequence[Any], value: Any) -> Any:
-    """Return ``value`` if it is one of ``known``, where 1 is not True."""
-    if any(type(value) is type(one) and value == one for one in known):
-        return value
-    raise InputError(f"found {_shown(value)}", expected=" or ".join(map(repr, known)))
-
-
-def _checked_keys(kind: type, value: Any) -> Any:
-    """Return ``value``. Raises ``InputError`` if it is a dictionary without the keys of the dataclass ``kind``."""
-    if not isinstance(value, dict):
-        raise InputError(f"found {_shown(value)}", expected=f"an object with the fields of {kind.__name__}")
-    known = {f.name: f for f in dataclasses.fields(kind) if f.init}
-    for key in value:
-        if key not in known:
-            hint = spelling_hint(key, known)
-            expected = None if hint else f"any of {', '.join(known)}"
-            raise InputError(f"{kind.__name__} has no field {key!r}{hint}", expected=expected)
-    nothing = dataclasses.MISSING
-    required = [name for name, f in known.items() if f.default is f.default_factory is nothing]
-    if missing := [repr(name) for name in required if name not in value]:
-        raise InputError(f"{', '.join(missing)} missing", expected=f"all fields of {kind.__name__}")
-    return value
+    if found.get("type") == "union":  # the part of an error's path that stands for a member is no key
+        found["choices"] = [(choice, "") for choice in found["choices"]]
+    return found | STRICT.get(str(found.get("type")), {})
 
 
 def _first_error(errors: Sequence[Any], where: str) -> InputError:
     """Return the first of pydantic's errors, with all types of a union that the value is not of."""
     first = errors[0]
-    path = [part for part in first["loc"] if isinstance(part, str) and part != MEMBER]
-    place = ": ".join([where, *path])
-    if "error" in first.get("ctx", {}):  # what a dataclass or a check above raised
+    kind, place = first["type"], ": ".join([where, *(p for p in first["loc"] if p and isinstance(p, str))])
+    if "error" in first.get("ctx", {}):  # what a dataclass raised
         return InputError(first["ctx"]["error"], where=place)
+    if kind == "unexpected_keyword_argument" or (kind == "missing" and isinstance(first["loc"][-1], str)):
+        return InputError("missing" if kind == "missing" else "not a known key", where=place)
     texts = {e["type"]: e["msg"].removeprefix("Input should be ") for e in errors if e["loc"] == first["loc"]}
     expected = dict.fromkeys(EXPECTED.get(kind, text) for kind, text in texts.items())
     return InputError(f"found {_shown(first['input'])}", where=place, expected=" or ".join(expected))

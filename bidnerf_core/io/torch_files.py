@@ -5,15 +5,16 @@ from __future__ import annotations
 import pickle
 import re
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.io.archives import Archive
+from bidnerf_core.io.files import open_binary
 
 
 class _Ignored:
@@ -35,9 +36,9 @@ def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
     run code, it unpacks to more than its size or, unless ``mapped``, it holds a tensor that does, such as an expanded one
     (stride 0).
     """
-    if not path.is_file():
-        raise InputError("no such file", where=path, expected=expected)
-    path.open("rb").close()  # errors here concern opening the file; all later ones concern its content
+    open_binary(
+        path, expected
+    ).close()  # errors here concern opening the file; all later ones concern its content
     size = path.stat().st_size
     archive = Archive(path, expected) if zipfile.is_zipfile(path) else None
     if archive is not None and archive.unpacked_size > size:
@@ -60,21 +61,12 @@ def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
         else:
             found = f"not written by torch.save, or damaged ({type(error).__name__});"
         raise InputError(found, where=path, expected=expected) from error
-    for tensor in () if mapped else _tensors(content):  # those that stay in the file take no memory
+    for tensor in () if mapped else tree_leaves(content):  # those that stay in the file take no memory
+        if not isinstance(tensor, Tensor):
+            continue
         needed = tensor.numel() * tensor.element_size()
         stored = tensor.untyped_storage().nbytes() if tensor.layout is torch.strided else 0
         if needed > min(stored, size):
             found = f"a tensor {tuple(tensor.shape)} needs {needed:,} bytes, but the file has only {size:,};"
             raise InputError(found, where=path, expected=expected)
     return content
-
-
-def _tensors(found: Any) -> Iterator[Tensor]:
-    if isinstance(found, Tensor):
-        yield found
-    elif isinstance(found, dict):
-        for value in found.values():
-            yield from _tensors(value)
-    elif isinstance(found, list | tuple):
-        for value in found:
-            yield from _tensors(value)

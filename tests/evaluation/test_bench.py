@@ -117,7 +117,7 @@ def test_shards_share_all_trials_between_them(shards: int) -> None:
         ({"split": "train"}, "no split 'train'", "test"),
         ({"protocol": "parallel", "frames": ["0000"]}, "'parallel' defines its own frames", "all frames"),
         ({"protocol": "parallel", "seed": 3}, "25 trials from seed 3", "at most 25 from seed 1234"),
-        ({"scene": "demo:object"}, "has no map; train one with 'bidnerf demo'", None),
+        ({"scene": "demo:object"}, "'demo:object'", "'bidnerf demo' trains maps"),
         ({"scene": "demo:blops"}, "'demo:blops'", "demo:blobs"),
         ({"data": "demo:rom"}, "'demo:rom'", "demo:room"),
         ({"device": "gpu"}, "device 'gpu' does not work", "cpu"),
@@ -271,7 +271,7 @@ def test_a_last_line_that_lacks_only_its_end_is_kept(tmp_path: Path) -> None:
     ("content", "said"),
     [
         (b"my notes", "line 1: not JSON"),
-        (b'{"a": 1}', "line 1: TrialResult has no field 'a'"),
+        (b'{"a": 1}', "line 1: T_world_camera: missing"),
         (b'{"T_world_camera": \n{}\n', "line 1: not JSON"),
         (b"\xff\xfe\n", "line 1: not JSON"),
     ],

@@ -117,7 +117,7 @@ def test_a_full_disk_is_an_error_in_a_line(tmp_path: Path, monkeypatch: pytest.M
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(storage, "_reserve", full)
+    monkeypatch.setattr(storage.os, "posix_fallocate", full)
     with pytest.raises(
         InputError, match=rf"^{tmp_path}: no room for 5000 MB of images \(No space left on device\)"
     ):

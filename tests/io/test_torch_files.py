@@ -88,7 +88,7 @@ def test_code_is_refused_and_not_run(saved: Saved, tmp_path: Path) -> None:
 def test_damage_and_absence_are_told_in_one_line(saved: Saved, tmp_path: Path) -> None:
     path = saved({"a": torch.zeros(100)})
     path.write_bytes(path.read_bytes()[:-200])
-    for file, said in ((path, "damaged"), (tmp_path / "none", "no such file"), (tmp_path, "no such file")):
+    for file, said in ((path, "damaged"), (tmp_path / "none", "no such file"), (tmp_path, "is a folder")):
         for mapped in (True, False):
             with refused(where=file, found=said, expected="a checkpoint"):
                 read_saved(file, "a checkpoint", mapped)
