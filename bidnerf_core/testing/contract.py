@@ -14,9 +14,9 @@ from torch import Tensor, nn
 from bidnerf_core.backend import Backend, load_backend
 from bidnerf_core.fields import RadianceField, levels
 from bidnerf_core.io import from_plain, to_plain
-from bidnerf_core.testing import derivatives, recipes, samples, values
+from bidnerf_core.testing import field_checks, recipes
 from bidnerf_core.testing.device import check_steps
-from bidnerf_core.testing.faults import calling, query, require_that
+from bidnerf_core.testing.faults import calling, is_one_line, query, require
 from bidnerf_core.testing.scene import SCENE_BOUNDS, awkward_rays, joined, points, rgb_views, rgbd_views
 
 
@@ -35,87 +35,92 @@ class BackendContract:
     # The object that the entry point names.
 
     def test_backend_says_what_it_is(self) -> None:
-        backend = self._backend()
-        require_that(
-            isinstance(backend, Backend),
-            f"{type(backend).__name__} lacks some of summary, config_type, build, train",
-        )
+        backend, who = self._backend(), type(self._backend()).__name__
+        require(who, (isinstance(backend, Backend), "lacks some of summary, config_type, build, train"))
         summary = backend.summary
-        one_line = isinstance(summary, str) and summary.strip() != "" and "\n" not in summary
-        require_that(one_line, f"{type(backend).__name__}.summary is {summary!r}, expected one line of text")
+        require(f"{who}.summary", (is_one_line(summary), f"is {summary!r}, expected one line of text"))
 
     def test_config_is_a_frozen_dataclass_with_defaults_and_steps(self) -> None:
         kind, who = self._backend().config_type, f"{type(self._backend()).__name__}.config_type"
-        require_that(
-            isinstance(kind, type) and dataclasses.is_dataclass(kind),
-            f"{who} is {kind!r}, expected a dataclass",
-        )
-        require_that(
-            cast(Any, kind).__dataclass_params__.frozen,
-            f"{who} {kind.__name__} is not frozen, expected @dataclass(frozen=True)",
-        )
-        missing = dataclasses.MISSING
+        is_one = isinstance(kind, type) and dataclasses.is_dataclass(kind)
+        require(who, (is_one, f"is {kind!r}, expected a dataclass"))
         bare = [
-            f.name for f in dataclasses.fields(kind) if f.default is missing and f.default_factory is missing
+            f.name
+            for f in dataclasses.fields(kind)
+            if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
         ]
-        require_that(
-            not bare,
-            f"{who} {kind.__name__} has no default for {', '.join(bare)}, expected one for every field",
+        require(
+            f"{who} {kind.__name__}",
+            (cast(Any, kind).__dataclass_params__.frozen, "not frozen, expected @dataclass(frozen=True)"),
+            (not bare, f"has no default for {', '.join(bare)}, expected one for every field"),
         )
         steps = getattr(kind(), "steps", None)
-        require_that(
-            type(steps) is int and steps > 0,
-            f"{who} {kind.__name__} has steps = {steps!r}, expected a field of type int: the length of a training",
+        require(
+            f"{who} {kind.__name__}",
+            (
+                type(steps) is int and steps > 0,
+                f"has steps = {steps!r}, expected a field of type int: the length of a training",
+            ),
         )
 
     def test_config_survives_json(self) -> None:
         for config in (self._backend().config_type(), self._config()):
             found = self._reread(config)
-            require_that(
-                found == config, f"{type(config).__name__} comes back from JSON as {found}, expected {config}"
+            require(
+                type(config).__name__,
+                (found == config, f"comes back from JSON as {found}, expected {config}"),
             )
 
     def test_build_gives_a_field(self) -> None:
         field = self._build()
-        who = f"{type(self._backend()).__name__}.build returned a {type(field).__name__}"
-        require_that(
-            isinstance(field, nn.Module), f"{who}, expected an nn.Module, whose state_dict is what is saved"
+        require(
+            f"{type(self._backend()).__name__}.build",
+            (
+                isinstance(field, nn.Module),
+                f"returned a {type(field).__name__}, expected an nn.Module, whose state_dict is what is saved",
+            ),
+            (
+                isinstance(field, RadianceField),
+                f"returned a {type(field).__name__} without query or sampler, expected both",
+            ),
         )
-        require_that(isinstance(field, RadianceField), f"{who} without query or sampler, expected both")
 
     def test_build_is_reproducible(self) -> None:
         with torch.random.fork_rng(devices=[]):
             first, second = (self._build().state_dict() for _ in range(2))
+        expected = "expected all randomness to come from a seed in the config"
         for name, value in first.items():
-            require_that(
-                torch.equal(value, second[name]),
-                f"{type(self._backend()).__name__}.build: {name!r} differs between two builds of one config,"
-                " expected all randomness to come from a seed in the config",
+            require(
+                f"{type(self._backend()).__name__}.build",
+                (
+                    torch.equal(value, second[name]),
+                    f"{name!r} differs between two builds of one config, {expected}",
+                ),
             )
 
     # The field's values, at each of its levels.
 
     def test_query_takes_any_shape(self) -> None:
-        self._each(values.check_shapes)
+        self._each(field_checks.check_shapes)
 
     def test_query_is_finite_and_in_range(self) -> None:
-        self._each(values.check_ranges)
+        self._each(field_checks.check_ranges)
 
     def test_query_is_differentiable_by_position(self) -> None:
-        self._each(lambda field: derivatives.check_position_derivatives(*precise(field)))
+        self._each(lambda field: field_checks.check_position_derivatives(*precise(field)))
 
     def test_query_is_differentiable_by_direction(self) -> None:
-        self._each(lambda field: derivatives.check_direction_derivatives(*precise(field)))
+        self._each(lambda field: field_checks.check_direction_derivatives(*precise(field)))
 
     def test_jacobian_is_the_derivative_of_query(self) -> None:
-        self._each(lambda field: derivatives.check_jacobian(*precise(field)))
+        self._each(lambda field: field_checks.check_jacobian(*precise(field)))
 
     def test_query_follows_the_dtype(self) -> None:
         for field in self._fields():
             with calling(f"{type(field).__name__}.double()"):
                 doubled = copy.deepcopy(field).double()
             for level, moved in zip(levels(field), levels(cast(RadianceField, doubled)), strict=True):
-                values.check_precision(level, moved)
+                field_checks.check_precision(level, moved)
 
     def test_field_moves_to_a_device(self) -> None:
         if not torch.cuda.is_available():
@@ -126,39 +131,37 @@ class BackendContract:
             moved = copy.deepcopy(field).to("cuda")
             names = (f.name for f in dataclasses.fields(rays))
             elsewhere = dataclasses.replace(rays, **{name: getattr(rays, name).cuda() for name in names})
-            found = samples.seen(cast(RadianceField, moved), elsewhere, "rays on CUDA").cpu()
-        require_that(
-            values.close(found, samples.seen(field, rays, "rays"), 2e-2),
-            f"{type(field).__name__} renders otherwise on CUDA than on the CPU",
-        )
+            found = field_checks.seen(cast(RadianceField, moved), elsewhere, "rays on CUDA").cpu()
+        same = field_checks.close(found, field_checks.seen(field, rays, "rays"), 2e-2)
+        require(type(field).__name__, (same, "renders otherwise on CUDA than on the CPU"))
 
     def test_query_serves_several_threads(self) -> None:
-        self._each(values.check_threads)
+        self._each(field_checks.check_threads)
 
     # Sampling and rendering.
 
     def test_samples_are_sorted_disjoint_and_on_the_ray(self) -> None:
-        self._each(samples.check_intervals)
+        self._each(field_checks.check_intervals)
 
     def test_samples_are_repeatable(self) -> None:
-        self._each(samples.check_repeatable)
+        self._each(field_checks.check_repeatable)
 
     def test_rays_do_not_depend_on_each_other(self) -> None:
-        self._each(samples.check_rays_alone)
+        self._each(field_checks.check_rays_alone)
 
     def test_rays_that_miss_see_the_background(self) -> None:
-        self._each(samples.check_background)
+        self._each(field_checks.check_background)
 
     def test_hits_agree_with_the_density(self) -> None:
-        self._each(samples.check_hits)
+        self._each(field_checks.check_hits)
 
     def test_levels_are_fields_coarsest_first(self) -> None:
         for field in self._fields():
-            samples.check_levels(field)
+            field_checks.check_levels(field)
 
     def test_rendering_carries_gradients_to_the_pose(self) -> None:
         for level in levels(self._trained()):
-            derivatives.check_pose_gradient(*precise(level))
+            field_checks.check_pose_gradient(*precise(level))
 
     def test_steps_stay_on_the_device(self) -> None:
         check_steps(self._trained())
@@ -172,14 +175,16 @@ class BackendContract:
         loaded = frozen(fresh)
         rays = joined(list(awkward_rays().values()))
         same = torch.equal(_answers(loaded), _answers(trained)) and all(
-            torch.equal(samples.seen(a, rays, "rays"), samples.seen(b, rays, "rays"))
+            torch.equal(field_checks.seen(a, rays, "rays"), field_checks.seen(b, rays, "rays"))
             for a, b in zip(levels(loaded), levels(trained), strict=True)
         )
-        require_that(
-            same,
-            f"{type(fresh).__name__}: saved, rebuilt and loaded, it renders differently than before,"
-            " expected the same bits; is some state not in state_dict (a plain attribute, a buffer with"
-            " persistent=False)?",
+        require(
+            f"{type(fresh).__name__}, saved, rebuilt and loaded",
+            (
+                same,
+                "it renders differently than before, expected the same bits; is some state not in state_dict (a plain"
+                " attribute, a buffer with persistent=False)?",
+            ),
         )
 
     # Training.
@@ -206,10 +211,8 @@ class BackendContract:
     def _backend(self) -> Any:
         if self.name is not None:
             return load_backend(self.name)
-        require_that(
-            self.backend is not None,
-            f"{type(self).__name__} has neither backend nor name, expected one of them",
-        )
+        given = self.backend is not None
+        require(type(self).__name__, (given, "has neither backend nor name, expected one of them"))
         return self.backend
 
     def _config(self) -> Any:
@@ -229,13 +232,12 @@ class BackendContract:
 
     def _trained(self) -> Any:
         """Return a field that was trained on RGB-D views, once per test class, and frozen like that of a loaded map."""
-        kept = type(self).__dict__.get("_kept")
-        if kept is None:
-            kept = self._build()
+        if "_kept" not in vars(type(self)):
+            field = self._build()
             with calling(f"{type(self._backend()).__name__}.train"):
-                self._backend().train(kept, rgbd_views(), self._config(), recipes.Recorder())
-            type(self)._kept = frozen(kept)  # type: ignore[attr-defined]
-        return type(self).__dict__["_kept"]
+                self._backend().train(field, rgbd_views(), self._config(), recipes.Recorder())
+            type(self)._kept = frozen(field)  # type: ignore[attr-defined]
+        return vars(type(self))["_kept"]
 
     def _fields(self) -> Iterator[Any]:
         yield frozen(self._build())
@@ -269,4 +271,4 @@ def precise(field: RadianceField) -> tuple[RadianceField, torch.dtype]:
 
 
 def _answers(field: RadianceField) -> Tensor:
-    return values.stacked(query(field, *points(256), "points"))
+    return field_checks.stacked(query(field, *points(256), "points"))

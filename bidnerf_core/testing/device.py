@@ -1,15 +1,29 @@
-"""Check that the steps of a localization can stay on the field's device."""
+"""A simulated device, which proves on any machine that code neither copies between devices nor waits for one.
+
+Tensors on the device "meta" stand in for those on a GPU. While ``Elsewhere`` is active they have values,
+which are stored and computed on the CPU, so that code runs as it would on a GPU; but operations on tensors of
+both devices, which a GPU does not allow, raise ``DeviceFault``. Within ``strict``, so does anything that
+makes the host wait for the device: copies to and from the CPU, reading numbers from a tensor (``float``,
+``bool``, ``item``, ``tolist``), and sizes that depend on values (``nonzero``, indexing by a mask). Elsewhere,
+these are counted. ``check_steps`` checks that the steps of a localization can stay on the field's device.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import copy
-from collections.abc import Iterator
+import sys
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, cast
 
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map, tree_map_only
 
+from bidnerf_core import devices
 from bidnerf_core.devices import moved, without_waiting
 from bidnerf_core.fields import RadianceField, levels
 from bidnerf_core.localization import (
@@ -29,11 +43,198 @@ from bidnerf_core.localization import (
     states_at,
 )
 from bidnerf_core.mapping import descend
-from bidnerf_core.testing.faults import calling, require_that
+from bidnerf_core.testing.faults import calling, require
+from bidnerf_core.testing.field_checks import close
 from bidnerf_core.testing.scene import SCENE_BOUNDS, rgbd_views
-from bidnerf_core.testing.simulated_device import DEVICE, DeviceFault, Elsewhere
 from bidnerf_core.testing.textured_field import MapWithLandmarks
-from bidnerf_core.testing.values import close
+
+DEVICE = torch.device("meta")
+"""The simulated device."""
+
+_aten = torch.ops.aten
+_adam: Any = sys.modules[torch.optim.Adam.__module__]
+READS = {
+    **dict.fromkeys(("_local_scalar_dense", "is_nonzero"), "reads a number"),
+    "equal": "reads whether tensors are equal",
+    **dict.fromkeys(
+        (
+            "nonzero",
+            "masked_select",
+            "_unique2",
+            "unique_dim",
+            "unique_consecutive",
+            "repeat_interleave",
+            "bincount",
+        ),
+        "has a size that depends on values",
+    ),
+    **dict.fromkeys(
+        ("_linalg_svd", "_linalg_eigh", "_linalg_solve_ex", "linalg_cholesky", "linalg_lstsq"),
+        "is a factorization that waits for the device",
+    ),
+}
+"""Operations that make the host wait, by name."""
+INDEXED = ("index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_index")
+"""Operations with indices, which may be masks."""
+
+
+class DeviceFault(AssertionError):
+    """Code waited for the device, copied from or to it, or mixed it with the CPU."""
+
+
+class _There(torch.Tensor):
+    """A tensor that claims to be on ``DEVICE`` and keeps its values in a tensor on the CPU."""
+
+    held: Tensor
+
+    @staticmethod
+    def __new__(cls, values: Tensor) -> _There:
+        made: _There = torch.Tensor._make_wrapper_subclass(
+            cls, values.size(), strides=values.stride(), storage_offset=values.storage_offset(),
+            dtype=values.dtype, layout=values.layout, device=DEVICE,
+        )  # fmt: skip
+        made.held = values
+        return made
+
+    def __init__(self, values: Tensor) -> None:
+        pass
+
+    def tolist(self) -> Any:
+        return self.cpu().tolist()
+
+    def numpy(self, *, force: bool = False) -> Any:
+        return self.cpu().numpy(force=force)
+
+    def new_tensor(self, data: Any, *args: Any, **options: Any) -> Tensor:
+        return torch.tensor(data, dtype=options.pop("dtype", self.dtype), **options).to(DEVICE)
+
+    def __repr__(self) -> str:  # type: ignore[override]
+        return f"elsewhere({self.held!r})"
+
+    @classmethod
+    def __torch_dispatch__(  # type: ignore[override]
+        cls, func: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        return _run(func, args, kwargs or {}, None)
+
+
+class Elsewhere(TorchDispatchMode):
+    """Makes ``DEVICE`` usable. Outside ``strict()``, tensors may be moved between devices and read, but not mixed.
+
+    ``waits`` counts, by operation, how often the host waited for the device.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.waits = Counter[str]()
+        self._strict = False
+
+    def __enter__(self) -> Any:
+        devices.forget()
+        self._generator = torch.Generator
+        torch.Generator = _generator_of(torch.Generator)  # type: ignore[misc]
+        self._check = _adam._device_dtype_check_for_fused
+        _adam._device_dtype_check_for_fused = lambda *_, **__: None
+        return super().__enter__()
+
+    def __exit__(self, *exception: Any) -> None:
+        super().__exit__(*exception)
+        torch.Generator = self._generator  # type: ignore[misc]
+        _adam._device_dtype_check_for_fused = self._check
+        devices.forget()
+
+    @contextmanager
+    def strict(self) -> Iterator[None]:
+        """Raise ``DeviceFault`` for anything that would make a GPU and its host wait for each other."""
+        self._strict = True
+        try:
+            yield
+        finally:
+            self._strict = False
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return _run(func, args, kwargs or {}, self)
+
+
+def _run(func: Any, args: Any, kwargs: dict[str, Any], mode: Elsewhere | None) -> Any:
+    flat = tree_leaves((args, kwargs))
+    there = any(isinstance(part, _There) for part in flat)
+    wanted = None if kwargs.get("device") is None else torch.device(kwargs["device"]).type
+    if any(isinstance(part, Tensor) and part.is_meta and not isinstance(part, _There) for part in flat):
+        raise DeviceFault(
+            "a tensor was made of the host's numbers on the device, as torch.tensor(..., device=...)"
+        )
+    if not there and wanted != DEVICE.type:
+        return func(*args, **kwargs)
+    name, schema = func._schema.name.removeprefix("aten::"), func._schema
+    if mode is not None and (fault := _waiting(name, args, flat, there, wanted)) is not None:
+        if mode._strict:
+            raise DeviceFault(fault)
+        mode.waits[name] += 1
+    # PyTorch itself moves numbers, and the indices of a tensor on the device.
+    indexed = name in INDEXED and isinstance(args[0], _There)
+    here = [part for part in _on_cpu(tree_leaves(args[2:]) if indexed else flat) if part.ndim > 0]
+    if there and here and name not in ("_to_copy", "copy_"):
+        shapes = ", ".join(str(tuple(part.shape)) for part in here)
+        raise DeviceFault(f"{name} mixes devices: a tensor of shape {shapes} is on the CPU")
+    if wanted == DEVICE.type or func is _aten._to_copy.default:
+        kwargs = kwargs | {"device": torch.device("cpu")}
+    plain_args, plain_kwargs = tree_map_only(_There, lambda part: part.held, (args, kwargs))
+    found = func(*plain_args, **plain_kwargs)
+    if wanted == "cpu":
+        return found.clone() if isinstance(found, Tensor) else found
+    # A result that is written in place is the argument itself.
+    written = [
+        args[place] if place < len(args) else kwargs.get(argument.name)
+        for place, argument in enumerate(schema.arguments)
+        if argument.alias_info is not None and argument.alias_info.is_write
+    ]
+    if written and schema.returns:
+        return written[0] if len(schema.returns) == 1 else tuple(written)
+    return tree_map(lambda part: _There(part) if type(part) is Tensor else part, found)
+
+
+def _on_cpu(parts: Iterable[Any]) -> list[Tensor]:
+    return [part for part in parts if isinstance(part, Tensor) and not isinstance(part, _There)]
+
+
+def _waiting(name: str, args: Any, flat: list[Any], there: bool, wanted: str | None) -> str | None:
+    """Return why an operation makes the host wait for the device, or copies between them; None if it does neither."""
+    if there and name in READS:
+        return f"{name} {READS[name]}: the host waits for the device"
+    if name == "copy_":
+        return "copy_ copies between devices" if _on_cpu(flat) else None
+    if name == "_to_copy":
+        moves = there != ((wanted or args[0].device.type) == DEVICE.type)
+        return f"a tensor of shape {tuple(args[0].shape)} is copied between devices" if moves else None
+    if name not in INDEXED:
+        return None
+    if any(index is not None and index.dtype == torch.bool for index in args[1]):
+        return "an index by a mask has a size that depends on values: the host waits for the device"
+    if there and any(part.ndim > 0 for part in _on_cpu(flat)):
+        return f"{name} copies an index between devices"
+    return None
+
+
+def _generator_of(kind: Any) -> Any:
+    """Return a subclass of the generators' class whose instances may claim to be on ``DEVICE``."""
+
+    class There(kind):
+        def __new__(cls, device: Any = "cpu") -> Any:
+            elsewhere = torch.device(device).type == DEVICE.type
+            return super().__new__(cls) if elsewhere else kind(device)
+
+        def __init__(self, device: Any = "cpu") -> None:
+            pass
+
+        @property
+        def device(self) -> torch.device:
+            return DEVICE
+
+    return There
+
+
+# Steps.
 
 CHECKED_RAYS = 48
 
@@ -41,37 +242,32 @@ CHECKED_RAYS = 48
 def check_steps(field: RadianceField) -> None:
     """Check that steps at each level stay on the device and reach the same pose as on the CPU.
 
-    They must neither copy between devices nor wait for one. The device is simulated, see ``simulated_device``.
+    They must neither copy between devices nor wait for one. The device is simulated.
     Fields without parameters and buffers have no device and pass.
     """
     for number in range(len(levels(field))):
         expected = _first_order(_problem(field), number, None)
+        who = f"{type(field).__name__}, level {number}"
         with Elsewhere() as mode:
             with calling(f"{type(field).__name__}.to(device)"):
                 there: Any = cast(Any, copy.deepcopy(field)).to(DEVICE)
             problem = _problem(there)
             if problem.device != DEVICE:
                 return
-            who = f"{type(field).__name__}, level {number}"
-            with _naming(f"{who}: a step of Adam"):
+            try:
+                step = "a step of Adam"
                 found = _first_order(problem, number, mode)
-            with _naming(f"{who}: a step of Levenberg-Marquardt"):
+                step = "a step of Levenberg-Marquardt"
                 _second_order(problem, number, mode)
-        same = close(found, expected, 1e-3)
-        require_that(
-            same,
-            f"{who}: steps on another device lead to a different pose than on the CPU; is some state not moved?",
-        )
-
-
-@contextmanager
-def _naming(what: str) -> Iterator[None]:
-    """Turn a ``DeviceFault`` into a contract failure that names the place where it happened."""
-    try:
-        yield
-    except DeviceFault as fault:
-        require_that(
-            False, f"{what}: {fault}; expected all of it on the field's device, in shapes that are known"
+            except DeviceFault as fault:
+                expected_place = "expected all of it on the field's device, in shapes that are known"
+                raise AssertionError(f"{who}: {step}: {fault}; {expected_place}") from fault
+        require(
+            who,
+            (
+                close(found, expected, 1e-3),
+                "steps on another device lead to a different pose than on the CPU; is some state not moved?",
+            ),
         )
 
 
@@ -93,11 +289,8 @@ def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor
     steps = AdamSteps(loss, pivot("scene", problem), AdamSettings(), start.to(device))
     with without_waiting():
         steps()
-        if mode is None:
+        with contextlib.nullcontext() if mode is None else mode.strict():
             steps()
-        else:
-            with mode.strict():
-                steps()
     return steps.T.to("cpu").matrix()
 
 

@@ -14,10 +14,19 @@ from bidnerf_core.fields import FieldValues, RadianceField, Rays, RaySamples
 T = TypeVar("T")
 
 
-def require_that(condition: bool, fault: str) -> None:
-    """Raise ``AssertionError`` unless ``condition`` holds. An ``assert`` would be skipped under ``python -O``."""
-    if not condition:
-        raise AssertionError(fault)
+def require(who: str, *claims: tuple[object, str]) -> None:
+    """Raise ``AssertionError`` with the fault of the first claim (condition, fault) that does not hold of ``who``.
+
+    An ``assert`` would be skipped under ``python -O``.
+    """
+    for condition, fault in claims:
+        if not condition:
+            raise AssertionError(f"{who}: {fault}")
+
+
+def is_one_line(text: object) -> bool:
+    """Return whether something is one line of text."""
+    return isinstance(text, str) and text.strip() != "" and "\n" not in text
 
 
 @contextmanager
@@ -34,12 +43,15 @@ def calling(doing: str) -> Iterator[None]:
 class Named:
     """The base of contracts of parts that are registered by ``name``."""
 
+    kind: ClassVar[str] = ""
     name: ClassVar[str] = ""
 
+    @property
+    def _who(self) -> str:
+        return f"{self.kind} {self.name!r}"
+
     def _part(self, load: Callable[[str], T]) -> T:
-        require_that(
-            self.name != "", f"{type(self).__name__} has no name, expected the one that is registered"
-        )
+        require(type(self).__name__, (self.name != "", "no name, expected the one that is registered"))
         return load(self.name)
 
 
@@ -49,14 +61,14 @@ def query(field: RadianceField, positions: Tensor, directions: Tensor, of: str) 
     with calling(who):
         values = field.query(positions, directions)
     shape = tuple(positions.shape[:-1])
-    for what, found, expected in (
-        ("density", values.density, shape),
-        ("rgb", values.rgb, (*shape, 3)),
-    ):
-        require_that(
-            tuple(found.shape) == expected,
-            f"{who}: {what} has shape {tuple(found.shape)}, expected {expected} for positions of shape"
-            f" {tuple(positions.shape)}",
+    for what, found, expected in (("density", values.density, shape), ("rgb", values.rgb, (*shape, 3))):
+        require(
+            who,
+            (
+                tuple(found.shape) == expected,
+                f"{what} has shape {tuple(found.shape)}, expected {expected} for positions of shape"
+                f" {tuple(positions.shape)}",
+            ),
         )
     return values
 
@@ -66,13 +78,15 @@ def sample(field: RadianceField, rays: Rays, of: str, jitter: Generator | None =
     who = f"sampler {type(field.sampler).__name__} of {of}"
     with calling(who):
         samples = field.sampler(rays, jitter)
-    shape, found = samples.starts.shape, tuple(rays.near.shape)
-    require_that(
-        tuple(shape[:-1]) == found and samples.ends.shape == shape and samples.valid.shape == shape,
-        f"{who}: starts, ends and valid have shapes {tuple(shape)}, {tuple(samples.ends.shape)} and"
-        f" {tuple(samples.valid.shape)}, expected the same for all three: {found} and one more axis",
-    )
-    require_that(
-        samples.valid.dtype == torch.bool, f"{who}: valid is {samples.valid.dtype}, expected torch.bool"
+    shapes = [tuple(part.shape) for part in (samples.starts, samples.ends, samples.valid)]
+    found = tuple(rays.near.shape)
+    require(
+        who,
+        (
+            shapes == shapes[:1] * 3 and shapes[0][:-1] == found,
+            f"starts, ends and valid have shapes {shapes[0]}, {shapes[1]} and {shapes[2]}, expected the same for all"
+            f" three: {found} and one more axis",
+        ),
+        (samples.valid.dtype == torch.bool, f"valid is {samples.valid.dtype}, expected torch.bool"),
     )
     return samples

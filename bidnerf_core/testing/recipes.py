@@ -16,7 +16,7 @@ from torch import Tensor
 from bidnerf_core.backend import Backend
 from bidnerf_core.fields import RadianceField, SceneBounds, render
 from bidnerf_core.frames import View
-from bidnerf_core.testing.faults import calling, require_that
+from bidnerf_core.testing.faults import calling, require
 from bidnerf_core.testing.scene import DIMMED_BOUNDS, SCENE_BOUNDS, camera_rays, exposed_views, rgbd_views
 from bidnerf_core.training import TrainingState, TrainingStep, TrainingStopped
 
@@ -67,11 +67,13 @@ def check_learning(
     most = 0.8 * before  # the squared error must fall by a fifth
     _train(backend, field, views, config, Recorder(), f"on {kind} views")
     after = colour_error(field)
-    require_that(
-        after <= most,
-        f"{type(backend).__name__}.train on {kind} views: {config.steps} steps took the squared error of colour from"
-        f" {before:.4g} to {after:.4g}, expected {most:.4g} or less; does the recipe change the field that it"
-        " is given? does the test's config suffice?",
+    require(
+        f"{type(backend).__name__}.train on {kind} views",
+        (
+            after <= most,
+            f"{config.steps} steps took the squared error of colour from {before:.4g} to {after:.4g}, expected {most:.4g} or"
+            " less; does the recipe change the field that it is given? does the test's config suffice?",
+        ),
     )
 
 
@@ -97,11 +99,14 @@ def check_exposure(backend: Backend, config: Any) -> None:
         ratio = (bright * dark).sum() / dark.square().sum().clamp(min=1e-12)
         found.append((-1) ** number * math.log(max(float(ratio), 1e-6)) / (2 * EXPOSURE))
     share = sum(found) / len(found)
-    require_that(
-        share <= most,
-        f"{type(backend).__name__}.train: {share:.0%} of the images' exposures went into the colours of the field, expected"
-        f" {most:.0%} or less; train with bidnerf_core.training.Supervision, which learns the exposure of each image"
-        " beside the field (its fit, step and loss do)",
+    require(
+        f"{type(backend).__name__}.train",
+        (
+            share <= most,
+            f"{share:.0%} of the images' exposures went into the colours of the field, expected {most:.0%} or less; train with"
+            " bidnerf_core.training.Supervision, which learns the exposure of each image beside the field (its fit, step and"
+            " loss do)",
+        ),
     )
 
 
@@ -112,23 +117,26 @@ def check_reports(backend: Backend, field: Any, config: Any) -> None:
     report = Recorder(due)
     _train(backend, field, rgbd_views(), config, report, "")
     who = f"{type(backend).__name__}.train"
-    told = [(progress.step, progress.total) for progress in report.steps]
-    require_that(
-        told == [(i + 1, total) for i in range(total)],
-        f"{who}: report.step was called with {_shortly(told)}, expected (1, {total}) to ({total}, {total}),"
-        " once per step",
-    )
+    steps = [(progress.step, progress.total) for progress in report.steps]
     odd = [p for p in report.steps if not (math.isfinite(p.loss) and math.isfinite(p.psnr))]
-    require_that(not odd, f"{who}: reported a loss or PSNR that is not finite: {odd[:1]}")
     saved = [state.step for state in report.saved]
-    require_that(
-        saved == due,
-        f"{who}: saved after steps {saved}, expected {due}: exactly when report.due(step) is True",
+    require(
+        who,
+        (
+            steps == [(i + 1, total) for i in range(total)],
+            f"report.step was called with {_shortly(steps)}, expected (1, {total}) to ({total}, {total}), once per step",
+        ),
+        (not odd, f"reported a loss or PSNR that is not finite: {odd[:1]}"),
+        (
+            saved == due,
+            f"saved after steps {saved}, expected {due}: exactly when report.due(step) is True",
+        ),
     )
     _require_same(
         report.saved[-1].field,
         field.state_dict(),
-        f"{who}: the state saved after the last step is not that of the trained field",
+        who,
+        "the state saved after the last step is not that of the trained field",
     )
 
 
@@ -141,33 +149,33 @@ def check_resuming(backend: Backend, make: Callable[[], Any], config: Any) -> No
     for field in (second, third):  # another test checks whether builds differ
         field.load_state_dict(beginning)
     report = Recorder(stop=middle)
+    stop = f"report.stopping was set after step {middle}"
     try:
         _train(backend, second, rgbd_views(), config, report, "")
     except TrainingStopped as stopped:
-        require_that(
-            stopped.step == middle,
-            f"{who}: TrainingStopped says step {stopped.step}, but report.stopping was set after step {middle}",
-        )
+        require(who, (stopped.step == middle, f"TrainingStopped says step {stopped.step}, but {stop}"))
     else:
-        raise AssertionError(
-            f"{who}: did not stop when report.stopping was set after step {middle}, expected TrainingStopped"
-        )
+        require(who, (False, f"did not stop when {stop}, expected TrainingStopped"))
     saved = [state.step for state in report.saved]
-    require_that(
-        saved == [middle],
-        f"{who}: when stopped after step {middle}, saved after steps {saved}, expected [{middle}]",
+    require(
+        who,
+        (saved == [middle], f"stopped after step {middle}, saved after steps {saved}, expected [{middle}]"),
     )
     rest = Recorder(state=report.saved[0])
     _train(backend, third, rgbd_views(), config, rest, "resumed")
-    told = [progress.step for progress in rest.steps]
-    require_that(
-        told == list(range(middle + 1, config.steps + 1)),
-        f"{who}: resumed after step {middle}, it reported steps {_shortly(told)}, expected {middle + 1} to {config.steps}",
+    steps = [progress.step for progress in rest.steps]
+    require(
+        who,
+        (
+            steps == list(range(middle + 1, config.steps + 1)),
+            f"resumed after step {middle}, it reported steps {_shortly(steps)}, expected {middle + 1} to {config.steps}",
+        ),
     )
     _require_same(
         third.state_dict(),
         first.state_dict(),
-        f"{who}: a resumed training arrives elsewhere than an uninterrupted one, expected the same bits; is all state in"
+        who,
+        "a resumed training arrives elsewhere than an uninterrupted one, expected the same bits; is all state in"
         " state_dict, and all randomness from the saved generator?",
     )
 
@@ -197,15 +205,12 @@ def _train(
         raise
 
 
-def _require_same(found: dict[str, Tensor], expected: dict[str, Tensor], fault: str) -> None:
-    require_that(
-        found.keys() == expected.keys(),
-        f"{fault}: the tensors are {sorted(found)}, expected {sorted(expected)}",
-    )
+def _require_same(found: dict[str, Tensor], expected: dict[str, Tensor], who: str, fault: str) -> None:
+    names = f"the tensors are {sorted(found)}, expected {sorted(expected)}"
+    require(who, (found.keys() == expected.keys(), f"{fault}: {names}"))
     for name, value in expected.items():
-        require_that(
-            torch.equal(found[name].cpu(), value.detach().cpu()), f"{fault} (tensor {name!r} differs)"
-        )
+        same = torch.equal(found[name].cpu(), value.detach().cpu())
+        require(who, (same, f"{fault} (tensor {name!r} differs)"))
 
 
 def _shortly(items: list[Any]) -> str:

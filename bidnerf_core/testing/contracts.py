@@ -1,0 +1,523 @@
+"""The requirements on readers, methods, keypoint detectors and faults, one test each."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.captures import pose_contradiction
+from bidnerf_core.datasets import READERS, Capture, DatasetOptions
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation import FAULTS, Fault
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import METHODS, Localization, Localizer
+from bidnerf_core.mapping import (
+    DEFAULT_LANDMARKS,
+    Keypoints,
+    TrackedViews,
+    depth_ratio,
+    find_features,
+    squared_distances,
+    tracked_views,
+)
+from bidnerf_core.registry import interface_defects
+from bidnerf_core.testing.faults import Named, calling, is_one_line, require
+from bidnerf_core.testing.textured_field import (
+    CAMERA,
+    POSES,
+    T_MOVED_WORLD,
+    MapWithLandmarks,
+    moved_map,
+    seen,
+    textured_map,
+    training_views,
+    unseen,
+)
+
+
+def _equal(a: Tensor | None, b: Tensor | None) -> bool:
+    return a is b or (a is not None and b is not None and torch.equal(a, b))
+
+
+def _are_colours(rgb: Tensor) -> bool:
+    return bool(rgb.isfinite().all() and (rgb >= 0).all() and (rgb <= 1).all())
+
+
+def _is_depth(depth: Tensor | None) -> bool:
+    return depth is None or bool(depth.isfinite().all() and (depth >= 0).all())
+
+
+# Readers.
+
+ENOUGH_POINTS = 30
+"""Smallest number of points that several images must agree on for their poses to be judged."""
+UNUSUAL_RATIO = 0.1
+"""Largest relative difference between measured depth and triangulated depth."""
+MOST_VIEWS = 24
+"""Largest number of images that are compared with each other."""
+
+
+class ReaderContract(Named):
+    """Tests of a reader: derive a class whose name begins with ``Test``, and set ``name`` and ``folder``.
+
+    ``name`` is the name under which the reader is registered, ``folder`` a capture in its format: at least
+    ten images of something textured, taken from different places, as small as possible. It is opened with
+    ``options``.
+    """
+
+    kind = "reader"
+    folder: ClassVar[Path | str] = ""
+    options: ClassVar[DatasetOptions] = DatasetOptions()
+
+    def test_folder_is_recognised_and_an_empty_one_is_not(self) -> None:
+        reader = self._part(READERS.load)
+        with tempfile.TemporaryDirectory() as empty, calling(f"{self._who}.recognises"):
+            is_own, is_any = reader.recognises(Path(self.folder)), reader.recognises(Path(empty))
+        text = isinstance(reader.expected, str) and reader.expected.strip() != ""
+        require(
+            self._who,
+            (is_own, f"does not recognise {self.folder}"),
+            (not is_any, "recognises an empty folder"),
+            (text, f"expected is {reader.expected!r}, expected the files of the format in words"),
+        )
+
+    def test_names_are_unique(self) -> None:
+        data = self._dataset()
+        for split in data.splits:
+            names = data.frame_names(split)
+            twice = sorted({name for name in names if names.count(name) > 1})
+            read = [view.frame.name for view in self._views(split)]
+            require(
+                self._who,
+                (not twice, f"{twice[:3]} occur twice in split {split!r}"),
+                (read == names[: len(read)], f"views of {split!r} have other names: {read[:3]}"),
+            )
+
+    def test_background_is_the_one_that_is_asked_for(self) -> None:
+        colour = (1.0, 0.5, 0.0)
+        found = tuple(self._dataset(background=colour).background)
+        require(
+            self._who, (found == colour, f"the background is {found}, expected {colour}, as its options say")
+        )
+
+    def test_poses_are_rigid(self) -> None:
+        for view in self._views():
+            pose = view.T_ref_camera
+            is_right = bool(pose.is_rigid()) and pose.translation.dtype == torch.float64
+            require(
+                self._who, (is_right, f"the pose of {view.frame.name} is not a rigid transform in float64")
+            )
+
+    def test_images_are_images(self) -> None:
+        for frame in (view.frame for view in self._views()):
+            shape = frame.intrinsics.height, frame.intrinsics.width
+            require(
+                f"{self._who}, {frame.name}",
+                (tuple(frame.rgb.shape) == (*shape, 3), f"the intrinsics have another size: {shape}"),
+                (_are_colours(frame.rgb), "colours are not from 0 to 1"),
+                (_is_depth(frame.depth), "depth is negative or not finite, expected metres, 0 for none"),
+            )
+
+    def test_axes_are_those_of_opencv(self) -> None:
+        tracked = self._tracked()
+        other = pose_contradiction(tracked.observations.images)
+        count = tracked.triangulated(DEFAULT_LANDMARKS)[0].count
+        require(
+            self._who,
+            (other is None, "" if other is None else other.sentence),
+            (
+                count >= ENOUGH_POINTS,
+                f"the images agree on {count} points, expected {ENOUGH_POINTS} or more; are the poses T_world_camera with"
+                " x right, y down and z forward, and the intrinsics in pixels of these images? or does"
+                f" {self.folder} show too little texture, or everything from one place?",
+            ),
+        )
+
+    def test_depth_has_the_unit_of_the_poses(self) -> None:
+        tracked = self._tracked()
+        if not bool((tracked.observations.depth > 0).any()):
+            return
+        ratio = depth_ratio(*tracked.triangulated(DEFAULT_LANDMARKS))
+        require(
+            self._who,
+            (
+                ratio is None or abs(ratio - 1) <= UNUSUAL_RATIO,
+                f"depth is {ratio or math.nan:.3g} times the depth that the poses and images imply, expected planar z (not"
+                " the distance along the ray) in the unit of the poses, metres",
+            ),
+        )
+
+    def test_sequence_is_in_order_of_time(self) -> None:
+        with calling(f"{self._who}: read of {self.folder}"):
+            sequence = self.options.open_sequence(self.folder, [self._part(READERS.load)])
+        times = [timed.time for timed in sequence]
+        known = [time for time in times if time is not None]
+        late = [i for i, (a, b) in enumerate(pairwise(known)) if b < a]
+        require(
+            self._who,
+            (len(times) == len(sequence), "the sequence has a different length than it states"),
+            (len(known) in (0, len(times)), "some frames have a time, others have none"),
+            (not late, f"frame {late[:1]} of the sequence is later than the next"),
+        )
+
+    def test_reading_twice_gives_the_same(self) -> None:
+        for a, b in zip(self._views(), self._views(), strict=True):
+            same = (
+                a.frame.name == b.frame.name
+                and torch.equal(a.frame.rgb, b.frame.rgb)
+                and torch.equal(a.T_ref_camera.matrix(), b.T_ref_camera.matrix())
+                and a.frame.intrinsics == b.frame.intrinsics
+                and _equal(a.frame.depth, b.frame.depth)
+            )
+            require(self._who, (same, f"{a.frame.name} differs when it is read again"))
+
+    def _dataset(self, **options: Any) -> Capture:
+        with calling(f"{self._who}: read of {self.folder}"):
+            return replace(self.options, **options).open(self.folder, [self._part(READERS.load)])
+
+    def _views(self, split: str | None = None) -> list[View]:
+        data = self._dataset()
+        split = split or data.splits[0]
+        with calling(f"{self._who}: views of {split!r}"):
+            return data.views(split, data.frame_names(split)[:MOST_VIEWS])
+
+    def _tracked(self) -> TrackedViews:
+        """Return the keypoints of the images, joined into tracks; computed once per test class."""
+        if "_kept" not in vars(type(self)):
+            type(self)._kept = tracked_views(self._views())  # type: ignore[attr-defined]
+        return vars(type(self))["_kept"]
+
+
+# Methods.
+
+START_OFF = (0.02, -0.015, 0.02, 0.01, -0.008, 0.012)
+"""Tangent vector (metres, radians) from the true pose to the start of methods that need one."""
+
+
+class MethodContract(Named):
+    """Tests of a localization method: derive a class whose name begins with ``Test``, and set ``name``.
+
+    ``name`` is the name under which the method is registered, ``config`` a config for small images; without
+    it, the default config is used. The scene is a textured ground 2.4 m wide, seen by a camera of 128 x 96
+    pixels, with depth. ``largest_error`` (metres and radians) is the largest error allowed for an accepted
+    pose.
+    """
+
+    kind = "method"
+    config: ClassVar[Any] = None
+    largest_error: ClassVar[float] = 0.03
+
+    def test_method_says_what_it_is(self) -> None:
+        method = self._part(METHODS.load)
+        parts = {"solve": ("problem", "config", "seed")}
+        for defect in interface_defects(method, ("summary", "config_type"), parts):
+            require(self._who, (False, defect))
+        summary, kind = method.summary, method.config_type
+        require(self._who, (is_one_line(summary), f"summary is {summary!r}, expected one line of text"))
+        for preset, settings in method.presets.items():
+            is_right, given = isinstance(settings, kind), type(settings).__name__
+            require(self._who, (is_right, f"preset {preset!r} is a {given}, expected a {kind.__name__}"))
+
+    def test_pose_is_found(self) -> None:
+        found = self._found(textured_map(surface=True))
+        error = _difference(found.T_world_camera, unseen().T_ref_camera)
+        require(
+            self._who,
+            (
+                found.converged,
+                f"an image of the map's scene is rejected ({found.reason}), expected its pose; does the test's config"
+                " suffice?",
+            ),
+            (
+                error <= self.largest_error,
+                f"an accepted pose is off by {error:.3g} (metres, radians), expected {self.largest_error:g} or less",
+            ),
+        )
+
+    def test_answer_is_sound(self) -> None:
+        found = self._found(textured_map(surface=True))
+        covariance = torch.eye(6) if found.covariance is None else found.covariance
+        symmetric = torch.allclose(covariance, covariance.mT, rtol=1e-6)
+        require(
+            self._who,
+            (found.T_world_camera.is_rigid(), "the pose is not a rigid transform"),
+            (found.reason.strip() != "", "the answer has no reason, expected one in words"),
+            (
+                symmetric and float(torch.linalg.eigvalsh(covariance.double())[0]) > 0,
+                "the covariance is not symmetric and positive definite",
+            ),
+        )
+
+    def test_same_seed_gives_the_same_pose(self) -> None:
+        first, second = (self._found(textured_map(surface=True)).T_world_camera.matrix() for _ in range(2))
+        expected = "expected all randomness to come from it"
+        require(
+            self._who,
+            (torch.equal(first, second), f"two calls with one seed give different poses, {expected}"),
+        )
+
+    def test_pose_moves_with_the_world(self) -> None:
+        here, there = self._found(textured_map(surface=True)), self._found(moved_map(), moved=True)
+        error = _difference(there.T_world_camera, T_MOVED_WORLD @ here.T_world_camera)
+        require(
+            f"{self._who}, in a world that is moved",
+            (there.converged, f"the image is rejected ({there.reason})"),
+            (
+                error <= self.largest_error,
+                f"the pose is off by {error:.3g} (metres, radians) from the moved one, expected"
+                f" {self.largest_error:g} or less; does it depend on the world's axes or origin?",
+            ),
+        )
+
+    def test_image_of_another_scene_is_rejected(self) -> None:
+        scene = textured_map(surface=True)
+        found = self._localized(scene, seen(POSES[1], CAMERA, "other", seed=1).frame, POSES[1])
+        require(
+            self._who,
+            (
+                not found.converged,
+                f"the pose of an image of another scene is accepted ({found.reason}), expected an outcome other than"
+                " CONVERGED",
+            ),
+        )
+
+    def test_missing_start_is_refused(self) -> None:
+        if not self._part(METHODS.load).needs_start:
+            return
+        try:
+            Localizer(textured_map(surface=True), self.name, self.config, warm_up=False)(unseen().frame)
+        except InputError:
+            return
+        require(self._who, (False, "needs a start, but does without one, expected an InputError"))
+
+    def _found(self, scene: MapWithLandmarks, moved: bool = False) -> Localization:
+        truth = unseen().T_ref_camera
+        return self._localized(scene, unseen().frame, T_MOVED_WORLD @ truth if moved else truth)
+
+    def _localized(self, scene: MapWithLandmarks, frame: Frame, truth: SE3) -> Localization:
+        near = truth.to("cpu", torch.float64).retract(torch.tensor(START_OFF, dtype=torch.float64))
+        with calling(self._who):
+            localizer = Localizer(scene, self.name, self.config, warm_up=False)
+            return localizer(frame, near if self._part(METHODS.load).needs_start else None)
+
+
+def _difference(found: SE3, truth: SE3) -> float:
+    return float((truth.to(dtype=torch.float64).inverse() @ found.to(dtype=torch.float64)).log().norm())
+
+
+# Keypoint detectors.
+
+SHIFT = 6
+"""Pixels by which an image is shifted."""
+NEAR = 1.5
+"""Largest distance (pixels) between keypoints that count as the same."""
+
+
+class FeaturesContract(Named):
+    """Tests of a detector: derive a class whose name begins with ``Test``, and set its registered ``name``.
+
+    ``repeated`` is the minimum repeatability: the fraction of keypoints that must be detected again, and
+    matched by their descriptors, in an image shifted by a few pixels.
+    """
+
+    kind = "detector"
+    repeated: ClassVar[float] = 0.5
+
+    def test_keypoints_are_well_formed(self) -> None:
+        for number, image in enumerate(_images()):
+            found = self._found(image)
+            pixels, sizes, descriptors = found.pixels, found.sizes, found.descriptors
+            count, (height, width) = len(pixels), image.shape[:2]
+            shapes = tuple(pixels.shape), tuple(sizes.shape), tuple(descriptors.shape[:1])
+            who = f"{self._who}, image {number}"
+            require(
+                who,
+                (count > 0, "no keypoint in a textured image, expected some"),
+                (
+                    shapes == ((count, 2), (count,), (count,)) and descriptors.ndim == 2,
+                    f"pixels, sizes and descriptors have shapes {shapes}, expected (n, 2), (n) and (n, d)",
+                ),
+                (
+                    descriptors.dtype == torch.uint8,
+                    f"descriptors are {descriptors.dtype}, expected bytes;"
+                    " bidnerf_core.mapping.landmarks.features.quantized converts numbers to bytes",
+                ),
+            )
+            inside = (pixels >= 0).all() and (pixels <= torch.tensor([width, height])).all()
+            positive = (sizes > 0).all()
+            require(
+                who,
+                (inside, "keypoints lie outside the image"),
+                (positive, "sizes are not positive, expected pixels"),
+            )
+
+    def test_descriptors_have_one_length(self) -> None:
+        lengths = {self._found(image).descriptors.shape[1] for image in (*_images(), _blank())}
+        require(
+            self._who,
+            (
+                len(lengths) == 1,
+                f"descriptors have {sorted(lengths)} channels in different images (a blank one among them), expected one"
+                " number",
+            ),
+        )
+
+    def test_same_image_gives_the_same_keypoints(self) -> None:
+        image = _images()[0]
+        expected = self._found(image)
+        with ThreadPoolExecutor(4) as pool:
+            same = [
+                torch.equal(found.pixels, expected.pixels)
+                and torch.equal(found.descriptors, expected.descriptors)
+                for found in pool.map(self._found, [image] * 8)
+            ]
+        require(
+            self._who,
+            (all(same), "several threads with one image get different keypoints, expected the same"),
+        )
+
+    def test_blank_image_has_no_keypoints(self) -> None:
+        count = len(self._found(_blank()).pixels)
+        require(self._who, (count == 0, f"{count} keypoints in an image of one colour, expected none"))
+
+    def test_keypoints_move_with_the_image(self) -> None:
+        image = _images()[0]
+        first, second = self._found(image[:-SHIFT, :-SHIFT]), self._found(image[SHIFT:, SHIFT:])
+        require(self._who, (len(second.pixels) > 0, "no keypoint in a shifted image"))
+        moved = first.pixels - SHIFT
+        height, width = image.shape[0] - SHIFT, image.shape[1] - SHIFT
+        shared = ((moved > 0) & (moved < torch.tensor([width - SHIFT, height - SHIFT]))).all(1)
+        nearest = squared_distances(first.descriptors, second.descriptors).argmin(1)
+        off = torch.linalg.vector_norm(second.pixels[nearest] - moved, dim=-1)
+        share = float((off[shared] <= NEAR).double().mean()) if bool(shared.any()) else 0.0
+        require(
+            self._who,
+            (
+                share >= self.repeated,
+                f"of the keypoints, {share:.0%} are recognised in the image shifted by {SHIFT} pixels, expected"
+                f" {self.repeated:.0%} or more; is the centre of the first pixel at (0.5, 0.5)?",
+            ),
+        )
+
+    def _found(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
+        with calling(self._who):
+            return self._part(find_features)(rgb)
+
+
+def _images() -> tuple[Float[Tensor, "h w 3"], ...]:
+    """Return images of 256 x 192 pixels."""
+    small = torch.stack([view.frame.rgb for view in training_views()[:2]]).movedim(-1, 1)
+    large = torch.nn.functional.interpolate(small, scale_factor=2, mode="bicubic").clamp(0, 1).movedim(1, -1)
+    return large[0], large[1]
+
+
+def _blank() -> Float[Tensor, "h w 3"]:
+    return torch.full((96, 128, 3), 0.4)
+
+
+# Faults.
+
+
+class FaultContract(Named):
+    """Tests of a fault: derive a class whose name begins with ``Test``, and set its registered ``name``."""
+
+    kind = "fault"
+
+    def test_fault_says_what_it_is(self) -> None:
+        fault = self._fault
+        sizes = [*fault.sizes, *([] if fault.neutral is None else [fault.neutral])]
+        texts = (("summary", fault.summary), ("unit", fault.unit))
+        require(
+            self._who,
+            *((is_one_line(t), f"{what} is {t!r}, expected one line of text") for what, t in texts),
+            (len(fault.sizes) > 0, "no sizes, expected those worth measuring"),
+            *((s in fault.allowed, f"size {s:g} is not allowed, expected {fault.allowed}") for s in sizes),
+        )
+
+    def test_other_sizes_change_something(self) -> None:
+        frame = _frame()
+        for size in self._fault.sizes:
+            found = self._changed(frame, size)
+            changed = (
+                not _same(found, frame)
+                or found.intrinsics != frame.intrinsics
+                or found.focal_is_approximate != frame.focal_is_approximate
+                or self._fault.T_true_faulty is not None
+            )
+            require(self._who, (changed, f"size {size:g} changes nothing, expected a fault"))
+
+    def test_same_seed_gives_the_same_image(self) -> None:
+        expected = "expected all randomness to come from the generator"
+        for size in self._fault.sizes:
+            same = _same(*(self._changed(_frame(), size) for _ in range(2)))
+            require(self._who, (same, f"two calls with one seed differ, {expected}"))
+
+    def test_image_stays_an_image(self) -> None:
+        for size in self._fault.sizes:
+            found = self._changed(_frame(), size)
+            shape, rgb, depth = (found.intrinsics.height, found.intrinsics.width), found.rgb, found.depth
+            require(
+                f"{self._who} of size {size:g}",
+                (
+                    tuple(rgb.shape) == (*shape, 3) and rgb.dtype == torch.float32,
+                    f"colours are {rgb.dtype} of shape {tuple(rgb.shape)}, expected float32 of shape {(*shape, 3)}, as the"
+                    " intrinsics say",
+                ),
+                (_are_colours(rgb), "colours are not from 0 to 1"),
+                (
+                    depth is None or (tuple(depth.shape) == shape and depth.dtype == torch.float32),
+                    f"depth is not float32 of {shape}",
+                ),
+                (
+                    _is_depth(depth),
+                    "depth is negative or not finite, expected metres, 0 where there is none",
+                ),
+            )
+
+    def test_given_image_is_left_alone(self) -> None:
+        frame = _frame()
+        for size in self._fault.sizes:
+            self._changed(frame, size)
+        require(self._who, (_same(frame, _frame()), "writes into the given image, expected a new one"))
+
+    def test_fault_of_depth_needs_depth(self) -> None:
+        fault = self._fault
+        if not fault.needs_depth:
+            return
+        try:
+            fault.change(_frame().replace(depth=None), fault.sizes[0], _generator())
+        except InputError:
+            return
+        require(self._who, (False, "changes depth, but accepts an image without it, expected an InputError"))
+
+    @property
+    def _fault(self) -> Fault:
+        return self._part(FAULTS.load)
+
+    def _changed(self, frame: Frame, size: float) -> Frame:
+        with calling(f"{self._who} of size {size:g}"):
+            return self._fault.change(frame, size, _generator())
+
+
+def _frame() -> Frame:
+    frame = training_views()[0].frame
+    assert frame.depth is not None
+    return replace(frame, rgb=frame.rgb.clone(), depth=frame.depth.float().clone())
+
+
+def _generator() -> torch.Generator:
+    return torch.Generator().manual_seed(7)
+
+
+def _same(a: Frame, b: Frame) -> bool:
+    return _equal(a.rgb, b.rgb) and _equal(a.depth, b.depth)
