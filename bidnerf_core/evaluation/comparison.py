@@ -2,35 +2,40 @@
 
 from __future__ import annotations
 
-import logging
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
+from itertools import count, product
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import nn
 
-from bidnerf_core.errors import InputError, amount, printable
+from bidnerf_core.errors import InputError, printable
 from bidnerf_core.evaluation.plan import Plan, Trial, parse_settings, planned
 from bidnerf_core.evaluation.results import aligned, as_line
 from bidnerf_core.evaluation.run import (
-    Data,
     InThisProcess,
     Scene,
     device_name,
     ended_on_failure,
     name_of,
     open_both,
-    open_data,
     own_processes,
 )
-from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, Success, Summary, summarize
-from bidnerf_core.evaluation.trial import Opened, TrialResult, opened, registered_for, run_trial
+from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, Summary, summarize
+from bidnerf_core.evaluation.trial import (
+    Data,
+    Opened,
+    TrialResult,
+    open_data,
+    opened,
+    registered_for,
+    run_trial,
+)
 from bidnerf_core.fields import device_of, levels
 from bidnerf_core.frames import View, draw, uniform
 from bidnerf_core.geometry import SE3, symbol
@@ -45,11 +50,8 @@ from bidnerf_core.progress import (
     job_context,
     report_progress,
 )
-from bidnerf_core.results import CRITERIA
 from bidnerf_core.scenes import is_closed_form
 from bidnerf_core.settings import to_flat
-
-log = logging.getLogger("bidnerf")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +72,34 @@ class MapRow(Summary):
             map=label, backend=first.backend, weights=first.weights, samples_per_ray=statistics.fmean(samples),
             map_bytes=size, **vars(summarize(results)),
         )  # fmt: skip
+
+    def cells(self) -> dict[str, str]:
+        """Return the statistics as text, by name."""
+        usual = self.success[RELATIVE] or self.success[ABSOLUTE]
+        assert usual is not None  # the absolute criterion always applies
+        rates = {
+            f"success {name}": "-" if s is None
+            else f"{s.rate.successes}/{s.rate.trials} ({100 * s.rate.low:.0f}-{100 * s.rate.high:.0f} %)"
+            for name, s in self.success.items()
+        }  # fmt: skip
+        return {
+            "backend": self.backend,
+            **rates,
+            "median error": f"{_known(self.translation, 4)} {symbol(self.unit)}",
+            "median error, deg": _known(self.rotation_deg, 2),
+            "s a trial": f"{self.seconds:.2f}",
+            "steps": f"{self.steps:g}",
+            "steps to success": _known(usual.steps, 0),
+            "ms a step": f"{self.ms_per_step:.1f}",
+            "ms to success": _known(usual.milliseconds, 0),
+            "peak memory, MiB": f"{self.peak_memory_bytes / 2**20:.0f}",
+            "samples a ray": f"{self.samples_per_ray:.1f}",
+            "map, MiB": f"{self.map_bytes / 2**20:.1f}",
+        }  # fmt: skip
+
+
+def _known(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 @dataclass(frozen=True)
@@ -97,9 +127,12 @@ class Comparison:
 
     def __str__(self) -> str:
         stepwise = any(row.steps > 1 for row in self.rows)
-        shown = {name: cell for name, cell in LINES.items() if stepwise or "step" not in name}
-        lines = [["", *(row.map for row in self.rows)]]
-        lines += [[name, *map(cell, self.rows)] for name, cell in shown.items()]
+        columns = [row.cells() for row in self.rows]
+        names = [name for name in columns[0] if stepwise or "step" not in name]
+        lines = [
+            ["", *(row.map for row in self.rows)],
+            *([n, *(cells[n] for cells in columns)] for n in names),
+        ]
         usual = RELATIVE if self.rows[0].success[RELATIVE] else ABSOLUTE
         note = (
             f"success: number and Wilson's 95 % interval; to success: median of the trials that met {usual}"
@@ -139,62 +172,49 @@ def compare(
     if len(plan.starts()) > 1 or len(plan.faults) > 1:
         raise InputError("maps are compared from one kind of start", expected="one size and one fault")
     with job_context(progress, cancel):
+        for scene in named.values():
+            if not isinstance(scene, Map) and not is_closed_form(str(scene)):
+                load_info(Path(scene))
+        in_memory = not isinstance(data, str | Path)
         here = {
-            name: open_both(scene, data, plan)
-            if isinstance(scene, Map) or not isinstance(data, str | Path) else None
+            name: open_both(scene, data, plan) if in_memory or isinstance(scene, Map) else None
             for name, scene in named.items()
-        }  # fmt: skip
-        dataset = next((scene[1] for scene in here.values() if scene is not None), None)
-        starts = planned(plan, "", name_of(data), open_data(data, plan) if dataset is None else dataset)
-        folders = [str(scene) for name, scene in named.items() if here[name] is None]
-        for folder in folders:
-            if not is_closed_form(folder):
-                load_info(Path(folder))
-        begins = "; a process for each begins" if folders else ""
-        log.info("%s in %s%s", amount(len(starts), "start"), amount(len(named), "map"), begins)
-        return _compared(named, here, starts, plan)
-
-
-def _compared(
-    named: Mapping[str, Scene], here: Mapping[str, Opened | None], starts: Sequence[Trial], plan: Plan
-) -> Comparison:
-    """Run the trials of each start, one map after another; a map that is not open ``here`` runs in its own process."""
-    results: dict[str, list[TrialResult]] = {name: [] for name in named}
-    samples: dict[str, list[float]] = {name: [] for name in named}
-    with ExitStack() as stack:
-        places = {
-            name: stack.enter_context(ended_on_failure(InThisProcess() if scene else own_processes(1)))
-            for name, scene in here.items()
         }
-        for number, start in enumerate(starts):
-            for place, (name, scene) in enumerate(named.items()):
+        dataset = next((scene[1] for scene in here.values() if scene is not None), None)
+        if dataset is None:
+            dataset = open_data(data, plan.reading)
+        starts = planned(plan, "", name_of(data), dataset)
+        with ExitStack() as stack:
+            places = {
+                name: stack.enter_context(ended_on_failure(InThisProcess() if scene else own_processes(1)))
+                for name, scene in here.items()
+            }
+            found: dict[str, list[tuple[TrialResult, float]]] = {name: [] for name in named}
+            for number, (start, (name, scene)) in enumerate(product(starts, named.items()), start=1):
                 check_cancelled("comparison")
-                map_name = name if here[name] else str(scene)
-                trial = replace(start, map=map_name, device=device_name(scene, plan.device))
+                trial = replace(
+                    start, map=name if here[name] else str(scene), device=device_name(scene, plan.device)
+                )
                 running = places[name].submit(measured, trial, here[name], registered_for(trial))
                 try:
-                    result, each = running.result()
+                    found[name].append(running.result())
                 except BrokenProcessPool as error:
                     raise InputError(
                         f"the process that localized frame {trial.frame} ended", where=trial.map,
                         expected="a result; was memory short, or does the main module begin work outside of"
                         " 'if __name__ == \"__main__\"'?",
                     ) from error  # fmt: skip
-                results[name].append(result)
-                samples[name].append(each)
-                found = "not finite"
-                if result.error is not None:
-                    length = f"{result.error.translation:.3f} {symbol(result.unit)}"
-                    found = f"{length}, {result.error.rotation_deg:.2f} deg"
-                steps = f", {amount(result.steps, 'step')}" if result.steps > 1 else ""
-                text = f"{result.frame} in {name}: {found}{steps}, {result.seconds:.1f} s"
-                done = number * len(named) + place + 1
-                report_progress(Progress("comparison", done, len(starts) * len(named), "trials", text))
-    rows = [MapRow.of(name, map_bytes(scene), results[name], samples[name]) for name, scene in named.items()]
+                total, text = len(starts) * len(named), f"{trial.frame} in {name}"
+                report_progress(Progress("comparison", number, total, "trials", text))
+    results = {name: tuple(result for result, _ in pairs) for name, pairs in found.items()}
+    rows = tuple(
+        MapRow.of(name, map_bytes(scene), results[name], [samples for _, samples in found[name]])
+        for name, scene in named.items()
+    )
     first, run = starts[0], next(iter(results.values()))[0]
     return Comparison(
         run.trial.data, first.split, first.protocol, first.size, run.method, run.settings, first.seed,
-        len(starts), tuple(rows), tuple(map(tuple, results.values())),
+        len(starts), rows, tuple(results.values()),
     )  # fmt: skip
 
 
@@ -210,12 +230,12 @@ def measured(
     (view,) = dataset.views(trial.split, trial.frames[-1:])
     number = to_flat(parse_settings(trial.method, trial.config)).get("level")
     level = stored.field if number is None else levels(stored.field)[number]
-    own, count = (View(view.frame, SE3.identity()),), 2048  # rays on which samples are counted
+    own, rays = (View(view.frame, SE3.identity()),), 2048  # on which samples are counted
     device = device_of(stored.field)
-    pixels = draw(own, count, uniform, torch.Generator().manual_seed(trial.seed), device=device)
+    pixels = draw(own, rays, uniform, torch.Generator().manual_seed(trial.seed), device=device)
     with torch.no_grad():
         samples = level.sampler(pixels.rays(view.T_ref_camera.translated(-origin_of(stored)), stored.bounds))
-    return result, float(samples.valid.sum()) / count
+    return result, float(samples.valid.sum()) / rays
 
 
 def map_bytes(stored: Scene) -> int:
@@ -237,55 +257,14 @@ def _named(scenes: Sequence[Scene]) -> dict[str, Scene]:
     labels = iter(map_labels(folders))
     found: dict[str, Scene] = {}
     for scene in scenes:
-        name = base = name_of(scene) if isinstance(scene, Map) else next(labels)
-        number = 1
-        while name in found:
-            number += 1
-            name = f"{base} {number}"
-        found[name] = scene
+        base = name_of(scene) if isinstance(scene, Map) else next(labels)
+        names = (f"{base} {number}" if number > 1 else base for number in count(1))
+        found[next(name for name in names if name not in found)] = scene
     return found
 
 
 def map_labels(maps: Sequence[str]) -> list[str]:
     """Return the folders' names, prefixed with as few of their parents as make them unique."""
     parts = [Path(m).resolve().parts for m in maps]
-    length = 1
-    while len({p[-length:] for p in parts}) < len(parts):
-        length += 1
+    length = next(n for n in count(1) if len({p[-n:] for p in parts}) == len(parts))
     return ["/".join(p[-length:]) for p in parts]
-
-
-def _rate(row: MapRow, criterion: str) -> str:
-    success = row.success[criterion]
-    if success is None:
-        return "-"
-    rate = success.rate
-    return f"{rate.successes}/{rate.trials} ({100 * rate.low:.0f}-{100 * rate.high:.0f} %)"
-
-
-def _usual(row: MapRow) -> Success:
-    """Return the success by the relative criterion, or by the absolute one if there was no start."""
-    success = row.success[RELATIVE] or row.success[ABSOLUTE]
-    assert success is not None  # the absolute criterion always applies
-    return success
-
-
-def _known(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-LINES: dict[str, Callable[[MapRow], str]] = {
-    "backend": lambda row: row.backend,
-    **{f"success {name}": partial(_rate, criterion=name) for name in CRITERIA},
-    "median error": lambda row: f"{_known(row.translation, 4)} {symbol(row.unit)}",
-    "median error, deg": lambda row: _known(row.rotation_deg, 2),
-    "s a trial": lambda row: f"{row.seconds:.2f}",
-    "steps": lambda row: f"{row.steps:g}",
-    "steps to success": lambda row: _known(_usual(row).steps, 0),
-    "ms a step": lambda row: f"{row.ms_per_step:.1f}",
-    "ms to success": lambda row: _known(_usual(row).milliseconds, 0),
-    "peak memory, MiB": lambda row: f"{row.peak_memory_bytes / 2**20:.0f}",
-    "samples a ray": lambda row: f"{row.samples_per_ray:.1f}",
-    "map, MiB": lambda row: f"{row.map_bytes / 2**20:.1f}",
-}
-"""The lines of a comparison as text, by name; each map has a column."""

@@ -1,39 +1,232 @@
-"""What is tried: the options that trials share, a single trial, and a plan of many."""
+"""What is tried: protocols, which choose frames, seeds and starts; the options that trials share; trials, and plans of many."""
 
 from __future__ import annotations
 
 import json
-import logging
+import math
 import os
 import warnings
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
 from bidnerf_core.datasets import Capture, DatasetOptions, in_other_split
-from bidnerf_core.errors import InputError, InputWarning, amount, refuse_text
-from bidnerf_core.evaluation.arcs import arc
-from bidnerf_core.evaluation.faults import NO_FAULT, check_depth, expand_faults
-from bidnerf_core.evaluation.protocols import MOST_TRIALS, Size, find_protocol
-from bidnerf_core.frames import INVERTED, HiddenColour, MaskFolder
+from bidnerf_core.errors import InputError, InputWarning, amount, refuse_text, unknown_name
+from bidnerf_core.evaluation.faults import NO_FAULT, check_depth, expand_faults, random_units
+from bidnerf_core.frames import INVERTED, HiddenColour
+from bidnerf_core.geometry import SE3, turned_about
 from bidnerf_core.io import parse_record
 from bidnerf_core.localization import find_method, settings_of
-from bidnerf_core.maps import Map
-from bidnerf_core.scenes import ClosedFormData, closed_form_data, is_closed_form
+from bidnerf_core.scenes import ClosedFormData, is_closed_form
 from bidnerf_core.settings import LARGEST_SEED, Range, Settings, WholeNumbers, to_flat
 
-log = logging.getLogger("bidnerf")
+# Protocols.
+
+
+def bid_start(T_true: SE3, size: float, seed: int, widest: float = math.pi / 4) -> SE3:
+    """Return the start of BID-NeRF, ``T_true exp((e_t u1, e_r u2))`` with random unit u1, u2 and e_t = ``size``.
+
+    The paper does not state which e_r belongs to which e_t, only that errors stay below 45 degrees. Here e_r grows
+    linearly from 0.2 rad at e_t = 0.5 to ``widest`` (rad) at e_t = 3.4, the ends of the range of e_t in the paper's
+    tables. e_t is in units of a scene whose object fills a 2x2x2 cube, and in metres in rooms.
+    """
+    u1, u2 = random_units(2, torch.Generator().manual_seed(seed))
+    e_r = max(0.0, 0.2 + (size - 0.5) / (3.4 - 0.5) * (widest - 0.2))
+    return T_true.to(dtype=torch.float64).retract(torch.cat([size * u1, e_r * u2]))
+
+
+def perturb(T_true: SE3, translation: float, rotation_deg: float, seed: int) -> SE3:
+    """Return a start whose error is exactly ``translation`` (metres) and ``rotation_deg``, in random directions."""
+    if not (0 <= translation < math.inf and 0 <= rotation_deg < math.inf):
+        raise InputError(
+            f"is {translation} and {rotation_deg} degrees",
+            where="perturbation",
+            expected="finite numbers, 0 or more",
+        )
+    u1, u2 = random_units(2, torch.Generator().manual_seed(seed))
+    turn = SE3.exp(torch.cat([torch.zeros_like(u2), math.radians(rotation_deg) * u2])).rotation
+    return T_true.to(dtype=torch.float64) @ SE3(turn, translation * u1)
+
+
+def inerf_start(T_true: SE3, seed: int) -> SE3:
+    """Return a perturbed start as in iNeRF (Yen-Chen et al. 2021, IV-A): off by up to 40 degrees, and 0.2 along each axis.
+
+    The camera is rotated about a random axis through its own centre by an angle that is uniform in -40 to 40 degrees; the
+    offsets are uniform in -0.2 to 0.2.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    axis = random_units(1, generator)[0]
+    chance = 2 * torch.rand(4, generator=generator, dtype=torch.float64) - 1
+    turn = SE3.exp(torch.cat([torch.zeros_like(axis), math.radians(40) * chance[0] * axis])).rotation
+    return T_true.to(dtype=torch.float64) @ SE3(turn, 0.2 * chance[1:])
+
+
+# The 25 starts of Lin et al. 2023, "Parallel Inversion of Neural Radiance Fields for Robust Pose Estimation", from the
+# description of its published bulk experiment. The program seeds NumPy's legacy generator once and draws 5 frames of the test
+# file *with* replacement, 5x5x3 Euler angles uniform in +-15 degrees, and 5x5x3 translations uniform in +-0.25. The angles
+# (phi, theta, psi) turn the camera about its own centre and the *world's* axes, R' = Rz(phi) Ry(-theta) Rx(psi) R, and the
+# centre moves along the world's axes. The numbers depend on the number of frames in the split, since the choice of frames
+# consumes random numbers. Ranges and seed are options of the program that its repository sets for each experiment; 1234, 15
+# and 0.25 are assumed here. The published scenes may be scaled; here lengths are those of the data.
+
+PARALLEL_SEED, PARALLEL_TRIALS = 1234, 25
+
+
+def draw_starts(
+    frames: int,
+) -> tuple[Int[np.ndarray, "5"], Float[np.ndarray, "5 5 3"], Float[np.ndarray, "5 5 3"]]:
+    """Return the published indices of frames, angles (degrees) and translations (units of the data), bit for bit."""
+    generator = np.random.RandomState(PARALLEL_SEED)
+    chosen, shape = generator.choice(frames, 5), (5, 5, 3)
+    angles = generator.uniform(-15.0, 15.0, size=shape)
+    return chosen, angles, generator.uniform(-0.25, 0.25, size=shape)
+
+
+def parallel_cases(frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
+    """Return the frame index and the seed of each trial; 1234 is the first of the 25."""
+    if seed != PARALLEL_SEED or trials > PARALLEL_TRIALS:
+        raise InputError(
+            f"{trials} trials from seed {seed}",
+            where="parallel",
+            expected=f"at most {PARALLEL_TRIALS} from seed {PARALLEL_SEED}, since the list is fixed",
+        )
+    chosen = draw_starts(frames)[0]
+    return [(int(chosen[i // 5]), PARALLEL_SEED + i) for i in range(trials)]
+
+
+def parallel_start(T_true: SE3, seed: int, frames: int) -> SE3:
+    """Return T_world_camera of the trial with ``seed`` (1234 to 1258) in a split of ``frames`` frames."""
+    from scipy.spatial.transform import Rotation  # imported here: other protocols do without
+
+    if not PARALLEL_SEED <= seed < PARALLEL_SEED + PARALLEL_TRIALS:
+        last = PARALLEL_SEED + PARALLEL_TRIALS - 1
+        raise InputError(f"seed is {seed}", where="parallel", expected=f"{PARALLEL_SEED} to {last}")
+    _, angles, moves = draw_starts(frames)
+    place = divmod(seed - PARALLEL_SEED, 5)
+    phi, theta, psi = angles[place]
+    turn = torch.from_numpy(Rotation.from_euler("xyz", (psi, -theta, phi), degrees=True).as_matrix())
+    true = T_true.to(dtype=torch.float64)
+    return SE3(turn @ true.rotation, true.translation + torch.from_numpy(moves[place]))
+
+
+Size = tuple[float, ...]
+MOST_TRIALS = 100_000
+"""The maximum number of trials per size, since all trials of a plan are in memory."""
+
+
+def each_in_turn(frames: int, trials: int, seed: int, times: int = 1) -> list[tuple[int, int]]:
+    """Return all frames in random order, each ``times`` in a row, repeatedly; every trial has its own seed."""
+    order = torch.randperm(frames, generator=torch.Generator().manual_seed(seed)).tolist()
+    return [(order[i // times % frames], seed + i) for i in range(trials)]
+
+
+def once_each(frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
+    """Return as many distinct frames as trials were requested, in random order; every trial has its own seed."""
+    return each_in_turn(frames, min(trials, frames), seed)
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """A way of choosing frames, seeds and starts.
+
+    ``start`` takes the true pose, a size, the seed and the number of frames.
+    """
+
+    summary: str
+    start: Callable[[SE3, Size, int, int], SE3 | None]
+    sizes: tuple[Size, ...] = ((),)  # used by default
+    units: tuple[str, ...] = ()  # units of the numbers in a size
+    trials: int = 24  # per size, by default
+    seed: int = 0
+    cases_of: Callable[[int, int, int], list[tuple[int, int]]] = each_in_turn
+    """Takes the numbers of frames and trials and the seed; returns the index of the frame and the seed of each trial."""
+    fixed: bool = False  # whether it always chooses from all frames of a split
+
+    def cases(self, frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
+        """Return the cases for one size. A larger number of trials begins with the same cases."""
+        if frames < 1:
+            raise InputError("nothing to try:", expected="at least one frame")
+        if trials > MOST_TRIALS:
+            raise InputError(f"{trials} trials", expected=f"at most {MOST_TRIALS} per size")
+        return self.cases_of(frames, trials, seed)
+
+    def check_size(self, size: Size) -> None:
+        """Raise ``InputError`` for a size with the wrong number of values, or with one that is out of range."""
+        most = [180.0 if "deg" in unit else 1e6 for unit in self.units]  # degrees, metres
+        if len(size) != len(self.units) or not all(0 <= x <= m for x, m in zip(size, most, strict=True)):
+            expected = (
+                " : ".join(self.units) or "none, since this protocol has no sizes, as bid and others have"
+            )
+            limits = f", 0 to {' : '.join(f'{m:g}' for m in most)}" if most else ""
+            raise InputError(
+                f"size is {':'.join(f'{x:g}' for x in size) or 'missing'}", expected=f"{expected}{limits}"
+            )
+
+
+PROTOCOLS = {
+    "bid": Protocol(
+        "BID-NeRF: e_t in a random direction and a rotation from 0.2 rad (at 0.5) to pi/4 (at 3.4)",
+        lambda T_true, size, seed, frames: bid_start(T_true, size[0], seed),
+        ((0.5,), (0.8,), (1.2,)),
+        ("e_t (m)",),
+    ),
+    "bid-hard": Protocol(
+        "like bid, with rotations up to 1.4 rad",
+        lambda T_true, size, seed, frames: bid_start(T_true, size[0], seed, 1.4),
+        ((0.5,), (0.8,), (1.2,)),
+        ("e_t (m)",),
+    ),
+    "inerf": Protocol(
+        "iNeRF: up to 40 degrees about a random axis and up to 0.2 along each axis; five starts per frame",
+        lambda T_true, size, seed, frames: inerf_start(T_true, seed),
+        trials=25,
+        cases_of=partial(each_in_turn, times=5),  # starts for each frame
+    ),
+    "parallel": Protocol(
+        "Parallel Inversion: its 25 starts, up to 15 degrees and 0.25 along each axis",
+        lambda T_true, size, seed, frames: parallel_start(T_true, seed, frames),
+        trials=PARALLEL_TRIALS,
+        seed=PARALLEL_SEED,
+        cases_of=parallel_cases,
+        fixed=True,
+    ),
+    "perturb": Protocol(
+        "exactly the given errors, in random directions",
+        lambda T_true, size, seed, frames: perturb(T_true, size[0], size[1], seed),
+        ((0.2, 10.0),),
+        ("metres", "degrees"),
+    ),
+    "none": Protocol(
+        "no start at all; one trial per frame",
+        lambda T_true, size, seed, frames: None,
+        cases_of=once_each,
+    ),
+}
+"""All protocols by name."""
+
+
+def find_protocol(name: str) -> Protocol:
+    """Return a protocol by name. Raises ``InputError`` for an unknown name."""
+    if name not in PROTOCOLS:
+        raise unknown_name("protocol", name, PROTOCOLS)
+    return PROTOCOLS[name]
+
+
+# Trials.
 
 FOLDERS = ("map", "data", "depth_points", "masks", "camera", "register_depth")
-READING = ("split", "device", "masks", "mask_hides", "camera", "register_depth", "depth_unit")
-"""The options that decide how a map and a dataset are read."""
+"""The fields that may name a file or folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Setup:
-    """What all trials of a plan share. Raises ``InputError`` for anything that cannot be the name of a file or folder."""
+    """What all trials of a plan share."""
 
     protocol: str = "none"  # how starts are chosen
     method: str = "auto"
@@ -57,28 +250,11 @@ class Setup:
                 object.__setattr__(self, name, str(value))
 
     @property
-    def reading(self) -> Setup:
-        """The setup that reads the same map and data, with everything else at its default."""
-        return Setup(**{name: getattr(self, name) for name in READING})
-
-    def open(self, name: str, stored: Map | None = None) -> Capture:
-        """Open the dataset in the folder ``name``, or of the closed-form scene of that name; ``stored`` gives the background colour."""
-        if is_closed_form(name):
-            return self.prepared(closed_form_data(name))
-        options = DatasetOptions(
-            self.camera, self.split, self.register_depth, self.depth_unit, self.masks, self.mask_hides,
-            background=None if stored is None else stored.bounds.background,
-        )  # fmt: skip
-        return options.open(name)
-
-    def prepared(self, dataset: Capture) -> Capture:
-        """Return a dataset in memory with its masks. Raises ``InputError`` for options of files."""
-        if not self.camera is self.register_depth is self.depth_unit is None:
-            raise InputError(
-                "has its own cameras and depth; leave out camera, register_depth and depth_unit",
-                where=dataset.path,
-            )
-        return dataset if self.masks is None else dataset.masked(MaskFolder(self.masks, self.mask_hides))
+    def reading(self) -> DatasetOptions:
+        """How the dataset is read."""
+        return DatasetOptions(
+            self.camera, self.split, self.register_depth, self.depth_unit, self.masks, self.mask_hides
+        )
 
 
 @dataclass(frozen=True)
@@ -120,7 +296,9 @@ class Plan(Setup, Settings):
     sizes: Sequence[float | Sequence[float]] | None = None  # errors of the starts, in the protocol's units
     # settings of the method, a dictionary of those that differ from the defaults, or its JSON
     config: Any = "{}"
-    trials: Annotated[int, WholeNumbers(1, MOST_TRIALS)] | None = None  # of each size
+    trials: Annotated[int, WholeNumbers(1, MOST_TRIALS)] | None = (
+        None  # of each size; without a start, at most one per frame
+    )
     seed: Annotated[int, WholeNumbers(0, LARGEST_SEED)] | None = None
     frames: Sequence[str] | None = None  # use only these
     images: Annotated[int, WholeNumbers(1, 1000)] = 1  # length of the sequence that is localized jointly
@@ -139,12 +317,9 @@ class Plan(Setup, Settings):
                 raise InputError(f"{name} is {getattr(self, name)!r}", expected="a whole number")
         if not 0 <= self.shard < self.shards:
             raise InputError(f"shard is {self.shard}", expected=f"0 to {self.shards - 1}")
-        twice = [name for name, count in Counter(self.frames or ()).items() if count > 1]
-        if twice:
-            raise InputError(f"frames names {twice[0]} more than once", expected="each once")
-        given = (
-            settings_of(self.method, dict(self.config)) if isinstance(self.config, Mapping) else self.config
-        )
+        given = self.config
+        if isinstance(given, Mapping):
+            given = settings_of(self.method, dict(given))
         text = given if isinstance(given, str) else changed_settings(self.method, given)
         parse_settings(self.method, text)
         object.__setattr__(self, "config", text)
@@ -168,6 +343,21 @@ class Plan(Setup, Settings):
         return sizes
 
 
+def changed_settings(method: str, settings: Any) -> str:
+    """Return the JSON of the settings that differ from the method's defaults."""
+    usual, given = to_flat(find_method(method).config_type()), to_flat(settings)
+    return json.dumps({k: v for k, v in given.items() if v != usual[k]}, sort_keys=True)
+
+
+def parse_settings(method: str, config: str) -> Any:
+    """Return the settings of ``method`` from the JSON of those that differ from its defaults."""
+    given = parse_record("config", config, f"an object of settings of {method}").values
+    return settings_of(method, dict(given))
+
+
+# Plans.
+
+
 def planned(plan: Plan, map: str, data: str, dataset: Capture) -> list[Trial]:
     """Return all trials of a plan in the order of the results; ``map`` and ``data`` name the map and ``dataset``.
 
@@ -182,11 +372,6 @@ def planned(plan: Plan, map: str, data: str, dataset: Capture) -> list[Trial]:
         )
     count = protocol.trials if plan.trials is None else plan.trials
     cases = protocol.cases(len(rigs), count, protocol.seed if plan.seed is None else plan.seed)
-    if plan.trials is not None and len(cases) < plan.trials:
-        log.info(
-            f"{amount(len(cases), 'trial')}, one per frame, instead of {plan.trials}: without a start,"
-            " repeating a frame gives no new information"
-        )
     shared = {field.name: getattr(plan, field.name) for field in fields(Setup)}
     every = [
         Trial(map, data, rigs[place], size, seed, fault, **shared)
@@ -195,32 +380,6 @@ def planned(plan: Plan, map: str, data: str, dataset: Capture) -> list[Trial]:
         for place, seed in cases
     ]
     return every[plan.shard :: plan.shards]
-
-
-def repeated_frames(trials: Sequence[Trial]) -> str | None:
-    """Return a sentence about frames that are tried several times at each size, or None if there are none."""
-    times = Counter((trial.fault, trial.size, trial.frames) for trial in trials)
-    if not times or max(times.values()) == 1:
-        return None
-    frames = len({frames for _, _, frames in times})
-    fewest, most = min(times.values()), max(times.values())
-    often = f"{most}" if fewest == most else f"{fewest} to {most}"
-    a_size = " of each size" if len({size for _, size, _ in times}) > 1 else ""
-    distinct = f"{frames} distinct frame{'s' if frames > 1 else ''}"
-    return f"{distinct} of split {trials[0].split!r}, each tried {often} times{a_size} with different seeds"
-
-
-def changed_settings(method: str, settings: Any) -> str:
-    """Return the JSON of the settings that differ from the method's defaults."""
-    usual, given = to_flat(find_method(method).config_type()), to_flat(settings)
-    return json.dumps({k: v for k, v in given.items() if v != usual[k]}, sort_keys=True)
-
-
-def parse_settings(method: str, config: str) -> Any:
-    """Return the settings of ``method`` from the JSON of those that differ from its defaults."""
-    return settings_of(
-        method, dict(parse_record("config", config, f"an object of settings of {method}").values)
-    )
 
 
 def listed(frames: Sequence[str]) -> str:
@@ -239,9 +398,8 @@ def _rigs(plan: Plan, dataset: Capture, names: list[str], data: str) -> list[tup
     every = set(dataset.wholly_hidden(plan.split))
     hidden = [name for name in wanted if name in every]
     if hidden:
-        text = (
-            f"masks hide {amount(len(hidden), 'whole frame')} of {len(wanted)}, not tried: {listed(hidden)}"
-        )
+        count = amount(len(hidden), "whole frame")
+        text = f"masks hide {count} of {len(wanted)}, not tried: {listed(hidden)}"
         if len(hidden) == len(wanted):
             raise InputError(f"{text}; {INVERTED}", where=plan.masks or data)
         warnings.warn(f"{plan.masks or data}: {text}", InputWarning, stacklevel=3)
@@ -261,3 +419,37 @@ def _rigs(plan: Plan, dataset: Capture, names: list[str], data: str) -> list[tup
             where=data,
         )
     return rigs
+
+
+def arc(poses: Sequence[SE3], last: int, count: int, angle_deg: float) -> tuple[int, ...] | None:
+    """Return the indices of ``count`` frames, ``angle_deg`` apart about their common centre, ending with ``last``
+    (BID-NeRF, Table 2).
+
+    The centre is the point that the surrounding cameras look at, the least-squares intersection of their optical axes. At
+    each step about the vertical axis, the frame nearest in direction from the centre is chosen. Both senses of rotation
+    are tried, and the better fit is returned; None if at some step no unused frame lies within half a step.
+    """
+    rotations, positions = (
+        torch.stack([T.rotation for T in poses]),
+        torch.stack([T.translation for T in poses]),
+    )
+    eye, axes = torch.eye(3, dtype=torch.float64), rotations[:, :, 2]
+    across = eye - axes[:, :, None] * axes[:, None]
+    normal = across.sum(0) + 1e-9 * eye  # for parallel axes, any point will do
+    middle = torch.linalg.solve(normal, (across @ positions[..., None]).sum(0)[:, 0])
+    mean = -rotations[:, :, 1].mean(0)
+    up = torch.nn.functional.normalize(mean if mean.norm() > 1e-3 else -rotations[0, :, 1], dim=0)
+    directions = torch.nn.functional.normalize(positions - middle, dim=-1)
+    fitting = []
+    for step in (angle_deg, -angle_deg):
+        turns = [turned_about(poses[last], middle, up, number * step) for number in range(count)]
+        ideal = torch.nn.functional.normalize(torch.stack([T.translation for T in turns]) - middle, dim=-1)
+        cosines = directions @ ideal.mT  # (frames, steps)
+        taken, missed = [last], [0.0]
+        for number in range(1, count):
+            cosines[taken, number] = -1
+            taken.append(int(cosines[:, number].argmax()))
+            missed.append(math.acos(min(1.0, float(cosines[taken[-1], number]))))
+        if max(missed) <= math.radians(abs(angle_deg)) / 2:
+            fitting.append((sum(missed), tuple(reversed(taken))))
+    return min(fitting)[1] if fitting else None

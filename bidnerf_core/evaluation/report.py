@@ -7,7 +7,6 @@ import io
 import itertools
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -16,11 +15,10 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
 
-from bidnerf_core.datasets import Capture
+from bidnerf_core.datasets import Capture, DatasetOptions
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.evaluation.plots import Figure, Figures
-from bidnerf_core.evaluation.provenance import Provenance
-from bidnerf_core.evaluation.results import ResultTable
+from bidnerf_core.evaluation.results import Provenance, ResultTable
 from bidnerf_core.evaluation.summary import (
     ABSOLUTE,
     RELATIVE,
@@ -30,9 +28,8 @@ from bidnerf_core.evaluation.summary import (
     pairwise_tests,
     situations,
     succeeded,
-    usual_criterion,
 )
-from bidnerf_core.evaluation.trial import TrialResult, trial_views
+from bidnerf_core.evaluation.trial import TrialResult, open_data, trial_views
 from bidnerf_core.io import is_temporary, open_binary, output_folder, write_file
 from bidnerf_core.results import CRITERIA, CRITERION_NAMES, as_picture, require_matplotlib
 from bidnerf_core.scenes import is_closed_form
@@ -91,7 +88,7 @@ def write_report(
 def chosen_criterion(given: str | None, groups: Sequence[Group]) -> str:
     """Return the criterion to use where only one is shown. Raises ``InputError`` for one that applies to no trial."""
     if given is None:
-        return usual_criterion([result for group in groups for result in group.results])
+        return RELATIVE if all(applies(RELATIVE, group.results) for group in groups) else ABSOLUTE
     if given not in CRITERIA:
         raise InputError(f"criterion is {given!r}", expected=f"one of {', '.join(CRITERIA)}")
     if not any(applies(given, group.results) for group in groups):
@@ -174,8 +171,8 @@ def thumbnails(rows: Sequence[TrialResult], data: Sequence[str | Path]) -> list[
             pictures.append(None)
             continue
         if (name, trial.split) not in opened:  # results hold names of other files, not paths
-            setup = replace(trial.reading, masks=None, camera=None, register_depth=None)
-            opened[name, trial.split] = setup.open(name)
+            options = DatasetOptions(split=trial.split, depth_unit=trial.depth_unit)
+            opened[name, trial.split] = open_data(name, options)
         view, content = trial_views(trial, opened[name, trial.split])[-1], io.BytesIO()
         image = Image.fromarray(as_picture(view.frame.rgb))
         image.thumbnail((240, 240))
@@ -201,15 +198,14 @@ def _facts(name: str, runs: Sequence[Provenance]) -> dict[str, str]:
     if not runs:
         return {}
     first, last = runs[0], runs[-1]
+    changed = {False: "", True: ", with local changes"}
     commits = [
-        "unknown (no checkout of this code)" if r.commit is None
-        else r.commit + (", with local changes" if r.dirty else "")
-        for r in runs
-    ]  # fmt: skip
-    memories = ["" if r.memory_bytes is None else f", {r.memory_bytes / 2**30:.0f} GiB" for r in runs]
+        f"{r.commit}{changed[r.dirty]}" if r.commit else "unknown (no checkout of this code)" for r in runs
+    ]
     machines = [
-        f"{r.cpu}, {r.cores} cores{memory}, {r.gpu or 'no GPU'}, {r.system}"
-        for r, memory in zip(runs, memories, strict=True)
+        f"{r.cpu}, {r.cores} cores{f', {r.memory_bytes / 2**30:.0f} GiB' if r.memory_bytes else ''},"
+        f" {r.gpu or 'no GPU'}, {r.system}"
+        for r in runs
     ]
     return {
         "file": name,

@@ -1,15 +1,31 @@
-"""Trial results: a table in memory, and a file of one JSON line per trial, each on disk before its trial counts as done."""
+"""Trial results: a table in memory, a file of one JSON line per trial, each on disk before its trial counts as done, and
+the runs that made such a file.
+"""
 
 from __future__ import annotations
 
+import filecmp
 import json
 import os
+import platform
+import re
+import shlex
+import subprocess
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import cached_property
+from importlib.metadata import distribution, version
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
+import psutil
+import torch
+
+import bidnerf_core
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.evaluation.plan import Trial
 from bidnerf_core.evaluation.summary import (
@@ -29,6 +45,7 @@ from bidnerf_core.io import (
     parse_json,
     read_file,
     read_open_file,
+    read_record,
     take_lock,
     to_plain,
     write_file,
@@ -37,6 +54,7 @@ from bidnerf_core.results import CRITERIA
 
 LARGEST_FILE = 512 * 2**20
 """Largest size of a file of results in bytes. A trial takes a few kilobytes, so that a hundred thousand trials fit."""
+EXPECTED = "lines as written by 'bidnerf evaluate'"
 BEGINNING = b'{"T_world_camera": '
 """The beginning of each line of a file of results."""
 
@@ -131,9 +149,27 @@ def read_results(paths: Iterable[Path]) -> list[TrialResult]:
     """
     found: dict[Any, TrialResult] = {}
     for path in paths:
-        for result in ResultsFile.read(path):
+        for result in _parsed(path, read_file(path, EXPECTED, LARGEST_FILE))[0]:
             found.setdefault((key_of(result.trial), result.weights, result.inputs), result)
     return list(found.values())
+
+
+def _parsed(path: Path, content: bytes) -> tuple[list[TrialResult], int]:
+    """Return the result of each complete line, and the number of bytes in these lines."""
+    lines, found, length = content.split(b"\n"), [], 0
+    for number, line in enumerate(lines, start=1):
+        where = f"{path}: line {number}"
+        try:
+            plain = parse_json(line, where, EXPECTED) if line.strip() else None
+        except InputError:
+            # The last line is dropped only if it begins as a result does, so that no unrelated file is truncated.
+            if number == len(lines) and (line.startswith(BEGINNING) or BEGINNING.startswith(line)):
+                break
+            raise
+        if plain is not None:
+            found.append(from_plain(TrialResult, plain, where))
+        length += len(line) + (number < len(lines))
+    return found, length
 
 
 class ResultsFile:
@@ -144,43 +180,18 @@ class ResultsFile:
     names the line, and is never deleted. Without a path, results are kept in memory only.
     """
 
-    expected = "lines as written by 'bidnerf evaluate'"
-
     def __init__(self, path: Path | None) -> None:
         self.path = path
         self.values: dict[str, TrialResult] = {}  # by the ``key_of`` of their trials
         self._file: BinaryIO | None = None
-
-    @classmethod
-    def read(cls, path: Path) -> list[TrialResult]:
-        """Return the result of each complete line. Raises ``InputError`` if the file cannot be read."""
-        return cls._parsed(path, read_file(path, cls.expected, LARGEST_FILE))[0]
-
-    @classmethod
-    def _parsed(cls, path: Path, content: bytes) -> tuple[list[TrialResult], int]:
-        """Return the result of each complete line, and the number of bytes in these lines."""
-        lines, found, length = content.split(b"\n"), [], 0
-        for number, line in enumerate(lines, start=1):
-            where = f"{path}: line {number}"
-            try:
-                plain = parse_json(line, where, cls.expected) if line.strip() else None
-            except InputError:
-                # The last line is dropped only if it begins as a result does, so that no unrelated file is truncated.
-                if number == len(lines) and (line.startswith(BEGINNING) or BEGINNING.startswith(line)):
-                    break
-                raise
-            if plain is not None:
-                found.append(from_plain(TrialResult, plain, where))
-            length += len(line) + (number < len(lines))
-        return found, length
 
     def __enter__(self) -> Self:
         if self.path is None:
             return self
         file = self._open(self.path)
         try:
-            content = read_open_file(file, self.path, self.expected, LARGEST_FILE)
-            results, whole = self._parsed(self.path, content)
+            content = read_open_file(file, self.path, EXPECTED, LARGEST_FILE)
+            results, whole = _parsed(self.path, content)
             for result in results:
                 self.values.setdefault(key_of(result.trial), result)
             if whole < len(content):
@@ -228,11 +239,7 @@ class ResultsFile:
     def _unmoved(self, path: Path) -> BinaryIO:
         """Return the open file. Raises ``InputError`` if the path no longer names it: lines would be lost unnoticed."""
         assert self._file is not None
-        try:
-            same = os.path.samestat(os.fstat(self._file.fileno()), path.stat())
-        except FileNotFoundError:
-            same = False
-        if not same:
+        if not (path.exists() and os.path.samestat(os.fstat(self._file.fileno()), path.stat())):
             raise InputError(
                 "was removed or replaced while it was being written, so its content is lost; start again, or"
                 " move the file back",
@@ -245,7 +252,7 @@ class ResultsFile:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             if path.exists():
-                open_binary(path, self.expected).close()  # raises for a pipe, which would wait for a reader
+                open_binary(path, EXPECTED).close()  # raises for a pipe, which would wait for a reader
             self._file = path.open("a+b")
         except OSError as error:
             raise InputError(
@@ -261,3 +268,112 @@ class ResultsFile:
 def as_line(plain: Any) -> bytes:
     """Return ``plain`` as one line of strict JSON."""
     return json.dumps(plain, allow_nan=False).encode() + b"\n"
+
+
+# How results were made: command, code and machine.
+
+RUNS = ".meta.json"
+"""The ending of the file that lists the runs behind a results file, next to it."""
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """When, how and where a run took place."""
+
+    date: str  # UTC, when it began
+    command: str
+    # of the checkout that the code was run from, or was installed from without changes since
+    commit: str | None
+    dirty: bool  # whether files of that checkout were modified
+    cpu: str
+    cores: int | None
+    gpu: str | None
+    memory_bytes: int | None
+    system: str
+    python: str
+    versions: dict[str, str]
+    workers: str  # a description of the workers that ran the trials
+
+
+def provenance(command: str, workers: str) -> Provenance:
+    """Return the provenance of a run that begins now; ``workers`` describes what runs it."""
+    # Uncommitted changes in these folders make a run irreproducible from its commit.
+    sources = ("bidnerf_core", "backends", "plugins", "benchmarks", ":!benchmarks/results")
+    return Provenance(
+        date=datetime.now(UTC).isoformat(timespec="seconds"),
+        command=command,
+        commit=_git("rev-parse", "--verify", "HEAD") or None,
+        dirty=bool(_git("status", "--porcelain", "--untracked-files=no", "--", *sources)),
+        cpu=_cpu_model(),
+        cores=os.cpu_count(),
+        gpu=torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        memory_bytes=psutil.virtual_memory().total,
+        system=f"{platform.system()} {platform.machine()}",
+        python=platform.python_version(),
+        versions={name: version(name) for name in ("bidnerf", "torch", "numpy", "scipy", "kornia")}
+        | {"torch": str(torch.__version__)},
+        workers=workers,
+    )
+
+
+def note_run(results: Path, run: Provenance) -> None:
+    """Add a run to the list next to a results file, which may take several runs to complete."""
+    runs = [*read_runs(results), run]
+    write_file(results.with_suffix(RUNS), (json.dumps({"runs": to_plain(runs)}, indent=1) + "\n").encode())
+
+
+def read_runs(results: Path) -> list[Provenance]:
+    """Return the runs behind a results file, in order; empty if there is no list next to it."""
+    path = results.with_suffix(RUNS)
+    if not path.is_file():
+        return []
+    expected = "the list that 'bidnerf evaluate' writes next to its results"
+    runs = read_record(path, expected).items("runs")
+    if runs is None:
+        raise InputError("not a list of runs", where=path, expected=expected)
+    return [from_plain(Provenance, run, str(path)) for run in runs]
+
+
+def _git(*arguments: str) -> str:
+    """Return the output of a git command in this package's checkout; empty if there is no checkout or no git."""
+    package = Path(bidnerf_core.__file__).resolve().parent
+    root = package.parent
+    # An installed package may lie inside another project; PEP 610 names the folder from which it was installed.
+    if not (root / ".git").exists():
+        stated = json.loads(distribution("bidnerf").read_text("direct_url.json") or "{}").get("url", "")
+        root = Path(url2pathname(urlsplit(stated).path))
+        code = [str(file.relative_to(package)) for file in package.rglob("*.py")]
+        _, *others = filecmp.cmpfiles(package, root / "bidnerf_core", code)
+        if any(others) or not (root / ".git").exists():
+            return ""
+    try:
+        done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return done.stdout.strip()
+
+
+def _cpu_model() -> str:
+    """Return the name of the processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor())
+
+
+def script_command() -> str:
+    """Return the command of the running script; paths are relative to the checkout, or only names outside it."""
+    root = Path(bidnerf_core.__file__).resolve().parents[1]
+
+    def shortened(part: str) -> str:
+        path = Path(part)
+        if not path.is_absolute():
+            return part
+        return str(path.relative_to(root)) if path.is_relative_to(root) else path.name
+
+    # Words such as ``--out=PATH`` and ``MAP:DATA`` hold paths, too.
+    words = ["".join(map(shortened, re.split(r"([=:])", word))) for word in sys.argv]
+    is_ours = Path(words[0]).stem == "bidnerf"  # wherever it is installed
+    return shlex.join(["bidnerf", *words[1:]] if is_ours else ["python", *words])

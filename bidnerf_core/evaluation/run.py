@@ -6,7 +6,6 @@ import logging
 import os
 import signal
 import threading
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -18,17 +17,18 @@ from typing import Any, TypeAlias
 
 import torch
 
-from bidnerf_core.datasets import Capture, of_views
+from bidnerf_core.datasets import Capture
 from bidnerf_core.errors import Cancelled, InputError, amount
 from bidnerf_core.evaluation.faults import NO_FAULT
-from bidnerf_core.evaluation.plan import Plan, Trial, listed, parse_settings, planned, repeated_frames
-from bidnerf_core.evaluation.provenance import note_run, provenance, script_command
-from bidnerf_core.evaluation.results import ResultsFile, ResultTable
+from bidnerf_core.evaluation.plan import Plan, Trial, listed, parse_settings, planned
+from bidnerf_core.evaluation.results import ResultsFile, ResultTable, note_run, provenance, script_command
 from bidnerf_core.evaluation.summary import succeeded
 from bidnerf_core.evaluation.trial import (
+    Data,
     Opened,
     TrialResult,
     input_digests,
+    open_data,
     open_map,
     opened,
     opened_points,
@@ -37,7 +37,6 @@ from bidnerf_core.evaluation.trial import (
     trial_views,
 )
 from bidnerf_core.fields import device_of
-from bidnerf_core.frames import View
 from bidnerf_core.io import to_plain, usable_cores
 from bidnerf_core.localization import find_method, require_use_of_depth
 from bidnerf_core.maps import Map
@@ -55,8 +54,6 @@ log = logging.getLogger("bidnerf")
 
 Scene: TypeAlias = Map | str | Path
 """A map in memory, the folder of a map, or demo:NAME."""
-Data: TypeAlias = Capture | Sequence[View] | str | Path
-"""A dataset in memory, posed images (T_world_camera), the folder of a dataset, or demo:NAME."""
 Workers: TypeAlias = int | str | None
 """A number of processes, None for one per core, or the address of a dask scheduler such as ``tcp://host:8786``."""
 PATIENCE = "20s"
@@ -112,8 +109,6 @@ def evaluate(
                     f"has no points for {len(blind)} of {len(rigs)} frames ({listed(blind)}); choose others with --frame",
                     where=plan.depth_points,
                 )
-        if repeated := repeated_frames(trials):
-            log.info(repeated)
         with ResultsFile(None if out is None else Path(out)) as file:
             run_trials(trials, file, here, 1 if in_memory else workers)
             file.put_in_order(trials)
@@ -136,8 +131,7 @@ def run_trials(
     todo = left_to_do(trials, file, scene)
     if len(todo) < len(trials):
         log.info("%s: %d of %d trials are already there", file.path, len(trials) - len(todo), len(trials))
-    unchecked = sum(file[trial].inputs is None for trial in trials if trial in file)
-    if unchecked:
+    if unchecked := sum(trial in file and file[trial].inputs is None for trial in trials):
         log.info(
             "%s: %d results of an earlier version do not record their images and are kept unchecked", file.path, unchecked
         )  # fmt: skip
@@ -167,36 +161,32 @@ def run_trials(
 def _run(
     todo: Sequence[Trial], file: ResultsFile, executor: Executor, at_once: int, scene: Opened | None
 ) -> None:
-    """Run trials and store their results, ``at_once`` at a time; raise the first error once the running ones have ended."""
-    waiting, running = iter(todo), set[Future[TrialResult]]()
-    failure: BaseException | None = None
+    """Run trials, ``at_once`` at a time, and store their results; raise the first error once the running ones have ended."""
+    running = set[Future[TrialResult]]()
     count = right = 0
-    while True:
-        while len(running) < at_once and failure is None and (trial := next(waiting, None)) is not None:
-            try:
-                check_cancelled("trials")
-            except Cancelled as stopped:
-                failure = stopped
-                break
-            running.add(executor.submit(run_trial, trial, scene, registered_for(trial)))
-        if not running:
-            break
-        done, running = wait(running, return_when=FIRST_COMPLETED)
-        for future in done:
-            error = future.exception()
-            if error is not None:
-                failure = failure or error
-                continue
+
+    def store_finished() -> None:
+        nonlocal count, right
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            running.remove(future)
             file.add(future.result())
             count, right = count + 1, right + succeeded(future.result())
-            try:
-                report_progress(
-                    Progress("trials", count, len(todo), "trials", f"{right} within 5 deg and 0.05")
-                )
-            except Cancelled as stopped:
-                failure = failure or stopped
-    if failure is not None:
-        raise failure
+            text = f"{right} within 5 deg and 0.05"
+            report_progress(Progress("trials", count, len(todo), "trials", text))
+
+    try:
+        for trial in todo:
+            check_cancelled("trials")
+            running.add(executor.submit(run_trial, trial, scene, registered_for(trial)))
+            if len(running) == at_once:
+                store_finished()
+        while running:
+            store_finished()
+    except Exception:
+        for future in wait(running).done:
+            if future.exception() is None:
+                file.add(future.result())
+        raise
 
 
 def left_to_do(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None = None) -> list[Trial]:
@@ -340,24 +330,7 @@ def open_both(scene: Scene, data: Data, plan: Plan) -> Opened:
     if isinstance(scene, str | Path) and isinstance(data, str | Path):
         return opened(str(scene), str(data), plan)
     stored = scene if isinstance(scene, Map) else open_map(str(scene), plan.device)
-    return stored, open_data(data, plan, stored)
-
-
-def open_data(data: Data, plan: Plan, stored: Map | None = None) -> Capture:
-    """Return a dataset, read from its folder unless it is in memory."""
-    if isinstance(data, str | Path):
-        return plan.open(str(data), stored)
-    if isinstance(data, Capture):
-        return plan.prepared(data)
-    views = tuple(view for view in data if isinstance(view, View)) if isinstance(data, Sequence) else ()
-    if not views or len(views) < len(data):
-        raise InputError(
-            f"data is a {type(data).__name__}", expected="a folder, a dataset or a list of views"
-        )
-    name, count = Counter(view.frame.name for view in views).most_common(1)[0]
-    if count > 1:  # trials identify their frames by name
-        raise InputError(f"data holds {count} frames named {name!r}", expected="different names")
-    return plan.prepared(of_views(views, Path("views")))
+    return stored, open_data(data, plan.reading, stored)
 
 
 def device_name(scene: Scene, given: str) -> str:

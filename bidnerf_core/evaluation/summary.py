@@ -8,8 +8,10 @@ import math
 import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from operator import itemgetter
+from typing import Any, NamedTuple
 
+from bidnerf_core.errors import amount
 from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, parse_faults
 from bidnerf_core.evaluation.trial import TrialResult
 from bidnerf_core.geometry import LengthUnit
@@ -107,14 +109,19 @@ def situation_titles(every: Sequence[Situation]) -> dict[Situation, str]:
 def _condition(result: TrialResult) -> dict[str, Any]:
     """Return all that distinguishes what localized one trial from what localized another, by name."""
     trial = result.trial
-    own = {name: getattr(trial, name) for name in ("depth", "depth_points", "camera", "register_depth")}
-    own |= {"depth_unit": trial.depth_unit, "backend": result.backend, "device": trial.device}
+    own = {
+        name: getattr(trial, name)
+        for name in ("depth", "depth_points", "camera", "register_depth", "depth_unit")
+    }
     hidden = None if trial.masks is None else f"{trial.mask_hides} of {trial.masks}"
-    return {"method": result.method, "images": len(trial.frames), "hidden": hidden, **own, **result.settings}
+    return {
+        "method": result.method, "images": len(trial.frames), "hidden": hidden, **own, "backend": result.backend,
+        "device": trial.device, **result.settings,
+    }  # fmt: skip
 
 
 WORDS: dict[str, Callable[[Any], str]] = {
-    "images": lambda count: f"{count} image{'s' if count != 1 else ''}",
+    "images": lambda count: amount(count, "image"),
     "depth": lambda used: "RGB-D" if used else "RGB",
     "depth_points": lambda folder: "no points" if folder is None else f"points of {folder}",
     "hidden": lambda masks: "nothing hidden" if masks is None else f"{masks} hidden",
@@ -131,16 +138,9 @@ def _labels(conditions: Sequence[dict[str, Any]]) -> dict[str, str]:
     for key, own in every.items():
         same = [other for other in every.values() if other["method"] == own["method"]]
         words = [own["method"]]
-        for name, value in own.items():
-            if any(other.get(name) != value for other in same):
-                text = (
-                    f"{value:.12g}"
-                    if isinstance(value, float)
-                    else "none"
-                    if value is None
-                    else str(value).lower()
-                )
-                words.append(WORDS[name](value) if name in WORDS else f"{name.replace('_', ' ')} {text}")
+        for name in (name for name in own if any(other.get(name) != own[name] for other in same)):
+            value = f"{own[name]:.12g}" if isinstance(own[name], float) else str(own[name]).lower()
+            words.append(WORDS[name](own[name]) if name in WORDS else f"{name.replace('_', ' ')} {value}")
         labels[key] = ", ".join(words)
     return labels
 
@@ -213,11 +213,6 @@ def applies(criterion: str, results: Sequence[TrialResult]) -> bool:
     return not needs_start or all(result.start_error is not None for result in results)
 
 
-def usual_criterion(results: Sequence[TrialResult]) -> str:
-    """Return the name of the criterion to use where only one is shown."""
-    return RELATIVE if applies(RELATIVE, results) else ABSOLUTE
-
-
 def are_stepwise(results: Sequence[TrialResult]) -> bool:
     """Return whether a method moved the pose in steps, which have a speed; others answer at once."""
     return statistics.median(result.steps for result in results) > 1
@@ -227,18 +222,6 @@ def steps_of(results: Sequence[TrialResult], criterion: str) -> list[float]:
     """Return the steps to success of each trial, ``NEVER`` for those without success."""
     found = (steps_to_success(result.errors.as_error(), CRITERIA[criterion]) for result in results)
     return [NEVER if steps is None else float(steps) for steps in found]
-
-
-def seconds_to_success(results: Sequence[TrialResult], criterion: str) -> list[float]:
-    """Return the sorted times to success of the trials that met the criterion.
-
-    That of a method without steps is the time of the whole answer.
-    """
-    return sorted(
-        steps * result.seconds / result.steps if result.steps > 1 else result.seconds
-        for steps, result in zip(steps_of(results, criterion), results, strict=True)
-        if steps < NEVER
-    )
 
 
 def succeeded(result: TrialResult) -> bool:
@@ -257,9 +240,14 @@ def success_of(results: Sequence[TrialResult], criterion: str) -> Success | None
     if not applies(criterion, results):
         return None
     steps = steps_of(results, criterion)
-    times = [1000 * seconds for seconds in seconds_to_success(results, criterion)]
     rate = rate_of(results, [s < NEVER for s in steps])
-    return Success(rate, median(s for s in steps if s < NEVER), median(times))
+    # The time of a method without steps is that of the whole answer.
+    reached = [
+        (s, 1000 * (s * r.seconds / r.steps if r.steps > 1 else r.seconds))
+        for s, r in zip(steps, results, strict=True)
+        if s < NEVER
+    ]
+    return Success(rate, median(s for s, _ in reached), median(milliseconds for _, milliseconds in reached))
 
 
 def median(values: Iterable[float | None]) -> float | None:
@@ -301,37 +289,37 @@ def compare_pair(first: Group, second: Group, criterion: str) -> PairTest:
     """Test whether two groups differ in success rate or in steps to success, by one criterion."""
     from scipy.stats import fisher_exact, mannwhitneyu  # imported here: it takes a second
 
-    steps = [steps_of(group.results, criterion) for group in (first, second)]
-    reached = [[s for s in row if s < NEVER] for row in steps]
-    tables = [[len(good), len(row) - len(good)] for good, row in zip(reached, steps, strict=True)]
-    test = mannwhitneyu(*reached, alternative="two-sided") if all(reached) else None
+    a, b = (steps_of(group.results, criterion) for group in (first, second))
+    good_a, good_b = ([s for s in row if s < NEVER] for row in (a, b))
+    test = mannwhitneyu(good_a, good_b, alternative="two-sided") if good_a and good_b else None
     # Over all trials, failures tie, behind every success; if all trials tie, nothing differs.
-    last = 1 + max(itertools.chain(*reached), default=0)
-    ranks = [[min(s, last) for s in row] for row in steps]
-    tie = len({*ranks[0], *ranks[1]}) == 1
+    last = 1 + max(good_a + good_b, default=0)
+    ranks = [[min(s, last) for s in row] for row in (a, b)]
+    all_p = 1.0
+    if len({*ranks[0], *ranks[1]}) > 1:
+        all_p = float(mannwhitneyu(*ranks, alternative="two-sided", method="asymptotic").pvalue)
     return PairTest(
         first=first.label,
         second=second.label,
-        trials=(len(steps[0]), len(steps[1])),
-        successes=(len(reached[0]), len(reached[1])),
-        rates_p=float(fisher_exact(tables).pvalue),
-        median_steps=(median(reached[0]), median(reached[1])),
+        trials=(len(a), len(b)),
+        successes=(len(good_a), len(good_b)),
+        rates_p=float(
+            fisher_exact([[len(good_a), len(a) - len(good_a)], [len(good_b), len(b) - len(good_b)]]).pvalue
+        ),
+        median_steps=(median(good_a), median(good_b)),
         steps_u=None if test is None else float(test.statistic),
         steps_p=None if test is None else float(test.pvalue),
-        all_p=1.0
-        if tie
-        else float(mannwhitneyu(*ranks, alternative="two-sided", method="asymptotic").pvalue),
+        all_p=all_p,
     )
 
 
-@dataclass(frozen=True)
-class FaultCurve:
+class FaultCurve(NamedTuple):
     """The trials of one condition under one kind of fault, by the fault's size in ascending order."""
 
     situation: Situation  # without fault
     label: str  # of the condition
     name: str  # of the fault
-    points: tuple[tuple[float, Group], ...]
+    points: list[tuple[float, Group]]
 
 
 def fault_curves(groups: Sequence[Group]) -> list[FaultCurve]:
@@ -339,17 +327,15 @@ def fault_curves(groups: Sequence[Group]) -> list[FaultCurve]:
 
     Trials without any fault belong to every curve of their situation and condition whose fault has a neutral size.
     """
-    found: dict[tuple[Situation, str, str], list[tuple[float, Group]]] = {}
+    found: dict[tuple[Situation, str, str], dict[float, Group]] = {}
     for group in groups:
         parts = parse_faults(group.situation.fault)
         if len(parts) == 1 and group.situation.size is not None:
             key = replace(group.situation, fault=NO_FAULT), group.label, parts[0].name
-            found.setdefault(key, []).append((parts[0].size, group))
+            found.setdefault(key, {})[parts[0].size] = group
     clean = {(group.situation, group.label): group for group in groups}
     for (situation, label, name), points in found.items():
-        neutral, usual = FAULTS.load(name).neutral, clean.get((situation, label))
-        if neutral is not None and usual is not None and neutral not in dict(points):
-            points.append((neutral, usual))
-    return [
-        FaultCurve(*key, tuple(sorted(points, key=lambda point: point[0]))) for key, points in found.items()
-    ]
+        neutral = FAULTS.load(name).neutral
+        if neutral is not None and (situation, label) in clean:
+            points.setdefault(neutral, clean[situation, label])
+    return [FaultCurve(*key, sorted(points.items(), key=itemgetter(0))) for key, points in found.items()]

@@ -12,8 +12,9 @@ import json
 import math
 import os
 import sys
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -22,12 +23,11 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets import Capture, SparseChoice, SparsePoints
+from bidnerf_core.datasets import Capture, DatasetOptions, SparseChoice, SparsePoints, of_views
 from bidnerf_core.devices import threads_at_most, working_device
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.faults import faulty, parse_faults
-from bidnerf_core.evaluation.plan import Setup, Trial, parse_settings
-from bidnerf_core.evaluation.protocols import find_protocol
+from bidnerf_core.evaluation.plan import Setup, Trial, find_protocol, parse_settings
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.io import from_plain, to_plain
@@ -35,12 +35,14 @@ from bidnerf_core.localization import Localizer
 from bidnerf_core.maps import DESCRIPTION, Map, MapInfo, cameras_of, load_map
 from bidnerf_core.registry import registered_names, require_registered
 from bidnerf_core.results import PoseError, plain_localization, pose_error
-from bidnerf_core.scenes import closed_form_map, is_closed_form
+from bidnerf_core.scenes import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.settings import to_flat
 
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
 Opened: TypeAlias = tuple[Map, Capture]
 """A map, and a dataset of the same scene."""
+Data: TypeAlias = Capture | Sequence[View] | str | Path
+"""A dataset in memory, posed images (T_world_camera), the folder of a dataset, or demo:NAME."""
 DIGEST_BYTES = 16  # enough that no two inputs coincide by chance
 
 
@@ -140,10 +142,10 @@ def run_trial(
         protocol.check_size(trial.size)
         start = protocol.start(truth, trial.size, trial.seed, len(dataset.frame_names(trial.split)))
         settings = parse_settings(trial.method, trial.config)
-        digests = input_digests(trial, stored, views)
         points = None if trial.depth_points is None else opened_points(trial.depth_points, stored)
         rays = None if points is None else points.rays(views, trial.split)
         localizer = Localizer(stored, trial.method, settings, warm_up=False)
+        digests = input_digests(trial, stored, views)
         forget_peak_memory()
         found = localizer(views, start, rays, trial.seed)
     trace = pose_error(found.poses, truth)
@@ -195,19 +197,51 @@ def open_map(name: str, device: str = "cpu") -> Map:
     return closed_form_map(name) if is_closed_form(name) else load_map(Path(name), where)
 
 
+def open_data(data: Data, options: DatasetOptions, stored: Map | None = None) -> Capture:
+    """Return a dataset, read from its folder unless it is in memory; ``stored`` gives the background colour.
+
+    Raises ``InputError`` for anything else, and for options of files if there are none.
+    """
+    if isinstance(data, str | Path) and not is_closed_form(str(data)):
+        return replace(options, background=None if stored is None else stored.bounds.background).open(data)
+    if isinstance(data, str | Path):
+        capture: Capture = closed_form_data(str(data))
+    elif isinstance(data, Capture):
+        capture = data
+    else:
+        views = [view for view in data if isinstance(view, View)] if isinstance(data, Sequence) else []
+        if not views or len(views) < len(data):
+            raise InputError(
+                f"data is a {type(data).__name__}", expected="a folder, a dataset or a list of views"
+            )
+        name, count = Counter(view.frame.name for view in views).most_common(1)[0]
+        if count > 1:  # trials identify their frames by name
+            raise InputError(f"data holds {count} frames named {name!r}", expected="different names")
+        capture = of_views(views, Path("views"))
+    if not options.camera is options.register_depth is options.depth_unit is None:
+        raise InputError(
+            "has its own cameras and depth; leave out camera, register_depth and depth_unit",
+            where=capture.path,
+        )
+    return capture if options.mask_folder is None else capture.masked(options.mask_folder)
+
+
 def opened(map_name: str, data_name: str, setup: Setup | None = None) -> Opened:
     """Return the map and dataset with these names, which are read once per process unless the map has changed since."""
     version: tuple[int, int] | None = None
     with contextlib.suppress(OSError):  # a closed-form scene, or not a map, which is detected on reading
         file = os.stat(Path(map_name) / DESCRIPTION)
         version = file.st_ino, file.st_mtime_ns
-    return _opened(map_name, data_name, (setup or Setup()).reading, version)
+    setup = setup or Setup()
+    return _opened(map_name, data_name, setup.device, setup.reading, version)
 
 
 @lru_cache(maxsize=4)
-def _opened(map_name: str, data_name: str, reading: Setup, version: tuple[int, int] | None) -> Opened:
-    stored = open_map(map_name, reading.device)
-    return stored, reading.open(data_name, stored)
+def _opened(
+    map_name: str, data_name: str, device: str, options: DatasetOptions, version: tuple[int, int] | None
+) -> Opened:
+    stored = open_map(map_name, device)
+    return stored, open_data(data_name, options, stored)
 
 
 @lru_cache(maxsize=4)

@@ -336,7 +336,6 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
         ({"seed": -1}, "seed is -1", "a whole number, 0 to 2,147,483,647"),
         ({"sizes": [(0.3, 1.0)]}, "size is 0.3:1", "e_t (m)"),
         ({"config": {"ray": 3}}, "'ray', did you mean 'rays'?", None),
-        ({"frames": ["0001", "0001"]}, "frames names 0001 more than once", "each once"),
         ({"faults": ["blurr:1"]}, "no fault 'blurr'", None),
         ({"faults": "blur:1"}, "faults is 'blur:1'", "a list, such as ['blur:1']"),
         ({"frames": "0001"}, "frames is '0001'", "a list, such as ['0001']"),

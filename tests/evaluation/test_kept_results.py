@@ -20,7 +20,7 @@ from bidnerf_core.evaluation import (
 )
 
 # Inside: records of runs with any content, of which a script makes only its own
-from bidnerf_core.evaluation.provenance import Provenance, provenance
+from bidnerf_core.evaluation.results import Provenance, provenance
 from bidnerf_core.io import from_plain
 from drawn import record
 

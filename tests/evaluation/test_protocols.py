@@ -13,7 +13,7 @@ from scipy.stats import kstest
 from bidnerf_core.evaluation import PROTOCOLS, find_protocol
 
 # Inside: distributions of many starts, which trials draw one at a time
-from bidnerf_core.evaluation.protocols import draw_starts, inerf_start
+from bidnerf_core.evaluation.plan import draw_starts, inerf_start
 from bidnerf_core.geometry import SE3
 from bidnerf_core.results import pose_error
 from refusals import refused

@@ -2,15 +2,17 @@
 wrong answers.
 """
 
-from bidnerf_core.evaluation.faults.composition import (
+from bidnerf_core.evaluation.faults.fault import (
+    FAULTS,
     NO_FAULT,
     AppliedFault,
+    Fault,
     check_depth,
     expand_faults,
     faulty,
     parse_faults,
+    random_units,
 )
-from bidnerf_core.evaluation.faults.fault import FAULTS, Fault
 
 __all__ = [
     "FAULTS",
@@ -21,4 +23,5 @@ __all__ = [
     "expand_faults",
     "faulty",
     "parse_faults",
+    "random_units",
 ]

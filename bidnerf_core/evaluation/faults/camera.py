@@ -1,20 +1,23 @@
-"""Camera faults: wrong calibrations, the shutter, and the orientation."""
+"""Faults of the camera: wrong calibrations, the shutter, the orientation, exposure, optics and compression."""
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from kornia.color import rgb_to_grayscale
+from kornia.filters import gaussian_blur2d
+from PIL import Image
 from torch import Generator, Tensor
 
 from bidnerf_core.camera import Intrinsics, Orientation, exposure_times, poses_of_rows
-from bidnerf_core.evaluation.faults.fault import Change, random_direction
-from bidnerf_core.evaluation.faults.warp import nearest, warped
-from bidnerf_core.evaluation.protocols import random_units
+from bidnerf_core.evaluation.faults.fault import Change, random_direction, random_units
 from bidnerf_core.frames import Frame
 
 
@@ -118,3 +121,85 @@ def _of_images(frame: Frame, change: Callable[[Tensor], Tensor], **more: Any) ->
         image = getattr(frame, name)
         more[name] = None if image is None else change(image)
     return replace(frame, **more)
+
+
+# Colours, as they are stored, in [0, 1].
+
+
+def recoloured(frame: Frame, rgb: Float[Tensor, "h w 3"]) -> Frame:
+    """Return the frame with other colours; values brighter than white are clipped."""
+    return replace(frame, rgb=rgb.clamp(0, 1))
+
+
+def blur(frame: Frame, pixels: float, generator: Generator) -> Frame:
+    """Blur the colours with a Gaussian whose standard deviation is ``pixels``. Depth stays sharp."""
+    smallest = min(frame.rgb.shape[:2])
+    # Padding by reflection at the border cannot be wider than the image.
+    size = min(2 * max(1, round(3 * pixels)) + 1, smallest - 1 + smallest % 2)
+    images = frame.rgb.permute(2, 0, 1)[None]
+    return recoloured(frame, gaussian_blur2d(images, (size, size), (pixels, pixels))[0].permute(1, 2, 0))
+
+
+def jpeg(frame: Frame, quality: float, generator: Generator) -> Frame:
+    """Compress the colours as JPEG of ``quality`` 1 to 100, and decode them."""
+    file = io.BytesIO()
+    Image.fromarray((frame.rgb * 255).round().to(torch.uint8).numpy()).save(
+        file, "JPEG", quality=int(quality)
+    )
+    return recoloured(frame, torch.from_numpy(np.array(Image.open(file))).to(frame.rgb) / 255)
+
+
+def grey(frame: Frame, share: float, generator: Generator) -> Frame:
+    """Remove ``share`` of the colours' saturation: 1 leaves only their brightness."""
+    brightness = rgb_to_grayscale(frame.rgb.permute(2, 0, 1)).permute(1, 2, 0)
+    return recoloured(frame, frame.rgb + share * (brightness - frame.rgb))
+
+
+def vignetting(frame: Frame, share: float, generator: Generator) -> Frame:
+    """Darken the image with the square of the distance from its centre, the corners by ``share``."""
+    camera = frame.intrinsics
+    middle = frame.rgb.new_tensor([camera.width / 2, camera.height / 2])
+    radius = (camera.pixel_centres() - middle).norm(dim=-1, keepdim=True) / middle.norm()
+    return recoloured(frame, frame.rgb * (1 - share * radius.square()))
+
+
+# Resampling.
+
+
+def warped(frame: Frame, pixels: Float[Tensor, "h w 2"]) -> Frame:
+    """Return the frame whose pixel (v, u) shows what ``frame`` shows at ``pixels[v, u]``, given as (u, v).
+
+    Colour and alpha are interpolated, with border values replicated beyond the border. Depth is that of the
+    nearest pixel, since a mean across an edge lies on neither surface; it is 0 beyond the border.
+    """
+    alpha = None if frame.alpha is None else _interpolated(frame.alpha[..., None], pixels)[..., 0]
+    depth = None if frame.depth is None else nearest(frame.depth, pixels)
+    hidden = None if frame.hidden is None else nearest(frame.hidden.float(), pixels) > 0
+    rgb = _interpolated(frame.rgb, pixels).clamp(0, 1)
+    return replace(frame, rgb=rgb, alpha=alpha, depth=depth, hidden=hidden)
+
+
+def reflected(pixels: Float[Tensor, "*p 2"], width: int, height: int) -> Float[Tensor, "*p 2"]:
+    """Return pixels (u, v) inside an image: those beyond a border are reflected at it."""
+    size = pixels.new_tensor([width, height])
+    folded = pixels.remainder(2 * size)
+    return torch.minimum(folded, 2 * size - folded)
+
+
+def nearest(image: Float[Tensor, "h w"], pixels: Float[Tensor, "*p 2"]) -> Float[Tensor, "*p"]:
+    """Return the values of the pixels that contain the positions ``pixels``, and 0 beyond the border."""
+    height, width = image.shape
+    column, row = pixels.floor().long().unbind(-1)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    values = image[row.clamp(0, height - 1), column.clamp(0, width - 1)]
+    return torch.where(inside, values, torch.zeros_like(values))
+
+
+def _interpolated(image: Float[Tensor, "h w c"], pixels: Float[Tensor, "h w 2"]) -> Float[Tensor, "h w c"]:
+    height, width = image.shape[:2]
+    size = torch.tensor([width, height], dtype=torch.float64)
+    grid = (pixels.double() * 2 / size - 1).to(image.dtype)
+    moved = torch.nn.functional.grid_sample(
+        image.permute(2, 0, 1)[None], grid[None], mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return moved[0].permute(1, 2, 0)

@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from bidnerf_core.evaluation.faults import camera, colour, depth, scene
+from bidnerf_core.evaluation.faults import camera, depth, scene
 from bidnerf_core.evaluation.faults.fault import SHARE, SWITCH, Fault, depth_of
 from bidnerf_core.geometry import SE3
 from bidnerf_core.settings import Above, Range, WholeNumbers
@@ -59,18 +59,18 @@ CATALOGUE: dict[str, Fault] = {
     "rolling-shutter": Fault("degrees during the exposure of all rows", Range(0.0, 30.0), 0.0, (0.5, 2.0), camera.rolling_shutter,
         summary="rolling shutter while the camera rotates"),
     "exposure": Fault("factor", FACTOR, 1.0, (0.5, 0.7, 1.3, 2.0),
-        lambda frame, factor, _: colour.recoloured(frame, frame.rgb * factor),
+        lambda frame, factor, _: camera.recoloured(frame, frame.rgb * factor),
         summary="all values multiplied by a factor"),
     "white-balance": Fault("factor", FACTOR, 1.0, (0.8, 1.25),
-        lambda frame, factor, _: colour.recoloured(frame, frame.rgb * frame.rgb.new_tensor([factor, 1.0, 1 / factor])),
+        lambda frame, factor, _: camera.recoloured(frame, frame.rgb * frame.rgb.new_tensor([factor, 1.0, 1 / factor])),
         summary="red multiplied and blue divided by a factor"),
-    "blur": Fault("standard deviation, pixels", Range(0.0, 1000.0), 0.0, (1.0, 3.0, 5.0), colour.blur,
+    "blur": Fault("standard deviation, pixels", Range(0.0, 1000.0), 0.0, (1.0, 3.0, 5.0), camera.blur,
         summary="colours blurred by a Gaussian"),
-    "jpeg": Fault("quality", WholeNumbers(1, 100), None, (50.0, 20.0, 5.0), colour.jpeg,
+    "jpeg": Fault("quality", WholeNumbers(1, 100), None, (50.0, 20.0, 5.0), camera.jpeg,
         summary="colours compressed as JPEG"),
-    "grey": Fault("share of it", SHARE, 0.0, (1.0,), colour.grey,
+    "grey": Fault("share of it", SHARE, 0.0, (1.0,), camera.grey,
         summary="saturation removed"),
-    "vignetting": Fault("share of the light lost in the corners", SHARE, 0.0, (0.3, 0.6), colour.vignetting,
+    "vignetting": Fault("share of the light lost in the corners", SHARE, 0.0, (0.3, 0.6), camera.vignetting,
         summary="corners darkened"),
     "occluder": Fault("share of the image", SHARE, 0.0, (0.1, 0.25, 0.5), scene.occluder,
         summary="something in front, with its depth"),

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
+from bidnerf_core.evaluation.faults.camera import nearest
 from bidnerf_core.evaluation.faults.fault import Change, depth_of, random_direction, random_pixel
-from bidnerf_core.evaluation.faults.warp import nearest
 from bidnerf_core.frames import Frame
 
 

@@ -1,9 +1,10 @@
-"""A fault: a seeded change of a frame, whose size is one number."""
+"""A fault: a seeded change of a frame, whose size is one number; faults as text, alone or composed."""
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -12,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import Frame
+from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.registry import Plugins
 from bidnerf_core.settings import Range, WholeNumbers
@@ -61,6 +62,12 @@ def depth_of(frame: Frame) -> Float[Tensor, "h w"]:
     return frame.depth
 
 
+def random_units(count: int, generator: Generator) -> Float[Tensor, "n 3"]:
+    """Return unit vectors, uniform on the sphere (float64)."""
+    normal = torch.randn((count, 3), generator=generator, dtype=torch.float64)
+    return torch.nn.functional.normalize(normal, dim=-1)
+
+
 def random_direction(generator: Generator) -> tuple[float, float]:
     """Return a unit vector of the image plane, uniformly distributed."""
     angle = 2 * math.pi * uniform_number(generator)
@@ -77,3 +84,109 @@ def random_pixel(mask: Bool[Tensor, "h w"], generator: Generator) -> tuple[int, 
     places = mask.nonzero()
     row, column = places[int(torch.randint(len(places), (), generator=generator))].tolist()
     return row, column
+
+
+# Faults as text, alone or composed.
+
+NO_FAULT = "none"
+"""The name that leaves a view unchanged."""
+
+
+@dataclass(frozen=True)
+class AppliedFault:
+    """A fault by name, with its size. Raises ``InputError`` for an unknown name and a size out of range."""
+
+    name: str
+    size: float
+
+    def __post_init__(self) -> None:
+        allowed = FAULTS.load(self.name).allowed
+        if self.size not in allowed:
+            raise InputError(f"size is {self.size:.12g}", where=f"fault {self.name}", expected=allowed)
+
+    def __str__(self) -> str:
+        return f"{self.name}:{self.size:.12g}"
+
+    def __call__(self, view: View, seed: int) -> View:
+        """Return the view with this fault. Raises ``InputError`` if it is a fault of depth and none was measured."""
+        fault = FAULTS.load(self.name)
+        if self.size == fault.neutral:
+            return view
+        # Each fault on each frame has a seed of its own for its random choices.
+        text = f"{seed}\n{view.frame.name}\n{self.name}".encode(errors="surrogatepass")
+        stream = int.from_bytes(hashlib.blake2b(text, digest_size=7).digest(), "big")
+        generator = torch.Generator().manual_seed(stream)
+        T_ref_camera = view.T_ref_camera
+        if fault.T_true_faulty is not None:
+            T_ref_camera = T_ref_camera.to(dtype=torch.float64) @ fault.T_true_faulty
+        changed = fault.change(view.frame, self.size, generator)
+        if not isinstance(changed, Frame):
+            raise InputError(
+                f"returned a {type(changed).__name__}", where=f"fault {self}", expected="a Frame"
+            )
+        return View(changed, T_ref_camera)
+
+
+def expand_faults(words: Iterable[str]) -> tuple[str, ...]:
+    """Expand a command's words to all the faults they name, in canonical form.
+
+    A word is ``none``, ``NAME:SIZE``, ``NAME:SIZE,SIZE...`` for several faults, or faults with one size each
+    joined by ``+``, which are applied together, from left to right. A fault that is simply on or off needs no
+    size. Raises ``InputError`` for anything else, and for duplicate faults.
+    """
+    found: list[str] = []
+    for word in words:
+        name, colon, sizes = word.partition(":")
+        parts = [name + colon + size for size in sizes.split(",")] if "+" not in word else [word]
+        found += ["+".join(map(str, parse_faults(part))) or NO_FAULT for part in parts]
+    twice = next((fault for place, fault in enumerate(found) if fault in found[:place]), None)
+    if twice is not None:
+        raise InputError(f"fault {twice} is given twice", expected="different ones")
+    return tuple(found)
+
+
+def parse_faults(text: str) -> tuple[AppliedFault, ...]:
+    """Parse a text such as ``depth-scale:1.02+exposure:0.7``; the result is empty for ``NO_FAULT``."""
+    if text == NO_FAULT:
+        return ()
+    faults = tuple(_parsed(part) for part in text.split("+"))
+    names = [fault.name for fault in faults]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"fault {text} has {twice} twice", expected="each once")
+    return faults
+
+
+def faulty(view: View, faults: str | Sequence[AppliedFault], seed: int) -> View:
+    """Return the view with all faults, applied in order.
+
+    ``T_ref_camera`` is the true pose of the faulty image. The random choices of a fault depend only on the
+    seed, the frame and the fault, regardless of other faults.
+    """
+    for fault in parse_faults(faults) if isinstance(faults, str) else faults:
+        view = fault(view, seed)
+    return view
+
+
+def check_depth(faults: Iterable[str], depth: bool) -> None:
+    """Raise ``InputError`` for an unknown fault and, unless ``depth`` is used, for a fault of depth."""
+    for part in (part for text in faults for part in parse_faults(text)):
+        if FAULTS.load(part.name).needs_depth and not depth:
+            raise InputError(f"fault {part} changes the measured depth, which the method does not receive")
+
+
+def _parsed(text: str) -> AppliedFault:
+    name, colon, size = text.partition(":")
+    fault = FAULTS.load(name)
+    if not size:
+        if fault.is_switch and not colon:
+            return AppliedFault(name, 1.0)
+        example = "NAME:SIZE such as depth-scale:1.02"
+        raise InputError(f"fault {name} has no size", expected=f"{example}; its unit is: {fault.unit}")
+    try:
+        number = float(size)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(f"size is {size!r}", where=f"fault {name}", expected=fault.allowed)
+    return AppliedFault(name, number)

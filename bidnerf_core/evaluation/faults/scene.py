@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import binary_dilation
 from torch import Generator, Tensor
 
+from bidnerf_core.evaluation.faults.camera import reflected, warped
 from bidnerf_core.evaluation.faults.fault import depth_of, random_direction, random_pixel, uniform_number
-from bidnerf_core.evaluation.faults.warp import reflected, warped
 from bidnerf_core.frames import Frame
 
 RIM = 3
