@@ -174,7 +174,6 @@ FAULTS: dict[str, list[tuple[str, Edit, str | tuple[str, ...]]]] = {
         (JSON, frame(file_path="./images/r_0"), ("frame 1 (./images/r_0)", "same image as frame 0")),
         (JSON, frame(transform_matrix=[[1, 0], [0, 1]]), ("transform_matrix", "3x4 or 4x4")),
         (JSON, frame(transform_matrix=[1.0] * 16), ("transform_matrix", "3x4 or 4x4")),
-        (JSON, pose_with(None), ("transform_matrix", "null")),
         (JSON, pose_with(POSE[0][1] + 0.1, 0, 1), ("frame 1 (images/r_1.png)", "off orthonormal", "rigid")),
         (JSON, frame(transform_matrix=[[-r[0], *r[1:]] for r in POSE[:3]]), "mirror image"),
         (JSON, pose_with(0.5, 3, 0), ("[0.5, 0.0, 0.0, 1.0]", "[0, 0, 0, 1]")),
@@ -235,7 +234,7 @@ def test_a_fault_is_named_in_one_line(case: str, sound: dict[str, tuple[Path, Pa
 
 @pytest.mark.parametrize(
     "pose",
-    [pose_with(math.nan), pose_with(-math.inf), pose_with(math.nan, 0, 0), frame(transform_matrix=None),
+    [pose_with(None), pose_with(math.nan), pose_with(-math.inf), pose_with(math.nan, 0, 0), frame(transform_matrix=None),
      frame(transform_matrix=[[0.0] * 4] * 4)],
 )  # fmt: skip
 def test_frames_without_a_pose_are_left_out_and_counted(pose: Edit, tmp_path: Path) -> None:

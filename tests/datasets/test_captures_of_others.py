@@ -153,15 +153,6 @@ def turned(root: Path) -> Path:
     return folder
 
 
-def edited(**keys: Any) -> Write:
-    def write(root: Path) -> Path:
-        folder = write_nerfstudio(root, small_views(COUNT))
-        edit_keys(folder / JSON, **keys)
-        return folder
-
-    return write
-
-
 def far(root: Path) -> Path:
     folder = write_nerfstudio(root, small_views(COUNT))
     matrix = np.eye(4)
@@ -212,10 +203,6 @@ def unknown_lens(root: Path) -> Path:
 
 REFUSED: dict[str, tuple[Write, tuple[str, ...]]] = {
     "turned after SfM": (turned, ("image is 12x16", "not turned by a quarter")),
-    "NaN in applied_transform": (
-        edited(applied_transform=[[float("nan")] * 4]),
-        ("applied_transform", "finite"),
-    ),
     "a pose far away": (far, ("r_2 is at 1e+30", "below 1e+10")),
     "one file for two names": (two_for_one, ("frame 1", "different images")),
     "a model without images": (without_images, ("sparse/0", "no cameras and images")),

@@ -132,8 +132,7 @@ def test_dialects_give_the_same_views(dialect: str, capture: Path) -> None:
 
 def test_depth_that_is_switched_off_is_not_read(capture: Path) -> None:
     instant_ngp(enable_depth_loading=False)(capture)
-    (remark,) = remarks_of(capture)
-    assert "enable_depth_loading is false" in remark
+    assert remarks_of(capture) == []
     assert all(view.frame.depth is None for view in read_all(capture).values())
 
 
@@ -180,8 +179,7 @@ def test_lists_of_names_that_no_frame_has(capture: Path) -> None:
     listed = ["images/r_1.png", "images/nix.png", "images\\r_2.png", 7]
     edit_keys(capture / "transforms.json", train_filenames=listed)
     (remark,) = remarks_of(capture)
-    assert "train_filenames lists 'images/nix.png' and 1 more" in remark
-    assert "the other 2 are used" in remark
+    assert "list 2 names that no frame has, first: 'images/nix.png'" in remark
     with pytest.warns(match="nix"):
         dataset = open_dataset(capture)
     assert dataset.splits == ("train",)

@@ -42,7 +42,8 @@ def _read(path: Path, found: list[Path], options: DatasetOptions) -> Capture:
     listed, names = read_splits(path), FileNames(path)
     images = [names.path(frame.file_path, IMAGE_ENDINGS, moved=True) for frame, _ in listed]
     _check_images(path, [frame for frame, _ in listed], images)
-    steps, units = {frame.depth_unit for frame, _ in listed}, {frame.unit for frame, _ in listed}
+    steps = {frame.depth_unit for frame, _ in listed if frame.depth_path}
+    units = {frame.unit for frame, _ in listed}
     read_depth, size = DepthReader(), _first_size([frame for frame, _ in listed], images)
     shots, first = list[Shot](), dict[tuple[str, ...], Path]()
     for (frame, splits), image in zip(listed, images, strict=True):
@@ -70,7 +71,7 @@ def _read(path: Path, found: list[Path], options: DatasetOptions) -> Capture:
         )
         if is_file(image):
             first.setdefault(splits[:1], image)
-    white = options.background is None and any(map(_has_alpha, first.values()))
+    white = options.background is None and any(has_alpha for _, has_alpha in map(_header, first.values()))
     return Capture(
         path, shots, background_colour("white") if white else options.colour,
         unit=units.pop() if len(units) == 1 else None,
@@ -110,11 +111,9 @@ def _camera(frame: FrameRecord, size: tuple[int, int] | None) -> Camera | Camera
 def _first_size(frames: Sequence[FrameRecord], images: Sequence[Path]) -> tuple[int, int] | None:
     """Return the size of the first readable image. A remark says that cameras are scaled if its camera has another size."""
     for frame, image in zip(frames, images, strict=True):
-        try:
-            header = read_header(image)
-        except InputError:  # the image is missing, or the error is raised again when that frame is read
+        size, _ = _header(image)
+        if size is None:
             continue
-        size = header.width, header.height
         given = frame.camera.width or size[0], frame.camera.height or size[1]
         if given != size and same_aspect(given, size):
             expected = f"w and h are {given[0]}x{given[1]}; cameras are scaled to the images"
@@ -123,11 +122,13 @@ def _first_size(frames: Sequence[FrameRecord], images: Sequence[Path]) -> tuple[
     return None
 
 
-def _has_alpha(image: Path) -> bool:
+def _header(image: Path) -> tuple[tuple[int, int] | None, bool]:
+    """Return the size of an image, and whether it has an alpha channel; None if it is not readable, an error when it is read."""
     try:
-        return read_header(image).has_alpha
-    except InputError:  # the error is raised again when that frame is read
-        return False
+        header = read_header(image)
+    except InputError:
+        return None, False
+    return (header.width, header.height), header.has_alpha
 
 
 expected = "transforms.json or transforms_train.json, transforms_val.json, transforms_test.json"

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, get_args
+
+import numpy as np
 
 from bidnerf_core.camera import CameraRecord, camera_record
 from bidnerf_core.datasets.capture import SPLITS, remark
@@ -69,22 +70,17 @@ def read_splits(path: Path) -> list[tuple[FrameRecord, tuple[str, ...]]]:
     if not any(lists.values()):
         return [(frame, ()) for frame in frames]
     by_path = {frame.file_path: frame for frame in frames}
-    splits: dict[FrameRecord, tuple[str, ...]] = {}  # in the order of the lists
-    for split, listed in lists.items():
-        names = [posix_name(name) if isinstance(name, str) else None for name in listed or []]
-        own = [by_path[name] for name in names if name in by_path]
-        strange = [name for name, path in zip(listed or [], names, strict=True) if path not in by_path]
-        if strange and own:
-            more = f" and {len(strange) - 1} more" if len(strange) > 1 else ""
-            text = f"{split}_filenames lists {strange[0]!r}{more}, which no frame has; the other {len(own)} are used"
-            remark(record.where, text)
-        for frame in own:
+    splits, unknown = dict[FrameRecord, tuple[str, ...]](), list[str]()  # in the order of the lists
+    for split, name in [(split, str(name)) for split, listed in lists.items() for name in listed or []]:
+        if (frame := by_path.get(posix_name(name))) is not None:
             splits[frame] = *splits.get(frame, ()), split
-    if not splits:
-        (key, listed), *_ = ((f"{split}_filenames", listed) for split, listed in lists.items() if listed)
-        raise record.error(
-            f"{key} lists {listed[0]!r}", expected=f"the file_path of one of its {len(by_path)} frames"
-        )
+        else:
+            unknown.append(name)
+    if unknown:
+        found = f"{SPLITS[0]}_filenames and the like list {len(unknown)} names that no frame has, first: {unknown[0]!r}"
+        if not splits:
+            raise record.error(found, expected=f"the file_path of one of its {len(by_path)} frames")
+        remark(record.where, found)
     return list(splits.items())
 
 
@@ -97,15 +93,15 @@ def read_frames(file: Record) -> list[FrameRecord]:
     if not entries:
         found = "no frames" if entries is None else "frames is empty"
         raise file.error(found, expected="a list of objects with file_path and transform_matrix")
-    unposed = [entry for entry in entries if _lacks_pose(entry)]
-    if 0 < len(unposed) < len(entries):
+    posed = [(number, entry) for number, entry in enumerate(entries) if not _lacks_pose(entry)]
+    if 0 < len(posed) < len(entries):
+        first = next(entry.get("file_path") for entry in entries if _lacks_pose(entry))
         remark(
             file.where,
-            f"{len(unposed)} of {amount(len(entries), 'frame')} have no pose (transform_matrix"
-            f" is missing, zero or not finite) and are left out, first: {unposed[0].get('file_path')}",
+            f"{len(entries) - len(posed)} of {amount(len(entries), 'frame')} have no pose (transform_matrix"
+            f" is missing, zero or not finite) and are left out, first: {first}",
         )
-    is_used = [len(unposed) == len(entries) or not _lacks_pose(entry) for entry in entries]
-    frames = [_frame(file, number, entry) for number, entry in enumerate(entries) if is_used[number]]
+    frames = [_frame(file, number, entry) for number, entry in posed or enumerate(entries)]
     seen: dict[tuple[str, ...], int] = {}
     for number, frame in enumerate(frames):
         first = seen.setdefault(frame.parts, number)
@@ -118,11 +114,6 @@ def read_frames(file: Record) -> list[FrameRecord]:
             f"{whose} {len(frames)} matrices have a scale (frame {scaled[0].file_path}: {scaled[0].scale:.6g}), which is"
             " removed; the positions of the cameras are those of the matrices",
         )
-    for row in file.items("applied_transform") or []:  # which is not undone
-        for number in row if isinstance(row, list) else [row]:
-            file.checked_number(number, "an entry of applied_transform")
-    if file.value("enable_depth_loading") is False and any("depth_path" in f.record.values for f in frames):
-        remark(file.where, "enable_depth_loading is false, so the images of depth_path are not read")
     return frames
 
 
@@ -130,15 +121,11 @@ def _lacks_pose(entry: Any) -> bool:
     """Return whether a frame has no matrix, a zero matrix, or one with numbers that are not finite."""
     if not isinstance(entry, dict):
         return False
-    rows = entry.get("transform_matrix")
-    if rows is None:
-        return True
-    if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
+    try:
+        matrix = np.array(entry.get("transform_matrix"), dtype=np.float64)  # None becomes NaN
+    except (TypeError, ValueError, OverflowError):  # an error when the frame is read
         return False
-    numbers = [value for row in rows for value in row]
-    if any(isinstance(value, float) and not math.isfinite(value) for value in numbers):
-        return True
-    return bool(numbers) and all(value in (0, None) for row in rows[:3] for value in row[:3])
+    return not np.isfinite(matrix).all() or (matrix.ndim == 2 and not matrix[:3, :3].any())
 
 
 def _frame(file: Record, number: int, entry: object) -> FrameRecord:
@@ -170,18 +157,13 @@ def _depth(record: Record, own: Record) -> tuple[PurePosixPath | None, float]:
 
     nerfstudio and instant-ngp use different keys for both; ``enable_depth_loading`` disables instant-ngp's.
     """
-    paths = {key: own.text(key) for key in UNIT_KEYS}
-    if record.value("enable_depth_loading") is False:
-        paths["depth_path"] = None
-    used = next((key for key, path in paths.items() if path), "depth_file_path")
-    for key in (UNIT_KEYS[used], *UNIT_KEYS.values()):
-        unit = record.number(key)
+    for key, unit_key in UNIT_KEYS.items():
+        path, unit = own.text(key), record.number(unit_key)
         if unit is not None and unit <= 0:
-            raise record.error(f"{key} is {unit:g}", expected="a positive number of metres")
-        if unit is not None:
-            break
-    path = paths[used]
-    return posix_name(path) if path else None, METRES_PER_DEPTH_UNIT if unit is None else unit
+            raise record.error(f"{unit_key} is {unit:g}", expected="a positive number of metres")
+        if path and (key == "depth_file_path" or record.value("enable_depth_loading") is not False):
+            return posix_name(path), METRES_PER_DEPTH_UNIT if unit is None else unit
+    return None, METRES_PER_DEPTH_UNIT
 
 
 def _time(own: Record) -> float | None:
