@@ -1,10 +1,13 @@
-"""The cameras of a map's training images, as ``map.json`` stores them."""
+"""The cameras of a map's training images, as ``map.json`` and the ``cameras.json`` of 3D Gaussian splatting store them."""
 
 from __future__ import annotations
 
+import json
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from statistics import median
 
 import torch
@@ -12,14 +15,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics, Orientation
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.frames import View
-from bidnerf_core.geometry import SE3, multiplied
+from bidnerf_core.geometry import SE3, Similarity, multiplied
+from bidnerf_core.io import parse_record, read_file, write_file
 
 MatrixRows = tuple[tuple[float, float, float, float], ...]
 """The rows of a 4x4 matrix."""
 RowMotion = tuple[float, float, float, float, float, float]
 """A camera's motion during the readout of an image, see ``rolling_shutter``: metres, then radians."""
+INRIA_CAMERAS = "cameras.json"
+"""The file that the original code of 3D Gaussian splatting writes beside its result."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +75,9 @@ class MovedCamera:
     rotation_deg: float
     pixels: float  # median shift of points in the image
     motion: RowMotion | None = None  # of the camera from the first row of the image to the last
+
+    def __str__(self) -> str:
+        return f"{self.name} by {self.translation:.3g} and {self.rotation_deg:.2g}° or {self.pixels:.1f} px"
 
 
 @dataclass(frozen=True)
@@ -163,34 +172,27 @@ def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> li
     """Return a sentence or two on the consistency of the given poses and how far they were moved."""
     moved = sorted(moved_cameras(cameras), key=lambda m: m.pixels, reverse=True)
     wrong = [m for m in moved if m.name in found.replaced]
-    motions = [camera.motion for camera in cameras if camera.motion is not None]
-    cause = "errors of the given poses" + (" and camera motion during readout" if motions else "")
+    motions = torch.tensor([camera.motion for camera in cameras if camera.motion], dtype=torch.float64)
+    cause = "errors of the given poses" + (" and camera motion during readout" if len(motions) else "")
     result = "the other poses are kept" if wrong else "the poses are kept"
     if found.refined and moved:
         metres, degrees, pixels = (
             median(getattr(m, name) for m in moved) for name in ("translation", "rotation_deg", "pixels")
         )
-        most = moved[0]
-        result = (
-            f"the poses are refined by {metres:.3g} and {degrees:.2g}° or {pixels:.1f} px (median), {most.name} most,"
-            f" by {most.translation:.3g} and {most.rotation_deg:.2g}° or {most.pixels:.1f} px"
-        )
+        result = f"the poses are refined by {metres:.3g} and {degrees:.2g}° or {pixels:.1f} px (median), most for {moved[0]}"
     lines = [
         f"{cause} add {found.inconsistency:.2f} px to the {found.noise_after:.2f} px of keypoints; {result}"
     ]
-    if motions:
-        metres, radians = (
-            median(math.hypot(*m[:3]) for m in motions),
-            median(math.hypot(*m[3:]) for m in motions),
-        )
+    if len(motions):
+        metres, radians = (median(part.norm(dim=-1).tolist()) for part in motions.split(3, dim=-1))
         lines.append(
             f"the images have a rolling shutter: during the readout the camera moved by {metres:.2g} and"
             f" {math.degrees(radians):.2g}° (median)"
         )
     if wrong:
-        listed = ", ".join(f"{m.name} by {m.translation:.3g} and {m.rotation_deg:.2g}°" for m in wrong[:6])
-        listed += f" and {len(wrong) - 6} more" if len(wrong) > 6 else ""
-        lines.append(f"moved to the poses given by the landmarks of the other images: {listed}")
+        more = f" and {len(wrong) - 6} more" if len(wrong) > 6 else ""
+        listed = ", ".join(map(str, wrong[:6]))
+        lines.append(f"moved to the poses given by the landmarks of the other images: {listed}{more}")
     return lines
 
 
@@ -219,3 +221,56 @@ def _rows(T: SE3) -> MatrixRows:
 
 def _pose(rows: MatrixRows | Sequence[MatrixRows]) -> SE3:
     return SE3.from_matrix(torch.tensor(rows, dtype=torch.float64))
+
+
+def write_inria_cameras(folder: Path, cameras: Sequence[StoredCamera]) -> list[Path]:
+    """Write a ``cameras.json``, unless there are no cameras, and return it.
+
+    The principal points become the middles of the images, as the format does not have any.
+    """
+    if not cameras:
+        return []
+    rows = [
+        {
+            "id": number,
+            "img_name": camera.name,
+            "width": camera.intrinsics.width,
+            "height": camera.intrinsics.height,
+            "position": camera.pose.translation.tolist(),
+            "rotation": camera.pose.rotation.tolist(),
+            "fx": camera.intrinsics.fx,
+            "fy": camera.intrinsics.fy,
+        }
+        for number, camera in enumerate(cameras)
+    ]
+    write_file(folder / INRIA_CAMERAS, (json.dumps(rows) + "\n").encode())
+    return [folder / INRIA_CAMERAS]
+
+
+def cameras_beside(path: Path, placement: Similarity) -> tuple[StoredCamera, ...]:
+    """Return the cameras in the ``cameras.json`` beside a file or up to two folders above, transformed by ``placement``.
+
+    There are none if there is no such file, or it is damaged or another program's, which is a warning.
+    """
+    folders = [path.parent, *list(path.parent.parents)[:2]]
+    file = next((folder / INRIA_CAMERAS for folder in folders if (folder / INRIA_CAMERAS).is_file()), None)
+    if file is None:
+        return ()
+    cameras = list[StoredCamera]()
+    try:
+        record = parse_record(str(file), b'{"cameras":' + read_file(file, INRIA_CAMERAS) + b"}")
+        for entry in record.items("cameras") or []:
+            width, height = entry["width"], entry["height"]
+            fx, fy = float(entry["fx"]), float(entry["fy"])
+            camera = Intrinsics(fx, fy, width / 2, height / 2, int(width), int(height))
+            rotation, position = (
+                torch.tensor(entry[key], dtype=torch.float64) for key in ("rotation", "position")
+            )
+            turned = placement.T_target_source.rotation.double() @ rotation
+            rows = _rows(SE3(turned, placement.apply(position)))
+            cameras.append(StoredCamera(str(entry["img_name"]), camera, rows))
+    except (InputError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        found = f"{file}: camera {len(cameras)} is not readable in Inria's layout ({error}); ignored"
+        warnings.warn(found, InputWarning, stacklevel=2)
+        return ()
+    return tuple(cameras)

@@ -1,4 +1,4 @@
-"""The views for training: with refined poses, and with the landmarks they show."""
+"""The views for training: with poses corrected where the photos contradict them, and with the landmarks they show."""
 
 from __future__ import annotations
 
@@ -8,6 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.camera import STILL, MotionPrior
 from bidnerf_core.captures.cameras import (
     PoseRefinement,
     StoredCamera,
@@ -17,20 +22,32 @@ from bidnerf_core.captures.cameras import (
 )
 from bidnerf_core.captures.coverage import shows_distances
 from bidnerf_core.captures.pose_conventions import pose_contradiction
-from bidnerf_core.captures.training_poses import INCONSISTENT, training_poses
+from bidnerf_core.captures.survey import linked, relocated, suspects
 from bidnerf_core.carving import has_outline
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
+from bidnerf_core.geometry import KEYPOINTS_PER_INDEPENDENT, SE3, mad_deviation
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
     ENOUGH_IMAGES,
+    LEAST_NOISE,
     LEAST_VISIBLE_POINTS,
     SIFT,
     USUAL_FEATURES,
+    Adjustment,
     ImageKeypoints,
+    LandmarkConfig,
+    PosePrior,
+    TrackedKeypoints,
     TrackedViews,
+    adjusted,
     depth_ratio,
+    log_evidence,
+    noise,
+    pinhole,
+    pose_updates,
     posed_keypoints,
+    resections,
     tracked_views,
 )
 from bidnerf_core.progress import counter
@@ -40,7 +57,15 @@ log = logging.getLogger("bidnerf")
 RefinementChoice = Literal["auto", "always", "never"]
 """When to refine the given poses: ``auto`` refines them if they are inconsistent."""
 
-
+INCONSISTENT = 0.25
+"""Smallest deviation (pixels) added to the keypoints by errors of the given poses at which the poses are
+refined. Poses from structure from motion or a renderer add less than a tenth.
+"""
+ROUNDS = 3
+"""Largest number of adjustments. After each, the keypoints are rematched, which finds matches that wrong
+poses prevented."""
+MOST_EVIDENCE = 10.0
+"""Largest contribution of an image to the log evidence for or against a motion, so that no few images decide."""
 UNUSUAL_RATIO = 0.05
 """Smallest relative error of measured depth, compared with triangulated points, that is reported."""
 
@@ -160,11 +185,6 @@ def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> 
     remedy = "check the unit of the depth images (depth_unit_scale_factor in a transforms.json)"
     if depth_unit is not None:
         right = depth_unit / ratio
-        # The usual units (metres per step of depth images) of floats, and of the integers of sensors and datasets.
-        usual = min(
-            (1.0, 0.01, 0.001, 1e-4, 1 / 4000, 1 / 5000), key=lambda unit: abs(math.log(unit / right))
-        )
-        right = usual if abs(usual / right - 1) < UNUSUAL_RATIO else right
         remedy = (
             f"if the poses are in metres, a step of the depth images is {right:.3g} m and not {depth_unit:.3g} m (--depth-unit"
             f" {right:.3g}, depth_unit in Python, or depth_unit_scale_factor in a transforms.json)"
@@ -183,3 +203,137 @@ def _with_landmarks(views: Sequence[View], tracked: TrackedViews) -> list[View]:
     count = sum(len(part.distance) for part in seen)
     log.info(f"{count} sightings of landmarks in {len(views)} views")
     return [replace(view, landmarks=part) for view, part in zip(views, seen, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingPoses:
+    """The poses to train with, and how far they are from the given ones."""
+
+    tracked: TrackedViews  # with these poses
+    pixels: Float[Tensor, "v"]  # median shift of the points in an image; 0 if its pose was kept
+    replaced: list[int]  # images whose given pose was wrong, localized with the others' landmarks
+    refined: bool  # whether all poses were refined
+    consistency: PoseRefinement | None  # of the given poses; None if not known
+
+
+def training_poses(
+    tracked: TrackedViews,
+    views: Sequence[View],
+    least: float = INCONSISTENT,
+    config: LandmarkConfig = DEFAULT_LANDMARKS,
+) -> TrainingPoses:
+    """Return the poses to train with, for ``views`` whose keypoints are ``tracked``.
+
+    A photo whose given pose no group of photos supports is moved to where the landmarks of the others place
+    it. All poses are refined if errors of the given ones add at least ``least`` pixels to the deviation of the
+    keypoints; otherwise they are kept.
+    """
+    seen, _ = tracked.triangulated(config)
+    elsewhere = relocated(tracked, views, suspects(seen, linked(seen)), config)
+    wrong = {i: photo for i, photo in elsewhere.items() if photo.problem in ("badly posed", "turned")}
+    if wrong:
+        updates = torch.zeros(len(views), 6, dtype=torch.float64)
+        for number, photo in wrong.items():
+            updates[number] = photo.update
+        tracked = tracked.at(tracked.T_world_camera.retract(updates)).matched_anew(config)
+    fit = adjusted_poses(tracked, config, least)
+    pixels, refined = torch.zeros(len(views), dtype=torch.float64), False
+    if fit is not None and fit[2].inconsistency >= least:
+        (tracked, pixels, _), refined = fit, True
+    elif fit is not None and wrong:
+        poses, better = tracked.T_world_camera, fit[0].T_world_camera
+        for number in wrong:
+            poses.rotation[number] = better.rotation[number]
+            poses.translation[number] = better.translation[number]
+        tracked = tracked.at(poses).matched_anew(config)
+    for number, photo in wrong.items():
+        pixels[number] = photo.pixels
+    return TrainingPoses(tracked, pixels, list(wrong), refined, None if fit is None else fit[2])
+
+
+def adjusted_poses(
+    tracked: TrackedViews, config: LandmarkConfig, least: float = 0.0
+) -> tuple[TrackedViews, Float[Tensor, "v"], PoseRefinement] | None:
+    """Adjust the poses of ``tracked`` images and the points that they show; None if there are too few of either.
+
+    Returns the tracks with these poses, rematched with them; the median shift (pixels) in each image of the points that it
+    shows, 0 without points; and how well the given poses and these fit the keypoints.
+
+    The errors of the given poses are assumed to be independent, and as large as resection of the images
+    suggests. This prior alone fixes the gauge (position, orientation and scale of the whole), so the mean
+    motion of the images is about zero. If the keypoints show a rolling shutter, the motions of the cameras
+    during readout are estimated too. Otherwise, if the first adjustment finds an inconsistency of less than
+    ``least`` pixels, its poses are returned at once.
+    """
+
+    def noise_of(seen: TrackedKeypoints, points: Float[Tensor, "n 3"]) -> float:
+        return max(LEAST_NOISE, noise(seen.sightings, points))
+
+    given = tracked.T_world_camera
+    seen, points = tracked.triangulated(config)
+    before = noise_of(seen, points)
+    updates = list(pose_updates(seen, points).values())
+    if len(updates) < ENOUGH_IMAGES:
+        return None
+    deviations, motion = _deviations(torch.stack(updates)), STILL
+    for number in range(ROUNDS):
+        start = Adjustment(tracked.T_world_camera, points, tracked.motion)
+        prior = PosePrior(given, *deviations, motion)
+        fit = adjusted(seen.sightings, start, prior, noise_of(seen, points), KEYPOINTS_PER_INDEPENDENT)
+        step = _image_motion(seen, fit.points, tracked.T_world_camera, fit.T_world_camera)
+        moved = _deviations((given.inverse() @ fit.T_world_camera).log())
+        deviations = max(deviations[0], moved[0]), max(deviations[1], moved[1])
+        pixels = _image_motion(seen, fit.points, given, fit.T_world_camera)
+        tracked, noticed = tracked.at(fit.T_world_camera, fit.motion), False
+        seen, points = tracked.triangulated(config)
+        if motion == STILL and number < ROUNDS - 1:  # later ones could no longer be estimated
+            motion = common_motion(seen, points, KEYPOINTS_PER_INDEPENDENT)
+            noticed = motion != STILL
+        consistency = PoseRefinement(before, noise_of(seen, points))
+        if number == 0 and not noticed and consistency.inconsistency < least:
+            break
+        tracked = tracked.matched_anew(config)
+        seen, points = tracked.triangulated(config)
+        consistency = PoseRefinement(before, noise_of(seen, points))
+        if float(step.max()) <= 0.25 and not noticed:  # pixels
+            break
+    return tracked, pixels, consistency
+
+
+def _deviations(updates: Float[Tensor, "v 6"]) -> tuple[float, float]:
+    """Return robust standard deviations about zero (metres, radians) of pose updates, along and about each axis."""
+    return max(1e-9, mad_deviation(updates[:, :3])), max(1e-9, mad_deviation(updates[:, 3:]))
+
+
+def _image_motion(
+    seen: TrackedKeypoints, points: Float[Tensor, "n 3"], given: SE3, found: SE3
+) -> Float[Tensor, "v"]:
+    """Return the median shift (pixels) of each image's points between its given and its found pose."""
+    shown, image = points[seen.point], seen.image
+    focal = seen.sightings.focal[:, None]
+    places = [pinhole(T[image].inverse().apply(shown))[0] * focal for T in (given, found)]
+    away = torch.linalg.vector_norm(places[1] - places[0], dim=-1)
+    medians = torch.zeros(len(seen.images), dtype=torch.float64)
+    for number in image.unique().tolist():
+        medians[number] = away[image == number].median()
+    return medians
+
+
+def common_motion(seen: TrackedKeypoints, points: Float[Tensor, "n 3"], correlation: float) -> MotionPrior:
+    """Return the prior of the cameras' motions if a rolling shutter is more probable, else ``STILL``.
+
+    The hypotheses concern the capture as a whole: either all images have a rolling shutter, or none. Each of up to 60
+    images is resected from ``points`` with and without a motion. ``correlation`` is the number of keypoints
+    that count as one.
+    """
+    sightings = seen.sightings
+    numbers = (torch.bincount(seen.image) >= LEAST_VISIBLE_POINTS).nonzero()[:, 0]
+    if len(numbers) < ENOUGH_IMAGES:
+        return STILL
+    prior = MotionPrior.usual(float(sightings.in_camera(points)[:, 2].median()))
+    total, some = 0.0, numbers[:: -(-len(numbers) // 60)]
+    for _, states, normal in resections(sightings, points, some, correlation, (STILL, prior)):
+        still, moving = log_evidence(states, normal).view(2, -1)
+        gain = (moving - still).clamp(-MOST_EVIDENCE, MOST_EVIDENCE)
+        total += float(gain.nan_to_num(-MOST_EVIDENCE).sum())
+    return prior if total > 0 else STILL

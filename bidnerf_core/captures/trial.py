@@ -117,15 +117,26 @@ def _correlation(
 ) -> float:
     """Return the ``correlation`` for which the errors are as large as the covariances of the fits predict."""
     covariances = torch.stack([answer.covariance / HEAVY_TAILS for answer in answers])
-    low, high = 1.0, MOST_CORRELATED
-    for _ in range(30):  # bisection, geometrically
-        middle = (low * high) ** 0.5
-        factors = _factors(matches, replace(landmarks, correlation=middle))
+
+    def are_larger(correlation: Tensor) -> Tensor:
+        factors = _factors(matches, replace(landmarks, correlation=float(correlation)))
         information = torch.linalg.inv(factors[:, None, None] * covariances + landmarks.pose_covariance)
         squared = torch.einsum("ni,nij,nj->n", updates, information, updates)
-        above = float(squared.quantile(QUANTILE)) > chi_squared_quantile(QUANTILE, 6)
-        low, high = (middle, high) if above else (low, middle)
-    return (low * high) ** 0.5
+        return squared.quantile(QUANTILE) > chi_squared_quantile(QUANTILE, 6)
+
+    ones = torch.ones((), dtype=torch.float64)
+    return float(_bisected(ones, MOST_CORRELATED * ones, are_larger))
+
+
+def _bisected(
+    low: Float[Tensor, "*n"], high: Float[Tensor, "*n"], is_above: Callable[[Tensor], Tensor]
+) -> Float[Tensor, "*n"]:
+    """Return, by geometric bisection, where ``is_above`` becomes false between ``low`` and ``high``."""
+    for _ in range(30):
+        middle = (low * high).sqrt()
+        above = is_above(middle)
+        low, high = torch.where(above, middle, low), torch.where(above, high, middle)
+    return (low * high).sqrt()
 
 
 def _factors(matches: Sequence[int], landmarks: LandmarkMap) -> Float[Tensor, "n"]:
@@ -141,10 +152,10 @@ def _calibration_scatter(answers: Sequence[Answer], factors: Float[Tensor, "n"])
     widest = [found.posterior.camera_of(found.explanations.widest) for found in answers]
     apparent, noise = (torch.stack([camera[part][:4] for camera in widest]) for part in (0, 1))
     explained = factors[:, None] * noise.square()
-    low, high = torch.full((4,), 1e-5, dtype=torch.float64), torch.ones(4, dtype=torch.float64)
-    for _ in range(30):
-        middle = (low * high).sqrt()
-        squared = apparent.square() / (explained + middle.square())
-        above = squared.quantile(QUANTILE, dim=0) > chi_squared_quantile(QUANTILE, 1)
-        low, high = torch.where(above, middle, low), torch.where(above, high, middle)
-    return (low * high).sqrt()
+    limit = chi_squared_quantile(QUANTILE, 1)
+
+    def are_larger(scatter: Tensor) -> Tensor:
+        return (apparent.square() / (explained + scatter.square())).quantile(QUANTILE, dim=0) > limit
+
+    ones = torch.ones(4, dtype=torch.float64)
+    return _bisected(1e-5 * ones, ones, are_larger)

@@ -11,7 +11,7 @@ from bidnerf_core import SE3, View
 
 # Inside: the refinement of poses is tested without a training around it
 from bidnerf_core.captures import TrainingPoses
-from bidnerf_core.captures.training_poses import training_poses
+from bidnerf_core.captures.training_views import training_poses
 from bidnerf_core.mapping import tracked_views
 from landmark_scene import Points, looking_in
 

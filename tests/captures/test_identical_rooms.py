@@ -13,7 +13,7 @@ from bidnerf_core import SE3, View
 from bidnerf_core.captures import TrainingPoses, pose_contradiction, surveyed
 
 # Inside: the choice of poses is tested without a training around it
-from bidnerf_core.captures.training_poses import training_poses
+from bidnerf_core.captures.training_views import training_poses
 from bidnerf_core.localization import LandmarkMatcher, Loop, Outcome
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, posed_keypoints, tracked_views
 from landmark_scene import Points, looking_in

@@ -26,8 +26,7 @@ from bidnerf_core.captures import (
     tried_landmarks,
 )
 from bidnerf_core.captures.cameras import moved_from
-from bidnerf_core.captures.pose_refinement import common_motion
-from bidnerf_core.captures.training_poses import training_poses
+from bidnerf_core.captures.training_views import common_motion, training_poses
 from bidnerf_core.fields import render, render_image
 from bidnerf_core.frames import all_pixels, observe
 from bidnerf_core.localization import MOVING, LandmarkMatcher, Loop

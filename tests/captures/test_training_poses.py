@@ -24,9 +24,7 @@ from bidnerf_core.captures import (
 
 # Inside: how far each pose was refined, and the checks of depth that precede a training
 from bidnerf_core.captures.cameras import moved_from
-from bidnerf_core.captures.pose_refinement import adjusted_poses
-from bidnerf_core.captures.training_poses import training_poses
-from bidnerf_core.captures.training_views import check_depth_unit
+from bidnerf_core.captures.training_views import adjusted_poses, check_depth_unit, training_poses
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import LandmarkConfig, Sift, TrackedViews, tracked_views
@@ -155,7 +153,7 @@ def test_stored_cameras_hold_both_poses_and_how_far_they_are_apart() -> None:
     found_noise = found.consistency.noise_before, found.consistency.noise_after
     (line,) = pose_sentences(cameras, PoseRefinement(*found_noise, True))
     worst = max(range(VIEWS), key=lambda i: float(found.pixels[i]))
-    assert f"{views[worst].frame.name} most" in line
+    assert f"most for {views[worst].frame.name} by" in line
 
 
 def test_cameras_that_did_not_move_have_one_pose() -> None:
