@@ -15,7 +15,7 @@ from bidnerf_core.datasets.options import DepthRegistration
 from bidnerf_core.depth import DepthCamera as DepthCamera  # for authors of readers
 from bidnerf_core.errors import InputError, InputWarning, amount, enumeration
 from bidnerf_core.frames import MaskFolder, photos_in
-from bidnerf_core.io import IMAGE_SUFFIXES
+from bidnerf_core.io import IMAGE_SUFFIXES, is_file
 from bidnerf_core.io import Background as Background  # for authors of readers
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 
@@ -203,6 +203,11 @@ class Format(Generic[Found]):
         found = self.find(path)
         assert found is not None  # ensured by recognises
         return self.load(path, found, options)
+
+
+def first_file(path: Path, *names: str) -> Path | None:
+    """Return the first of the files in a folder that exists, such as the metadata by which its format is recognized."""
+    return next((file for name in names if is_file(file := path / name)), None)
 
 
 def _defects(reader: Any) -> Iterator[str]:

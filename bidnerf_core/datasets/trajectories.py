@@ -253,6 +253,17 @@ def pose_of_numbers(where: str, numbers: Sequence[float], opengl: bool) -> SE3 |
     return SE3(rotation, torch.tensor(found[:3], dtype=torch.float64))
 
 
+def numbers_in(where: object, text: str, count: int) -> list[float]:
+    """Return the numbers of a text, separated by spaces or commas. Raises ``InputError`` unless there are ``count``."""
+    try:
+        numbers = [float(word) for word in text.replace(",", " ").split()]
+    except ValueError as error:
+        raise InputError(error, where=where, expected=f"{count} numbers") from error
+    if len(numbers) != count:
+        raise InputError(f"has {len(numbers)} numbers", where=where, expected=f"{count}")
+    return numbers
+
+
 def pose_of_matrix(where: object, numbers: Sequence[float], what: str = "the rotation") -> SE3:
     """Return the pose in the first three rows of a matrix of four columns, given row by row.
 

@@ -118,7 +118,6 @@ FAULTS: dict[str, list[tuple[str, Edit, str | tuple[str, ...]]]] = {
         ("metadata", content("{"), "not JSON"),
         ("rgbd/0.depth", lambda file: file.write_bytes(file.read_bytes()[:50]), ""),
         ("rgbd/0.depth", content(lzfse.compress(bytes(10**7))), ""),
-        ("rgbd/0.depth", content(bytes(range(256)) * 1000), "256000 bytes"),
         ("rgbd/0.jpg", lambda file: file.write_bytes(file.read_bytes()[:300]), "not readable as an image"),
         ("rgbd/0.jpg", content(b""), "the file is empty"),
     ],
@@ -335,8 +334,7 @@ def test_members_that_unpack_to_too_much(tmp_path: Path, monkeypatch: pytest.Mon
 def test_the_package_that_decodes_depth_is_named_where_it_is_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("lzfse", "liblzfse"):
-        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setitem(sys.modules, "lzfse", None)
     files = record3d_files(small_views(2))
     file = packed(tmp_path, files)
     with refused(where=file, found="pip install 'bidnerf[record3d]'"):

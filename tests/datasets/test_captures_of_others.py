@@ -17,7 +17,6 @@ from refusals import refused
 from scan_layouts import (
     SMALL,
     edit_frame,
-    edit_keys,
     message,
     pixels,
     read_all,

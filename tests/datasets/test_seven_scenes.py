@@ -148,7 +148,6 @@ def test_a_camera_in_the_folder_is_that_of_the_images(scene: Path) -> None:
     [
         ("", "", "lists no sequences", "lines such as sequence1"),
         ("sequence2\nsequence7", ": line 2", "no folder for sequence7", "seq-07"),
-        ("sequence2\n\nsequence2", ": line 3", "sequence2 is repeated", "each sequence once"),
         ("the second", "", "line 1: 'the second'", "a sequence such as sequence1"),
     ],
 )

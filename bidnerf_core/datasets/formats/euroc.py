@@ -18,8 +18,8 @@ from pathlib import Path
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets.capture import Capture, Shot
 from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format
-from bidnerf_core.datasets.trajectories import pose_of_matrix, read_timed_files, read_trajectory
+from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
+from bidnerf_core.datasets.trajectories import numbers_in, pose_of_matrix, read_timed_files, read_trajectory
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import is_file, read_file
@@ -29,7 +29,7 @@ TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0", "gt0")
 
 def _read(path: Path, root: Path, options: DatasetOptions) -> Capture:
     """Read the lists. Raises ``InputError`` if one is missing or invalid."""
-    truth = next((file for name in TRUTHS if is_file(file := root / name / "data.csv")), None)
+    truth = first_file(root, *(f"{name}/data.csv" for name in TRUTHS))
     rows = read_timed_files(root / "cam0" / "data.csv")
     camera, T_body_camera = _sensor(root / "cam0" / "sensor.yaml", options)
     trajectory = None if truth is None else read_trajectory(truth)
@@ -71,13 +71,7 @@ def _numbers(file: Path, text: str, key: str, count: int) -> list[float]:
     The list may stand below a matrix's ``data:``.
     """
     found = re.search(rf"^\s*{key}\s*:[^\[]*\[([^\]]*)\]", text, re.MULTILINE)
-    try:
-        numbers = [float(word) for word in found[1].replace(",", " ").split()] if found else []
-    except ValueError as error:
-        raise InputError(f"{key}: {error}", where=file, expected=f"{count} numbers") from error
-    if len(numbers) != count:
-        raise InputError(f"{key} has {len(numbers)} numbers", where=file, expected=f"{count} in brackets")
-    return numbers
+    return numbers_in(f"{file}: {key}", found[1] if found else "", count)
 
 
 reader = Format("mav0/cam0/data.csv with mav0/cam0/sensor.yaml (EuRoC)", _find, _read, ["camera"])

@@ -18,7 +18,7 @@ import torch
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.capture import Capture, Shot, remark
 from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
 from bidnerf_core.datasets.trajectories import read_matrices
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import photos_in
@@ -35,8 +35,7 @@ def _read(path: Path, folder: Path, options: DatasetOptions) -> Capture:
     number = folder.name.removeprefix("image_")
     camera, T_first_camera = _calibration(path / "calib.txt", f"P{number}", (header.width, header.height))
     name = f"{sequence.name}.txt"
-    places = path / "poses.txt", path / name, sequence.parent.parent / "poses" / name
-    file = next((place for place in places if is_file(place)), None)
+    file = first_file(path, "poses.txt", name, f"{sequence.parent.parent}/poses/{name}")
     poses = dict(enumerate([] if file is None else read_matrices(file)))
     stamps, times = path / "times.txt", dict[int, float]()
     if is_file(stamps):

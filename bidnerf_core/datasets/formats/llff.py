@@ -17,11 +17,11 @@ import torch
 
 from bidnerf_core.datasets.capture import Capture, Shot
 from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import photos_in
 from bidnerf_core.geometry import rigid_pose
-from bidnerf_core.io import is_file, read_array
+from bidnerf_core.io import read_array
 
 POSES = "poses_bounds.npy"
 
@@ -50,8 +50,4 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     return Capture(path, shots, options.colour, pose_file=file)
 
 
-def _find(path: Path) -> Path | None:
-    return file if is_file(file := path / POSES) else None
-
-
-reader = Format(f"images with {POSES} (LLFF)", _find, _read)
+reader = Format(f"images with {POSES} (LLFF)", lambda path: first_file(path, POSES), _read)

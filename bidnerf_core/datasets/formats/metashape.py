@@ -17,7 +17,7 @@ from bidnerf_core.datasets.capture import Capture, Shot
 from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames
 from bidnerf_core.datasets.pose_rows import camera_of
 from bidnerf_core.datasets.reader import DatasetOptions, Format
-from bidnerf_core.datasets.trajectories import pose_of_matrix
+from bidnerf_core.datasets.trajectories import numbers_in, pose_of_matrix
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import SE3
@@ -32,7 +32,7 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
         for sensor in chunk.iter("sensor")
     }
     metric = chunk.find("transform/scale")
-    scale = 1.0 if metric is None else _numbers(metric, f"{file}: the scale of the chunk", 1)[0]
+    scale = 1.0 if metric is None else numbers_in(f"{file}: the scale of the chunk", metric.text or "", 1)[0]
     names = FileNames(path, *(path / place for place in ("images", "photos", "input")))
     listed = list(chunk.iter("camera"))
     cameras = {camera.get("label") or "": camera for camera in listed}
@@ -48,7 +48,7 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
         if sensor is None:
             raise InputError("has no calibrated sensor", where=where, expected="the id of one")
         if transform is not None:
-            pose = pose_of_matrix(where, _numbers(transform, where, 16))
+            pose = pose_of_matrix(where, numbers_in(where, transform.text or "", 16))
             pose = SE3(pose.rotation, pose.translation * scale)
         shots.append(Shot(image=image, camera=sensor, T_world_camera=pose))
     return Capture(
@@ -83,16 +83,6 @@ def _chunk(file: Path) -> ElementTree.Element:
     return chunk
 
 
-def _numbers(element: ElementTree.Element, where: str, count: int) -> list[float]:
-    try:
-        numbers = [float(word) for word in (element.text or "").split()]
-    except ValueError as error:
-        raise InputError(error, where=where, expected=f"{count} numbers") from error
-    if len(numbers) != count:
-        raise InputError(f"has {len(numbers)} numbers", where=where, expected=f"{count}")
-    return numbers
-
-
 def _camera(sensor: ElementTree.Element, where: str) -> Camera | None:
     """Return the camera of a sensor; None if it is not calibrated."""
     size, found = sensor.find("resolution"), sensor.findall("calibration")
@@ -110,7 +100,7 @@ def _camera(sensor: ElementTree.Element, where: str) -> Camera | None:
     if not adjusted:
         return None
     values = {
-        child.tag: _numbers(child, where, 1)[0]
+        child.tag: numbers_in(where, child.text or "", 1)[0]
         for child in adjusted[0]
         if child.tag not in ("resolution", "covariance", "params")
     }

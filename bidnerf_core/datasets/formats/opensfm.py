@@ -19,11 +19,11 @@ from bidnerf_core.camera import Camera, PanoramaFace, colmap_camera
 from bidnerf_core.datasets.capture import Capture, Shot, remark
 from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames
 from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import Record, is_file, read_json
+from bidnerf_core.io import Record, read_json
 
 KINDS = ("perspective", "brown", "simple_radial", "radial", "fisheye_opencv")
 """The kinds of cameras that are read, besides panoramas."""
@@ -69,8 +69,7 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
 
 
 def _find(path: Path) -> Path | None:
-    names = ("reconstruction.json", "opensfm/reconstruction.json")
-    return next((file for name in names if is_file(file := path / name)), None)
+    return first_file(path, "reconstruction.json", "opensfm/reconstruction.json")
 
 
 def _camera(record: Record) -> Camera:

@@ -15,7 +15,7 @@ from pathlib import Path
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.capture import Capture, DepthFile, Shot
 from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
 from bidnerf_core.datasets.trajectories import pose_of_matrix
 from bidnerf_core.depth import DepthReader
 from bidnerf_core.errors import InputError
@@ -55,8 +55,7 @@ def _find(path: Path) -> list[Path]:
 
 def _camera(path: Path) -> tuple[Intrinsics, float]:
     """Return the camera, and the metres per step of depth."""
-    places = (place / "cam_params.json" for place in (path, path.resolve().parent))
-    file = next(filter(is_file, places), None)
+    file = first_file(path, "cam_params.json", f"{path.resolve().parent}/cam_params.json")
     if file is None:
         return Intrinsics(600.0, 600.0, 600.0, 340.0, 1200, 680), 1 / 6553.5
     record = read_record(file)

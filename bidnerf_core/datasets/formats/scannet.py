@@ -16,12 +16,12 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.capture import Capture, DepthFile, Shot
 from bidnerf_core.datasets.formats.twelve_scenes import own_sensor
 from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
 from bidnerf_core.datasets.trajectories import read_pose_matrix
 from bidnerf_core.depth import MILLIMETRE, DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import photos_in
-from bidnerf_core.io import is_file, read_header, read_rows
+from bidnerf_core.io import read_header, read_rows
 
 
 def _read(path: Path, found: tuple[list[Path], Path], options: DatasetOptions) -> Capture:
@@ -59,7 +59,7 @@ def _find(path: Path) -> tuple[list[Path], Path] | None:
 
 def _intrinsics(path: Path, kind: str) -> Path | None:
     name = f"intrinsic_{kind}.txt"
-    return next(filter(is_file, (path / "intrinsic" / name, path / name, path / "intrinsics" / name)), None)
+    return first_file(path, f"intrinsic/{name}", name, f"intrinsics/{name}")
 
 
 def _camera(file: Path, image: Path) -> Intrinsics:

@@ -132,8 +132,6 @@ def _listed(file: Path, folders: dict[int, Path]) -> list[int]:
         number = int(found[1])
         if number not in folders:
             raise InputError(f"no folder for {row.text}", where=row.where, expected=f"seq-{number:02d}")
-        if number in numbers:
-            raise InputError(f"{row.text} is repeated", where=row.where, expected="each sequence once")
         numbers.append(number)
     if not numbers:
         raise InputError("lists no sequences", where=file, expected="lines such as sequence1")

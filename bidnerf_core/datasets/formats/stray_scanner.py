@@ -17,7 +17,7 @@ from pathlib import Path
 from bidnerf_core.datasets import lidar
 from bidnerf_core.datasets.capture import Capture, DepthFile, Shot
 from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
 from bidnerf_core.datasets.trajectories import pose_of_numbers, read_table
 from bidnerf_core.datasets.video import Video, VideoPicture
 from bidnerf_core.errors import InputError
@@ -47,9 +47,8 @@ def _read(path: Path, odometry: Path, options: DatasetOptions) -> Capture:
         where, stem = str(matrix) if own is None else row.where, f"{number:06d}"
         pose = row.plain_numbers([words[name] or "nan" for name in POSE])
         # The first versions wrote depth as .npy.
-        files = (path / "depth" / f"{stem}{suffix}" for suffix in (".png", ".npy"))
-        depth, sure = next(filter(is_file, files), None), path / "confidence" / f"{stem}.png"
-        confidence = sure if is_file(sure) else None
+        depth = first_file(path / "depth", f"{stem}.png", f"{stem}.npy")
+        confidence = first_file(path / "confidence", f"{stem}.png")
         shots.append(
             Shot(
                 image=VideoPicture(video, number) if number < len(video) else video.path / stem,
@@ -69,11 +68,7 @@ def _read(path: Path, odometry: Path, options: DatasetOptions) -> Capture:
 
 
 def _find(path: Path) -> Path | None:
-    return (
-        path / "odometry.csv"
-        if all(map(is_file, (path / "odometry.csv", path / "camera_matrix.csv")))
-        else None
-    )
+    return first_file(path, "odometry.csv") if is_file(path / "camera_matrix.csv") else None
 
 
 reader = Format("rgb.mp4 with odometry.csv and camera_matrix.csv (Stray Scanner)", _find, _read)

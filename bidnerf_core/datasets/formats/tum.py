@@ -31,17 +31,17 @@ from pathlib import Path
 import numpy as np
 
 from bidnerf_core.camera import Camera, Intrinsics, folder_camera
-from bidnerf_core.datasets.capture import Capture, DepthFile, Shot
+from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, remark
 from bidnerf_core.datasets.file_names import FileNames
-from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
 from bidnerf_core.datasets.trajectories import (
     LARGEST_GAP,
     TimedRow,
-    Trajectory,
     read_timed_files,
     read_trajectory,
 )
 from bidnerf_core.depth import DepthReader
+from bidnerf_core.errors import amount
 from bidnerf_core.io import is_file
 
 CAMERAS = {
@@ -68,17 +68,29 @@ def _read(path: Path, colour_list: Path, options: DatasetOptions) -> Capture:
     unknown, ways = f"its name contains none of {sensors}", f"one of {sensors}, or a file"
     camera = folder_camera(path, given, _published(path.resolve().name), unknown, ways)
     sensor, unit = options.sensor(path), options.depth_unit or 1 / 5000
-    depths = read_timed_files(path / "depth.txt") if is_file(path / "depth.txt") else []
-    partners = associate(times, [row.time for row in depths], 0.02)  # as in the benchmark's own association
-    read_depth, shots = DepthReader(documented=("65535",)), list[Shot]()
-    for index, row in enumerate(colours):
-        depth = _file(depths[partners[index]], names) if index in partners else None
+    depth_list, read_depth = path / "depth.txt", DepthReader(documented=("65535",))
+    images = [_file(row, names) for row in colours]
+    measured = (
+        [(row.time, _file(row, names)) for row in read_timed_files(depth_list)] if is_file(depth_list) else []
+    )
+    depths = [(time, file) for time, file in measured if is_file(file)]
+    if lost := len(measured) - len(depths):
+        remark(depth_list, f"{lost} of {amount(len(measured), 'depth image')} are missing and left out")
+    # Only what exists is associated: the next depth image may belong to an image whose nearest one is missing.
+    there = [index for index, image in enumerate(images) if is_file(image)]
+    partners = associate(
+        [times[index] for index in there], [time for time, _ in depths], 0.02
+    )  # as in the benchmark
+    depth_of = {there[place]: depths[other][1] for place, other in partners.items()}
+    shots = list[Shot]()
+    for index, (time, image) in enumerate(zip(times, images, strict=True)):
+        depth = depth_of.get(index)
         shots.append(
             Shot(
-                image=_file(row, names),
+                image=image,
                 camera=camera,
-                T_world_camera=None if trajectory is None else trajectory.at(row.time),
-                time=row.time,
+                T_world_camera=None if trajectory is None else trajectory.at(time),
+                time=time,
                 depth=None if depth is None else DepthFile(depth, partial(read_depth, depth, unit), sensor),
             )
         )
@@ -86,12 +98,12 @@ def _read(path: Path, colour_list: Path, options: DatasetOptions) -> Capture:
     return Capture(
         path, shots, options.colour, unit="metres", depth_unit=unit, pose_file=truth,
         poses_expected="the poses of the frames of a dataset" if trajectory is None else samples,
-        unposed=_unposed(trajectory),
+        unposed=f"before its first pose, after its last, or in gaps of more than {LARGEST_GAP:g} s",
     )  # fmt: skip
 
 
 def _find(path: Path) -> Path | None:
-    return file if is_file(file := path / "rgb.txt") else None
+    return first_file(path, "rgb.txt")
 
 
 def _published(name: str, whole: bool = False) -> Intrinsics | None:
@@ -104,17 +116,6 @@ def _published(name: str, whole: bool = False) -> Intrinsics | None:
 def _file(row: TimedRow, names: FileNames) -> Path:
     """Return the file that a row lists, whose name may contain spaces; it may be missing."""
     return names.find(row.rest.strip("\"'")) or names.path(row.words[0])
-
-
-def _unposed(trajectory: Trajectory | None) -> str:
-    """Return why images may have no pose, with the usual gap between poses if that is large."""
-    gap = float(trajectory.times.diff().median()) if trajectory is not None and len(trajectory) > 1 else 0.0
-    if trajectory is None or gap <= LARGEST_GAP:
-        return f"before its first pose, after its last, or in gaps of more than {LARGEST_GAP:g} s"
-    return (
-        f"its {len(trajectory)} poses are usually {gap:.2g} s apart, like those of keyframes, and none is"
-        f" interpolated over more than {LARGEST_GAP:g} s"
-    )
 
 
 def associate(times: Sequence[float], others: Sequence[float], largest: float) -> dict[int, int]:

@@ -20,11 +20,11 @@ from bidnerf_core.camera import CameraSource, Intrinsics
 from bidnerf_core.datasets.capture import Capture, Shot
 from bidnerf_core.datasets.formats.seven_scenes import frames_of, images_of
 from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
 from bidnerf_core.depth import MILLIMETRE, DepthCamera, DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import is_file, read_rows
+from bidnerf_core.io import read_rows
 
 
 def _read(path: Path, found: tuple[Path, Path], options: DatasetOptions) -> Capture:
@@ -51,12 +51,8 @@ def _read(path: Path, found: tuple[Path, Path], options: DatasetOptions) -> Capt
 def _find(path: Path) -> tuple[Path, Path] | None:
     """Return the folder of the frames, and the file of their cameras."""
     folder = next((place for place in (path / "data", path) if images_of(place)), None)
-    info = _beside(path, "info.txt", "_info.txt")
+    info = first_file(path, "info.txt", "_info.txt", "../info.txt", "../_info.txt")
     return None if folder is None or info is None else (folder, info)
-
-
-def _beside(path: Path, *names: str) -> Path | None:
-    return next(filter(is_file, (place / name for place in (path, path.parent) for name in names)), None)
 
 
 def own_sensor(colour: Intrinsics, depth: Intrinsics | None) -> DepthCamera | None:
@@ -78,7 +74,7 @@ def _camera(info: Path, values: dict[str, list[float]], kind: str) -> Intrinsics
 
 def _in_splits(path: Path, shots: list[Shot]) -> list[Shot]:
     """Return the frames with those of the first sequence as "test" and the others as "train"."""
-    file = _beside(path, "split.txt")
+    file = first_file(path, "split.txt", "../split.txt")
     if file is None:
         return shots
     rows = read_rows(file, "a list of sequences", "start and end")
