@@ -334,18 +334,17 @@ class Capture:
             return chosen
         refuse_text(f"{where}: names", names)
         by_name = {shot.name: shot for shot in chosen}
-        for name in (name for name in names if name not in by_name):
-            splits = {each: self.frame_names(each) for each in self.splits}
-            if (elsewhere := in_other_split(name, splits)) is not None:
-                raise InputError(elsewhere, where=where)
-            if meant := [shot.name for shot in chosen if shot.stem == name]:
-                listed = ", ".join(meant[:4]) + (", ..." if len(meant) > 4 else "")
-                raise InputError(f"frame {name!r} is ambiguous", where=where, expected=f"one of {listed}")
-            hint = spelling_hint(name, by_name)
+        unknown = next((name for name in names if name not in by_name), None)
+        if unknown is None:
+            return [by_name[name] for name in names]
+        elsewhere = in_other_split(unknown, {each: self.frame_names(each) for each in self.splits})
+        meant = [shot.name for shot in chosen if shot.stem == unknown]
+        hint, expected = spelling_hint(unknown, by_name), f"one of {', '.join(meant[:4])}" if meant else None
+        found = f"frame {unknown!r} is ambiguous" if meant else elsewhere
+        if found is None:
+            found = f"no frame {unknown!r} among its {len(chosen)} frames{hint}"
             expected = f"a name such as {chosen[0].name!r}" if chosen and not hint else None
-            found = f"no frame {name!r} among its {len(chosen)} frames{hint}"
-            raise InputError(found, where=where, expected=expected)
-        return [by_name[name] for name in names]
+        raise InputError(found, where=where, expected=expected)
 
     def views(
         self,

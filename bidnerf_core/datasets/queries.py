@@ -91,12 +91,10 @@ def read_depth_points(path: Path) -> Observations:
         arrays = read_archive(path, ("points", "T_camera_sensor"), "a .npz file of points")
         if "points" not in arrays:
             raise InputError("no array 'points'", where=path, expected=f"one with {EXPECTED_POINTS}")
-        points = arrays["points"]
-        if (given := arrays.get("T_camera_sensor")) is not None:
-            matrix = (
-                torch.from_numpy(given.astype(np.float64)) if given.dtype.kind in "fiu" else torch.empty(0)
-            )
-            T_camera_sensor = pose_from_matrix(matrix, "T_camera_sensor", path)
+        points, given = arrays["points"], arrays.get("T_camera_sensor")
+        if given is not None:
+            matrix = given.astype(np.float64) if given.dtype.kind in "fiu" else np.zeros(0)
+            T_camera_sensor = pose_from_matrix(torch.from_numpy(matrix), "T_camera_sensor", path)
     elif path.suffix == ".npy":
         points = read_array(path, "a .npy file of points")
     else:
@@ -121,54 +119,7 @@ def read_depth_points(path: Path) -> Observations:
         raise InputError(error, where=path) from error
 
 
-class Queries:
-    """Frames of a capture as queries, each of them the last of a rig: names of frames with known relative poses.
-
-    Frames of a ``split`` are named as in it; without one, frames have no pose, and each is a rig of its own.
-    """
-
-    def __init__(
-        self,
-        capture: Capture,
-        rigs: Sequence[tuple[str, ...]],
-        split: str | None,
-        points: DepthPoints | None = None,
-    ) -> None:
-        self.capture, self._rigs, self._split, self._points = capture, rigs, split, points
-        self._remarks, self._without_depth = set[str](), set[str]()
-
-    @property
-    def names(self) -> Sequence[str]:
-        return [rig[-1] for rig in self._rigs]
-
-    def read(self, place: int) -> Query:
-        """Read the query at index ``place``. Raises ``InputError`` if one of its files is missing or unusable."""
-        if self._split is None:
-            shot = self.capture.shots[place]
-            if shot.name in self._without_depth:
-                log.info("%s: no measured depth was given; colour only", shot.name)
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always", InputWarning)
-                frame = self.capture[place].frame
-            for warning in caught:
-                self._remark(shot.name, str(warning.message).partition(": ")[2] or str(warning.message))
-            self._remark(shot.name, f"{frame.camera_source}")
-            views: tuple[View, ...] = (View(frame, SE3.identity()),)
-            truth = None
-        else:
-            views = tuple(self.capture.views(self._split, self._rigs[place]))
-            (shot,), truth = self.capture.select(self._split, self._rigs[place][-1:]), views[-1].T_ref_camera
-        rays = None if self._points is None else self._points.rays(views, self._split or "")
-        return Query(views[-1].frame.name, views, truth, rays, shot.file)
-
-    def _remark(self, name: str, text: str) -> None:
-        """Log the source of a camera, or an assumption, unless the same was logged for an earlier photo."""
-        if text not in self._remarks:
-            self._remarks.add(text)
-            log.info("%s: %s", name, text)
-
-
-class Photos(Queries):
+class Photos:
     """Image files, each of them a query. ``depth`` holds the depth files of photos that have one.
 
     Without a background among the ``options``, the map in which a photo is localized gives it.
@@ -181,27 +132,53 @@ class Photos(Queries):
         depth: Mapping[Path, Path] | None = None,
         points: DepthPoints | None = None,
     ) -> None:
-        depth, sensor = depth or {}, options.sensor("register_depth")
+        self._depth, self._points, self._remarks = depth or {}, points, set[str]()
+        sensor = options.sensor("register_depth")
         shots = [
             PhotoShot(
                 image=file,
                 camera=options.camera_source,
-                depth_image=depth.get(file),
+                depth_image=self._depth.get(file),
                 depth_unit=options.depth_unit,
                 sensor=sensor,
                 awaits_background=options.background is None,
             )
             for file in files
         ]
-        capture = Capture(Path("photos"), shots, options.colour)
+        self.capture = Capture(Path("photos"), shots, options.colour)
         if (masks := options.mask_folder) is not None:
-            capture = capture.masked(masks, by_stem=True)
-        super().__init__(capture, [(name,) for name in capture.names], None, points)
-        self._without_depth = {shot.name for shot in capture.shots if depth and shot.file not in depth}
+            self.capture = self.capture.masked(masks, by_stem=True)
+
+    @property
+    def names(self) -> Sequence[str]:
+        return self.capture.names
+
+    def read(self, place: int) -> Query:
+        """Read the query at index ``place``. Raises ``InputError`` if one of its files is missing or unusable.
+
+        The source of its camera, and what is assumed, is logged unless the same was logged for an earlier photo.
+        """
+        shot = self.capture.shots[place]
+        if self._depth and shot.file not in self._depth:
+            log.info("%s: no measured depth was given; colour only", shot.name)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", InputWarning)
+            frame = self.capture[place].frame
+        texts = [str(warning.message) for warning in caught]
+        for text in [*(text.partition(": ")[2] or text for text in texts), f"{frame.camera_source}"]:
+            if text not in self._remarks:
+                log.info("%s: %s", shot.name, text)
+            self._remarks.add(text)
+        views = (View(frame, SE3.identity()),)
+        rays = None if self._points is None else self._points.rays(views, "")
+        return Query(frame.name, views, None, rays, shot.file)
 
 
-class DatasetFrames(Queries):
-    """Frames of a dataset as queries: one rig of ``names``, or each frame of a split with the ``window - 1`` before it."""
+class DatasetFrames:
+    """Frames of a dataset as queries: one rig of ``names``, or each frame of a split with the ``window - 1`` before it.
+
+    The pose of the last frame of each rig is to be found.
+    """
 
     def __init__(
         self,
@@ -211,20 +188,33 @@ class DatasetFrames(Queries):
         window: int = 1,
         points: DepthPoints | None = None,
     ) -> None:
+        self.capture, self._split, self._points = dataset, split, points
         listed = dataset.frame_names(split)
         if not listed:
             raise InputError(f"split {split!r} has no frames", where=dataset.path)
         if window > len(listed):
             raise UsageError(f"--window is {window}", expected=f"1 to {len(listed)}")
-        rigs = []
-        for rig in [names] if names else [(name,) for name in listed]:
-            if window > 1 and rig[0] in listed:  # an unknown name is rejected on reading
-                rig = windowed(listed, listed.index(rig[0]), window)
-                if len(rig) < window:
-                    before = f"{rig[-1]} has only {len(rig) - 1} before it in split {split!r}"
-                    log.info("--window %d: %s; a rig of %d", window, before, len(rig))
-            rigs.append(rig)
-        super().__init__(dataset, rigs, split, points)
+        self._rigs = [names] if names else [(name,) for name in listed]
+        if window > 1 and self._rigs[0][0] in listed:  # an unknown name is rejected on reading
+            self._rigs = [windowed(listed, listed.index(rig[0]), window) for rig in self._rigs]
+        for rig in self._rigs:
+            if window > len(rig):
+                before = f"{rig[-1]} has only {len(rig) - 1} before it in split {split!r}"
+                log.info("--window %d: %s; a rig of %d", window, before, len(rig))
+
+    @property
+    def names(self) -> Sequence[str]:
+        return [rig[-1] for rig in self._rigs]
+
+    def read(self, place: int) -> Query:
+        """Read the query at index ``place``. Raises ``InputError`` if one of its files is missing or unusable."""
+        rig = self._rigs[place]
+        views, (shot,) = (
+            tuple(self.capture.views(self._split, rig)),
+            self.capture.select(self._split, rig[-1:]),
+        )
+        rays = None if self._points is None else self._points.rays(views, self._split)
+        return Query(views[-1].frame.name, views, views[-1].T_ref_camera, rays, shot.file)
 
 
 def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]:

@@ -42,10 +42,7 @@ class Video:
             pass
         with _opened(path) as (container, stream):
             self.size = int(stream.codec_context.width), int(stream.codec_context.height)
-            try:
-                found = [packet for packet in container.demux(stream) if packet.pts is not None]
-            except (OSError, ValueError) as error:
-                raise _no_video(path, reason(error)) from error
+            found = [packet for packet in container.demux(stream) if packet.pts is not None]
             start = (container.start_time or 0) / 1e6  # microseconds
             shown = [(p.pts, float(p.pts * stream.time_base) - start) for p in found if not p.is_discard]
         # Frames before the start are only needed to decode what follows.
@@ -72,9 +69,8 @@ class Video:
         picture = self._picture(number)
         try:
             pixels: np.ndarray = picture.to_ndarray(format="rgb24")
-        except (
-            OSError
-        ):  # FFmpeg lacks the colour space that the file names, such as BT.2020 with constant luminance
+        except OSError:
+            # FFmpeg lacks the colour space that the file names, such as BT.2020 with constant luminance.
             picture.colorspace = 9  # BT.2020's YCbCr-to-RGB matrix (ITU-T H.273)
             pixels = picture.to_ndarray(format="rgb24")
         return np.ascontiguousarray(np.rot90(pixels, round(picture.rotation / 90))) if is_upright else pixels
@@ -164,15 +160,16 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     import av
 
     try:
-        container = av.open(str(path.resolve()), options=OPTIONS)
+        with av.open(str(path.resolve()), options=OPTIONS) as container:
+            if not container.streams.video:
+                raise _no_video(path, "it has no video stream")
+            stream = container.streams.video[0]
+            stream.codec_context.options = {"max_pixels": str(LARGEST_IMAGE)}
+            yield container, stream
+    except InputError:
+        raise
     except (OSError, ValueError) as error:
         raise _no_video(path, reason(error)) from error
-    with container:
-        if not container.streams.video:
-            raise _no_video(path, "it has no video stream")
-        stream = container.streams.video[0]
-        stream.codec_context.options = {"max_pixels": str(LARGEST_IMAGE)}
-        yield container, stream
 
 
 def _no_video(path: Path, why: str) -> InputError:
