@@ -49,7 +49,7 @@ def run(
         if not names:
             raise InputError(f"split {images.split!r} has no frames", where=data)
         scene = load_map(map)
-        views = dataset.views(images.split, names, counter("reading", "images"))
+        views = dataset.views(images.split, names)
         names = [view.frame.name for view in views]
         for name in {f"{name}.depth" for name in names} & set(names):
             raise InputError(

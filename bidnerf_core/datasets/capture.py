@@ -350,25 +350,21 @@ class Capture:
         self,
         split: str,
         names: Sequence[str] | None = None,
-        progress: Callable[[int, int], None] | None = None,
         limit: int | None = None,
     ) -> list[View]:
         """Read the frames ``names``, in that order, or the whole split; no other image is opened.
 
         When reading a whole split, frames that a mask hides entirely are left out. Images with more than ``limit``
-        pixels along the longer side are downscaled to that, where the user asked for nothing else. ``progress`` is
-        called with (frames read, frames requested) after each frame. Raises ``InputError`` for an unknown split or
-        frame, and for a file that is missing or invalid.
+        pixels along the longer side are downscaled to that, where the user asked for nothing else. Raises
+        ``InputError`` for an unknown split or frame, and for a file that is missing or invalid.
         """
         shots, views = self.select(split, names), list[View]()
-        for done, shot in enumerate(shots, start=1):
+        for shot in shots:
             try:
                 views.append(self.view(shot, limit))
             except WhollyHidden:
                 if names is not None:
                     raise
-            if progress is not None:
-                progress(done, len(shots))
         return views
 
     def wholly_hidden(self, split: str) -> list[str]:

@@ -52,7 +52,14 @@ class SparsePoints:
     ) -> None:
         self.folder = folder
         images, self._points = read_model(folder)
-        self._images = _Names(folder, images)
+        # By the name of the frame: the stem, or folders and stem as joined by datasets ("left_0001").
+        self._images: dict[str, list[tuple[tuple[str, ...], ModelImage]]] = defaultdict(list)
+        for image in images:
+            parts = PurePosixPath(image.name.replace("\\", "/")).with_suffix("").parts
+            for name in {"_".join(parts[-count:]) for count in range(1, len(parts) + 1)}:
+                self._images[name].append((parts[:-1], image))
+        listed = ", ".join([*(image.name for image in images[:3]), *(["..."] if len(images) > 3 else [])])
+        self._some = f"{len(images)} images" + (f" ({listed})" if listed else "")
         points = self._points
         sound = points.positions.isfinite().all(-1) & ~points.errors.isnan()
         # A negative error was never computed and excludes no point.
@@ -63,23 +70,24 @@ class SparsePoints:
                 f" pixels or less and {choice.points_views} observations or more",
                 where=folder,
             )
-        pairs = [(self._images.find(name, split), T.translation) for name, T in places]
+        pairs = [(self._image(name, split), T.translation) for name, T in places]
         known = [(image.T_camera_model.inverse().translation, place) for image, place in pairs if image]
         if len(known) < 2:
             raise InputError(
                 f"has {len(known)} of the {len(places)} training cameras",
                 where=folder,
-                expected=f"at least 2 to determine its unit; it has {self._images.some}",
+                expected=f"at least 2 to determine its unit; it has {self._some}",
             )
         there, here = (torch.stack([pair[i].double().cpu() for pair in known]) for i in (0, 1))
+        fits = torch.ones(len(known), dtype=torch.bool)
         try:
-            off = torch.linalg.vector_norm(fit_similarity(there, here).apply(there) - here, dim=-1)
-            # A second fit leaves out cameras that are off by several medians, but none that is off by hardly anything.
-            fits = off <= max(3 * float(off.median()), 0.01 * spread(here))
-            there, here, self.cameras = there[fits], here[fits], int(fits.sum())
-            fit = fit_similarity(there, here)
-            off = torch.linalg.vector_norm(fit.apply(there) - here, dim=-1)
-            self.metres, self.misfit = fit.scale, float(off.median()) / spread(here)
+            for _ in range(2):
+                # The second fit leaves out cameras that are off by several medians, but none that is off by hardly anything.
+                used, fit = fits, fit_similarity(there[fits], here[fits])
+                off = torch.linalg.vector_norm(fit.apply(there) - here, dim=-1)
+                fits = off <= max(3 * float(off.median()), 0.01 * spread(here))
+            self.metres, self.cameras = fit.scale, int(used.sum())
+            self.misfit = float(off[used].median()) / spread(here[used])
         except InputError as error:
             where = f"{folder}: the unit cannot be estimated from the training cameras"
             raise InputError(error, where=where) from error
@@ -90,6 +98,21 @@ class SparsePoints:
                 where=folder,
                 expected="at most 20%; is it a model of these images?",
             )
+
+    def _image(self, name: str, split: str) -> ModelImage | None:
+        """Return the image of a frame, or None. Folders named train, val or test separate the frames of splits.
+
+        Raises ``InputError`` if the name is ambiguous.
+        """
+        others = {"train", "val", "test"} - {split}
+        fits = [
+            (folders, image) for folders, image in self._images.get(name, []) if not others & set(folders)
+        ]
+        fits = [(folders, image) for folders, image in fits if split in folders] or fits
+        if len(fits) > 1:
+            found = f"frame {name!r} may be any of {', '.join(image.name for _, image in fits[:4])};"
+            raise InputError(found, where=self.folder, expected="one image of that name")
+        return fits[0][1] if fits else None
 
     @property
     def summary(self) -> str:
@@ -102,7 +125,7 @@ class SparsePoints:
 
     def seen(self, name: str, split: str) -> Float[Tensor, "n 3"]:
         """Return the points that a frame observes (metres, camera frame); none if the model lacks the frame."""
-        image = self._images.find(name, split)
+        image = self._image(name, split)
         if image is None:
             return torch.zeros((0, 3), dtype=torch.float64)
         place = torch.searchsorted(self._points.ids, image.points).clamp(max=len(self._points.ids) - 1)
@@ -124,9 +147,7 @@ class SparsePoints:
         ]
         if not parts:
             names = ", ".join(view.frame.name for view in views)
-            raise InputError(
-                f"has no points observed by {names}; it has {self._images.some}", where=self.folder
-            )
+            raise InputError(f"has no points observed by {names}; it has {self._some}", where=self.folder)
         return Observations.joined(parts)
 
     def onto(self, view: View, split: str) -> View:
@@ -139,43 +160,3 @@ class SparsePoints:
             return view
         depth = nearest_depth(points, view.frame.intrinsics)
         return View(view.frame.replace(depth=depth), view.T_ref_camera)
-
-
-class _Names:
-    """The images of a model by frame name: the stem, or folders and stem as joined by datasets ("left_0001")."""
-
-    def __init__(self, folder: Path, images: Sequence[ModelImage]) -> None:
-        self._folder, self._images = folder, images
-        self._by_name: dict[str, list[tuple[tuple[str, ...], ModelImage]]] = defaultdict(list)
-        for image in images:
-            parts = PurePosixPath(image.name.replace("\\", "/")).with_suffix("").parts
-            for name in {"_".join(parts[-count:]) for count in range(1, len(parts) + 1)}:
-                self._by_name[name].append((parts[:-1], image))
-
-    def find(self, name: str, split: str) -> ModelImage | None:
-        """Return the image of a frame, or None. Folders named train, val or test separate the frames of splits.
-
-        Raises ``InputError`` if the name is ambiguous.
-        """
-        others = {"train", "val", "test"} - {split}
-        fits = [
-            (folders, image) for folders, image in self._by_name.get(name, []) if not others & set(folders)
-        ]
-        if len(fits) > 1:
-            fits = [(folders, image) for folders, image in fits if split in folders] or fits
-        if len(fits) > 1:
-            listed = ", ".join(image.name for _, image in fits[:4])
-            raise InputError(
-                f"frame {name!r} may be any of {listed};",
-                where=self._folder,
-                expected="one image of that name",
-            )
-        return fits[0][1] if fits else None
-
-    @property
-    def some(self) -> str:
-        """The number of images and a few of their names, for messages."""
-        names = ", ".join(image.name for image in self._images[:3])
-        return f"{len(self._images)} images" + (
-            f" ({names}{', ...' if len(self._images) > 3 else ''})" if names else ""
-        )

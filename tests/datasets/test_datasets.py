@@ -225,10 +225,8 @@ def test_a_single_frame_is_in_both_splits(tmp_path: Path) -> None:
 
 def test_only_what_is_asked_for_is_read_and_in_that_order(blender: Path) -> None:
     (blender / "train/r_1.png").write_bytes(b"damaged")
-    told = list[tuple[int, int]]()
-    views = open_dataset(blender).views("train", ["r_2", "r_0"], lambda *now: told.append(now))
+    views = open_dataset(blender).views("train", ["r_2", "r_0"])
     assert [view.frame.name for view in views] == ["r_2", "r_0"]
-    assert told == [(1, 2), (2, 2)]
     assert open_dataset(blender).views("train", []) == []
 
 
