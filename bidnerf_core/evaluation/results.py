@@ -4,7 +4,6 @@ the runs that made such a file.
 
 from __future__ import annotations
 
-import filecmp
 import json
 import os
 import platform
@@ -16,11 +15,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
-from importlib.metadata import distribution, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
-from urllib.parse import urlsplit
-from urllib.request import url2pathname
 
 import psutil
 import torch
@@ -282,8 +279,7 @@ class Provenance:
 
     date: str  # UTC, when it began
     command: str
-    # of the checkout that the code was run from, or was installed from without changes since
-    commit: str | None
+    commit: str | None  # of the checkout that the code was run from
     dirty: bool  # whether files of that checkout were modified
     cpu: str
     cores: int | None
@@ -336,16 +332,10 @@ def read_runs(results: Path) -> list[Provenance]:
 
 def _git(*arguments: str) -> str:
     """Return the output of a git command in this package's checkout; empty if there is no checkout or no git."""
-    package = Path(bidnerf_core.__file__).resolve().parent
-    root = package.parent
-    # An installed package may lie inside another project; PEP 610 names the folder from which it was installed.
+    root = Path(bidnerf_core.__file__).resolve().parents[1]
+    # An installed package may lie inside another project.
     if not (root / ".git").exists():
-        stated = json.loads(distribution("bidnerf").read_text("direct_url.json") or "{}").get("url", "")
-        root = Path(url2pathname(urlsplit(stated).path))
-        code = [str(file.relative_to(package)) for file in package.rglob("*.py")]
-        _, *others = filecmp.cmpfiles(package, root / "bidnerf_core", code)
-        if any(others) or not (root / ".git").exists():
-            return ""
+        return ""
     try:
         done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):

@@ -161,7 +161,7 @@ class BidConfig(Settings):
     adam: AdamSettings = AdamSettings(decay=0.4, decay_steps=80)
     colour: ColourSettings = ColourSettings()
     depth: DepthSettings = DepthSettings()
-    # Favour pixels on matter, and keep measured points in the scene's box: the best variant on Lego (``benchmarks/bid_variants.py``).
+    # Favour pixels on matter, and keep measured points in the scene's box: the best variant on Lego (records ``bid_depth_*``).
     reach: ReachSettings = ReachSettings(candidates=3, box_weight=1.0)
 
 

@@ -13,12 +13,13 @@ import pytest
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
-@pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], ModuleType]]:
+@pytest.fixture(scope="module")
+def script() -> Iterator[Callable[[str], ModuleType]]:
     """Imports a module of the benchmarks, which is forgotten afterwards."""
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
     known = set(sys.modules)
-    yield importlib.import_module
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(BENCHMARKS))
+        yield importlib.import_module
     for name in set(sys.modules) - known:
         if Path(getattr(sys.modules[name], "__file__", None) or "").parent == BENCHMARKS:
             del sys.modules[name]

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -19,19 +17,10 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import faulty
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-
 
 @pytest.fixture(scope="module")
-def answers() -> Iterator[ModuleType]:
-    """The script, with the modules of the benchmarks that it imports."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(BENCHMARKS))
-        before = set(sys.modules)
-        yield importlib.import_module("answers")
-        for name in set(sys.modules) - before:
-            if str(BENCHMARKS) in str(getattr(sys.modules[name], "__file__", "")):
-                del sys.modules[name]
+def answers(script: Callable[[str], ModuleType]) -> ModuleType:
+    return script("answers")
 
 
 def view(name: str = "0007") -> View:

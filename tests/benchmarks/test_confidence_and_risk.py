@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 from collections.abc import Callable
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -15,20 +13,14 @@ import pytest
 from bidnerf_core.localization import LogisticModel
 
 
-def benchmark(name: str) -> ModuleType:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
-        return importlib.import_module(name)
+@pytest.fixture(scope="module")
+def calibration(script: Callable[[str], ModuleType]) -> ModuleType:
+    return script("risk")
 
 
 @pytest.fixture(scope="module")
-def calibration() -> ModuleType:
-    return benchmark("risk")
-
-
-@pytest.fixture(scope="module")
-def learning() -> ModuleType:
-    return benchmark("confidence")
+def learning(script: Callable[[str], ModuleType]) -> ModuleType:
+    return script("confidence")
 
 
 def test_the_fit_recovers_probabilities(learning: ModuleType) -> None:

@@ -56,15 +56,6 @@ def test_a_part_is_recorded(tmp_path: Path) -> None:
     assert len((tmp_path / "inerf_demo_blobs.jsonl").read_text().splitlines()) == 2
 
 
-def test_each_variant_of_bid_can_be_tried(script: Script) -> None:
-    module = script("bid_variants")
-    for group, (_, variants, sizes) in module.GROUPS.items():
-        found = module.plans(group, Plan(protocol="bid", method="bid", trials=2, seed=0), None, None)
-        trials = [trials_of(plan) for plan in found]  # raises where there is no such setting
-        assert [len(some) for some in trials] == [2 * len(sizes)] * len(variants)
-        assert len({some[0].config for some in trials}) == len(variants)
-
-
 def test_presets_become_settings_of_each_method(script: Script) -> None:
     settings_of_preset = script("paper_tables").preset_settings
     bid = settings_of_preset("paper", {"rays": 7}, "bid")

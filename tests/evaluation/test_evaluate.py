@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import signal
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, wait
+from concurrent.futures import Future, ProcessPoolExecutor, wait
 from importlib import import_module
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -25,17 +27,23 @@ from bidnerf_core.evaluation import (
     Comparison,
     Plan,
     ResultTable,
+    Trial,
     TrialResult,
+    forget_peak_memory,
     local_processes,
     opened,
+    peak_memory_bytes,
     read_results,
+    run_trial,
 )
 
 # Inside: a map that stays in memory, and processes that outlive an evaluation
 from bidnerf_core.evaluation.run import InThisProcess
-from bidnerf_core.io import from_plain
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.localization import find_method
 from bidnerf_core.progress import Progress
+from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import closed_form_data, closed_form_map
 from refusals import refused
 
@@ -233,30 +241,6 @@ def test_frames_that_masks_hide_wholly_are_named_and_left_out(
     assert "--mask-hides" in caught.error.found
 
 
-def test_all_splits_are_evaluated_together(shared: Path, tmp_path: Path) -> None:
-    data = open_dataset(shared / "data")
-    count = sum(len(data.frame_names(split)) for split in data.splits)
-    words = ["evaluate", str(shared / "map"), str(shared / "data"), *WORDS, "--split", "all"]
-    assert main([*words, "--trials", str(count), "--out", str(tmp_path / "r.jsonl")]) == 0
-    rows = read_results([tmp_path / "r.jsonl"])
-    assert {row.trial.split for row in rows} == {"all"}
-    assert len({row.frame for row in rows}) == count
-    for given in (shared / "data", data):
-        found = bn.evaluate(shared / "map", given, quick(split="all", trials=count))
-        assert timeless(found.rows) == timeless(rows)
-    compared = bn.compare([bn.load_map(shared / "map")], data, quick(split="all", trials=2))
-    assert compared.split == "all"
-
-
-def test_folders_without_masks_are_refused(
-    shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = [str(shared / "map"), str(shared / "data"), "--masks", str(tmp_path)]
-    assert main(["evaluate", *words, "--out", str(tmp_path / "r.jsonl")]) == 1
-    assert "expected masks" in capsys.readouterr().err
-    assert main(["compare", str(shared / "map"), str(shared / "data"), "--mask-hides", "white"]) == 2
-
-
 def test_frames_of_one_name_are_refused() -> None:
     views = [dataclasses.replace(v, frame=dataclasses.replace(v.frame, name="image")) for v in tiny.views(2)]
     with refused(found="2 frames named 'image'", expected="different names"):
@@ -373,3 +357,142 @@ def test_maps_in_memory_and_in_folders_are_compared(
     assert from_plain(Comparison, json.loads((tmp_path / "c.json").read_text()), "c") == named
     with pytest.raises(bn.Cancelled):
         bn.compare([scene], data, plan, cancel=lambda: True)
+
+
+# Single trials, and trials on a cluster.
+
+
+@pytest.fixture
+def trial(shared: Path) -> Trial:
+    folders = str(shared / "map"), str(shared / "data")
+    return Trial(
+        *folders, ("t_0001",), (0.5,), 3, protocol="bid", method="bid", config='{"max_steps": 4, "rays": 64}'
+    )
+
+
+def test_a_line_has_what_localize_prints_and_more(
+    trial: Trial, shared: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = to_plain(run_trial(trial))
+    capsys.readouterr()
+    assert main(["localize", str(shared / "map"), str(shared / "data"), "--frame", "t_0001", "--json",
+                 "--method", "bid", "--perturb", "0.1", "5", "--max-steps", "2", "--rays", "32"]) == 0  # fmt: skip
+    assert json.loads(capsys.readouterr().out).keys() <= line.keys()
+    assert json.loads(json.dumps(line, allow_nan=False)) == line
+    assert line["frame"] == "t_0001"
+    assert line["seed"] == 3
+    assert line["steps"] == 4
+    assert line["start_error"]["translation"] == pytest.approx(0.5, rel=0.01)  # exp bends it a little
+    assert line["start_error"]["rotation_deg"] == pytest.approx(math.degrees(0.2))
+    for kind in ("translation", "rotation_deg"):
+        assert len(line["errors"][kind]) == 5
+        assert line["errors"][kind][0] == pytest.approx(line["start_error"][kind])
+        assert line["errors"][kind][-1] == pytest.approx(line["error"][kind])
+    assert line["settings"]["rays"] == 64
+    assert line["settings"]["depth_weight"] == 1.0
+    assert line["weights"].startswith("weights-")
+    assert line["peak_memory_bytes"] > 10**7
+
+
+def test_its_trial_has_the_names_of_folders_alone(trial: Trial) -> None:
+    found = run_trial(trial).trial
+    assert found == trial.portable == trial.portable.portable
+    assert hash(found) == hash(trial.portable)
+
+
+def test_its_error_is_that_of_its_pose(trial: Trial, shared: Path) -> None:
+    result = run_trial(trial)
+    matrix = torch.tensor(result.T_world_camera, dtype=torch.float64)
+    truth = tiny.views(3, seed=1)[1].T_ref_camera
+    error = pose_error(SE3.from_matrix(matrix), truth)
+    assert result.error is not None
+    assert result.error.translation == pytest.approx(float(error.translation), abs=1e-6)
+
+
+@pytest.mark.slow
+def test_the_same_trial_gives_the_same_line_here_and_elsewhere(trial: Trial) -> None:
+    (first,) = timeless([run_trial(trial)])
+    torch.manual_seed(17)
+    assert timeless([run_trial(trial)]) == [first]
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        assert timeless([pool.submit(run_trial, trial).result()]) == [first]
+    other = run_trial(dataclasses.replace(trial, seed=4))
+    assert other.start_error is not None
+    assert other.T_world_camera != first.T_world_camera
+
+
+def test_a_trial_without_depth_is_given_none(trial: Trial, tmp_path: Path) -> None:
+    """Whatever the weight of depth: as if the data had none."""
+    tiny.write_dataset(tmp_path / "data", depth=False)
+    blind = run_trial(dataclasses.replace(trial, depth=False))
+    bare = run_trial(dataclasses.replace(trial, data=str(tmp_path / "data")))
+    assert blind.T_world_camera == bare.T_world_camera
+    assert blind.T_world_camera != run_trial(trial).T_world_camera
+
+
+def test_a_trial_that_cannot_be_is_refused(trial: Trial) -> None:
+    """Plans refuse most of it before; a trial may come from elsewhere."""
+    without: dict[str, Any] = {"protocol": "none", "size": ()}
+    wrong: list[tuple[dict[str, Any], str | None, str, str | None]] = [
+        ({"protocol": "bit"}, None, "no protocol 'bit', did you mean 'bid'?", None),
+        ({"size": ()}, None, "size is missing", "e_t (m)"),
+        ({"config": '{"ray": 1}'}, "config", "'ray', did you mean 'rays'?", None),
+        ({"config": "{"}, "config", "not JSON", "settings of bid"),
+        (without, None, "method 'bid' needs a start", None),
+        (without | {"method": "auto", "config": "{}"}, "the map has no surface", "method 'auto'", None),
+        ({"method": "magic"}, None, "no method 'magic'", None),
+        ({"frames": ("nope",)}, "split 'test'", "no frame 'nope'", "'t_0000'"),
+    ]
+    for change, where, found, expected in wrong:
+        with refused(where=where, found=found, expected=expected):
+            run_trial(dataclasses.replace(trial, **change))
+
+
+def test_peak_memory_is_of_what_went_on_since() -> None:
+    forget_peak_memory()
+    before = peak_memory_bytes()
+    block = torch.ones(40_000_000)
+    assert peak_memory_bytes() >= before + 100_000_000
+    del block
+    forget_peak_memory()
+    assert peak_memory_bytes() < before + 100_000_000
+
+
+@pytest.mark.slow
+def test_two_dask_workers_give_the_results_of_one_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.undo()  # the workers draw images of the usual size
+    six = ("--trials", "6")
+    alone, together = tmp_path / "alone.jsonl", tmp_path / "together.jsonl"
+    assert main(["evaluate", "demo:blobs", "--out", str(alone), *WORDS, *six]) == 0
+    cluster = distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
+    )
+    with cluster:
+        address = cluster.scheduler_address
+        assert (
+            main(["evaluate", "demo:blobs", "--out", str(together), "--dask", address, *six, *WORDS[:-2]])
+            == 0
+        )
+    lines = [[json.loads(line) for line in path.read_text().splitlines()] for path in (alone, together)]
+    for line in (*lines[0], *lines[1]):
+        del line["seconds"], line["peak_memory_bytes"]
+    assert lines[0] == lines[1]
+    (run,) = json.loads(together.with_suffix(".meta.json").read_text())["runs"]
+    assert run["workers"] == "dask, 2 threads"
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_is_not_there_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("bidnerf_core.evaluation.run.PATIENCE", "1s")
+    out = tmp_path / "r.jsonl"
+    assert (
+        main(["evaluate", "demo:blobs", "--out", str(out), "--dask", "tcp://127.0.0.1:9", *WORDS[:-2]]) == 1
+    )
+    said = capsys.readouterr().err.splitlines()
+    assert "no dask scheduler at tcp://127.0.0.1:9" in said[-1]

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from pathlib import Path
-from types import SimpleNamespace
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,7 +17,7 @@ from bidnerf_core.evaluation import (
 )
 
 # Inside: records of runs with any content, of which a script makes only its own
-from bidnerf_core.evaluation.results import Provenance, provenance
+from bidnerf_core.evaluation.results import Provenance
 from bidnerf_core.io import from_plain
 from drawn import record
 
@@ -45,21 +42,3 @@ def test_any_run_comes_back_as_it_was(run: Provenance, tmp_path: Path) -> None:
     note_run(tmp_path / "r.jsonl", run)
     assert read_runs(tmp_path / "r.jsonl") == [*before, run]
     (tmp_path / "r.meta.json").unlink()
-
-
-def test_the_commit_is_that_of_the_checkout_an_unchanged_installation_is_from(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    checkout, installed = tmp_path / "check out", tmp_path / "site"
-    for folder in (checkout, installed):
-        (folder / "bidnerf_core").mkdir(parents=True)
-        (folder / "bidnerf_core" / "__init__.py").write_text("code")
-    for words in ("init -q", "add .", "-c user.name=a -c user.email=a@b commit -q -m first"):
-        subprocess.run(["git", *words.split()], cwd=checkout, check=True)
-    monkeypatch.setattr("bidnerf_core.__file__", str(installed / "bidnerf_core" / "__init__.py"))
-    stated = SimpleNamespace(read_text=lambda _: json.dumps({"url": checkout.as_uri()}))
-    monkeypatch.setitem(provenance.__globals__, "distribution", lambda _: stated)
-    head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=checkout, check=True, capture_output=True)
-    assert provenance("x", "y").commit == head.stdout.decode().strip()
-    (checkout / "bidnerf_core" / "__init__.py").write_text("other code")
-    assert provenance("x", "y").commit is None

@@ -111,12 +111,6 @@ def test_a_summary_counts(results: list[TrialResult]) -> None:
     assert summarize([lied]).converged_but_wrong == 1
 
 
-def test_without_a_start_there_is_no_share_of_its_error() -> None:
-    summary = summarize([result(s, 2, protocol="none") for s in range(3)])
-    assert summary.success["10%"] is None
-    assert summary.success["5deg 0.05"] is not None
-
-
 def test_comparisons_agree_with_scipy(results: list[TrialResult]) -> None:
     near, far, both = pairwise_tests(grouped(results), "10%")
     quick, slow = ([float(r.errors.translation.index(0.001)) for r in rows]
