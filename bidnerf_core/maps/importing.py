@@ -8,7 +8,7 @@ import math
 import os
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,15 +39,29 @@ from bidnerf_core.maps.baking import check_alike
 from bidnerf_core.maps.description import MapInfo, cameras_of
 from bidnerf_core.maps.importers import ImportedField, Structure, bounds_about, importer_of, robust_box
 from bidnerf_core.maps.map import Map, frozen_field
-from bidnerf_core.maps.options import ImportOptions
 from bidnerf_core.maps.store import map_folder, write_parts
-from bidnerf_core.maps.training import bake_settings, baked_if_possible
+from bidnerf_core.maps.training import MapOptions, bake_settings, baked_if_possible
 from bidnerf_core.maps.viewpoints import viewpoints
 from bidnerf_core.maps.views import USEFUL_SIDE, Images, Origin, ReadViews, chosen_origin, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, job_context
 from bidnerf_core.training import TrainingState
 
 log = logging.getLogger("bidnerf")
+
+
+@dataclass(frozen=True)
+class ImportOptions(MapOptions):
+    """How the coordinates of a file are taken to the world, and by which importer."""
+
+    importer: str | None = None
+    """name of an installed importer, by default the one that recognizes the file"""
+
+    scale: float = 1.0
+    """factor of all lengths: metres per unit of the file"""
+
+    T_world_file: SE3 | None = None
+    """transforms the scaled coordinates of the file to the world"""
+
 
 AS_IN_THE_FILE = ImportOptions()
 

@@ -53,9 +53,8 @@ from bidnerf_core.mapping import (
     colour_noise,
     find_features,
 )
-from bidnerf_core.maps.anchor import Anchor
 from bidnerf_core.maps.baking import bake_landmarks, bake_surface, check_alike
-from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info
+from bidnerf_core.maps.description import DESCRIPTION, Anchor, MapInfo, load_info
 from bidnerf_core.maps.store import (
     checked_weights,
     content_digest,

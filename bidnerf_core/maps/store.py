@@ -43,8 +43,7 @@ from bidnerf_core.mapping import (
     surface_from_tensors,
     surface_tensors,
 )
-from bidnerf_core.maps.anchor import ANCHOR
-from bidnerf_core.maps.description import DESCRIPTION, PART_NAMES, MapInfo, load_info
+from bidnerf_core.maps.description import ANCHOR, DESCRIPTION, PART_NAMES, MapInfo, load_info
 from bidnerf_core.training import TrainingState
 
 PARTS = r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|(capture|anchor)-\d{8,}-[0-9a-f]{8}\.json)"

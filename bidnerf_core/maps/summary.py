@@ -1,177 +1,126 @@
-"""The summary of a map for users."""
+"""Summaries for users: the facts about a map, and how well it renders a photo."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from torch import nn
+import torch
+from jaxtyping import Float
+from kornia.metrics import psnr
+from torch import Tensor, nn
 
-from bidnerf_core.captures import (
-    CaptureReport,
-    MovedCamera,
-    PoseRefinement,
-    UpDirection,
-    moved_cameras,
-    pose_sentences,
-    sentences,
-)
+from bidnerf_core.captures import moved_cameras, pose_sentences, sentences
 from bidnerf_core.errors import amount
-from bidnerf_core.fields import SceneBounds, levels
-from bidnerf_core.geometry import LengthUnit
+from bidnerf_core.fields import RenderedImage, levels
+from bidnerf_core.frames import Frame
+from bidnerf_core.geometry import LengthUnit, symbol
 from bidnerf_core.io import to_plain
-from bidnerf_core.mapping import HeldOutTrial
+from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.progress import duration_text
 
 if TYPE_CHECKING:
     from bidnerf_core.maps.map import Map
 
-
-@dataclass(frozen=True)
-class SurfaceSize:
-    """The size of a map's surface."""
-
-    cell: float  # metres: side of a cell of its index
-    cells: int  # number of stored cells
-    MiB: float
+DESCRIBED = (
+    "backend", "data", "added", "unit", "distances", "step", "complete", "bounds", "origin", "config", "bidnerf",
+    "colour_noise",
+)  # fmt: skip
+"""The attributes of a map's description that are facts for users."""
 
 
 @dataclass(frozen=True)
 class MapSummary:
     """The facts about a map. ``str()`` gives a human-readable description, ``plain()`` a JSON object."""
 
-    map: str  # its folder; empty for a map in memory
-    backend: str
-    data: str  # name of the dataset's folder
-    cameras: int
-    added: int  # of these cameras, after training
-    unit: LengthUnit  # of all lengths
-    up: UpDirection | None  # the upward direction in the world, and its source
-    distances: bool  # whether the training images determine distances
-    poses: PoseRefinement | None  # the consistency of the given poses, if known
-    step: int
-    complete: bool
-    seconds: float  # of training
-    levels: int
-    parameters: int
-    surfels: int
-    surface: SurfaceSize | None
-    landmarks: int
-    trial: HeldOutTrial | None
-    bytes: int | None  # total size of the files in its folder
-    bounds: SceneBounds  # relative to the origin, as all positions in the map
-    origin: tuple[float, float, float]  # of the map's own coordinates, in the world
-    config: dict[str, Any]
-    bidnerf: str  # the version that wrote it
-    moved: tuple[MovedCamera, ...]  # by the refinement of poses
-    capture: CaptureReport | None  # the capture record, if there is one
-    colour_noise: float | None  # root mean square error of rendered colours on training images
+    info: MapInfo
+    facts: dict[str, Any]  # those that are not in the description
     remarks: tuple[str, ...]  # sentences about the poses and the photos
 
     @staticmethod
     def of(scene: Map) -> MapSummary:
         """Return the summary of a map."""
         info, field, surface, folder = scene.info, scene.field, scene.surface, scene.folder
-        refinement, capture = info.pose_refinement, scene.capture
+        refinement, capture, landmarks, size = info.pose_refinement, scene.capture, scene.landmarks, None
+        if surface is not None:
+            size = {
+                "cell": surface.cell,  # side of a cell of its index
+                "cells": surface.stored_cells,
+                "MiB": round(surface.mebibytes, 1),
+            }
+        facts = {
+            "map": "" if folder is None else str(folder),
+            "cameras": len(info.cameras),
+            "up": scene.up,
+            "poses": refinement,
+            "seconds": round(info.seconds, 1),
+            "levels": len(levels(field)),
+            "parameters": sum(p.numel() for p in field.parameters()) if isinstance(field, nn.Module) else 0,
+            "surfels": 0 if surface is None else len(surface.surfels),
+            "surface": size,
+            "landmarks": 0 if landmarks is None else len(landmarks),
+            "trial": None if landmarks is None else landmarks.trial,
+            "bytes": None
+            if folder is None
+            else sum(file.stat().st_size for file in folder.iterdir() if file.is_file()),
+            "moved": tuple(moved_cameras(info.cameras)),
+            "capture": capture,
+        }
         remarks = [] if refinement is None else pose_sentences(info.cameras, refinement)
         if capture is not None:
             remarks += sentences(capture)
-        size, files = None, None
-        if surface is not None:
-            size = SurfaceSize(surface.cell, surface.stored_cells, round(surface.mebibytes, 1))
-        if folder is not None:
-            files = sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
-        landmarks = scene.landmarks
-        return MapSummary(
-            map="" if folder is None else str(folder),
-            cameras=len(info.cameras),
-            up=scene.up,
-            poses=refinement,
-            seconds=round(info.seconds, 1),
-            levels=len(levels(field)),
-            parameters=sum(p.numel() for p in field.parameters()) if isinstance(field, nn.Module) else 0,
-            surfels=0 if surface is None else len(surface.surfels),
-            surface=size,
-            landmarks=0 if landmarks is None else len(landmarks),
-            trial=None if landmarks is None else landmarks.trial,
-            bytes=files,
-            moved=tuple(moved_cameras(info.cameras)),
-            capture=capture,
-            remarks=tuple(remarks),
-            **{
-                name: getattr(info, name)
-                for name in (
-                    "backend",
-                    "data",
-                    "added",
-                    "unit",
-                    "distances",
-                    "step",
-                    "complete",
-                    "bounds",
-                    "origin",
-                    "config",
-                    "bidnerf",
-                    "colour_noise",
-                )
-            },
-        )
+        return MapSummary(info, facts, tuple(remarks))
 
     def plain(self) -> dict[str, Any]:
         """Return the facts as JSON-serializable values."""
-        facts: dict[str, Any] = to_plain(replace(self, remarks=()))
-        del facts["remarks"]
+        described = {name: getattr(self.info, name) for name in DESCRIBED}
+        facts: dict[str, Any] = to_plain(described | self.facts)
         return facts
 
     def __str__(self) -> str:
-        rows = [f"{key + ':':<12} {value}" for key, value in self._lines().items()]
-        return "\n".join([*rows, *(f"- {remark}" for remark in self.remarks)])
-
-    def _lines(self) -> dict[str, str]:
-        photos = amount(self.cameras, "image") if self.cameras else "cameras not recorded"
-        added = f", {self.added} of which were added later" if self.added else ""
-        state = "complete" if self.complete else "not complete; 'bidnerf train --resume' continues it"
-        time = duration_text(self.seconds)
-        place = f"{self.map}, {(self.bytes or 0) / 2**20:.1f} MiB" if self.map else "in memory"
-        field, frame = (
-            f"{amount(self.parameters, 'parameter')} in {amount(self.levels, 'level')}",
-            "lengths in ",
-        )
-        if self.colour_noise is not None:
-            field += f", off by {self.colour_noise:.1%} of the range of colours on its training images (RMS)"
-        frame += (
-            "metres" if self.unit == "metres" else "units of unknown length ('bidnerf scale' gives metres)"
-        )
-        if self.up is not None:
+        info, facts, bounds = self.info, self.facts, self.info.bounds
+        up, surface = facts["up"], facts["surface"]
+        photos = amount(len(info.cameras), "image") if info.cameras else "cameras not recorded"
+        added = f", {info.added} of which were added later" if info.added else ""
+        place = f"{facts['map']}, {(facts['bytes'] or 0) / 2**20:.1f} MiB" if facts["map"] else "in memory"
+        training = "none; 'bidnerf train DATA --out MAP' trains a field and builds a surface"
+        field = "none; landmarks alone localize photos"
+        built = "none"
+        if info.step:
+            state = "complete" if info.complete else "not complete; 'bidnerf train --resume' continues it"
+            time = duration_text(info.seconds)
+            training = f"{info.step} steps of backend {info.backend} in {time}, {state}"
+            field = f"{amount(facts['parameters'], 'parameter')} in {amount(facts['levels'], 'level')}"
+            if info.colour_noise is not None:
+                field += (
+                    f", off by {info.colour_noise:.1%} of the range of colours on its training images (RMS)"
+                )
+            built = "none; 'bidnerf bake MAP' builds it"
+        if surface is not None:
+            cells = f"{amount(surface['cells'], 'cell')} with a side of {surface['cell']:.3g}"
+            built = f"{amount(facts['surfels'], 'surfel')}, indexed by {cells}, {surface['MiB']:.1f} MiB"
+        unknown = "units of unknown length ('bidnerf scale' gives metres)"
+        frame = f"lengths in {'metres' if info.unit == 'metres' else unknown}"
+        if up is not None:
             sources = {"gravity": "gravity", "planes": "planes and cameras", "cameras": "the cameras"}
-            up = _shown(tuple(round(x, 4) for x in self.up.direction))
-            frame += f"; up is {up}, by {sources[self.up.source]}"
-        training = f"{self.step} steps of backend {self.backend} in {time}, {state}"
-        if not self.step:
-            training = "none; 'bidnerf train DATA --out MAP' trains a field and builds a surface"
-            field = "none; landmarks alone localize photos"
-        surface = "none; 'bidnerf bake MAP' builds it" if self.step else "none"
-        if self.surface is not None:
-            cells = f"{amount(self.surface.cells, 'cell')} with a side of {self.surface.cell:.3g}"
-            surface = f"{amount(self.surfels, 'surfel')}, indexed by {cells}, {self.surface.MiB:.1f} MiB"
-        bounds, beyond = self.bounds, "more" if self.bounds.contracted else "nothing"
-        box = f"a box of {' x '.join(f'{side:.3g}' for side in bounds.size)} from {_shown(bounds.lower)}, {beyond} beyond it"
-        box += f"; seen from {bounds.near:.3g} to {bounds.far:.3g}"
-        unknown = {"distances": "unknown, since all images were taken from one place"}
-        origin = {"origin": f"{_shown(self.origin)}, to which positions are relative"}
-        return {
-            "map": f"{place}, written by bidnerf {self.bidnerf}",
-            "made from": f"{self.data or 'views in memory'}, {photos}{added}",
+            frame += f"; up is {_shown(tuple(round(x, 4) for x in up.direction))}, by {sources[up.source]}"
+        rows = {
+            "map": f"{place}, written by bidnerf {info.bidnerf}",
+            "made from": f"{info.data or 'views in memory'}, {photos}{added}",
             "training": training,
             "field": field,
-            "scene": f"{box} away; background {_shown(bounds.background)}",
-            **(origin if any(self.origin) else {}),
-            **({} if self.distances else unknown),
+            "scene": f"a box of {' x '.join(f'{side:.3g}' for side in bounds.size)} from {_shown(bounds.lower)},"
+            f" {'more' if bounds.contracted else 'nothing'} beyond it; seen from {bounds.near:.3g} to {bounds.far:.3g}"
+            f" away; background {_shown(bounds.background)}",
+            "origin": f"{_shown(info.origin)}, to which positions are relative" if any(info.origin) else "",
+            "distances": "" if info.distances else "unknown, since all images were taken from one place",
             "frame": frame,
-            "surface": surface,
-            "landmarks": str(self.landmarks or "none; 'bidnerf bake MAP --data DATA' builds them"),
-            **({"settings": _shown(self.config)} if self.config else {}),
+            "surface": built,
+            "landmarks": str(facts["landmarks"] or "none; 'bidnerf bake MAP --data DATA' builds them"),
+            "settings": _shown(info.config) if info.config else "",
         }
+        listed = [f"{key + ':':<12} {value}" for key, value in rows.items() if value]
+        return "\n".join([*listed, *(f"- {remark}" for remark in self.remarks)])
 
 
 def _shown(value: Any) -> str:
@@ -180,3 +129,35 @@ def _shown(value: Any) -> str:
     if isinstance(value, list | tuple):
         return "(" + ", ".join(_shown(item) for item in value) + ")"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+@dataclass(frozen=True, eq=False)
+class RenderingScores:
+    """The quality of a rendered image, compared with the photo from the same pose."""
+
+    psnr: float  # dB
+    depth_errors: Float[Tensor, "n"]  # absolute errors of planar z, at the pixels with measured depth
+    unit: LengthUnit  # of the depth
+
+    @property
+    def depth_error(self) -> float | None:
+        """The median absolute depth error; None without measured depth."""
+        return float(self.depth_errors.median()) if len(self.depth_errors) else None
+
+    def __str__(self) -> str:
+        error = "-" if self.depth_error is None else f"{self.depth_error:.4f}"
+        return f"PSNR {self.psnr:.2f} dB  depth error {error} {symbol(self.unit)}"
+
+
+def rendering_scores(image: RenderedImage, frame: Frame, unit: LengthUnit = "units") -> RenderingScores:
+    """Compare a rendered image with the visible colours and measured depth of the frame from the same pose.
+
+    ``unit`` is the map's, for printing the depth error.
+    """
+    errors = torch.zeros(0)
+    if frame.depth is not None and frame.has_depth:
+        errors = (image.depth - frame.depth).abs()[frame.depth > 0]
+    shown, seen = image.rgb, frame.rgb
+    if frame.hidden is not None:
+        shown, seen = shown[~frame.hidden], seen[~frame.hidden]
+    return RenderingScores(float(psnr(shown, seen, 1.0)), errors, unit)

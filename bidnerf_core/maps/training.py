@@ -7,40 +7,174 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import torch
 from torch import nn
 
 from bidnerf_core.backend import load_backend, quick_config
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.captures import as_given, at_stored_poses, located, prepared, stored_cameras
+from bidnerf_core.captures import (
+    RefinementChoice,
+    as_given,
+    at_stored_poses,
+    located,
+    prepared,
+    stored_cameras,
+)
 from bidnerf_core.carving import estimate_bounds
-from bidnerf_core.datasets import HOLD_OUT_EVERY, DatasetOptions
+from bidnerf_core.datasets import HOLD_OUT_EVERY, DatasetOptions, SparseChoice
 from bidnerf_core.devices import moved, working_device
 from bidnerf_core.errors import Cancelled, InputError, amount, enumeration
-from bidnerf_core.fields import NoField, device_of, trained_field
+from bidnerf_core.fields import NoField, RadianceField, device_of, trained_field
 from bidnerf_core.frames import View
 from bidnerf_core.io import from_plain, packed, to_plain
-from bidnerf_core.mapping import BakeConfig, TrackedViews, tracked_views
-from bidnerf_core.maps.checkpoints import Checkpoints
+from bidnerf_core.mapping import (
+    USUAL_FEATURES,
+    BakeConfig,
+    LandmarkMap,
+    TrackedViews,
+    find_features,
+    tracked_views,
+)
 from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info, longest_side
 from bidnerf_core.maps.map import USUAL_BAKE, Map, build_field, frozen_field, load_map
-from bidnerf_core.maps.options import TrainOptions
 from bidnerf_core.maps.store import load_landmarks, load_state, map_folder, write_parts
 from bidnerf_core.maps.views import Images, ReadViews, chosen_origin, read_views
-from bidnerf_core.progress import Cancel, ProgressCallback, counter, duration_text, job_context
+from bidnerf_core.progress import (
+    Cancel,
+    Progress,
+    ProgressCallback,
+    counter,
+    current_job,
+    duration_text,
+    job_context,
+)
 from bidnerf_core.registry import PluginError
 from bidnerf_core.structure import lacks_poses
-from bidnerf_core.training import TrainingState, TrainingStopped
+from bidnerf_core.training import TrainingState, TrainingStep, TrainingStopped
 
 log = logging.getLogger("bidnerf")
 
+
+@dataclass(frozen=True)
+class MapOptions:
+    """What training and importing have in common: which images are used, and where the map goes."""
+
+    images: DatasetOptions = DatasetOptions()
+    """how the images are read: split, camera, size and so on"""
+
+    features: str = USUAL_FEATURES
+    """name of the detector of the landmarks"""
+
+    device: torch.device | str = "cpu"
+    """device of the training and of the map that is returned"""
+
+    overwrite: bool = False
+    """whether a folder that is not empty is replaced"""
+
+    def __post_init__(self) -> None:
+        find_features(self.features)
+
+
+@dataclass(frozen=True)
+class TrainOptions(MapOptions):
+    """How a map is trained, beside the settings of its backend."""
+
+    refine_poses: RefinementChoice = "auto"
+    """when the given poses are refined with the keypoints that images share: always, never, or auto (if the images contradict
+    them)"""
+
+    trust_poses: bool = False
+    """whether poses that contradict most pairs of images are accepted"""
+
+    depth_points: str | Path | None = None
+    """folder of a COLMAP sparse model whose points provide depth for images without any"""
+
+    point_choice: SparseChoice = SparseChoice()
+    """which of these points are used"""
+
+    checkpoint_seconds: float = 60.0
+    """time between checkpoints: the most work lost if the program is killed"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.refine_poses not in get_args(RefinementChoice):
+            choices = ", ".join(get_args(RefinementChoice))
+            raise InputError(f"refine_poses is {self.refine_poses!r}", expected=f"one of {choices}")
+        if not self.checkpoint_seconds >= 0:
+            raise InputError(f"checkpoint_seconds is {self.checkpoint_seconds}", expected="0 or more")
+
+
 USUAL = TrainOptions()
+
+
+class Checkpoints:
+    """The ``Report`` of a training run.
+
+    States are saved to ``folder``, unless that is None; ``info`` describes the last one. Progress goes to the
+    current job, which may also stop the training. ``state`` is the one to resume from, ``seconds`` the time
+    between checkpoints, and ``landmarks`` are stored with the first if they are not in the folder yet.
+    """
+
+    def __init__(
+        self,
+        info: MapInfo,
+        folder: Path | None = None,
+        state: TrainingState | None = None,
+        seconds: float = TrainOptions.checkpoint_seconds,
+        landmarks: LandmarkMap | None = None,
+    ) -> None:
+        self.info, self.folder = info, folder
+        self._state, self._seconds, self._job = state, seconds, current_job()
+        self._step = self._total = info.step
+        self._landmarks = landmarks
+        self._earlier, self._began = info.seconds, time.monotonic()
+        self._saved = self._began
+
+    @property
+    def stopping(self) -> bool:
+        return self._job.cancel is not None and self._job.cancel()
+
+    def resume(self) -> TrainingState | None:
+        return self._state
+
+    def step(self, progress: TrainingStep) -> None:
+        self._state = None  # free it: it is as large as the field and its optimizer
+        self._step, self._total = progress.step, progress.total
+        if self._job.progress is None:
+            return
+        figures = f"loss {progress.loss:.5f}  PSNR {progress.psnr:.2f} dB"
+        if not math.isnan(progress.samples_per_ray):  # not every recipe reports it
+            figures += f"  {progress.samples_per_ray:.1f} samples per ray"
+        self._job.progress(Progress("training", progress.step, progress.total, "steps", figures))
+
+    def due(self, step: int) -> bool:
+        waited = self.folder is not None and time.monotonic() - self._saved > self._seconds
+        return step == self._total or waited
+
+    def save(self, state: TrainingState) -> None:
+        seconds = self._earlier + time.monotonic() - self._began
+        info = replace(self.info, step=state.step, complete=state.step >= self._total, seconds=seconds)
+        if self.folder is not None:
+            if info.weights:  # the first save may replace another map, whose anchor does not count
+                info = replace(info, anchor=load_info(self.folder).anchor)
+            info = write_parts(self.folder, info, state, landmarks=self._landmarks, keep=True)
+            self._landmarks = None
+        self.info = info
+        self._saved = time.monotonic()
+
+    def finish(self, field: RadianceField) -> None:
+        """Save once more if the backend ended without reporting its last step."""
+        if not self.info.complete and isinstance(field, nn.Module):
+            self._total = self._step
+            self.save(TrainingState(self._step, field.state_dict(), {}))
 
 
 class OtherSettings(InputError):
@@ -94,12 +228,10 @@ def train(
     working_device(options.device)  # an invalid one is rejected before anything is read
     place, known = None if out is None else Path(out), None
     if place is not None and not options.overwrite:
-        there = None
         with contextlib.suppress(InputError):
             there = load_info(place)
-        # A map that is complete without a field, as an imported one may be, gets one.
-        if there is not None and there.complete and not there.step:
-            known = load_map(place)
+            # A map that is complete without a field, as an imported one may be, gets one.
+            known = there if there.complete and not there.step else None
     with (
         job_context(progress, cancel),
         finished_parts(place),
@@ -108,9 +240,10 @@ def train(
         else map_folder(place, options.overwrite or known is not None),
         posed_images(data, options.images, place, options.overwrite) as (posed, images),
     ):
-        if known is not None:
-            info = replace(known.info, backend=backend, config=to_plain(settings, "config"))
-            return _with_field(replace(known, info=info), posed, images, options, baking)
+        if known is not None and place is not None:
+            scene, views, tracked = _with_field(load_map(place), posed, images, options)
+            info = replace(scene.info, backend=backend, config=to_plain(settings, "config"))
+            return _completed(replace(scene, info=info), views, tracked, options, baking)
         read = read_views(posed, images, options.depth_points, options.point_choice, place)
         origin = chosen_origin(torch.stack([view.T_ref_camera.translation.cpu() for view in read.views]))
         if any(origin):
@@ -139,20 +272,17 @@ def train(
             origin=origin, gravity_up=read.gravity_up,
         )  # fmt: skip
         build_field(info, str(place or read.place))  # raises before anything is written
-        scene, tracked = Map(info, NoField()), taken.tracked
-        if baking is not None:
-            # A map that is already there stays until the first checkpoint.
-            if place is not None and not (place / DESCRIPTION).exists():
-                scene = replace(scene, info=write_parts(place, info, TrainingState(0, {}, {})), folder=place)
-            scene, tracked = scene.with_landmarks(taken.views, tracked=tracked)
-        scene = replace(scene, folder=place)
-        return _baked(_trained(taken.views, scene, options), taken.views, tracked, baking)
+        scene = Map(info, NoField())
+        # A map that is already there stays until the first checkpoint.
+        if baking is not None and place is not None and not (place / DESCRIPTION).exists():
+            scene = replace(scene, info=write_parts(place, info, TrainingState(0, {}, {})), folder=place)
+        return _completed(scene, taken.views, taken.tracked, options, baking, out=place)
 
 
 def _with_field(
-    scene: Map, data: Images, images: DatasetOptions, options: TrainOptions, config: BakeConfig | None
-) -> Map:
-    """Train the field that a map of landmarks describes, keeping the landmarks, the cameras and their poses."""
+    scene: Map, data: Images, images: DatasetOptions, options: TrainOptions
+) -> tuple[Map, list[View], TrackedViews | None]:
+    """Return a map of landmarks that a field is to be added to, with its images at its poses and their keypoints."""
     info, images = scene.info, replace(images, largest=longest_side(scene.info))
     read = read_views(data, images, options.depth_points, options.point_choice, scene.folder).about(
         info.origin
@@ -166,7 +296,7 @@ def _with_field(
     )
     bounds = estimate_bounds(views, read.background)
     info = replace(info, bounds=bounds, complete=False, hidden=read.hidden, sparse_depth=read.sparse_depth)
-    return _baked(_trained(views, replace(scene, info=info), options), views, tracked, config)
+    return replace(scene, info=info), views, tracked
 
 
 @contextlib.contextmanager
@@ -218,35 +348,24 @@ def resume(
             images = replace(images, background=info.bounds.background)
         read = read_views(posed, images, options.depth_points, options.point_choice, out).about(info.origin)
         _check_same_views(out, info, read, images.split)
-        views = at_stored_poses(read.views, info.cameras)
-        tracked = None
-        if not info.complete or info.landmarks is None or info.capture is None:
-            # These are the keypoints and views with which training began.
-            tracked, views = located(
-                views, features=info.landmark_features, trust_poses=True, depth_unit=read.depth_unit
-            )
-        state = None
+        # These are the keypoints and views with which training began.
+        tracked, views = located(
+            at_stored_poses(read.views, info.cameras), info.landmark_features, True, read.depth_unit
+        )
         if info.complete or finish:
             scene = load_map(out, device)
-        else:
-            scene = Map(info, NoField(), None, load_landmarks(out, info), out)
-            if info.step:
-                state = load_state(out, info, build_field(info, str(out)))
-                log.info(f"{out}: resuming from step {info.step}")
-        if finish and not info.complete:
-            log.info(f"{out}: ends with the {amount(info.step, 'step')} done so far")
-            field = cast(nn.Module, trained_field(scene.field)).state_dict()
-            done = replace(info, complete=True)  # the state that resuming would need is dropped
-            scene = replace(
-                scene, info=write_parts(out, done, TrainingState(info.step, field, {}), keep=True)
-            )
-        if scene.landmarks is None and baking is not None:
-            scene, tracked = scene.with_landmarks(views, tracked=tracked)
-        elif tracked is None and baking is not None and info.capture is None:
-            tracked = tracked_views(views, info.landmark_features)
-        if not (info.complete or finish):
-            scene = _trained(views, scene, options, state)
-        return _baked(scene, views, tracked, baking) if scene.has_field else scene
+            if not info.complete:
+                log.info(f"{out}: ends with the {amount(info.step, 'step')} done so far")
+                field = cast(nn.Module, trained_field(scene.field)).state_dict()
+                done = replace(info, complete=True)  # the state that resuming would need is dropped
+                stored = write_parts(out, done, TrainingState(info.step, field, {}), keep=True)
+                scene = replace(scene, info=stored)
+            return _completed(scene, views, tracked, options, baking, out=out)
+        scene, state = Map(info, NoField(), None, load_landmarks(out, info), out), None
+        if info.step:
+            state = load_state(out, info, build_field(info, str(out)))
+            log.info(f"{out}: resuming from step {info.step}")
+        return _completed(scene, views, tracked, options, baking, state, out)
 
 
 def interrupted(folder: Path, baking: bool = True) -> MapInfo:
@@ -335,9 +454,37 @@ def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> 
             raise OtherSettings(f"was started with {what.format(before, now)}", where=out)
 
 
-def _trained(
-    views: Sequence[View], scene: Map, options: TrainOptions, state: TrainingState | None = None
+def _completed(
+    scene: Map,
+    views: Sequence[View],
+    tracked: TrackedViews | None,
+    options: TrainOptions,
+    baking: BakeConfig | None,
+    state: TrainingState | None = None,
+    out: Path | None = None,
 ) -> Map:
+    """Go through the stages that a map lacks: landmarks, field, surface, and the capture record of its photos.
+
+    ``tracked`` are the keypoints of ``views``, ``state`` is that of the training to resume, and the field goes to folder ``out``.
+    """
+    if baking is not None and scene.landmarks is None:
+        scene, tracked = scene.with_landmarks(views, tracked=tracked)
+    elif baking is not None and tracked is None and scene.info.capture is None:
+        tracked = tracked_views(views, scene.info.landmark_features)
+    scene = replace(scene, folder=out or scene.folder)
+    if not scene.info.complete:
+        scene = _trained(views, scene, options, state)
+    if baking is not None and scene.has_field:
+        if scene.surface is None:
+            scene = baked_if_possible(scene, lambda whole: whole.with_surface(views, baking))
+        scene = scene.with_survey(views, tracked)
+    if scene.folder is not None:
+        size = sum(file.stat().st_size for file in scene.folder.iterdir()) / 2**20
+        log.info(f"{scene.folder}: map of {scene.info.data or 'views in memory'}, {size:.1f} MiB")
+    return scene
+
+
+def _trained(views: Sequence[View], scene: Map, options: TrainOptions, state: TrainingState | None) -> Map:
     """Train the field that a map describes to the end, from a ``state`` or from the beginning."""
     out, device = scene.folder, working_device(options.device)
     backend, where = load_backend(scene.info.backend, str(out or "")), scene.name
@@ -362,18 +509,6 @@ def _trained(
     weights = packed(cast(nn.Module, field).state_dict())
     trained = frozen_field(report.info, weights, out)
     return Map(report.info, trained, None, scene.landmarks, out, scene.record).to(device)
-
-
-def _baked(scene: Map, views: Sequence[View], tracked: TrackedViews | None, config: BakeConfig | None) -> Map:
-    """Bake what a map with a field lacks: its surface and its capture record, the latter from ``tracked`` keypoints."""
-    if config is not None:
-        if scene.surface is None:
-            scene = baked_if_possible(scene, lambda whole: whole.with_surface(views, config))
-        scene = scene.with_survey(views, tracked)
-    if scene.folder is not None:
-        size = sum(file.stat().st_size for file in scene.folder.iterdir()) / 2**20
-        log.info(f"{scene.folder}: map of {scene.info.data or 'views in memory'}, {size:.1f} MiB")
-    return scene
 
 
 def baked_if_possible(scene: Map, bake: Callable[[Map], Map]) -> Map:
