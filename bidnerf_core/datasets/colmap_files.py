@@ -72,11 +72,8 @@ def read_model(folder: Path) -> tuple[list[ModelImage], ModelPoints]:
     """Read the model in ``folder``. Raises ``InputError`` if there is none, or if a file is damaged."""
     images, points = files_of(folder, "images", "points3D") or (None, None)
     if images is None or points is None:
-        places = (folder / place for place in ("sparse/0", "sparse", "0"))
-        inside = next((place for place in places if files_of(place, "images", "points3D")), None)
-        hint = "" if inside is None else f"; did you mean {inside}?"
-        wanted = "images.bin and points3D.bin, or the same as .txt"
-        raise InputError("no COLMAP sparse model in it", where=folder, expected=f"{wanted}{hint}")
+        expected = "images.bin and points3D.bin, or the same as .txt, as in sparse/0 of a project"
+        raise InputError("no COLMAP sparse model in it", where=folder, expected=expected)
     found = sorted((n[0], n[1:4], n[7], len(track)) for _, n, _, track in _entries(points, POINTS))
     ids, positions, errors, tracks = zip(*found, strict=True) if found else ((), (), (), ())
     if len(set(ids)) < len(ids):

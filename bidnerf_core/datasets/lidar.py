@@ -22,7 +22,7 @@ from jaxtyping import Integer
 
 from bidnerf_core.datasets.capture import remark
 from bidnerf_core.depth import MILLIMETRE, DepthImage, read_depth_image
-from bidnerf_core.errors import InputError, enumeration
+from bidnerf_core.errors import InputError
 from bidnerf_core.io import decode
 
 LARGEST_SIDE = 640
@@ -79,13 +79,10 @@ class LidarDepth:
         sure = torch.where(torch.from_numpy(confidence == high), metres, 0)
         if not self._remarked and bool(metres.any()) and not bool(sure.any()):
             self._remarked = True
-            values = [str(value) for value in np.unique(confidence)]
-            said = f"the values {enumeration(values)}" if len(values) > 1 else f"only the value {values[0]}"
-            if len(values) > 4:
-                said = f"values from {values[0]} to {values[-1]}"
+            values = ", ".join(str(value) for value in np.unique(confidence)[:4])
             remark(
                 where,
-                f"has {said}, expected {high} where depth is sure; without it, all depth"
+                f"has the values {values}, expected {high} where depth is sure; without it, all depth"
                 " of this image is left out, and so it is in such images that follow",
             )
         return replace(measured, metres=sure)

@@ -152,6 +152,8 @@ class Protocol:
         """Return the cases for one size. A larger number of trials begins with the same cases."""
         if frames < 1:
             raise InputError("nothing to try:", expected="at least one frame")
+        if trials > MOST_TRIALS:
+            raise InputError(f"{trials} trials", expected=f"at most {MOST_TRIALS} per size")
         return self.cases_of(frames, trials, seed)
 
     def check_size(self, size: Size) -> None:

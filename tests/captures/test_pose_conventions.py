@@ -58,21 +58,6 @@ def test_right_poses_are_in_the_expected_convention_in_any_world(T_world: SE3) -
     assert judged([T_world @ pose for pose in true_poses()]) is None
 
 
-@pytest.mark.parametrize("T_world", WORLDS)
-@pytest.mark.parametrize("axes", [REVERSED, CYCLED])
-def test_other_axes_are_recognised(axes: Tensor, T_world: SE3) -> None:
-    truth = [T_world @ pose for pose in true_poses()]
-    given = [with_axes(T, axes) for T in truth]
-    found = judged(given)
-    assert is_explained(found, given, truth)
-    assert found is not None
-    assert found.agreeing == found.pairs
-    assert found.agreeing_as_given < 0.3 * found.pairs
-    # The given camera looks along the true one's x axis, so the true one's right is its forward.
-    cycled = "right, down and forward are the given ones' forward, right and down"
-    assert (cycled if axes is CYCLED else "diag(1, -1, -1, 1)") in found.sentence
-
-
 @pytest.mark.parametrize("height", [0.3, 0.0])
 @pytest.mark.parametrize("axes", [torch.eye(3, dtype=torch.float64), REVERSED])
 def test_inverse_matrices_are_recognised(axes: Tensor, height: float) -> None:
@@ -165,6 +150,12 @@ def positions(T: SE3, *factors: float) -> SE3:
 
 
 WRONG: dict[str, tuple[Callable[[SE3], SE3], str]] = {
+    "OpenCV's axes": (lambda T: with_axes(T, REVERSED), "diag(1, -1, -1, 1)"),
+    # The given camera looks along the true one's x axis, so the true one's right is its forward.
+    "other axes": (
+        lambda T: with_axes(T, CYCLED),
+        "right, down and forward are the given ones' forward, right and down",
+    ),
     "transposed": (opengl(lambda T: SE3(T.rotation.mT, T.translation)), "transpose the upper left 3x3"),
     "half an inverse": (opengl(lambda T: SE3(T.rotation, T.inverse().translation)), "-R t"),
     "no minus": (opengl(lambda T: SE3(T.rotation.mT, -T.inverse().translation)), "lack the minus"),
@@ -190,6 +181,7 @@ def test_mistakes_are_refused_with_the_remedy_that_works(mistake: str) -> None:
     assert found.reading is not None
     assert words in found.sentence
     assert found.agreeing >= 0.9 * found.pairs
+    assert found.agreeing_as_given < 0.5 * found.pairs
     corrected = found.reading.understand(given)
     known = corrected.translation.isfinite().all(-1).tolist()
     seen = seen_from(truth, corrected, COUNT)

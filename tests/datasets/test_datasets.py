@@ -11,7 +11,6 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.errors import InputWarning
@@ -100,26 +99,6 @@ def test_colours_are_laid_over_the_background_where_there_is_alpha(
     torch.testing.assert_close(frame.alpha, raw[..., 3])
     over = raw[..., :3] * raw[..., 3:] + torch.tensor(expected) * (1 - raw[..., 3:])
     torch.testing.assert_close(frame.rgb, over, atol=0.501 / 255, rtol=0)  # rounded to bytes
-
-
-@pytest.mark.parametrize("channels", [1, 2, 3])
-def test_images_without_alpha_or_colour_get_three_channels(nerfstudio: Path, channels: int) -> None:
-    iio.imwrite(nerfstudio / "images/r_0.png", random_pixels(0, channels))
-    dataset = open_dataset(nerfstudio)
-    assert dataset.background == ((1, 1, 1) if channels == 2 else (0, 0, 0))
-    frame = first(nerfstudio, background="black")
-    raw = from_zero_to_one(random_pixels(0, channels)).reshape(H, W, channels)
-    rgb = raw[..., :1] * raw[..., 1:] if channels == 2 else raw
-    torch.testing.assert_close(frame.rgb, rgb.expand(H, W, 3), atol=0.501 / 255, rtol=0)  # rounded to bytes
-    assert (frame.alpha is not None) == (channels == 2)
-
-
-def test_cmyk_becomes_rgb_and_is_not_taken_for_alpha(nerfstudio: Path) -> None:
-    edit_frame(nerfstudio / JSON, 0, file_path="images/a.jpg")
-    Image.new("CMYK", (W, H), (0, 255, 0, 0)).save(nerfstudio / "images/a.jpg")
-    frame = first(nerfstudio)
-    assert frame.alpha is None
-    torch.testing.assert_close(frame.rgb, torch.tensor([1.0, 0, 1]).expand(H, W, 3), atol=0.02, rtol=0)
 
 
 # Depth

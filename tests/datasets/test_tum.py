@@ -17,7 +17,6 @@ from bidnerf_core.datasets import open_dataset, open_sequence, read_trajectory
 from bidnerf_core.datasets.formats.tum import CAMERAS, associate
 
 # Inside: the published cameras and the association of times, compared with OpenCV and SciPy
-from bidnerf_core.datasets.trajectories import Trajectory
 from bidnerf_core.geometry import SE3
 from refusals import refused
 from scan_layouts import remarks_of, small_views, write_tum
@@ -241,13 +240,3 @@ def test_interpolation_is_scipys_slerp(tmp_path: Path) -> None:
         assert path.at(float(time)) is not None
     assert path.at(times[0] - 1e-3) is None
     assert path.at(times[-1] + 1e-3) is None
-
-
-def test_gaps_are_not_bridged() -> None:
-    eye = torch.eye(3, dtype=torch.float64).expand(2, 3, 3)
-    path = Trajectory(
-        torch.tensor([0.0, 0.3], dtype=torch.float64), eye, torch.zeros(2, 3, dtype=torch.float64)
-    )
-    assert path.at(0.1) is None
-    assert path.at(0.1, largest_gap=0.5) is not None
-    assert path.at(0.3) is not None

@@ -168,7 +168,6 @@ def test_a_missing_extra_is_named(clip: Path, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize(
     ("codec", "pixels", "space"),
     [
-        ("libx264", "yuv420p10le", 9),
         ("libx264", "yuv420p10le", 10),
         ("libx264", "yuv422p10le", 14),
         ("prores_ks", "yuv422p10le", 9),

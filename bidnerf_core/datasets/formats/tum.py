@@ -125,20 +125,12 @@ def associate(times: Sequence[float], others: Sequence[float], largest: float) -
     """
     if not len(times) or not len(others):
         return {}
-    forth, back = _nearest(np.array(times), np.array(others)), _nearest(np.array(others), np.array(times))
-    return {
-        place: int(other)
-        for place, other in enumerate(forth)
-        if back[other] == place and abs(times[place] - others[other]) <= largest
-    }
-
-
-def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the index of the other time nearest to each time; the earlier one if two are equally near."""
-    after = np.searchsorted(others, times).clip(1, max(1, len(others) - 1))
-    before = after - 1
-    after = after.clip(max=len(others) - 1)
-    return np.where(np.abs(times - others[before]) <= np.abs(others[after] - times), before, after)
+    ours, theirs = np.array(times), np.array(others)
+    # The nearest time is the one between whose middles with its neighbours a time lies.
+    forth = np.searchsorted((theirs[1:] + theirs[:-1]) / 2, ours)
+    back = np.searchsorted((ours[1:] + ours[:-1]) / 2, theirs)
+    is_pair = (back[forth] == np.arange(len(ours))) & (np.abs(ours - theirs[forth]) <= largest)
+    return {int(place): int(forth[place]) for place in np.flatnonzero(is_pair)}
 
 
 reader = Format(
