@@ -118,21 +118,20 @@ class Explanations:
         ]
         kinds = kinds or list(range(len(self)))
         still = [i for i in kinds if not self.names[i].endswith(MOVING)]
-        moving = [i for i in kinds if i not in still]
-        row = torch.tensor(still + moving[:1])
+        row = torch.tensor(still + [i for i in kinds if i not in still][:1])
         k, mean, deviation = len(row), self.mean[row], self.deviation[row]
         z = torch.zeros((k, N), dtype=torch.float64)
         # A deviation of 0 holds a nuisance at its mean.
         off = (seed.camera - mean[:, :6]) / deviation[:, :6].clamp(min=1e-12)
         z[:, :6] = torch.where(off.abs() <= 3, off, 0)
         change = (mean + deviation * z)[:, :6] - seed.camera
-        update = torch.zeros((k, 6), dtype=torch.float64)
-        update[:, 2] = seed.distance * (1 - change[:, 0].exp())
-        update[:, 3], update[:, 4] = -change[:, 2], change[:, 1]
+        none = torch.zeros(k, dtype=torch.float64)
+        along = seed.distance * (1 - change[:, 0].exp())
+        update = torch.stack([none, none, along, -change[:, 2], change[:, 1], none], -1)
         T = SE3(seed.T.rotation.expand(k, 3, 3), seed.T.translation.expand(k, 3)).retract(update)
-        number = torch.full((k,), mode, dtype=torch.long)
-        noises = torch.full((k,), noise, dtype=torch.float64)
-        return States(T, z, mean, deviation, self.log_prior[row], noises, number, row)
+        return States(
+            T, z, mean, deviation, self.log_prior[row], none + noise, torch.full_like(row, mode), row
+        )
 
     def about(self, free: States) -> States:
         """Return a state for each explanation of each mode: the poses of ``free`` (g), with the nuisances at their means."""
@@ -175,19 +174,22 @@ def explanations(
         rows.append(("exact", [0.0] * 6, [0.0] * 6, 1.0, True))
     single = moving and len(query.images) == 1  # views of a rig may be from different times
     share_moving = max(SHARE_MOVING, SHARE_AS_MAP * landmarks.moving) if single else 0.0
-    still, motion = [0.0] * 6, [MOVE * distance] * 3 + [TURN] * 3
-    kinds = (("", still, 1 - share_moving), (MOVING, motion, share_moving))[: 2 if single else 1]
-    every = [(row, kind) for kind in kinds for row in rows]
-    names = tuple(name + ending for (name, *_), (ending, *_) in every)
-    mean = torch.tensor([[*row[1], *[0.0] * 7] for row, _ in every], dtype=torch.float64)
-    freedoms = [[*row[2], *kind[1], depth_scale] for row, kind in every]
-    deviation = torch.tensor(freedoms, dtype=torch.float64)
-    prior = torch.tensor([row[3] * kind[2] for row, kind in every], dtype=torch.float64)
-    right = torch.tensor([row[4] for row, _ in every])
+    kinds = [("", [0.0] * 6, 1 - share_moving)]
+    if single:
+        kinds.append((MOVING, [MOVE * distance] * 3 + [TURN] * 3, share_moving))
+    every = [
+        (name + ending, [*c, *[0.0] * 7], [*deviation, *motion, depth_scale], share * of_kind, credible)
+        for ending, motion, of_kind in kinds
+        for name, c, deviation, share, credible in rows
+    ]
+    names, means, deviations, shares, right = zip(*every, strict=True)
+    mean, deviation, prior = (
+        torch.tensor(values, dtype=torch.float64) for values in (means, deviations, shares)
+    )
     # Landmarks of this map suggest corrections of right intrinsics, too; see ``calibration_scatter``.
     if query.has_one_camera:
         deviation[:, :4] = torch.hypot(deviation[:, :4], landmarks.calibration_scatter.double())
-    return Explanations(names, mean, deviation, prior.log(), right)
+    return Explanations(names, mean, deviation, prior.log(), torch.tensor(right))
 
 
 def cameras_of_map(query: Query, landmarks: LandmarkMap) -> list[Float[Tensor, "6"]]:
@@ -206,16 +208,15 @@ def cameras_of_map(query: Query, landmarks: LandmarkMap) -> list[Float[Tensor, "
     if not groups:
         groups = cameras_at_size(landmarks.cameras, *size, "stretched")
         groups += cameras_at_size(landmarks.cameras, *size, "cropped") if query.approximate else ()
-    nearly = torch.tensor(NEARLY, dtype=torch.float64)
+    nearly = 2 * torch.tensor(NEARLY, dtype=torch.float64)
     for group in groups:
         cameras = sorted(group, key=lambda camera: camera.fx)
         # At most nine cameras, evenly chosen by focal length, are compared with the stated one.
         chosen = torch.linspace(0, len(cameras) - 1, min(len(cameras), 9)).round().int().unique().tolist()
-        corrections = (correction_between(stated, cameras[i]) for i in chosen)
-        known = [correction for correction in corrections if correction is not None]
+        known = [c for i in chosen if (c := correction_between(stated, cameras[i])) is not None]
         if known:
-            agreeing = [correction for correction in known if bool((correction.abs() <= 2 * nearly).all())]
-            found.append((agreeing or [known[(len(known) - 1) // 2]])[0])
+            middle = known[(len(known) - 1) // 2]
+            found.append(next((c for c in known if bool((c.abs() <= nearly).all())), middle))
     return found
 
 

@@ -46,7 +46,7 @@ from bidnerf_core.localization.refinement import (
     weigh,
 )
 from bidnerf_core.localization.result import Outcome, Verdict
-from bidnerf_core.localization.terms.rays import FIELD_ERRORS, Rays
+from bidnerf_core.localization.terms.rays import Rays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.mapping import (
     Features,
@@ -63,14 +63,12 @@ MIRROR = "mirror image"
 """Name of the mode of an image whose mirror image fits."""
 DEPTH_WIDTH = 2.0
 """Ratio of the prior's deviation of the depth scale to that of the sensor's model, since some sensors are off by far more."""
-PADDED = 256
-"""Matches are padded to multiples of this number on an accelerator, so that few CUDA graphs are captured."""
+CELLS = 10
+"""Number of rows and columns of the grid whose occupied cells measure how far matches spread over an image."""
 RADII = (3.0, 1.5)
 """Radii of the rounds of matching by projection, in units of the inlier threshold."""
 HEAVY_TAILS = 1.7
 """Factor of the covariance by which the ellipsoid of a Gaussian's 95 % holds 95 % of the poses: errors have heavier tails."""
-CELLS = 10
-"""Number of rows and columns of the grid whose occupied cells measure how far matches spread over an image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,10 +206,10 @@ class Loop:
     def _term(self, modes: Sequence[Mode], best: States) -> Landmarks:
         """Return the reprojection errors of the modes' matches, padded; ``best`` (g) are the modes' states.
 
-        On an accelerator, few sizes occur.
+        On an accelerator, sizes are multiples of 256, so that few CUDA graphs are captured.
         """
         parts, size = [], max(len(mode.matches) for mode in modes)
-        size = size if self.device.type == "cpu" else -(-size // PADDED) * PADDED
+        size = size if self.device.type == "cpu" else -(-size // 256) * 256
         for number, mode in enumerate(modes):
             count, here = len(mode.matches), best[number : number + 1]
             index = torch.arange(size)
@@ -376,7 +374,8 @@ class Loop:
             best = States.cat([found.chosen, best[1:]])
             minima, by_rays = run_on(self.device, fit_with_rays, best, terms, rays, given)
             systematic = torch.zeros_like(minima[0].hessian)
-            systematic[:1] = (FIELD_ERRORS - 1) * by_rays.hessian
+            # The variance of the rays' gradients is ten times that by their noise: neighbouring rays share the field's errors.
+            systematic[:1] = 9 * by_rays.hessian
             found = self._posterior(minima, landmarks, systematic)
         if points is not None:
             near, both = run_on(self.device, agreement, points, found.chosen)

@@ -53,7 +53,6 @@ from bidnerf_core.localization.settings import (
 )
 from bidnerf_core.localization.support import support
 from bidnerf_core.localization.terms.images import ColourScales, field_renderer
-from bidnerf_core.localization.terms.rays import RAYS
 from bidnerf_core.localization.terms.sampled import SampledLoss
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 from bidnerf_core.settings import Settings, from_flat
@@ -63,10 +62,10 @@ from bidnerf_core.settings import Settings, from_flat
 class SharedSettings:
     """Settings of a method that trackers, collections of maps and the command line take into account as well."""
 
-    matches_landmarks: bool  # whether images are matched with the map's landmarks
-    depth_sensor: str  # name of the sensor that measured the depth
-    rays: int  # number of rays that may be rendered to compare explanations of an image
-    risk: float | None  # tolerated fraction of wrong answers among the accepted ones
+    matches_landmarks: bool = True  # whether images are matched with the map's landmarks
+    depth_sensor: str = UNKNOWN_SENSOR  # name of the sensor that measured the depth
+    rays: int = 0  # number of rays that may be rendered to compare explanations of an image
+    risk: float | None = None  # tolerated fraction of wrong answers among the accepted ones
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ class Method:
     presets: Mapping[str, Any] = field(default_factory=dict)  # alternatives to the default settings, by name
     uses_landmarks: bool = False  # whether the map's landmarks are prepared for it, as ``Problem.matcher``
     # returns those of its settings that matter elsewhere too
-    shared: Callable[[Any], SharedSettings] = lambda config: SharedSettings(True, UNKNOWN_SENSOR, 0, None)
+    shared: Callable[[Any], SharedSettings] = lambda config: SharedSettings()
     summary: str = field(kw_only=True)  # one line
 
     def settings(self, preset: str | None = None) -> Any:
@@ -206,7 +205,7 @@ def descended(
     by_depth = (
         None if depth is None else DepthLossSettings(depth.depth_weight, depth.depth_loss, depth.depth_scale)
     )
-    rays = RayTerms(config.colour, by_depth, False).term(problem, RAYS, seed, config.descent.level)
+    rays = RayTerms(config.colour, by_depth, False).term(problem, 1024, seed, config.descent.level)
     middle = middle_of_view(problem, T if bool(T.matrix().isfinite().all()) else None)
     found = support(lambda T: rays.costs(states_at(T)), T, middle, rays.plain_costs())
     most = config.adam.converged_loss

@@ -13,8 +13,8 @@ from bidnerf_core.devices import run_on
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import CAMERA, Landmarks, Normal, P, Quadratic, States, log_evidence
 
-TOLERANCE, ANGLE = 0.03, 0.05
-"""Within which the pose must be: relative to the distance of the scene, and radians."""
+TOLERANCE = 0.03
+"""Within which the position must be, relative to the distance of the scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,13 +112,13 @@ class Posterior:
 def mass_within(
     weight: Float[Tensor, "h"], off: Float[Tensor, "h 6"], covariance: Float[Tensor, "h 6 6"], distance: float
 ) -> float:
-    """Return the mass of a mixture of Gaussians of updates within ``TOLERANCE`` of the ``distance`` (metres) and ``ANGLE``."""
+    """Return the mass of a mixture of Gaussians of updates within ``TOLERANCE`` of the ``distance`` (metres) and 0.05 rad."""
     sane = covariance.isfinite().all(-1).all(-1)
     factor, info = torch.linalg.cholesky_ex(
         torch.where(sane[:, None, None], covariance, torch.eye(6, dtype=covariance.dtype))
     )
     drawn = off[:, None] + normal_draws() @ factor.mT
-    inside = (drawn[..., :3].norm(dim=-1) <= TOLERANCE * distance) & (drawn[..., 3:].norm(dim=-1) <= ANGLE)
+    inside = (drawn[..., :3].norm(dim=-1) <= TOLERANCE * distance) & (drawn[..., 3:].norm(dim=-1) <= 0.05)
     return float((weight * inside.double().mean(-1) * (sane & (info == 0))).sum())  # host
 
 

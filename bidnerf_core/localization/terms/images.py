@@ -22,11 +22,6 @@ from bidnerf_core.geometry import SE3, inlier_weight
 from bidnerf_core.localization.terms.exposure import fit_exposure
 from bidnerf_core.mapping import Normal, P, States, SurfaceMap, cast
 
-CHUNK = 16384
-"""Number of rays rendered at a time."""
-INDEPENDENT = 60.0
-"""Number of independent measurements in a small image."""
-
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
@@ -101,7 +96,7 @@ def field_renderer(field: RadianceField, bounds: SceneBounds) -> Renderer:
     @torch.no_grad()
     def rendered(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         parts = []
-        for o, d in zip(origins.split(CHUNK), directions.split(CHUNK), strict=True):
+        for o, d in zip(origins.split(2**14), directions.split(2**14), strict=True):
             seen = render(field, bounds.rays(o, d), bounds.background)
             passing = ((constant(bounds.centre, o) - o) * d).sum(-1)
             met = seen.distance / seen.opacity.clamp(min=0.5)
@@ -125,7 +120,9 @@ class ColourScales:
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """Mean over pixels of ``1 - 1 / (1 + c^2 / s^2)``, with the difference c between rendered and measured colour, times ``INDEPENDENT``.
+    """Mean over pixels of ``1 - 1 / (1 + c^2 / s^2)``, with the difference c between rendered and measured colour.
+
+    It is multiplied by 60, the number of independent measurements in a small image.
 
     By the mean of both images' gradients, colours are linearized with second-order accuracy (Benhimane and Malis 2004, "Real-time
     image-based tracking of planes using efficient second-order minimization"). Only the pose has derivatives. The cost is infinite for
@@ -140,7 +137,7 @@ class Images:
     def __call__(self, states: States) -> Normal:
         parts = [self._of_thumbnail(small, states.T) for small in self.thumbnails]
         cost, gradient, hessian = (
-            INDEPENDENT * torch.stack(values).mean(0).to(states.z) for values in zip(*parts, strict=True)
+            60.0 * torch.stack(values).mean(0).to(states.z) for values in zip(*parts, strict=True)
         )
         sound = states.T.translation.isfinite().all(-1) & states.T.rotation.isfinite().all(-1).all(-1)
         extra = P - 6

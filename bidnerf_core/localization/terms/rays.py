@@ -20,13 +20,8 @@ from bidnerf_core.localization.terms.rendering import channels, differentiate
 from bidnerf_core.localization.terms.surface import sights_of
 from bidnerf_core.mapping import MOTION, Normal, Sights, States, rays_by_camera, rays_through
 
-RAYS = 1024
-INDEPENDENT = 300.0
-"""Largest number of independent measurements among rendered rays, as far as their own noise is concerned."""
 ALONE = 10.0
 """Largest number of independent rays without other measurements, at a pose that may be far off."""
-FIELD_ERRORS = 10.0
-"""Variance of the rays' gradients relative to that by their noise: neighbouring rays share the errors of the field."""
 OUTLIER = 3.0
 """Residual, in scales of the loss, beyond which a ray disagrees with the rendering."""
 
@@ -46,7 +41,9 @@ class Rays:
     coloured: Float[Tensor, "n"]  # 1 where a colour was measured, else 0
     distance: Float[Tensor, "n"]  # metres along the ray, 0 where none was measured
     noise: float | Float[Tensor, ""] = 0.1  # of a channel, in the information of a ray
-    independent: float = INDEPENDENT
+    independent: float = (
+        300.0  # largest number of independent measurements, as far as their own noise is concerned
+    )
     # of the norm of a colour difference: wide enough for a wide basin, and narrow enough to reject occluders
     loss: Robust = Robust("geman-mcclure", 0.1)
     depth_loss: Robust | None = None  # of depth differences, metres; None: colours alone

@@ -27,14 +27,8 @@ from bidnerf_core.mapping import (
     rays_through,
 )
 
-POINTS = 500
-"""Number of points that are compared."""
-INDEPENDENT = 10.0
-"""Largest number of independent measurements among depths against the surface."""
 COLOUR = 0.15
 """Norm of the colour difference (three channels, each in [0, 1]) at which a point's inlier weight is one half."""
-MOST_CHANGE = 0.2
-"""Maximum change of a surfel's colour to which its gradient is extrapolated within the plane."""
 
 
 def sights_of(
@@ -65,11 +59,11 @@ class Surface:
     coloured: Float[Tensor, "n"]  # 1 where a colour was measured, else 0
     noise: float | Float[Tensor, ""]  # metres
     colour_weight: float = 0.0  # of colours, relative to distances
-    independent: float = INDEPENDENT  # number of independent measurements among the points
+    independent: float = 10.0  # largest number of independent measurements among the points
 
     @staticmethod
     def of(
-        views: Sequence[View], rays: Observations | None, surface: SurfaceMap, seed: int, count: int = POINTS,
+        views: Sequence[View], rays: Observations | None, surface: SurfaceMap, seed: int, count: int = 500,
         device: torch.device | str | None = None,
     ) -> Surface | None:  # fmt: skip
         """Draw measured points of ``views``, whose poses are relative to the last, in random order; None if there are too few.
@@ -209,8 +203,10 @@ class Surface:
         surfels = self.surface.surfels
         slope = surfels.rgb_gradient[index]
         change = (slope @ along.to(slope)[..., None])[..., 0]
-        slope = slope * (change.abs() < MOST_CHANGE)[..., None]
-        difference = surfels.rgb[index] + change.clamp(-MOST_CHANGE, MOST_CHANGE) - self.rgb
+        # A surfel's colour is extrapolated within its plane by a change of at most this.
+        most = 0.2
+        slope = slope * (change.abs() < most)[..., None]
+        difference = surfels.rgb[index] + change.clamp(-most, most) - self.rgb
         seen = self.coloured[:, None]
         return difference * seen, slope * seen[..., None]
 
