@@ -370,12 +370,16 @@ def _set_steps(axes: Any, kind: str, label: str) -> None:
 
 def _set_logarithmic(axes: Any, *names: str) -> None:
     """Give axes a logarithmic scale with plain numbers, and a grid."""
+    from matplotlib.ticker import LogLocator
+
     for name in names:
         axes.set(**{f"{name}scale": "log"})
         axis = getattr(axes, f"{name}axis")
         axis.set_major_formatter("{x:g}")
         low, high = getattr(axes, f"get_{name}lim")()
-        axis.set_minor_formatter("{x:g}" if high < 10 * low else "")  # at most one power of ten is in view
+        if high < 10 * low:  # at most one power of ten is in view
+            axis.set_minor_locator(LogLocator(subs=(1.5, 2, 3, 5)))
+        axis.set_minor_formatter("{x:g}" if high < 10 * low else "")
     axes.grid(which="major")
 
 

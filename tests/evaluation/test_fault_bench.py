@@ -256,24 +256,6 @@ def test_an_interrupted_run_goes_on_with_rows_of_the_same_content(
     assert [words.split()[0] for words in asked[6:]] == ["mirror:1"] * 3  # those images are others now
 
 
-def test_rows_survive_a_kill_and_files_of_something_else_are_left_alone(
-    script: ModuleType, tmp_path: Path
-) -> None:
-    path = tmp_path / "rows.jsonl"
-    with script.RowStore(path) as store:
-        assert [store.get([n], lambda n=n: n) for n in (1, 2)] == [1, 2]
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-5])  # a kill in the middle of the second row
-    with script.RowStore(path) as store:
-        assert [store.get([n], lambda n=n: n) for n in (1, 2)] == [1, 2]
-    assert path.read_bytes() == whole
-    for other in (b"notes", b"notes\n", b"[1]\n"):
-        path.write_bytes(other)
-        with pytest.raises((ValueError, TypeError)), script.RowStore(path):
-            pass
-        assert path.read_bytes() == other
-
-
 def test_unknown_diagnostics_are_left_out(script: ModuleType) -> None:
     @dataclasses.dataclass(frozen=True)
     class Diagnostics:
