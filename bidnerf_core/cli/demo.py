@@ -110,7 +110,6 @@ def run(
 def _draw(stored: Map, trials: list[Trial], out: Path) -> None:
     import numpy as np
 
-    from bidnerf_core.evaluation import convergence_plot
     from bidnerf_core.io import png_bytes, write_file
     from bidnerf_core.results import Painter, save_gif
 
@@ -132,12 +131,5 @@ def _draw(stored: Map, trials: list[Trial], out: Path) -> None:
     moments = sorted({round(steps * (i / (ANIMATED - 1)) ** 2) for i in range(ANIMATED)})
     with console.status("drawing the animation"):
         save_gif(out / "localization.gif", [painter.blended(path[i]) for i in moments])
-    drawn = ["overlay-*.png", "localization.gif"]
-    try:
-        traces = {trial.view.frame.name: trial.errors(trial.bid.poses) for trial in trials}
-        convergence_plot(out / "convergence.png", traces)
-        drawn.append("convergence.png")
-    except InputError as error:  # matplotlib is optional
-        say(str(error))
-    show(f"look at {', '.join(str(out / name) for name in drawn)}")
+    show(f"look at {out / 'overlay-*.png'}, {out / 'localization.gif'}")
     show(f"see why a pose was found: bidnerf view {out / 'map'} {out / 'data'}")

@@ -21,7 +21,6 @@ from .plan import parse_settings as parse_settings
 from .plan import perturb as perturb
 from .plan import planned as planned
 from .plots import comparison_figure as comparison_figure
-from .plots import convergence_plot as convergence_plot
 from .report import chosen_criterion as chosen_criterion
 from .report import write_report as write_report
 from .results import ResultsFile as ResultsFile

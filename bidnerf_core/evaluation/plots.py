@@ -1,4 +1,4 @@
-"""The figures of an evaluation: success, errors, confidence, convergence and faults; maps side by side; single trials.
+"""The figures of an evaluation: success, errors, confidence, convergence and faults; maps side by side.
 
 A figure is a grid of panels of one size, so that all of a page have the same type. A condition has the same colour in all.
 """
@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.comparison import Comparison
 from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT
 from bidnerf_core.evaluation.summary import (
@@ -38,22 +37,18 @@ from bidnerf_core.evaluation.summary import (
     unit_of,
 )
 from bidnerf_core.evaluation.trial import TrialResult
-from bidnerf_core.geometry import symbol
 from bidnerf_core.results import (
     COLOURS,
     CRITERIA,
     CRITERION_NAMES,
     SHORT_CRITERION_NAMES,
-    PoseError,
     Rate,
-    as_array,
     line_look,
     new_figure,
     require_matplotlib,
     save_figure,
     standard_deviations,
     styled,
-    write_figure,
 )
 
 WIDTH, COLUMNS = 10.8, 3
@@ -262,7 +257,10 @@ class Figures:
             look = self.looks[group.label]
             axes.plot(middle, **look)
             axes.fill_between(range(longest), low, high, color=look["color"], alpha=0.14, linewidth=0)
-        _set_steps(axes, kind, QUANTITIES[kind].label.format(unit=unit_of(groups[0].results)))
+        axes.axhline(QUANTITIES[kind].bound, **BOUND)
+        axes.set(xlabel="step", ylabel=QUANTITIES[kind].label.format(unit=unit_of(groups[0].results)))
+        axes.set_xlim(left=0)
+        _set_logarithmic(axes, "y")
 
     def _reliability(self, axes: Any, judged: Mapping[str, list[TrialResult]]) -> None:
         axes.plot([0, 100], [0, 100], **BOUND)
@@ -360,14 +358,6 @@ def _draw_curve(axes: Any, curve: FaultCurve) -> None:
     axes.grid(axis="y")
 
 
-def _set_steps(axes: Any, kind: str, label: str) -> None:
-    """Set up axes of an error by step, on a logarithmic scale, with a dashed line at its bound."""
-    axes.axhline(QUANTITIES[kind].bound, **BOUND)
-    axes.set(xlabel="step", ylabel=label)
-    axes.set_xlim(left=0)
-    _set_logarithmic(axes, "y")
-
-
 def _set_logarithmic(axes: Any, *names: str) -> None:
     """Give axes a logarithmic scale with plain numbers, and a grid."""
     from matplotlib.ticker import LogLocator
@@ -389,7 +379,7 @@ def _wrapped(text: str, width: float, lines: int = 4) -> str:
     return "\n".join("\n".join(wrap(line)) or line for line in text.split("\n"))
 
 
-# Several maps, and single trials.
+# Several maps.
 
 
 def comparison_figure(folder: Path, comparison: Comparison) -> Path:
@@ -424,25 +414,3 @@ def comparison_figure(folder: Path, comparison: Comparison) -> Path:
     drawn = figures._figure("compare", panels, figures.looks, "")
     assert drawn is not None  # there are panels
     return drawn.file
-
-
-def convergence_plot(path: str | Path, traces: Mapping[str, PoseError]) -> None:
-    """Plot translation and rotation error after each step on a logarithmic scale, one curve per name.
-
-    Entry 0 of a trace is the start. Values without a logarithm leave a gap. Raises ``InputError`` without matplotlib.
-    """
-    if not traces:
-        raise InputError("no traces to plot", where=path)
-    units = {symbol(trace.unit) for trace in traces.values()}
-    unit = units.pop() if len(units) == 1 else "units"
-    with styled():
-        figure = new_figure(9, 3.6)
-        for axes, kind in zip(figure.subplots(1, 2), ERRORS, strict=True):
-            for place, (label, trace) in enumerate(traces.items()):
-                values = as_array(getattr(trace, kind)).astype(np.float64).reshape(-1)
-                drawn = np.where(np.isfinite(values) & (values > 0), values, np.nan)
-                axes.plot(drawn, label=label, **line_look(place))
-            _set_steps(axes, kind, QUANTITIES[kind].label.format(unit=unit))
-        figure.axes[0].legend(fontsize="small")
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        write_figure(figure, Path(path), dpi=130)

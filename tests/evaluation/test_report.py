@@ -200,6 +200,15 @@ def test_a_report_of_one_hopeless_trial_without_a_start(tmp_path: Path) -> None:
     assert "no record of how it was made" in read(tmp_path / "out").text
 
 
+def test_without_matplotlib_a_report_tells_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = write(tmp_path / "r.jsonl", result(0, 2))
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert main(["report", str(file), "--out", str(tmp_path / "out")]) == 1
+    assert "matplotlib, which is missing: pip install 'bidnerf[plots]'" in capsys.readouterr().err
+
+
 def test_figures_are_the_same_each_time(tmp_path: Path, results: list[TrialResult]) -> None:
     first, second = (Figures(grouped(results), tmp_path / name, "10%").errors() for name in ("a", "b"))
     assert first.file.read_bytes() == second.file.read_bytes()

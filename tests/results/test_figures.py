@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -10,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.evaluation import convergence_plot
-from bidnerf_core.results import PoseError, as_picture, save_gif, tile
+from bidnerf_core.results import as_picture, save_gif, tile
 
 # Inside: single tiles of an overlay, before they are put together
 from bidnerf_core.results.overlays import blend, edges
@@ -77,37 +75,3 @@ def test_gif_keeps_frames_and_speed(tmp_path: Path) -> None:
     assert iio.immeta(path)["duration"] == pytest.approx(200)
     assert iio.immeta(path)["loop"] == 0
     assert np.abs(frames[2].astype(int) - as_picture(disc(20))).mean() < 3
-
-
-def errors(*values: float) -> PoseError:
-    far = torch.tensor(values, dtype=torch.float64)
-    return PoseError(far, 10 * far)
-
-
-def test_convergence_plot_draws_without_a_window_or_global_state(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    path = tmp_path / "new" / "plot.png"
-    convergence_plot(
-        path, {"0001": errors(1, 0.3, 0.1, 0.03), "0002": errors(1, float("nan"), 0, float("inf"))}
-    )
-    picture = iio.imread(path)
-    assert picture.shape[0] > 300
-    assert np.unique(picture.reshape(-1, picture.shape[-1]), axis=0).shape[0] > 20
-    if "matplotlib.pyplot" in sys.modules:
-        assert sys.modules["matplotlib.pyplot"].get_fignums() == []
-
-
-def test_convergence_plot_of_nothing(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    with refused(where=tmp_path / "plot.png", found="no traces"):
-        convergence_plot(tmp_path / "plot.png", {})
-    convergence_plot(tmp_path / "plot.png", {"empty": errors(), "zero": errors(0, 0)})
-    assert (tmp_path / "plot.png").exists()
-
-
-def test_convergence_plot_without_matplotlib_tells_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with refused(found="matplotlib, which is missing: pip install 'bidnerf[plots]'"):
-        convergence_plot(tmp_path / "plot.png", {"0001": errors(1, 0.1)})
