@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -107,7 +107,30 @@ class Frame:
     """Whether ``rgb`` is black behind transparent pixels only until a map is known, whose background then lies there."""
 
     def __post_init__(self) -> None:
-        self._check(IMAGES)
+        where, camera = f"frame {self.name}", self.intrinsics
+        if not isinstance(camera, Intrinsics):
+            raise InputError(f"intrinsics is a {type(camera).__name__}", where=where, expected="Intrinsics")
+        if camera.distortion and not _has_rays(replace(camera, distortion=tuple(camera.distortion))):
+            found = f"distortion is {camera.distortion}, which maps no ray to some of its pixels;"
+            raise InputError(found, where=where, expected="coefficients of a real lens")
+        for what in IMAGES:
+            image = self.__dict__[what]
+            if image is not None or what == "rgb":
+                _check_image(where, what, image, camera)
+        if self.rgb_bytes.dtype != torch.uint8:
+            self.__dict__["rgb"] = (self.rgb_bytes * 255).round_().clamp_(0, 255).to(torch.uint8)
+        if self.depth is not None and not _is_finite(self.depth):
+            self.__dict__["depth"] = self.depth.nan_to_num(0.0, 0.0, 0.0)
+        if self.hidden is None:
+            return
+        if self.hidden.device.type == "cpu" and bool(self.hidden.all()):
+            found = "hidden is all true"
+            raise WhollyHidden(found, where=where, expected="booleans that leave something visible")
+        if self.depth is not None:
+            hidden = self.hidden.to(self.depth.device)
+            # An image in a store is left there; the host does not wait for an accelerator.
+            if hidden.device.type != "cpu" or bool((self.depth[hidden] != 0).any()):
+                self.__dict__["depth"] = torch.where(hidden, 0, self.depth)
 
     def __repr__(self) -> str:
         """A one-line description without images."""
@@ -117,37 +140,6 @@ class Frame:
         return (
             f"<Frame {self.name}: {camera.width}x{camera.height}, {kinds}, focal length {camera.fx:.4g} px>"
         )
-
-    def _check(self, new: Collection[str]) -> None:
-        """Check that all images fit the camera, and the values of those that are ``new``."""
-        where, camera = f"frame {self.name}", self.intrinsics
-        if not isinstance(camera, Intrinsics):
-            raise InputError(f"intrinsics is a {type(camera).__name__}", where=where, expected="Intrinsics")
-        if camera.distortion and not _has_rays(replace(camera, distortion=tuple(camera.distortion))):
-            raise InputError(
-                f"distortion is {camera.distortion}, which maps no ray to some of its pixels;",
-                where=where,
-                expected="coefficients of a real lens",
-            )
-        for what in IMAGES:
-            image = self.__dict__[what]
-            if image is not None or what == "rgb":
-                _check_image(where, what, image, camera, is_new=what in new)
-        if "rgb" in new and self.rgb_bytes.dtype != torch.uint8:
-            rounded = (self.rgb_bytes * 255).round_().clamp_(0, 255).to(torch.uint8)
-            self.__dict__["rgb"] = rounded
-        if self.depth is not None and "depth" in new and not _is_finite(self.depth):
-            self.__dict__["depth"] = self.depth.nan_to_num(0.0, 0.0, 0.0)
-        if self.hidden is None or not {"depth", "hidden"} & {*new}:
-            return
-        if bool(self.hidden.all()):
-            raise WhollyHidden(
-                "hidden is all true", where=where, expected="booleans that leave something visible"
-            )
-        if self.depth is not None:
-            hidden = self.hidden.to(self.depth.device)
-            if bool((self.depth[hidden] != 0).any()):
-                self.__dict__["depth"] = torch.where(hidden, 0, self.depth)
 
     @staticmethod
     def open(
@@ -354,18 +346,8 @@ class Frame:
         return Frame(name, laid, intrinsics, metres, cover, hidden=unused, awaits_background=awaits)
 
     def replace(self, **changes: Any) -> Frame:
-        """Return the frame with other attributes.
-
-        Images that stay are neither converted nor checked again, as they are by ``dataclasses.replace``.
-        """
-        other = object.__new__(Frame)
-        other.__dict__.update({name: self.__dict__[name] for name in self.__dataclass_fields__})
-        for name, value in changes.items():
-            if name not in self.__dataclass_fields__:
-                raise TypeError(f"a frame has no {name}")
-            object.__setattr__(other, name, value)
-        other._check(changes)
-        return other
+        """Return the frame with other attributes, as ``dataclasses.replace`` does, without converting its colours."""
+        return replace(self, **({"rgb": self.rgb_bytes} | changes))
 
     def to(self, device: torch.device | str) -> Frame:
         """Return the frame with its images on ``device``; the frame itself if they are already there."""
@@ -414,10 +396,9 @@ class Frame:
         return self.measured_share >= SPARSE
 
 
-def _check_image(where: str, what: str, image: object, camera: Intrinsics, is_new: bool) -> None:
-    """Raise ``InputError`` unless the image is a tensor of the camera's size.
-
-    If it ``is_new``, it must also have measured, finite floats (bytes also for ``rgb``, booleans for ``hidden``).
+def _check_image(where: str, what: str, image: object, camera: Intrinsics) -> None:
+    """Raise ``InputError`` unless the image is a tensor of the camera's size with measured, finite floats (bytes also for ``rgb``,
+    booleans for ``hidden``).
     """
     if not isinstance(image, Tensor):
         raise InputError(
@@ -434,8 +415,6 @@ def _check_image(where: str, what: str, image: object, camera: Intrinsics, is_ne
     if found != wanted:
         expects = f"{camera.width}x{camera.height}"
         raise InputError(f"{what} is {found[1]}x{found[0]}, but its camera expects {expects}", where=where)
-    if not is_new:
-        return
     if image.layout != torch.strided or (image.is_meta and type(image) is Tensor):
         raise InputError(f"{what} is a sparse tensor or has no values", where=where, expected="a dense one")
     if image.dtype == {"rgb": torch.uint8, "hidden": torch.bool}.get(what):

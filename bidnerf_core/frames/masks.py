@@ -7,7 +7,6 @@ ignored and everything brighter is used; segmentation masks often mark the regio
 from __future__ import annotations
 
 import re
-import warnings
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path, PurePath
@@ -18,8 +17,8 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from bidnerf_core.camera import UPRIGHT, Raster, read_exif, same_aspect
-from bidnerf_core.errors import InputError, InputWarning, amount
+from bidnerf_core.camera import Raster
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.io import IMAGE_SUFFIXES, decode, resampled
 
 HiddenColour = Literal["black", "white"]
@@ -36,24 +35,13 @@ def read_mask(
 ) -> Bool[Tensor, "h w"]:
     """Return which pixels of an image of ``size`` (width, height) the mask in file ``path`` hides.
 
-    ``raster`` is that of the image file. A mask with its own EXIF orientation is turned upright accordingly;
-    one whose size fits the stored image is turned upright with it. If its size fits the upright image as
-    well, as for square photos and those taken upside down, an ``InputWarning`` is issued. A mask of another
+    ``raster`` is that of the image file, with which a mask is turned upright if its size fits the stored image. A mask of another
     resolution is resampled to the nearest of its pixels. Masks whose values are all small, such as 0 and 1,
     hide what is 0; otherwise the bright half of the values is white. If the colours are uniform, the alpha
     channel is the mask. Raises ``InputError`` if the file is not an image, or has another aspect ratio, and
     ``WhollyHidden`` if it hides everything.
     """
-    stored = torch.from_numpy(_white(decode(path)))
-    given, own = (stored.shape[1], stored.shape[0]), read_exif(path).orientation
-    if own != UPRIGHT and same_aspect(own.upright_size(*given), raster.upright_size):
-        white = own.upright(stored)
-    else:
-        fits = all(same_aspect(given, x) for x in (raster.size, raster.upright_size))
-        if raster.orientation != UPRIGHT and fits:
-            text = "the mask fits the image both as stored and as turned by EXIF; it is turned like the image"
-            warnings.warn(f"{path}: {text}", InputWarning, stacklevel=2)
-        white = raster.turned(stored, "mask", path)
+    white = raster.turned(torch.from_numpy(_white(decode(path))), "mask", path)
     if tuple(white.shape) != size[::-1]:
         white = resampled(white, *size)
     hidden = white if hides == "white" else ~white

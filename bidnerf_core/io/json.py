@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar, cast
 
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, spelling_hint
 from bidnerf_core.io.files import read_file
 
 if TYPE_CHECKING:
@@ -223,7 +223,7 @@ def from_plain(kind: type[_T], value: Any, where: str) -> _T:
     try:
         found: _T = _validator(cast(Any, kind)).validate_python([value])[0]
     except ValidationError as error:
-        raise _first_error(error.errors(include_url=False), where) from None
+        raise _first_error(error.errors(include_url=False), where, kind) from None
     except (TypeError, OverflowError) as error:  # raised by a dataclass itself
         raise InputError(error, where=where) from error
     return found
@@ -252,14 +252,21 @@ def _strict(node: Any) -> Any:
     return found | STRICT.get(str(found.get("type")), {})
 
 
-def _first_error(errors: Sequence[Any], where: str) -> InputError:
-    """Return the first of pydantic's errors, with all types of a union that the value is not of."""
+def _first_error(errors: Sequence[Any], where: str, of: Any) -> InputError:
+    """Return the first of pydantic's errors with a value of type ``of``, with all types of a union that the value is not of."""
     first = errors[0]
-    kind, place = first["type"], ": ".join([where, *(p for p in first["loc"] if p and isinstance(p, str))])
+    kind, path = first["type"], [where, *(p for p in first["loc"] if p and isinstance(p, str))]
     if "error" in first.get("ctx", {}):  # what a dataclass raised
-        return InputError(first["ctx"]["error"], where=place)
-    if kind == "unexpected_keyword_argument" or (kind == "missing" and isinstance(first["loc"][-1], str)):
-        return InputError("missing" if kind == "missing" else "not a known key", where=place)
+        return InputError(first["ctx"]["error"], where=": ".join(path))
+    if kind == "unexpected_keyword_argument":
+        known = [f.name for f in dataclasses.fields(of) if f.init] if len(first["loc"]) == 2 else []
+        return InputError(
+            f"no field {path[-1]!r}{spelling_hint(path[-1], known)}", where=": ".join(path[:-1])
+        )
+    if kind == "missing" and isinstance(first["loc"][-1], str):
+        return InputError("missing", where=": ".join(path))
     texts = {e["type"]: e["msg"].removeprefix("Input should be ") for e in errors if e["loc"] == first["loc"]}
     expected = dict.fromkeys(EXPECTED.get(kind, text) for kind, text in texts.items())
-    return InputError(f"found {_shown(first['input'])}", where=place, expected=" or ".join(expected))
+    return InputError(
+        f"found {_shown(first['input'])}", where=": ".join(path), expected=" or ".join(expected)
+    )

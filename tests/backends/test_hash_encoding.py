@@ -146,23 +146,6 @@ def test_refuses_double_backward() -> None:
         gradient.sum().backward()
 
 
-@both_interpolations
-def test_is_the_stored_feature_at_a_vertex(interpolation: Interpolation) -> None:
-    encoding = make(interpolation=interpolation)
-    vertices = torch.cartesian_prod(*[torch.arange(5)] * 3)
-    features = encoding(vertices.double() / 4, active_levels=1)[:, :2]
-    assert torch.equal(features, encoding.tables[0][vertices @ torch.tensor([1, 5, 25])])
-
-
-@both_interpolations
-def test_is_continuous_across_cells(interpolation: Interpolation) -> None:
-    encoding = make(interpolation=interpolation)
-    border = inner_points(encoding)
-    border[:, 1] = 0.25  # a border of the first level and of the last
-    step = torch.tensor([0, 1e-9, 0], dtype=torch.float64)
-    torch.testing.assert_close(encoding(border - step), encoding(border + step), rtol=0, atol=1e-6)
-
-
 def test_derivative_of_smooth_interpolation_is_continuous_across_cells() -> None:
     step = torch.tensor([0, 1e-9, 0], dtype=torch.float64)
     jumps = []

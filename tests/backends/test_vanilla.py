@@ -75,13 +75,6 @@ def test_the_order_of_sines_and_cosines_is_all_that_differs() -> None:
 # The network.
 
 
-def test_each_layer_takes_what_it_should() -> None:
-    net = NerfNetwork(NetworkConfig(5, 16, 3, 2, 1))
-    seen, turned = encoded_width(2, True), encoded_width(1, True)
-    assert [layer.in_features for layer in net.trunk] == [seen, 16, 16, 16 + seen, 16]
-    assert (net.view.in_features, net.view.out_features) == (16 + turned, 8)
-
-
 @pytest.mark.parametrize(("skip", "fed"), [(0, False), (1, True), (2, True), (3, False), (9, False)])
 def test_the_position_comes_again_after_skip_layers(skip: int, fed: bool) -> None:
     """What the layers before forget does not matter to one that is fed the position itself."""

@@ -72,10 +72,3 @@ def test_all_space_is_in_the_grid_of_an_open_scene() -> None:
     assert int(grid.numbers(centre)) == (8 * 16 + 8) * 16 + 8
     middle = grid.numbers(centre + torch.tensor([[0.99, 0.99, 0.99]]) * OPEN.side / 2)
     assert int(middle) == (11 * 16 + 11) * 16 + 11  # the box fills the inner half
-
-
-def test_contraction_is_continuous_where_it_begins() -> None:
-    face = points(1.0) / points(1.0).abs().amax(-1, keepdim=True)
-    torch.testing.assert_close(
-        contract_points(face * (1 + 1e-9)), contract_points(face * (1 - 1e-9)), rtol=0, atol=1e-8
-    )

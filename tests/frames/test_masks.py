@@ -68,19 +68,6 @@ def test_masks_of_every_kind_hide_what_is_black(tmp_path: Path, stored: np.ndarr
     assert torch.equal(read_mask(path, Raster(*SIZE), SIZE, "white"), ~hidden)
 
 
-def test_a_mask_that_fits_both_orientations_is_turned_by_its_own_exif(tmp_path: Path) -> None:
-    mask, turned = left(8, 8), Orientation.from_exif(6)
-    raster, upright = Raster(8, 8, turned), turned.upright(torch.from_numpy(mask == 0))
-    plain, tagged = saved(tmp_path / "plain.png", mask), write_photo(tmp_path / "tagged.png", mask, 6)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert torch.equal(read_mask(tagged, raster, (8, 8)), upright)
-        assert torch.equal(read_mask(tagged, Raster(8, 8), (8, 8)), upright)  # of a photo that is upright
-        read_mask(plain, Raster(8, 8), (8, 8))
-    with pytest.warns(InputWarning, match="both as stored and as turned by EXIF"):
-        assert torch.equal(read_mask(plain, raster, (8, 8)), upright)
-
-
 @pytest.mark.parametrize(
     ("mask", "error", "found", "expected"),
     [

@@ -193,7 +193,7 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         Frame.from_numpy(rgb.astype(float), CAMERA)
     spoilt = rgb / 255
     spoilt[0, 0] = np.nan
-    with refused(found="rgb has 3 values that are NaN", expected="[0, 1]"):
+    with refused(found="rgb has floats from nan to nan", expected="[0, 1]"):
         Frame.from_numpy(spoilt, CAMERA)
     with refused(where=where, found="rgb has an alpha channel, and alpha is given", expected="only one"):
         Frame.from_numpy(noise(HEIGHT, WIDTH, 4), CAMERA, alpha=rgb[..., 0])

@@ -14,7 +14,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -23,7 +22,7 @@ from safetensors.torch import save
 
 import sparse_model
 import tiny
-from bidnerf_core import Frame, Intrinsics, load_map
+from bidnerf_core import Frame, load_map
 from bidnerf_core.camera import read_camera
 from bidnerf_core.datasets import open_dataset, read_depth_points, read_model
 from bidnerf_core.depth import read_depth_image
@@ -171,41 +170,6 @@ def refused(read: Callable[[], object]) -> bool:
     return True
 
 
-JSON_VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers(-(10**30), 10**30) | st.floats() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
-    max_leaves=8,
-)
-
-
-@settings(max_examples=30)
-@given(content=st.binary(max_size=60), header=JSON_VALUES, length=st.none() | st.integers(0, 2**64 - 1))
-def test_any_header_of_tensors_is_judged(
-    content: bytes, header: Any, length: int | None, tmp_path: Path
-) -> None:
-    text = json.dumps(header).encode()
-    path = tmp_path / "t.safetensors"
-    path.write_bytes(struct.pack("<Q", len(text) if length is None else length) + text + content)
-    refused(lambda: read_tensors(path))
-
-
-WORDS = st.text(max_size=6) | st.sampled_from([
-    "info", "train", "render", "localize", "evaluate", "compare", "report", "bake", "backends", "--out", "--seed", "--json",
-    "--size", "--trials", "--nothing", "--frame", "--help", "--split", "--method", "--level", "\x1b[2J", "�", "1e400",
-    "-1", "nan", "a/b",
-])  # fmt: skip
-
-
-@settings(max_examples=30)
-@given(words=st.lists(WORDS, max_size=4))
-def test_any_words_end_in_a_status_and_printable_text(words: list[str], bidnerf: Run) -> None:
-    status, out, err = bidnerf(*words)
-    assert status in (0, 1, 2)
-    assert "Traceback" not in out + err
-    assert all(c == "\n" or c.isprintable() or c == "\udcff" for c in out + err)
-    assert status == 0 or err
-
-
 # Files in the place of which something else stands.
 
 
@@ -325,26 +289,6 @@ def test_a_header_of_tensors_that_contradicts_itself_is_refused(header: Any, tmp
     with pytest.raises(InputError, match="expected a safetensors file") as caught:
         read_tensors(tmp_path / "t")
     assert len(str(caught.value)) < 400 + len(str(tmp_path))
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_arguments_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
-    camera, image, path = tiny.CAMERA, np.zeros((24, 24, 3), np.uint8), tmp_path / "a.png"
-    iio.imwrite(path, image)
-    made: Any = Intrinsics  # without the annotations that these arguments contradict
-    calls: list[Callable[[], Any]] = [
-        lambda: made("1", 1, 0, 0, 24, 24), lambda: made(1, None, 0, 0, 24, 24),
-        lambda: made(1, 1, 0, 0, 24.5, 24), lambda: made(1, 1, 0, 0, True, 24),
-        lambda: made(1, 1, 0, 0, 24, 24, None), lambda: made(1, 1, 0, 0, 24, 24, ("a",) * 4),
-        lambda: made.from_hfov(40, 10**400, 24), lambda: made.from_focal(40, 24, 10**400),
-        lambda: made.from_hfov("40", 24, 24), lambda: made.from_focal(10**400, 24, 24),
-        lambda: Frame.from_numpy([[1, 2], [3]], camera),
-        lambda: Frame.from_numpy(image, camera, depth=[[1, 2], [3]]),
-        lambda: Frame.from_numpy(image, camera, depth=np.zeros((0, 24))),
-        lambda: Frame.open(path, hfov=40.0, largest="1"), lambda: Frame.open(path, hfov=40.0, largest=1.5),
-    ]  # fmt: skip
-    assert [refused(call) for call in calls] == [True] * 15
-    assert made(np.float32(2), np.float64(3), 0, np.int64(1), np.int32(24), 24).fx == 2
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,8 @@ import struct
 import subprocess
 import sys
 import tracemalloc
-import warnings
 import zlib
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -331,29 +329,12 @@ def test_resampling_takes_the_nearest_and_invents_nothing() -> None:
     assert set(resampled(image, 7, 5).flatten().tolist()) <= set(image.flatten().tolist())
 
 
-def test_threads_that_read_images_leave_warnings_as_they_were(tmp_path: Path) -> None:
-    """Filters of warnings belong to the process: one that stays behind would silence all later warnings of an application."""
-    Image.fromarray(noise(300, 400)).save(tmp_path / "a.png")
-    before = list(warnings.filters)
-    with ThreadPoolExecutor(4) as pool:
-        for _ in pool.map(read_image, [tmp_path / "a.png"] * 400):
-            pass
-    assert warnings.filters == before
-
-
 def test_oddities_of_a_file_cause_no_warning(tmp_path: Path) -> None:
     """Run apart, since pytest has filters of its own."""
     path = empty_png(tmp_path / "large.png", 9500, 1, (9500, 9500))  # Pillow warns from 89 megapixels on
     code = f"from pathlib import Path; from bidnerf_core.io.images import read_header; read_header(Path({str(path)!r}))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr == ""
-
-
-@pytest.mark.parametrize("size", [(29, 17), (40, 30), (41, 1), (8, 6)])
-def test_reducing_is_opencvs_area_filter(size: tuple[int, int]) -> None:
-    image = noise(30, 41).astype(np.float32) / 255
-    expected = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    np.testing.assert_allclose(reduced(torch.from_numpy(image), *size).numpy(), expected, atol=1e-6)
 
 
 def test_the_formats_that_photos_have_are_decoded(tmp_path: Path) -> None:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import errno
-import itertools
 import os
-import shutil
 import signal
 from pathlib import Path
 
@@ -14,12 +11,11 @@ import pytest
 import tiny
 
 # Inside: a lock is taken late, as if between two steps of another process; names of temporary files
-from bidnerf_core.io import FileInUse, files, is_temporary, locked, output_folder
+from bidnerf_core.io import FileInUse, files, locked, output_folder
 from bidnerf_core.maps import load_map
 from commands import Run
 
 BAKE = ["--cells", "2000"]
-QUICK = ["--trials", "2", "--workers", "1", "--method", "bid", "--max-steps", "1", "--rays", "32"]
 
 
 def test_a_training_killed_before_its_first_checkpoint_begins_anew(
@@ -48,50 +44,6 @@ def test_files_of_others_and_of_whole_maps_are_not_overwritten(
         status, _, err = bidnerf("train", shared / "data", "--out", out, *tiny.options(2))
         assert status == 1
         assert f"{out}: exists already and is not empty" in err
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("undrawn", "quick_trials")
-@pytest.mark.parametrize("command", ["train", "bake", "evaluate", "report"])
-def test_a_disk_that_is_full_at_the_second_write_leaves_whole_files(
-    command: str, bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """``test_interrupted_saves`` has each write of each saver; here, what a command says and leaves."""
-    results, data = tmp_path / "r.jsonl", shared / "data"
-    if command != "evaluate":
-        assert bidnerf("evaluate", "demo:blobs", "--out", results, *QUICK).status == 0
-    shutil.copytree(shared / "map", tmp_path / "map")
-    words = {
-        "train": ["train", data, "--out", tmp_path / "new", *tiny.options(2), "--checkpoint-every", "0"],
-        "bake": ["bake", tmp_path / "map", "--data", data, *BAKE],
-        "evaluate": ["evaluate", "demo:blobs", "--out", results, *QUICK],
-        "report": ["report", results, "--out", tmp_path / "report"],
-    }[command]
-    real, count = os.fsync, itertools.count(1)
-
-    def fsync(number: int) -> None:
-        if next(count) >= 2:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        real(number)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", fsync)
-        status, _, err = bidnerf(*words)
-    assert (status, "No space left on device" in err.splitlines()[-1]) == (1, True), err
-    assert [path.name for path in tmp_path.rglob("*") if is_temporary(path.name)] == []
-    load_map(tmp_path / "map")
-    assert bidnerf(*words).status == 0
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("undrawn", "quick_trials")
-def test_a_report_killed_before_its_page_begins_anew(bidnerf: Run, tmp_path: Path) -> None:
-    out = tmp_path / "report"
-    out.mkdir()
-    (out / ".index.html.0123abcd").write_text("<html")
-    assert bidnerf("evaluate", "demo:blobs", "--out", tmp_path / "r.jsonl", *QUICK).status == 0
-    assert bidnerf("report", tmp_path / "r.jsonl", "--out", out).status == 0
-    assert (out / "index.html").read_text().endswith("</html>\n")
 
 
 def test_a_map_that_another_process_writes_is_not_baked(bidnerf: Run, shared: Path, map_folder: Path) -> None:

@@ -77,8 +77,8 @@ def test_missing_keys_take_their_defaults_and_whole_numbers_serve_as_floats() ->
     [
         ({}, "here: need", "missing", None),
         ([], "here", "found []", "a dictionary or an instance of Outer"),
-        ({"need": 1, "raet": 2}, "here: raet", "not a known key", None),
-        ({"need": 1, "derived": 2}, "here: derived", "not a known key", None),
+        ({"need": 1, "raet": 2}, "here", "no field 'raet', did you mean 'rate'?", None),
+        ({"need": 1, "derived": 2}, "here", "no field 'derived'", None),
         ({"need": 1.5}, "here: need", "found 1.5", "int"),
         ({"need": True}, "here: need", "found True", "int"),
         ({"need": 2**63}, "here: need", 2**63, "an integer of at most 64 bits"),

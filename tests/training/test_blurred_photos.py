@@ -16,7 +16,7 @@ from bidnerf_core.fields import render
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.scenes import demo_object
 from bidnerf_core.testing import ground
-from bidnerf_core.training import Silent, Supervision, SupervisionConfig, TrainingStep, supervised_loss
+from bidnerf_core.training import Silent, Supervision, SupervisionConfig, TrainingStep
 from landmark_scene import looking_in
 from test_supervision import BACKENDS
 
@@ -59,14 +59,6 @@ def test_the_loss_is_that_of_weighted_squares() -> None:
     squares = (rendering.rgb - batch.observed.rgb).square().mean(-1)
     assert float(loss) == pytest.approx(float((weight[batch.image] * squares).mean()), rel=1e-5)
     assert mse == pytest.approx(float(squares.mean()), rel=1e-5)
-
-
-def test_weights_of_one_change_nothing() -> None:
-    supervision = Supervision(photos(), BOUNDS, SupervisionConfig())
-    batch = supervision.draw(100, torch.Generator().manual_seed(1))
-    rendering = render(ground(), batch.rays, batch.background)
-    plain = supervised_loss(rendering, batch, BOUNDS.side, 0.1)
-    assert supervised_loss(rendering, batch, BOUNDS.side, 0.1, torch.ones(100)) == plain
 
 
 @dataclass
