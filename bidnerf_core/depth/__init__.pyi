@@ -4,8 +4,6 @@ from .images import DepthImage as DepthImage
 from .images import DepthReader as DepthReader
 from .images import depth_image as depth_image
 from .images import read_depth_image as read_depth_image
-from .noise import estimated_depth_noise as estimated_depth_noise
-from .noise import noise_remark as noise_remark
 from .registration import DepthCamera as DepthCamera
 from .registration import nearest_depth as nearest_depth
 from .sensors import DEPTH_SENSORS as DEPTH_SENSORS
@@ -13,4 +11,6 @@ from .sensors import UNKNOWN as UNKNOWN
 from .sensors import UNKNOWN_SENSOR as UNKNOWN_SENSOR
 from .sensors import DepthNoise as DepthNoise
 from .sensors import DepthSensorModel as DepthSensorModel
+from .sensors import estimated_depth_noise as estimated_depth_noise
 from .sensors import find_depth_sensor as find_depth_sensor
+from .sensors import noise_remark as noise_remark

@@ -1,4 +1,4 @@
-"""Models of depth sensors: their accuracy as known beforehand.
+"""Depth sensors: their accuracy as known beforehand, and as estimated from one depth image.
 
 All assumptions about the accuracy of measured depth are stated here. Standard deviations are one sigma. An
 error of the scale or the offset is the same in all pixels of an image and shifts the whole pose; noise is
@@ -11,10 +11,14 @@ import math
 from dataclasses import dataclass
 from typing import overload
 
-from jaxtyping import Float
+import numpy as np
+import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError, unknown_name
+from bidnerf_core.geometry import MAD_TO_SIGMA
 
 
 @dataclass(frozen=True)
@@ -96,3 +100,88 @@ def find_depth_sensor(name: str) -> DepthSensorModel:
     if name not in DEPTH_SENSORS:
         raise unknown_name("depth sensor", name, DEPTH_SENSORS)
     return DEPTH_SENSORS[name]
+
+
+WINDOW_SIDE = 8
+"""Side, in pixels, of the square windows to which planes are fitted."""
+LEAST_WINDOWS = 20
+"""Minimum number of windows in a depth range from which its noise is estimated."""
+LEAST_VALUES = 8
+"""Minimum number of distinct rows and columns of a resampled depth image, and of distinct values of one that is stored in steps."""
+
+
+def estimated_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -> DepthNoise | None:
+    """Return the noise of a depth image (planar z, metres, 0: not measured), as a function of the depth.
+
+    Its relative noise is constant or grows linearly, ``linear + quadratic * z``; it is fitted to the larger
+    of the robust residuals of local planes and the rounding of stored values. Returns None if too few windows
+    are measured without gaps. Errors shared by neighbouring pixels go unnoticed, such as those of a warped
+    image, or of a lidar whose measurements were interpolated. If hardly any window is planar, relief of the
+    scene counts as noise.
+    """
+    if min(depth.shape) < WINDOW_SIDE:
+        return None
+    rows, columns = _lines_of_sensor(depth.detach().cpu())
+    image = intrinsics.unproject(intrinsics.pixel_centres(torch.float64)[rows][:, columns])[..., :2]
+    depth = depth.detach().cpu()[rows][:, columns].double()
+    z, x = (_windows(part) for part in (depth, image))
+    whole = ((z > 0) & z.isfinite()).all(-1)
+    z, x = z[whole], x[whole].mT
+    if len(z) < LEAST_WINDOWS:
+        return None
+    # The inverse depth of a plane is linear in the image coordinates, whatever its slant. A deviation e of 1/z is a relative
+    # deviation z e of z.
+    x = x - x.mean(1, keepdim=True)
+    off = 1 / z - (1 / z).mean(-1, keepdim=True)
+    off = off - (x @ torch.linalg.solve(x.mT @ x, x.mT @ off[..., None]))[..., 0]
+    middle, spare = z.median(-1).values, z.shape[-1] / (z.shape[-1] - 3)
+    # A quarter of the windows is assumed to be planar (the others may show edges, curved surfaces and relief): the noise is that
+    # quantile of their residuals, times the ratio of the two if all windows are planar and all pixels independent.
+    noise = 1.11 * MAD_TO_SIGMA * spare**0.5 * middle * off.abs().median(-1).values
+    ranges = middle.argsort().tensor_split(min(8, len(z) // LEAST_WINDOWS))
+    at = torch.stack([middle[some].median() for some in ranges]).numpy()
+    found = torch.stack([noise[some].quantile(0.25) for some in ranges]).numpy()
+    # The noise is at least the rounding to the usual step of the values, unless they are continuous or few.
+    measured = depth[(depth > 0) & depth.isfinite()]
+    values = measured.unique()
+    if len(values) >= LEAST_VALUES and len(measured) >= 4 * len(values):
+        found = np.maximum(found, float(values.diff().median()) / math.sqrt(12) / at)
+    if at.max() < 1.5 * at.min():  # too small a range to estimate how the noise grows with depth
+        return DepthNoise(linear=float(np.median(found)))
+    from scipy.optimize import nnls  # imported here, since it takes as long as the rest of scipy
+
+    (linear, quadratic), _ = nnls(np.stack([np.ones_like(at), at], axis=-1), found)
+    return DepthNoise(linear=float(linear), quadratic=float(quadratic))
+
+
+def _windows(image: Float[Tensor, "h w *c"]) -> Float[Tensor, "n *c p"]:
+    """Return the pixels of adjacent windows, one window per row; left-over rows and columns of the image are not used."""
+    parts = image.unfold(0, WINDOW_SIDE, WINDOW_SIDE).unfold(1, WINDOW_SIDE, WINDOW_SIDE)
+    return parts.flatten(0, 1).flatten(-2)
+
+
+def _lines_of_sensor(depth: Float[Tensor, "h w"]) -> tuple[Int[Tensor, "r"], Int[Tensor, "c"]]:
+    """Return the indices of the rows and columns that do not repeat the one before.
+
+    If the sensor's resolution is lower than the image's, depth was resampled by nearest neighbour: repeated
+    pixels are not separate measurements. All lines are returned if few of them repeat another, such as empty
+    ones along a border, and if hardly any would be left, as in an exact image of a wall.
+    """
+    first = torch.ones(1, dtype=torch.bool)
+    rows, columns = (torch.cat([first, (x[1:] != x[:-1]).any(-1)]) for x in (depth, depth.T))
+    if not all(LEAST_VALUES <= int(new.sum()) <= 0.8 * len(new) for new in (rows, columns)):
+        rows[:], columns[:] = True, True
+    return rows.nonzero()[:, 0], columns.nonzero()[:, 0]
+
+
+def noise_remark(depth: Float[Tensor, "h w"], intrinsics: Intrinsics, sensor: str) -> str | None:
+    """Return one line that compares the noise estimated from a depth image (metres) with that of a named sensor.
+
+    Returns None if the noise cannot be estimated from the image.
+    """
+    found = estimated_depth_noise(depth, intrinsics)
+    if found is None:
+        return None
+    z = float(depth[depth > 0].median())
+    estimated, expected = found.deviation(z) / z, find_depth_sensor(sensor).noise.deviation(z) / z
+    return f"depth noise at {z:.3g} m is about {estimated:.2%}; {sensor!r} usually has {expected:.2%}"

@@ -1,9 +1,9 @@
-"""Samplers: where on each ray a field is queried; and fields that wrap others."""
+"""Samplers: where on each ray a field is queried; and fields that wrap others, or stand for none."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,6 +11,7 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import max_pool1d, pad
 
 from bidnerf_core.devices import may_wait
+from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import (
     FieldDerivatives,
     FieldValues,
@@ -351,3 +352,19 @@ class ScaledSampler:
 def trained_field(field: RadianceField) -> RadianceField:
     """Return the field as its backend built it, in the unit of its training; its weights are the ones stored."""
     return field.trained if isinstance(field, ScaledField) else field
+
+
+class NoField(nn.Module):
+    """The field of a map of landmarks alone. Sampling or querying it raises ``InputError``, which says how to add one."""
+
+    def sampler(self, *_: object) -> NoReturn:
+        raise InputError(
+            "the map has no radiance field, which this needs; 'bidnerf train DATA --out MAP' adds one"
+        )
+
+    query = sampler
+
+
+def has_field(field: RadianceField) -> bool:
+    """Return whether there is a field behind the name, see ``NoField``."""
+    return not isinstance(trained_field(field), NoField)

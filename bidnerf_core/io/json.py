@@ -1,5 +1,5 @@
 """JSON: one parser, objects with typed access to values, and conversion of frozen dataclasses to and from
-plain values.
+plain values; and the YAML of calibrations.
 
 Everything that reads JSON uses ``parse_json``, so damaged text of any origin gives the same one-line error.
 """
@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import json
 import math
+import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -270,3 +271,29 @@ def _first_error(errors: Sequence[Any], where: str, of: Any) -> InputError:
     return InputError(
         f"found {_shown(first['input'])}", where=": ".join(path), expected=" or ".join(expected)
     )
+
+
+def parse_yaml(content: bytes, where: str, expected: str) -> Any:
+    """Return the first document of a YAML text, with all its values, numbers too, as text; tags, which may stand for code, are ignored.
+
+    Raises ``InputError``, whose message begins with ``where``, if it is malformed, too large or too deep, or has aliases.
+    """
+    import yaml  # imported here, since few commands read any
+
+    loader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
+    # Bytes, of which a calibration with the points of all its images takes some 100,000, and nested lists and mappings
+    most, deepest = 2**20, 50
+    if len(content) > most:
+        found = f"has {len(content):,} bytes of YAML"
+        raise InputError(found, where=where, expected=f"{expected} of at most {most:,}")
+    try:
+        text = re.sub(r"\A\s*%YAML.*\n", "", content.decode("utf-8-sig"))  # OpenCV's is malformed
+        depth = 0
+        for event in yaml.parse(text, Loader=loader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if isinstance(event, yaml.AliasEvent) or depth > deepest:
+                raise yaml.YAMLError(f"aliases, or more than {deepest} lists and mappings within each other")
+        return next(iter(yaml.load_all(text, Loader=loader)), None)
+    except (UnicodeDecodeError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"is not YAML ({reason})", where=where, expected=expected) from error

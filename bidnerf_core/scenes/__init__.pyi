@@ -1,4 +1,6 @@
 from .closed_form import ClosedFormScene as ClosedFormScene
+from .closed_form import look_around as look_around
+from .closed_form import orbit as orbit
 from .closed_form import views as views
 from .closed_form_data import ClosedFormData as ClosedFormData
 from .closed_form_data import closed_form_data as closed_form_data
@@ -12,7 +14,5 @@ from .primitives import Box as Box
 from .primitives import Primitive as Primitive
 from .primitives import Shape as Shape
 from .primitives import Sphere as Sphere
-from .textures import Texture as Texture
-from .textures import blotches as blotches
-from .trajectories import look_around as look_around
-from .trajectories import orbit as orbit
+from .primitives import Texture as Texture
+from .primitives import blotches as blotches

@@ -22,9 +22,9 @@ from bidnerf_core.fields import SceneBounds, render_image
 from bidnerf_core.frames import BLACK, Frame
 from bidnerf_core.geometry import SE3, turned_about
 from bidnerf_core.maps import Map, MapInfo
+from bidnerf_core.scenes.closed_form import look_around, orbit
 from bidnerf_core.scenes.demo import demo_object, demo_room
 from bidnerf_core.scenes.fields import GaussianBlobs
-from bidnerf_core.scenes.trajectories import look_around, orbit
 
 PREFIX = "demo:"
 DEMO_CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)

@@ -14,8 +14,18 @@ import torch
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import SE3
 from bidnerf_core.scenes.closed_form import ClosedFormScene
-from bidnerf_core.scenes.primitives import Box, Cylinder, Primitive, Shape, Sphere
-from bidnerf_core.scenes.textures import Faces, Texture, blotches, checker, stripes
+from bidnerf_core.scenes.primitives import (
+    Box,
+    Cylinder,
+    Faces,
+    Primitive,
+    Shape,
+    Sphere,
+    Texture,
+    blotches,
+    checker,
+    stripes,
+)
 
 C = SimpleNamespace(
     navy=(0.15, 0.27, 0.42), teal=(0.16, 0.62, 0.56), sand=(0.93, 0.78, 0.45), orange=(0.96, 0.60, 0.30),

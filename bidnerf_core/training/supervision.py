@@ -14,11 +14,9 @@ from bidnerf_core.captures import detail_kept
 from bidnerf_core.fields import RadianceField, Rendering, SceneBounds, render
 from bidnerf_core.frames import View
 from bidnerf_core.settings import NotNegative, Settings
-from bidnerf_core.training.colour_transform import ColourTransforms
-from bidnerf_core.training.loop import Replayable, StepOutcome, cosine, fit
-from bidnerf_core.training.loss import distortion, supervised_loss
+from bidnerf_core.training.loop import Replayable, Report, StepOutcome, cosine, fit
+from bidnerf_core.training.loss import ColourTransforms, distortion, supervised_loss
 from bidnerf_core.training.ray_bank import RayBank, TrainingBatch
-from bidnerf_core.training.report import Report
 
 
 @dataclass(frozen=True)

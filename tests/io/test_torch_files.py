@@ -49,7 +49,7 @@ MEASURED = """
 import sys
 from pathlib import Path
 import psutil
-from bidnerf_core.io.torch_files import read_saved
+from bidnerf_core.io.tensors import read_saved
 
 kept = []
 for mapped in (True, False):
