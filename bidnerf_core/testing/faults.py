@@ -30,11 +30,14 @@ def is_one_line(text: object) -> bool:
 
 
 @contextmanager
-def calling(doing: str) -> Iterator[None]:
-    """Turn an exception in the backend's code into a contract failure that names the call (``doing``)."""
+def calling(doing: str, passing: type[Exception] = AssertionError) -> Iterator[None]:
+    """Turn an exception in the backend's code into a contract failure that names the call (``doing``).
+
+    A failure itself, and an exception of the type ``passing``, is raised as it is.
+    """
     try:
         yield
-    except AssertionError:
+    except (AssertionError, passing):
         raise
     except Exception as error:
         raise AssertionError(f"{doing} raised {type(error).__name__}: {error}") from error

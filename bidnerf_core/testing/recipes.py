@@ -196,21 +196,25 @@ def rendered(field: RadianceField, view: View, bounds: SceneBounds) -> Float[Ten
 def _train(
     backend: Backend, field: RadianceField, views: Sequence[View], config: Any, report: Recorder, how: str
 ) -> None:
-    try:
-        with calling(f"{type(backend).__name__}.train {how}".rstrip()):
-            backend.train(field, views, config, report)
-    except AssertionError as error:
-        if isinstance(error.__cause__, TrainingStopped):
-            raise error.__cause__ from None
-        raise
+    with calling(f"{type(backend).__name__}.train {how}".rstrip(), passing=TrainingStopped):
+        backend.train(field, views, config, report)
 
 
 def _require_same(found: dict[str, Tensor], expected: dict[str, Tensor], who: str, fault: str) -> None:
-    names = f"the tensors are {sorted(found)}, expected {sorted(expected)}"
-    require(who, (found.keys() == expected.keys(), f"{fault}: {names}"))
-    for name, value in expected.items():
-        same = torch.equal(found[name].cpu(), value.detach().cpu())
-        require(who, (same, f"{fault} (tensor {name!r} differs)"))
+    require(
+        who,
+        (
+            found.keys() == expected.keys(),
+            f"{fault}: the tensors are {sorted(found)}, expected {sorted(expected)}",
+        ),
+        *(
+            (
+                name in found and torch.equal(found[name].cpu(), value.cpu()),
+                f"{fault} (tensor {name!r} differs)",
+            )
+            for name, value in expected.items()
+        ),
+    )
 
 
 def _shortly(items: list[Any]) -> str:
