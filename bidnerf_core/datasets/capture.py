@@ -141,11 +141,10 @@ class Shot:
         source = self.camera if isinstance(self.camera, CameraSource) else CameraSource(self.camera)
         found = source.find(str(self.image), raster).at_most(side)
         camera, size = found.camera, (found.camera.width, found.camera.height)
-        if pixels is not None:
-            rgb, alpha = pixels if size == raster.size else reduced(pixels, *size), None
-        else:
-            assert isinstance(self.image, ImageSource)
+        if isinstance(self.image, ImageSource):
             rgb, alpha = read_compact_image(self.image, background, None if size == raster.size else size)
+        elif pixels is not None:
+            rgb, alpha = pixels if size == raster.size else reduced(pixels, *size), None
         metres, hidden, about = None, None, dict[str, Any]()
         if self.depth is not None:
             measured, where = self.depth.read(), Path(self.depth.path)
@@ -227,9 +226,7 @@ class Capture:
         None  # the upward direction in the world if the capture measured gravity, as phones do
     )
     depth_unit: float | None = None  # metres per step of depth images, if the format accepts another unit
-    largest: int | None = (
-        None  # longer side to which the user asked to downscale images, instead of the usual one
-    )
+    largest: int | None = None  # longer side to which the user asked to downscale images, not the usual one
     pose_file: Path | str | None = None  # what records the poses, for messages
     poses_expected: str = "at least one"  # what has to be there for an image to have a pose
     unposed: str = ""  # why some images have none

@@ -1,11 +1,10 @@
 """Folders of a COLMAP project: images and a sparse model, with no other file.
 
 Models are looked for in ``sparse``, ``colmap/sparse`` (nerfstudio), the folder itself, ``dense`` and the
-like, as .bin or .txt (``cameras`` and ``images``; ``points3D``, ``rigs`` and ``frames`` are not read). If the
-mapper wrote several (``sparse/0``, ``sparse/1`` ...), the one with the most images is used, with a remark.
-Among the usual image folders, the one that holds most of the model's images is used. Missing images and
-photos that are not registered are left out and counted. Every eighth registered image in natural name order
-(the first, the ninth ...) is held out as "test" and the others are "train", as is usual for captures.
+like, as .bin or .txt (``cameras`` and ``images``; ``points3D``, ``rigs`` and ``frames`` are not read). If
+the mapper wrote several (``sparse/0``, ``sparse/1`` ...), the one with the most images is used, with a
+remark. Among the usual image folders, the one that holds most of the model's images is used. Missing images
+and photos that are not registered are left out and counted.
 
 In a dense workspace (``images``, ``sparse``, ``stereo/depth_maps``) the depth maps provide the images' depth:
 the geometrically filtered ones, or else the photometric ones.

@@ -2,12 +2,11 @@
 
 ``mav0/cam0/data.csv`` lists ``timestamp [ns],filename`` of the images in ``mav0/cam0/data``;
 ``mav0/cam0/sensor.yaml`` has ``T_BS`` (4x4, camera to body), ``intrinsics`` (fx, fy, cx, cy),
-``distortion_coefficients`` and ``resolution``. ``mav0/state_groundtruth_estimate0/data.csv`` (or ``mocap0``,
-``vicon0``) has the poses of the body: ``timestamp [ns], px, py, pz, qw, qx, qy, qz``, metres. They are
-interpolated at the image times and transformed to the camera. Images without a pose are in the sequence but
-not in the dataset, and a remark counts them. Principal points are relative to the centre of the upper left
-pixel, so half a pixel is added. Every eighth posed image (the first, the ninth ...) is held out as "test",
-the others are "train".
+``distortion_coefficients`` and ``resolution``. ``mav0/state_groundtruth_estimate0/data.csv`` (or
+``mocap0``, ``vicon0``) has the poses of the body: ``timestamp [ns], px, py, pz, qw, qx, qy, qz``, metres.
+They are interpolated at the image times and transformed to the camera. Images without a pose are in the
+sequence but not in the dataset, and a remark counts them. Principal points are relative to the centre of
+the upper left pixel, so half a pixel is added.
 """
 
 from __future__ import annotations

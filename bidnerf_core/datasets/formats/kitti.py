@@ -5,8 +5,7 @@ times (seconds), and ``image_2/000000.png`` ... the images of camera 2, the left
 existing folder of ``image_2``, ``image_0``, ``image_3`` and ``image_1`` is used. Poses are rows of twelve
 numbers (3x4, camera 0 to world, OpenCV axes, metres) in the folder's ``poses.txt`` or, as distributed, in
 ``../../poses/NN.txt`` for the sequence ``NN``; they are transformed to the camera whose images are used.
-Principal points are relative to the centre of the upper left pixel, so half a pixel is added. Every eighth
-image (the first, the ninth ...) is held out as "test" and the others are "train".
+Principal points are relative to the centre of the upper left pixel, so half a pixel is added.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
 """Photos whose cameras were exported by Agisoft Metashape (File > Export > Export Cameras, "Agisoft XML").
 
-A ``camera`` has the camera-to-chunk matrix ``transform`` (4x4, row by row; OpenCV axes), the photo's name in ``label``, and the
-``sensor`` that took it: ``resolution`` and the adjusted ``calibration`` with ``f`` (pixels), ``cx cy`` (from the image centre) and
-the distortion ``k1 k2 k3 p1 p2``, whose p1 and p2 are OpenCV's p2 and p1. The chunk's ``scale``, if it is georeferenced or has scale
-bars, makes positions metres; its rotation and translation are not applied, so the world is the chunk. Photos are in the folder or
-in ``images``. Every eighth one (the first, the ninth ...) is held out as "test" and the others are "train".
+A ``camera`` has the camera-to-chunk matrix ``transform`` (4x4, row by row; OpenCV axes), the photo's name
+in ``label``, and the ``sensor`` that took it: ``resolution`` and the adjusted ``calibration`` with ``f``
+(pixels), ``cx cy`` (from the image centre) and the distortion ``k1 k2 k3 p1 p2``, whose p1 and p2 are
+OpenCV's p2 and p1. The chunk's ``scale``, if it is georeferenced or has scale bars, makes positions metres;
+its rotation and translation are not applied, so the world is the chunk. Photos are in the folder or in
+``images``.
 """
 
 from __future__ import annotations

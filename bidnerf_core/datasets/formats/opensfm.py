@@ -1,11 +1,12 @@
 """Reconstructions of OpenSfM and OpenDroneMap (https://opensfm.org/docs/dataset.html): ``reconstruction.json``.
 
-The file is a list of reconstructions, of which the one with the most images is used, with a remark. ``shots`` have the world-to-camera
-pose (``rotation`` as an angle-axis vector, ``translation``; OpenCV axes), the name of their ``camera`` and the time in
-``capture_time`` (seconds). Parameters of ``cameras`` refer to an image whose longer side is 1 and whose origin is its centre:
-``focal`` (or ``focal_x``, ``focal_y``), ``c_x``, ``c_y``, and the distortion ``k1 k2 k3 p1 p2`` in OpenCV's convention. A pixel's
-centre is at integer coordinates there, so the origin is half a pixel from the middle. Photos are in ``images``. Every eighth one (the
-first, the ninth ...) is held out as "test" and the others are "train".
+The file is a list of reconstructions, of which the one with the most images is used, with a remark.
+``shots`` have the world-to-camera pose (``rotation`` as an angle-axis vector, ``translation``; OpenCV
+axes), the name of their ``camera`` and the time in ``capture_time`` (seconds). Parameters of ``cameras``
+refer to an image whose longer side is 1 and whose origin is its centre: ``focal`` (or ``focal_x``,
+``focal_y``), ``c_x``, ``c_y``, and the distortion ``k1 k2 k3 p1 p2`` in OpenCV's convention. A pixel's
+centre is at integer coordinates there, so the origin is half a pixel from the middle. Photos are in
+``images``.
 """
 
 from __future__ import annotations

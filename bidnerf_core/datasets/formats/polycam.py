@@ -7,9 +7,8 @@ exist, else ``cameras`` and ``images``. Newer exports store no size, so the phot
 ``keyframes/depth/TIME.png`` is planar z in millimetres at a lower resolution, with
 ``keyframes/confidence/TIME.png`` (0 low, 127 medium, 255 high). See ``lidar`` for how both are read.
 
-Undistorted photos have a black border, which must not be learned: 15 pixels of it are hidden, the width that
-other software crops. Every eighth photo (the first, the ninth ...) is held out as "test" and the others are
-"train".
+Undistorted photos have a black border, which must not be learned: 15 pixels of it are hidden, the width
+that other software crops.
 """
 
 from __future__ import annotations

@@ -4,9 +4,8 @@ parameters").
 The columns are ``#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2``. The rotation of the camera
 (OpenGL axes) is ``Rz(-heading) Rx(pitch) Ry(roll)``, in degrees, in a world whose z points up. ``f`` is the
 focal length in millimetres for a film 36 mm wide, ``px`` and ``py`` are the offset of the principal point
-from the image centre, both relative to the longer side of the photo; ``k1`` to ``t2`` are Brown's distortion
-in OpenCV's convention. Photos are in the folder, or in ``images``. Every eighth photo in natural name order
-(the first, the ninth ...) is held out as "test" and the others are "train".
+from the image centre, both relative to the longer side of the photo; ``k1`` to ``t2`` are Brown's
+distortion in OpenCV's convention. Photos are in the folder, or in ``images``.
 """
 
 from __future__ import annotations

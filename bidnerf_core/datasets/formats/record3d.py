@@ -9,8 +9,7 @@ package ``lzfse``, which the extra ``record3d`` installs. The world is that of t
 camera frame of its first frame, so none of its axes is vertical. See ``lidar`` for how depth and photos
 are read.
 
-Members of the archive are read one at a time and within limits. Every eighth frame of the dataset (the first, the ninth ...) is
-held out as "test" and the others are "train".
+Members of the archive are read one at a time and within limits.
 """
 
 from __future__ import annotations

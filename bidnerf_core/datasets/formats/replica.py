@@ -1,10 +1,10 @@
 """Rendered sequences of Replica as iMAP and NICE-SLAM distribute them (https://github.com/cvg/nice-slam).
 
-``results/frame000000.jpg`` and ``results/depth000000.png`` (16-bit planar z) are the frames; ``traj.txt`` has a row of sixteen
-numbers for each, the 4x4 camera-to-world matrix (OpenCV axes, metres). The camera and the steps of depth per metre (``scale``) are
-in ``cam_params.json`` of the folder or the one above; without it, the published ones apply. Principal points are relative to the
-centre of the upper left pixel, so half a pixel is added. Every eighth frame (the first, the ninth ...) is held out as "test" and
-the others are "train".
+``results/frame000000.jpg`` and ``results/depth000000.png`` (16-bit planar z) are the frames; ``traj.txt``
+has a row of sixteen numbers for each, the 4x4 camera-to-world matrix (OpenCV axes, metres). The camera and
+the steps of depth per metre (``scale``) are in ``cam_params.json`` of the folder or the one above; without
+it, the published ones apply. Principal points are relative to the centre of the upper left pixel, so half a
+pixel is added.
 """
 
 from __future__ import annotations

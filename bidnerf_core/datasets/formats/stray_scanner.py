@@ -4,9 +4,7 @@
 (seconds, metres; camera to world with OpenCV axes) and in newer recordings ``fx, fy, cx, cy``,
 ``camera_matrix.csv`` is the 3x3 camera matrix of all frames. ``depth/000000.png`` (16-bit planar z in
 millimetres, 256x192) and ``confidence/000000.png`` (0, 1, 2) belong to the frame with that number; some may
-be missing. See ``lidar`` for how depth and photos are read. Reading the video needs the extra
-``video``. Every eighth frame of the dataset (the first, the ninth ...) is held out as "test" and the others
-are "train".
+be missing. See ``lidar`` for how depth and photos are read. Reading the video needs the extra ``video``.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Folders with ``transforms.json``: the dialects of NeRF's Blender scenes and of nerfstudio (and instant-ngp).
 
-A folder holds some of ``transforms_train.json``, ``transforms_val.json`` and ``transforms_test.json``, or one
-``transforms.json`` whose lists ``train_filenames``, ``val_filenames`` and ``test_filenames`` define the splits. Without
-such lists every eighth frame (the first, the ninth ...) is held out as "test" and the others are "train", as is usual for
-captures; a single frame is both.
+A folder holds some of ``transforms_train.json``, ``transforms_val.json`` and ``transforms_test.json``, or
+one ``transforms.json`` whose lists ``train_filenames``, ``val_filenames`` and ``test_filenames`` define the
+splits.
 
 These keys are read from a frame or, where it lacks them, from the file: ``camera_angle_x [camera_angle_y]`` or
 ``fl_x [fl_y]``, ``cx cy w h``, ``k1 k2 p1 p2 k3``, ``camera_model``, ``depth_unit_scale_factor`` (metres per unit, default

@@ -5,10 +5,9 @@ the colour camera in the motion-capture frame: ``timestamp tx ty tz qx qy qz qw`
 axes. The three are sampled at different times and rates. A colour image is paired with the depth image
 nearest in time if they are mutual nearest neighbours at most 20 ms apart, and with the pose interpolated
 between the samples before and after it. A frame outside the time span of the ground truth, or in a gap of
-more than 0.1 s, has no pose: it is in the sequence but not in the dataset, and a remark counts it. The ground
-truth may also be in the format of EuRoC, or of KITTI with one pose for each image. Every eighth posed frame
-(the first, the ninth ...) is held out as "test" and the others are "train". Listed images that are missing
-are left out with a remark; names may contain spaces.
+more than 0.1 s, has no pose: it is in the sequence but not in the dataset, and a remark counts it. The
+ground truth may also be in the format of EuRoC, or of KITTI with one pose for each image. Listed images
+that are missing are left out with a remark; names may contain spaces.
 
 Depth is 16-bit planar z in steps of 1/5000 m, 0 where nothing was measured, registered to the colour image.
 The published images already include the depth scale correction. Depth of other recordings in this layout is

@@ -2,7 +2,7 @@
 
     python -c "
     from bidnerf_core.scenes.closed_form_data import closed_form_data
-    from bidnerf_core.datasets.writing import write_transforms
+    from bidnerf_core.datasets import write_transforms
     room = closed_form_data('demo:room')
     write_transforms('room', {split: room.views(split) for split in room.splits}, room.background)"
     python make_runs.py runs
