@@ -1,7 +1,5 @@
 from .client import ServiceClient as ServiceClient
 from .client import ServiceError as ServiceError
-from .jobs import Job as Job
-from .jobs import Queue as Queue
 from .models import LONGEST_NAME as LONGEST_NAME
 from .models import Refused as Refused
 from .models import Upload as Upload

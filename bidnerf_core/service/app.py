@@ -6,23 +6,20 @@ import asyncio
 import contextlib
 import json
 import logging
-import os
-import tempfile
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from importlib.metadata import version
 from typing import Any
 
 from fastapi import Depends, FastAPI, Path, Request
-from prometheus_client import CONTENT_TYPE_LATEST
+from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.types import Scope
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import parse_json
-from bidnerf_core.service.jobs import Job
 from bidnerf_core.service.models import Localization, MapFacts, Refused, checked
-from bidnerf_core.service.pool import Lost, Pool
+from bidnerf_core.service.pool import Pool
 from bidnerf_core.service.protocols import PROTOCOLS, ServiceProtocol
 from bidnerf_core.service.settings import ServiceLimits
 from bidnerf_core.service.web import (
@@ -48,17 +45,17 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         try:
-            await asyncio.to_thread(pool.start)
+            await pool.start()
             yield
         finally:
-            await asyncio.to_thread(pool.close)
+            await pool.close()
 
     def report(scope: Scope, status: int, seconds: float) -> None:
         """Count a request, and write one line of JSON about it to the log."""
         path = getattr(scope.get("route"), "path", "unknown" if status not in (401, 403) else "refused")
-        pool.metrics.requests.labels(path=path, status=status).inc()
+        pool.requests.labels(path=path, status=status).inc()
         if scope["method"] == "POST":
-            pool.metrics.seconds.observe(seconds)
+            pool.seconds.observe(seconds)
         if scope["method"] == "POST" or status >= 400:
             client = scope.get("client")
             line = {
@@ -94,17 +91,13 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
         summary="Whether the service can answer; needs no token.",
     )
     async def health() -> Response:
-        alive = len(pool.alive)
-        if not alive:
+        if not pool.workers:
             return problem(503, "no worker is currently alive", {"Retry-After": "1"})
-        folder = tempfile.gettempdir()
-        if os.path.isdir(folder) and not os.access(folder, os.W_OK):
-            return problem(503, "the folder for temporary files cannot be written", {"Retry-After": "60"})
-        return JSONResponse({"status": "ok", "workers": alive, "waiting": pool.queue.waiting})
+        return JSONResponse({"status": "ok", "workers": len(pool.workers), "waiting": pool.waiting})
 
     @app.get("/metrics", response_class=PlainTextResponse, summary="Counters and times for Prometheus.")
     async def metrics() -> Response:
-        return Response(pool.metrics.text(), headers={"Content-Type": CONTENT_TYPE_LATEST})
+        return Response(generate_latest(pool.registry), headers={"Content-Type": CONTENT_TYPE_LATEST})
 
     @app.get("/maps", response_model=dict[str, MapFacts], summary="The maps by name, with facts about each.")
     async def maps() -> Response:
@@ -115,23 +108,23 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
         return JSONResponse(pool.described[map])
 
     async def localize(request: Request) -> Response:
-        with pool.queue.place() as job:
+        with pool.place() as facts:
             upload = await photo_of(request, app.state.limits)
             usual = names[0] if len(names) == 1 else None  # None stands for the map that the photo shows
             name = request.path_params.get("map", upload.parameters.get("map", usual))
             task = {"map": name if name is None else await known(name), "upload": upload}
-            return JSONResponse(await _answer(request, job, task))
+            return JSONResponse(await _answer(request, facts, task))
 
     def ask(name: str, protocol: ServiceProtocol) -> Callable[[Request], Awaitable[Response]]:
         async def asked(request: Request) -> Response:
-            with pool.queue.place() as job:
+            with pool.place() as facts:
                 body = parse_json(await body_of(request, app.state.limits), "", "a JSON object")
                 checked(protocol.request, body)
                 map = request.path_params.get("map", request.query_params.get("map"))
                 if map is None and len(names) > 1:
                     raise InputError("several maps are served", expected=f"map as one of {', '.join(names)}")
                 task = {"map": await known(names[0] if map is None else map), "protocol": name, "body": body}
-                answer = await _answer(request, job, task)
+                answer = await _answer(request, facts, task)
             accepts = protocol.media_type.partition(";")[0] in request.headers.get("accept", "")
             return JSONResponse(answer, media_type=protocol.media_type if accepts else "application/json")
 
@@ -168,24 +161,15 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
     return app
 
 
-async def _answer(request: Request, job: Job, task: dict[str, Any]) -> Any:
-    """Return the JSON of a worker's answer; stop the work if it takes too long or the client disconnects.
-
-    Raises ``Refused``.
-    """
+async def _answer(request: Request, facts: dict[str, Any], task: dict[str, Any]) -> Any:
+    """Return the JSON of a worker's answer, and add ``facts`` about it to the log. Raises ``Refused``."""
     pool: Pool = request.app.state.pool
     upload = task.get("upload")
-    sizes = [] if upload is None else map(len, upload.files.values())
-    request.state.facts = facts = {"id": job.id, "map": task["map"], "bytes": sum(sizes)}
-    pool.queue.put(job, task)
-    try:
-        work = asyncio.wrap_future(job.result)
-        answer: dict[str, Any] = await answered(request, work, request.app.state.limits.timeout)
-    except Lost as error:
-        raise Refused(422, "the request crashed every worker that took it") from error
-    finally:
-        facts |= {"attempts": job.attempts, "waited": None if job.waited is None else round(job.waited, 4)}
-    pool.metrics.outcomes.labels(map=task["map"] or "", outcome=answer["outcome"]).inc()
+    facts |= {"map": task["map"], "bytes": 0 if upload is None else sum(map(len, upload.files.values()))}
+    request.state.facts = facts
+    work = asyncio.create_task(pool.answer(task, facts))
+    answer: dict[str, Any] = await answered(request, work, request.app.state.limits.timeout)
+    pool.outcomes.labels(map=task["map"] or "", outcome=answer["outcome"]).inc()
     facts |= {key: answer[key] for key in ("outcome", "worker", "fault") if key in answer}
     if answer["status"] != 200:
         raise Refused(answer["status"], answer["detail"], None, **answer.get("more", {}))

@@ -1,218 +1,228 @@
 """The worker processes of the service, which may be stopped or killed at any time.
 
-Each worker has a thread here, which gives it one request after another. A request whose worker dies is given to a new
-one. If a request takes too long, or its client disconnects, its worker is killed and replaced by a fork within
-milliseconds, so no computation continues that nobody waits for. A pool of the standard library would lose all its
-requests with one worker, cannot stop one, and would load the maps anew in each.
+A request whose worker dies is given to another. If a request takes too long, or its client disconnects, its worker is killed and
+replaced by a fork within milliseconds, so no computation continues that nobody waits for. A pool of the standard library would
+lose all its requests with one worker, cannot stop one, and would load the maps anew in each.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import os
+import pickle
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-from multiprocessing.connection import Connection
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import psutil
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.service.jobs import Job, Queue
-from bidnerf_core.service.metrics import Metrics
+from bidnerf_core.service.models import Refused
 from bidnerf_core.service.settings import ServiceLimits
 
 FORK_SECONDS = 60.0
 """Time for a new worker to report; on an accelerator it copies the maps first."""
 PAUSE = 1.0
-"""Seconds between two looks at an idle worker, and between two attempts to reload the maps."""
+"""Seconds between two attempts to fork a worker."""
 LOST = (OSError, EOFError, ValueError, psutil.Error)
-"""The exceptions that a connection raises if the process at its other end has died or sends nonsense."""
+"""The exceptions that reading from a process raises if it has died or sends nonsense."""
+ATTEMPTS = 3
+"""Workers that may die of a request before it is refused."""
+SECONDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0)
+"""Upper bounds of the buckets of times."""
 
 
-class Lost(Exception):
-    """Every worker that took the request died."""
+class Worker:
+    """A running worker process, which answers one request at a time."""
 
-
-class WorkerProcess:
-    """A running worker, as seen by the service."""
-
-    def __init__(self, connection: Connection) -> None:
-        """Wait for a new worker's first message. Raises ``InputError`` if the worker cannot serve, and ``LOST`` if it died."""
-        self._connection = connection
-        if not connection.poll(FORK_SECONDS):
-            raise TimeoutError
-        self.pid: int = _reply(connection)["pid"]
+    def __init__(self, pid: int, writer: asyncio.StreamWriter) -> None:
+        self.pid, self.stopped, self.ended = pid, "", False
+        self.reply = asyncio.get_running_loop().create_future()
+        self.reply.cancel()  # nothing was asked yet
+        self._writer = writer
         # It remembers when the process began, since its number may later be that of another.
-        self._process = psutil.Process(self.pid)
+        self._process = psutil.Process(pid)
 
-    @property
-    def ended(self) -> bool:
-        """Whether an idle worker has ended: only the end of the connection makes it readable."""
-        try:
-            return self._connection.poll()
-        except OSError:  # it is closed
-            return True
-
-    def ask(self, task: Any) -> dict[str, Any]:
+    async def ask(self, task: Any) -> dict[str, Any]:
         """Return the worker's answer. Raises ``LOST`` if it exits before answering."""
-        self._connection.send(task)
-        return _reply(self._connection) | {"worker": self.pid}
+        self.reply = asyncio.get_running_loop().create_future()
+        self._writer.write(pickle.dumps(task))
+        return json.loads(await self.reply) | {"worker": self.pid}
 
     def kill(self) -> None:
-        """Kill the process; ``ask`` then raises in the thread that waits there."""
+        """Kill the process."""
+        self._writer.close()
         with contextlib.suppress(psutil.NoSuchProcess):
             self._process.kill()
 
 
-def _reply(connection: Connection) -> dict[str, Any]:
-    """Return the JSON that a process sends. Raises ``InputError`` if it states an error, and ``LOST`` if the process died."""
-    reply: dict[str, Any] = json.loads(connection.recv_bytes(2**24))  # at most 16 MiB
-    if "error" in reply:
-        raise InputError(reply["error"])
-    return reply
-
-
 class Pool:
-    """The workers of a service and the threads that give them the jobs of its queue."""
+    """The workers of a service, which share the memory of its maps, and the requests that wait for them."""
 
     def __init__(self, order: dict[str, Any], limits: ServiceLimits) -> None:
         """``order`` is what the process that loads the maps gets, see ``worker.main``."""
-        self.queue = Queue(limits.processes + limits.queue, self._retry_after)
         self.described: dict[str, Any] = {}
+        self.places, self.taken, self.waiting = limits.processes + limits.queue, 0, 0
+        self.workers = list[Worker]()
         self._order, self._limits = order, limits
-        self._workers: dict[int, WorkerProcess] = {}
-        self._busy: set[int] = set()
+        self._idle = asyncio.Queue[Worker]()
+        self._keepers = list[asyncio.Task[None]]()
         self._maps: tuple[subprocess.Popen[bytes], socket.socket] | None = None
-        self._loading = threading.Lock()
-        self._threads: list[threading.Thread] = []
-        self.metrics = Metrics(
-            {
-                "queue_length": ("Requests that wait for a worker.", lambda: self.queue.waiting),
-                "requests_in_progress": ("Requests that are uploading, waiting or at work.", lambda: self.queue.taken),
-                "workers": ("Workers that are alive.", lambda: len(self.alive)),
-            },
-            {
-                "service": lambda: [os.getpid()],
-                "maps": lambda: [] if self._maps is None else [self._maps[0].pid],
-                "workers": lambda: self.alive,
-            },
-        )  # fmt: skip
+        self._loading = asyncio.Lock()
+        self.registry = CollectorRegistry()
+        count, times = (
+            partial(Counter, registry=self.registry),
+            partial(Histogram, registry=self.registry, buckets=SECONDS),
+        )
+        self.requests = count("bidnerf_requests", "Requests answered.", ["path", "status"])
+        self.outcomes = count("bidnerf_outcomes", "Localizations by their outcome.", ["map", "outcome"])
+        self.restarts = count("bidnerf_worker_restarts", "Workers replaced.", ["reason"])
+        self.seconds = times("bidnerf_request_seconds", "From the arrival of a request to its answer.")
+        self.waited = times("bidnerf_queue_seconds", "Waiting for a worker.")
+        gauge = partial(Gauge, registry=self.registry)
+        gauge("bidnerf_queue_length", "Requests that wait for a worker.").set_function(lambda: self.waiting)
+        text = "Requests that are uploading, waiting or at work."
+        gauge("bidnerf_requests_in_progress", text).set_function(lambda: self.taken)
+        gauge("bidnerf_workers", "Workers that are alive.").set_function(lambda: len(self.workers))
+        text = "Resident memory; pages shared by processes count for each."
+        memory = gauge("bidnerf_resident_bytes", text, ["process"])
+        processes: dict[str, Callable[[], Sequence[int]]] = {
+            "service": lambda: [os.getpid()],
+            "maps": lambda: [] if self._maps is None else [self._maps[0].pid],
+            "workers": lambda: [worker.pid for worker in self.workers],
+        }
+        for kind, numbers in processes.items():
+            memory.labels(process=kind).set_function(partial(_resident_bytes, numbers))
 
-    @property
-    def alive(self) -> list[int]:
-        """The process ids of the workers that have not ended."""
-        workers = list(self._workers.items())
-        return [worker.pid for number, worker in workers if number in self._busy or not worker.ended]
+    def metric(self, name: str, **labels: str) -> float:
+        """Return the value of a metric now; 0 for one that was never counted."""
+        return self.registry.get_sample_value(f"bidnerf_{name}", labels) or 0.0
 
-    def _retry_after(self) -> int:
-        mean = self.metrics.mean_seconds
-        return max(1, min(60, round(mean * self._limits.queue / self._limits.processes)))
+    @contextlib.contextmanager
+    def place(self) -> Iterator[dict[str, Any]]:
+        """Take one of the places for requests within the block, and yield the facts for its log. Raises ``Refused`` if none is left."""
+        if self.taken >= self.places:
+            mean = self.metric("request_seconds_sum") / max(1.0, self.metric("request_seconds_count")) or 1.0
+            seconds = max(1, min(60, round(mean * self._limits.queue / self._limits.processes)))
+            headers = {"Retry-After": str(seconds), "Connection": "close"}
+            raise Refused(429, f"all {self.places} places are taken, try again later", headers)
+        self.taken += 1
+        try:
+            yield {"id": uuid.uuid4().hex, "attempts": 0, "waited": None}
+        finally:
+            self.taken -= 1
 
-    def start(self) -> None:
+    async def answer(self, task: Any, facts: dict[str, Any]) -> dict[str, Any]:
+        """Return a worker's answer to a request. Raises ``Refused`` if every worker that took it died.
+
+        Cancelling this kills the worker that is at work; the message of the cancellation says why.
+        """
+        began = time.perf_counter()
+        os.makedirs(tempfile.gettempdir(), exist_ok=True)  # something may have removed it
+        for attempt in range(1, ATTEMPTS + 1):
+            facts["attempts"] = attempt
+            self.waiting += 1
+            try:
+                while (worker := await self._idle.get()).ended:
+                    pass
+            finally:
+                self.waiting -= 1
+            if facts["waited"] is None:
+                waited = time.perf_counter() - began
+                facts["waited"] = round(waited, 4)
+                self.waited.observe(waited)
+            with tempfile.TemporaryDirectory(prefix="bidnerf-serve-", ignore_cleanup_errors=True) as folder:
+                try:
+                    answer = await worker.ask((task, folder))
+                except LOST:
+                    worker.kill()
+                    continue
+                except asyncio.CancelledError as error:
+                    worker.stopped = str(error) or "cancelled"
+                    worker.kill()
+                    raise
+            self._idle.put_nowait(worker)
+            return answer
+        raise Refused(422, "the request crashed every worker that took it")
+
+    async def start(self) -> None:
         """Load the maps and fork the workers. Raises ``InputError`` if the maps cannot be served."""
         try:
-            self._load()
-            self._workers[0] = self._fork()
+            await self._load()
+            first = await self._fork()
         except BaseException as error:
-            self.close()
+            await self.close()
             if isinstance(error, LOST) and not isinstance(error, InputError):
                 raise InputError("the process that loads the maps died; was memory short?") from error
             raise
-        for number in range(self._limits.processes):
-            thread = threading.Thread(target=self._work, args=[number], name=f"worker {number}", daemon=True)
-            self._threads.append(thread)
-            thread.start()
+        new = [first, *[None] * (self._limits.processes - 1)]
+        self._keepers = [asyncio.create_task(self._keep(worker)) for worker in new]
 
-    def close(self) -> None:
-        """End all processes and remove their leftovers."""
-        self.queue.close()
-        for worker in list(self._workers.values()):
-            worker.kill()
+    async def close(self) -> None:
+        """End all processes."""
+        for keeper in self._keepers:
+            keeper.cancel()
+        await asyncio.gather(*self._keepers, return_exceptions=True)
         self._end_maps(group=True)
-        for thread in self._threads:
-            thread.join(2 * PAUSE)
-        self._end_maps(group=True)  # one that a thread was loading
 
-    def _work(self, number: int) -> None:
-        """Keep one worker alive and give it one job after another."""
-        while not self.queue.closed:
-            worker = self._workers.get(number)
-            if worker is None or worker.ended:
-                self._replace(number, "ended")
-                continue
-            job = self.queue.next(PAUSE)
-            if job is not None:
-                self._busy.add(number)
-                try:
-                    job.result.set_result(self._answered(job, number))
-                except Exception as error:  # of this process, such as a full disk; the request reports it
-                    job.result.set_exception(error)
-                finally:
-                    self._busy.discard(number)
+    async def _keep(self, new: tuple[Worker, asyncio.StreamReader] | None) -> None:
+        """Hand the answers of a worker to those who asked, and replace it whenever it has ended."""
+        while True:
+            worker, reader = new or await self._replacement()
+            self.workers.append(worker)
+            self._idle.put_nowait(worker)
+            try:
+                with contextlib.suppress(*LOST):
+                    while (line := await reader.readline()) and not worker.reply.done():
+                        worker.reply.set_result(line)
+            finally:
+                worker.ended = True
+                self.workers.remove(worker)
+                worker.kill()
+            reason = worker.stopped or ("ended" if worker.reply.done() else "died")
+            if reason == "died":
+                worker.reply.set_exception(EOFError())
+            self.restarts.labels(reason=reason).inc()
+            new = None
 
-    def _answered(self, job: Job, number: int) -> dict[str, Any] | None:
-        """Return a worker's answer to a job, or None if the job was stopped. Raises ``Lost`` if three workers died of it."""
-        self.metrics.waited.observe(job.waited or 0.0)
-        os.makedirs(tempfile.gettempdir(), exist_ok=True)  # something may have removed it
-        while job.attempts < 3 and (worker := self._workers.get(number)) is not None:
-            if worker.ended:  # it ended since it was last looked at, and not because of this job
-                self._replace(number, "ended")
-                continue
-            job.attempts += 1
-            with tempfile.TemporaryDirectory(prefix="bidnerf-serve-", ignore_cleanup_errors=True) as folder:
-                try:
-                    with job.killed_by(worker.kill):
-                        return worker.ask((job.task, folder))
-                except LOST:
-                    self._replace(number, job.stopped or "died")
-            if job.stopped:
-                return None
-        raise Lost
-
-    def _replace(self, number: int, reason: str) -> None:
-        """Fork a worker in the place of one that has ended or is killed here.
-
-        If the process that holds the maps has ended or does not answer, they are reloaded first.
-        """
-        worker = self._workers.pop(number, None)
-        if worker is not None:
-            worker.kill()
-            self.metrics.restarts.labels(reason=reason).inc()
-        while number not in self._workers and not self.queue.closed:
-            with self._loading:
+    async def _replacement(self) -> tuple[Worker, asyncio.StreamReader]:
+        """Fork a worker. If the process that holds the maps has ended or does not answer, they are reloaded first."""
+        while True:
+            async with self._loading:
                 try:
                     if self._maps is None:
-                        self._load()
-                    self._workers[number] = self._fork()
-                    return
+                        await self._load()
+                    return await self._fork()
                 except InputError:
                     # The error is the worker's own, such as too little memory on its accelerator, and reloading the maps would
                     # not help. If the maps cannot be served, their process ends, which is noticed when it is to fork.
                     pass
                 except LOST:
                     self._end_maps()
-                    self.metrics.restarts.labels(reason="maps").inc()
-            time.sleep(PAUSE)
+                    self.restarts.labels(reason="maps").inc()
+            await asyncio.sleep(PAUSE)
 
-    def _fork(self) -> WorkerProcess:
-        """Return a new worker. Raises as ``WorkerProcess`` does."""
+    async def _fork(self) -> tuple[Worker, asyncio.StreamReader]:
+        """Return a new worker. Raises as ``_greeting`` does."""
+        assert self._maps is not None
         ours, theirs = socket.socketpair()
-        connection = Connection(ours.detach())
         with theirs:
-            if self._maps is None:  # the pool is being closed
-                raise EOFError
             socket.send_fds(self._maps[1], [b"w"], [theirs.fileno()])
-        return WorkerProcess(connection)
+        found, reader, writer = await _greeting(ours, FORK_SECONDS)
+        return Worker(found["pid"], writer), reader
 
-    def _load(self) -> None:
-        """Start the process that loads the maps. Raises ``InputError`` if it cannot serve them, and ``LOST`` if it dies."""
+    async def _load(self) -> None:
+        """Start the process that loads the maps. Raises as ``_greeting`` does."""
         ours, theirs = socket.socketpair()
         with theirs:
             process = subprocess.Popen(
@@ -223,9 +233,10 @@ class Pool:
                 env={**os.environ, "OMP_NUM_THREADS": "1"},
             )
         self._maps = process, ours
-        with Connection(os.dup(ours.fileno())) as connection:
-            connection.send(self._order)
-            self.described = _reply(connection)["maps"]
+        ours.sendall(pickle.dumps(self._order))
+        found, _, writer = await _greeting(ours.dup(), None)
+        writer.close()
+        self.described = found["maps"]
 
     def _end_maps(self, group: bool = False) -> None:
         """Kill the process that holds the maps and, with ``group``, the workers that it forked."""
@@ -239,3 +250,30 @@ class Pool:
             process.kill()
         process.wait()
         control.close()
+
+
+async def _greeting(
+    connection: socket.socket, seconds: float | None
+) -> tuple[dict[str, Any], asyncio.StreamReader, asyncio.StreamWriter]:
+    """Return the first message of a new process, and streams of at most 16 MiB a message.
+
+    Raises ``InputError`` if the process states an error, and ``LOST`` if it died or does not answer in time.
+    """
+    reader, writer = await asyncio.open_connection(sock=connection, limit=2**24)
+    try:
+        async with asyncio.timeout(seconds):
+            found: dict[str, Any] = json.loads(await reader.readline())
+        if "error" in found:
+            raise InputError(found["error"])
+    except BaseException:
+        writer.close()
+        raise
+    return found, reader, writer
+
+
+def _resident_bytes(processes: Callable[[], Sequence[int]]) -> float:
+    total = 0
+    for process in processes():
+        with contextlib.suppress(psutil.Error):
+            total += psutil.Process(process).memory_info().rss
+    return total

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import re
 import secrets
-import signal
 import socket
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import is_dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -24,12 +21,8 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
 
 PORT = 8000
-HEAD_SECONDS = 10.0
-"""Time for the head of a request to arrive, counted from the connection or from the end of its idle time."""
 IDLE_SECONDS = 15
 """Time for which a connection may be idle between two requests."""
-CONNECTIONS = 256
-"""Open connections; a further one ends that which has been without a request for the longest."""
 NEEDS = "the service needs the extra 'serve' (pip install 'bidnerf[serve]')"
 
 
@@ -106,7 +99,7 @@ def token_for(host: str | None, token: str | None, needs: str) -> str | None:
     try:
         import uvicorn  # noqa: F401 (tried before the maps are read)
 
-        from bidnerf_core.service.access import is_loopback
+        from bidnerf_core.service.web import is_loopback
     except ImportError as error:
         raise InputError(needs) from error
     is_local = host is None or is_loopback(host)
@@ -127,12 +120,37 @@ def run_app(
     """
     import uvicorn
 
-    with _bound(host or "127.0.0.1", port) as bound:
-        options = uvicorn.Config(
-            app, http=_impatient(), ws="none", loop="asyncio", lifespan="off", log_config=None, access_log=False,
-            server_header=False, proxy_headers=False, timeout_keep_alive=IDLE_SECONDS, timeout_graceful_shutdown=grace, backlog=CONNECTIONS,
-        )  # fmt: skip
-        asyncio.run(_run(app, uvicorn.Server(options), bound, ready, stop))
+    class Server(uvicorn.Server):
+        async def on_tick(self, counter: int) -> bool:
+            return await super().on_tick(counter) or (stop is not None and stop.is_set())
+
+    async def run(bound: socket.socket) -> None:
+        async with app.router.lifespan_context(app):
+            name, number = bound.getsockname()[:2]
+            ready(
+                f"http://[{name}]:{number}" if ":" in name else f"http://{name}:{number}"
+            )  # connections wait by now
+            await server.serve(sockets=[bound])
+
+    options = uvicorn.Config(
+        app, http="h11", ws="none", loop="asyncio", lifespan="off", log_config=None, access_log=False,
+        server_header=False, proxy_headers=False, timeout_keep_alive=IDLE_SECONDS, timeout_graceful_shutdown=grace,
+    )  # fmt: skip
+    server, host = Server(options), host or "127.0.0.1"
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        listening = socket.create_server((host, port), family=family)
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(
+            f"cannot listen there ({reason}); choose another port", where=f"{host}:{port}"
+        ) from error
+    with listening:
+        try:
+            asyncio.run(run(listening))
+        except KeyboardInterrupt:
+            if not server.started:
+                raise
 
 
 def named(scenes: Scenes) -> dict[str, Path]:
@@ -152,93 +170,3 @@ def named(scenes: Scenes) -> dict[str, Path]:
                 expected="another one for each map, of letters, digits, '.', '-' and '_'; give it a name: NAME=MAP",
             )  # fmt: skip
     return {name: Path(folder) for name, folder in pairs}
-
-
-def _bound(host: str, port: int) -> socket.socket:
-    try:
-        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        return socket.create_server((host, port), family=family, backlog=CONNECTIONS)
-    except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(
-            f"cannot listen there ({reason}); choose another port", where=f"{host}:{port}"
-        ) from error
-
-
-async def _run(
-    app: FastAPI, server: Any, bound: socket.socket, ready: Callable[[str], Any], stop: threading.Event | None
-) -> None:  # fmt: skip
-    # uvicorn's own handler raises the signals again at the end.
-    server.capture_signals = partial(_signals_end, server)
-    async with app.router.lifespan_context(app):
-        serving = asyncio.ensure_future(server.serve(sockets=[bound]))
-        while not server.started and not serving.done():
-            await asyncio.sleep(0.02)
-        host, port = bound.getsockname()[:2]
-        if server.started:
-            ready(f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}")
-        while not serving.done():
-            server.should_exit |= stop is not None and stop.is_set()
-            await asyncio.wait({serving}, timeout=None if stop is None else 0.1)
-        await serving
-
-
-@contextlib.contextmanager
-def _signals_end(server: Any) -> Iterator[None]:
-    """End the service normally on the signals that ask a program to stop; a second signal ends it immediately."""
-
-    def end(*_: Any) -> None:
-        server.force_exit = server.should_exit
-        server.should_exit = True
-
-    is_main = threading.current_thread() is threading.main_thread()
-    names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if is_main and hasattr(signal, name)]
-    before: dict[int, Any] = {
-        getattr(signal, name): signal.getsignal(getattr(signal, name)) for name in names
-    }
-    before = {number: handler for number, handler in before.items() if handler is not signal.SIG_IGN}
-    for number in before:
-        signal.signal(number, end)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _impatient() -> type[Any]:
-    """Return uvicorn's protocol with limits on the time of a request's head, and on the number of connections."""
-    from uvicorn.protocols.http.h11_impl import H11Protocol
-
-    class Impatient(H11Protocol):
-        idle_since: float | None = None  # None while a request is answered
-
-        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-            super().connection_made(transport)
-            self._idle(HEAD_SECONDS)
-            others: list[Any] = [each for each in self.connections if not each.transport.is_closing()]
-            if len(others) > CONNECTIONS:
-                idle = [each for each in others if each.idle_since is not None]
-                min(idle, key=lambda each: each.idle_since).transport.close()
-
-        def handle_events(self) -> None:
-            last: Any = self.cycle
-            super().handle_events()
-            if self.cycle is not last and not self.cycle.response_complete:
-                self.idle_since = None
-
-        def on_response_complete(self) -> None:
-            self._idle(IDLE_SECONDS + HEAD_SECONDS)  # before the next request, which may have arrived already
-            super().on_response_complete()
-
-        def _idle(self, seconds: float) -> None:
-            """Close the connection if no request arrives within some seconds, even if bytes do."""
-            self.idle_since = began = self.loop.time()
-
-            def close() -> None:
-                if self.idle_since == began:
-                    self.transport.close()
-
-            self.loop.call_later(seconds, close)
-
-    return Impatient

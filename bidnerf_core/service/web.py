@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import hmac
+import ipaddress
 import json
 import logging
 import time
@@ -11,18 +14,18 @@ from importlib.metadata import version
 from importlib.resources import files
 from pathlib import PurePosixPath
 from typing import Any
+from urllib.parse import urlsplit
 
 import jinja2
 from fastapi import FastAPI, Request
 from starlette.datastructures import MutableHeaders, UploadFile
 from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException, MultiPartParser
-from starlette.requests import ClientDisconnect
+from starlette.requests import ClientDisconnect, HTTPConnection
 from starlette.responses import HTMLResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.service.access import OPEN, refusal
 from bidnerf_core.service.models import (
     LONGEST_NAME,
     PhotoForm,
@@ -184,6 +187,45 @@ async def _failure(request: Request, error: Exception) -> Response:
     return problem(400, str(error))
 
 
+# Access.
+
+OPEN = "/health"
+"""The path that needs no token: load balancers poll it, and it reveals nothing about the maps."""
+
+
+def refusal(scope: Scope, token: str | None, cookie: str | None = None) -> tuple[int, str] | None:
+    """Return the status and the reason for which a request is refused; None if it is passed on.
+
+    A web page in a browser may send requests to any address: these are detected by their ``Origin``, which is not the
+    address that they ask, or, if another site's name resolves to this machine, by their ``Host``. ``cookie`` is the name
+    of a cookie that may hold the token.
+    """
+    request = HTTPConnection(scope)
+    host, origin = request.headers.get("host", ""), request.headers.get("origin")
+    try:
+        is_local = is_loopback(urlsplit(f"//{host}").hostname)
+        is_own_page = origin is None or urlsplit(origin).netloc == host
+    except ValueError:  # the headers hold no valid addresses
+        is_local = is_own_page = False
+    if token is not None:
+        given = [(f"Bearer {token}", request.headers.get("authorization", ""))]
+        if cookie is not None and is_own_page:
+            given.append((token, request.cookies.get(cookie, "")))
+        if scope["path"] == OPEN or any(hmac.compare_digest(a.encode(), b.encode()) for a, b in given):
+            return None
+        return 401, "expected the header 'Authorization: Bearer TOKEN' with the token of this service"
+    if not is_local:
+        return 403, "without a token the service answers requests to localhost only"
+    return None if is_own_page else (403, "requests from pages of other sites are rejected")
+
+
+def is_loopback(host: str | None) -> bool:
+    """Return whether a name or address is a loopback one."""
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(host or "").is_loopback
+    return host == "localhost" or str(host).endswith(".localhost")
+
+
 # Requests.
 
 
@@ -235,19 +277,15 @@ async def photo_of(request: Request, limits: ServiceLimits) -> Upload:
     return Upload(({"name": stem} if stem else {}) | parameters, sent)
 
 
-class _InMemory(MultiPartParser):
-    """A parser that keeps files in memory, since their size is already limited, rather than on disk."""
-
-    spool_max_size = 2**40
-
-
 async def _parts(request: Request, content: bytes) -> list[tuple[str, str | UploadFile]]:
     async def once() -> AsyncGenerator[bytes, None]:
         yield content
 
     most = len(PhotoForm.model_fields)
     try:
-        parser = _InMemory(request.headers, once(), max_files=most, max_fields=most, max_part_size=MEBIBYTE)
+        parser = MultiPartParser(
+            request.headers, once(), max_files=most, max_fields=most, max_part_size=MEBIBYTE
+        )
         return (await parser.parse()).multi_items()
     except (MultiPartException, KeyError, ValueError, LookupError) as error:
         reason = getattr(error, "message", None) or "no boundary, or a violation of RFC 7578"
@@ -255,22 +293,27 @@ async def _parts(request: Request, content: bytes) -> list[tuple[str, str | Uplo
 
 
 async def answered(request: Request, work: asyncio.Future[Any], seconds: float | None = None) -> Any:
-    """Return the result of ``work``. Raises ``Refused`` if the client disconnects first, or it takes too long."""
+    """Return the result of ``work``, which is cancelled if the client disconnects first, or it takes too long.
+
+    Raises ``Refused`` in these cases.
+    """
 
     async def left() -> None:
         while (await request.receive())["type"] != "http.disconnect":
             pass
 
-    leaving: asyncio.Future[Any] = asyncio.ensure_future(left())
+    leaving, reason = asyncio.create_task(left()), "cancelled"
     try:
         await asyncio.wait({work, leaving}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
         if work.done():
             return work.result()
         if leaving.done():
             raise Refused(CLIENT_GONE, "the client has left")
+        reason = "timeout"
         raise Refused(504, f"no answer within {seconds:g} s")
     finally:
         leaving.cancel()
+        work.cancel(reason)
 
 
 # The description.

@@ -10,11 +10,12 @@ import contextlib
 import gc
 import json
 import os
+import pickle
 import signal
 import socket
 import sys
 from collections.abc import Mapping
-from multiprocessing.connection import Connection
+from io import BufferedRWPair
 from pathlib import Path
 from typing import Any
 
@@ -111,17 +112,16 @@ def main() -> None:
     control = socket.socket(fileno=int(sys.argv[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the system then reaps workers that end
-    connection = Connection(os.dup(control.fileno()))
-    order = connection.recv()
-    try:
-        worker = _loaded(order)
-    except (InputError, OSError, RuntimeError, MemoryError) as error:
-        _send(connection, {"error": str(error) or type(error).__name__})
-        return
-    gc.collect()
-    gc.freeze()  # otherwise a collection in a worker would write to, and so copy, every page with an object
-    _send(connection, {"maps": worker.describe()})
-    connection.close()
+    with control.makefile("rwb") as stream:
+        order = pickle.load(stream)
+        try:
+            worker = _loaded(order)
+        except (InputError, OSError, RuntimeError, MemoryError) as error:
+            _send(stream, {"error": str(error) or type(error).__name__})
+            return
+        gc.collect()
+        gc.freeze()  # otherwise a collection in a worker would write to, and so copy, every page with an object
+        _send(stream, {"maps": worker.describe()})
     while True:
         asked, descriptors, _, _ = socket.recv_fds(control, 1, 1)
         if not asked:
@@ -132,11 +132,11 @@ def main() -> None:
             control.close()
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             try:
-                _serve(worker, order["device"], Connection(descriptors[0]))
+                with socket.socket(fileno=descriptors[0]).makefile("rwb") as stream:
+                    _serve(worker, order["device"], stream)
             finally:
                 os._exit(0)
-        for descriptor in descriptors:
-            os.close(descriptor)
+        os.close(descriptors[0])
 
 
 def _loaded(order: Mapping[str, Any]) -> Worker:
@@ -160,7 +160,7 @@ def _loaded(order: Mapping[str, Any]) -> Worker:
     return Worker(maps, order["max_pixels"])
 
 
-def _serve(worker: Worker, device: str, connection: Connection) -> None:
+def _serve(worker: Worker, device: str, stream: BufferedRWPair) -> None:
     """Answer requests until the connection ends.
 
     On an accelerator, which does not survive a fork, the localizers are made anew.
@@ -173,18 +173,19 @@ def _serve(worker: Worker, device: str, connection: Connection) -> None:
             }
             worker = Worker(moved, worker.max_pixels)
     except (InputError, RuntimeError) as error:
-        _send(connection, {"error": str(error)})
+        _send(stream, {"error": str(error)})
         return
-    _send(connection, {"pid": os.getpid()})
+    _send(stream, {"pid": os.getpid()})
     with contextlib.suppress(EOFError, ConnectionError):
         while True:
-            task, folder = connection.recv()
-            _send(connection, worker.answer(task, Path(folder)))
+            task, folder = pickle.load(stream)
+            _send(stream, worker.answer(task, Path(folder)))
 
 
-def _send(connection: Connection, message: Mapping[str, Any]) -> None:
-    """Send JSON, so that nothing is unpickled in the process that listens, whatever a photo does to a worker."""
-    connection.send_bytes(json.dumps(message).encode())
+def _send(stream: BufferedRWPair, message: Mapping[str, Any]) -> None:
+    """Send a line of JSON, so that nothing is unpickled in the process that listens, whatever a photo does to a worker."""
+    stream.write(json.dumps(message).encode() + b"\n")
+    stream.flush()
 
 
 if __name__ == "__main__":

@@ -32,7 +32,6 @@ from bidnerf_core.localization import Localizer
 from bidnerf_core.progress import job_context
 from bidnerf_core.service import (
     Application,
-    Job,
     Refused,
     ServiceLimits,
     answered,
@@ -45,7 +44,7 @@ from bidnerf_core.service import (
     public_message,
     read_upload,
 )
-from bidnerf_core.viewer.jobs import Jobs, Read
+from bidnerf_core.viewer.jobs import Jobs, Read, ShownJob
 from bidnerf_core.viewer.packing import Json, jpeg
 from bidnerf_core.viewer.rendering import field_image, quick_image
 from bidnerf_core.viewer.saving import MapView
@@ -139,7 +138,7 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
         try:
             yield
         finally:
-            jobs.queue.close()
+            jobs.close()
             painter.shutdown(wait=False, cancel_futures=True)
 
     app = Application(
@@ -148,8 +147,9 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
     if token is not None:
         app.add_middleware(Login, token=token)
 
-    def queued(job: Job, read: Read) -> Response:
-        return JSONResponse({"job": jobs.put(job, read).id}, 202)
+    def queued(job: ShownJob, read: Read) -> Response:
+        jobs.put(job, read)
+        return JSONResponse({"job": job.id}, 202)
 
     @app.get("/", response_class=HTMLResponse, summary="The page.")
     async def page() -> Response:
@@ -173,7 +173,7 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
         summary="Queue the localization of a photo.",
     )  # fmt: skip
     async def photo(request: Request) -> Response:
-        with jobs.queue.place("photo") as job:
+        with jobs.place("photo") as job:
             upload = await photo_of(request, limits)
             if "map" in upload.parameters:
                 raise InputError("map is given", expected="none, since the viewer shows one map")
@@ -197,7 +197,7 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
     )  # fmt: skip
     async def query(number: str) -> Response:
         index = _index(number, len(names), "image with which the viewer was started")
-        with jobs.queue.place(names[index]) as job:
+        with jobs.place(names[index]) as job:
             assert shown.source is not None
             source = shown.source
             return queued(job, lambda: (source.read(index), None, 0))

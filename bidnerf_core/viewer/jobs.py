@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
-from collections.abc import Callable
+import uuid
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -15,7 +18,7 @@ from bidnerf_core.io import to_plain
 from bidnerf_core.localization import Localizer, SearchRecord
 from bidnerf_core.progress import job_context
 from bidnerf_core.results import BAD_INPUT
-from bidnerf_core.service import Job, Queue
+from bidnerf_core.service import Refused
 from bidnerf_core.viewer.answer import no_answer
 from bidnerf_core.viewer.packing import Json
 from bidnerf_core.viewer.view import localized
@@ -66,28 +69,39 @@ class ShownJob:
 
 
 class Jobs:
-    """Runs localizations in a thread, in the order in which they were requested.
-
-    ``shown`` holds them by their ids. Closing the queue discards those that wait, and soon stops the one in progress.
-    """
+    """Runs localizations in a thread, in the order in which they were requested; ``shown`` holds them by their ids."""
 
     def __init__(self, localizer: Localizer) -> None:
-        self.queue, self._localizer, self.shown = Queue(PLACES), localizer, dict[str, ShownJob]()
-        threading.Thread(target=self._work, name="localizing", daemon=True).start()
+        self.shown = dict[str, ShownJob]()
+        self._localizer, self._closed = localizer, threading.Event()
+        self._thread = ThreadPoolExecutor(1, "localizing")
 
-    def put(self, job: Job, read: Read) -> ShownJob:
-        """Queue a localization of what ``read`` returns, for a job of the queue."""
-        shown = self.shown[job.id] = ShownJob(job.id, job.name)
+    @contextlib.contextmanager
+    def place(self, name: str) -> Iterator[ShownJob]:
+        """Enter a localization, which is forgotten if the block raises an error. Raises ``Refused`` if no place is left."""
+        if sum(each.state != "done" for each in self.shown.values()) >= PLACES:
+            headers = {"Retry-After": "5", "Connection": "close"}
+            raise Refused(429, f"all {PLACES} places are taken, try again later", headers)
+        job = ShownJob(uuid.uuid4().hex, name)
+        self.shown[job.id] = job
+        try:
+            yield job
+        except BaseException:
+            del self.shown[job.id]
+            raise
+
+    def put(self, job: ShownJob, read: Read) -> None:
+        """Queue the localization of what ``read`` returns."""
         done = [each.id for each in self.shown.values() if each.state == "done"]
         for old in done[: max(0, len(self.shown) - 64)]:  # the answers of 64 localizations stay in memory
             del self.shown[old]
-        self.queue.put(job, read)
-        return shown
+        self._thread.submit(self._run, job, read)
 
-    def _work(self) -> None:
-        with job_context(cancel=lambda: self.queue.closed):
-            while not self.queue.closed:
-                job = self.queue.next()
-                if job is not None:
-                    self.shown[job.id].run(self._localizer, job.task)
-                    job.result.set_result(None)
+    def close(self) -> None:
+        """Discard the localizations that wait, and soon stop the one in progress."""
+        self._closed.set()
+        self._thread.shutdown(wait=False, cancel_futures=True)
+
+    def _run(self, job: ShownJob, read: Read) -> None:
+        with job_context(cancel=self._closed.is_set):
+            job.run(self._localizer, read)

@@ -19,7 +19,6 @@ from base64 import b64encode
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -98,7 +97,7 @@ class Service:
 
     def metric(self, name: str, **labels: str) -> float:
         """A number that the service tells of itself now."""
-        return self.pool.metrics.value(name, **labels)
+        return self.pool.metric(name, **labels)
 
     def run(self, work: Awaitable[Any]) -> Any:
         async def waited() -> Any:
@@ -391,14 +390,13 @@ def test_messages_name_the_parameters_of_requests(tmp_path: Path) -> None:
 
 
 def test_requests_beyond_the_bound_are_turned_away(service: Service, place: Place) -> None:
-    queue = service.pool.queue
-    taken = [queue.enter() for _ in range(queue.places)]
-    reply = service.post("/localize?map=map", place.photo)
-    assert reply.status == 429
-    assert int(reply.headers["retry-after"]) >= 1
-    assert service.get("/health").status == 200
-    for job in taken:
-        job.stop("test")
+    with contextlib.ExitStack() as taken:
+        for _ in range(service.pool.places):
+            taken.enter_context(service.pool.place())
+        reply = service.post("/localize?map=map", place.photo)
+        assert reply.status == 429
+        assert int(reply.headers["retry-after"]) >= 1
+        assert service.get("/health").status == 200
     assert service.post("/localize?map=map", place.photo).status == 422
 
 
@@ -412,11 +410,11 @@ def quickly(condition: Callable[[], bool]) -> None:
 @contextlib.contextmanager
 def stopped(service: Service) -> Iterator[int]:
     """Let the only worker stand still, as one does that computes for long."""
-    quickly(lambda: len(service.pool.alive) == 1)
-    (process,) = service.pool.alive
-    os.kill(process, signal.SIGSTOP)
-    yield process
-    quickly(lambda: service.pool.alive not in ([], [process]))
+    quickly(lambda: len(service.pool.workers) == 1)
+    (worker,) = service.pool.workers
+    os.kill(worker.pid, signal.SIGSTOP)
+    yield worker.pid
+    quickly(lambda: service.pool.workers not in ([], [worker]))
 
 
 def request(service: Service, place: Place, leaving: asyncio.Event | None = None) -> Any:
@@ -459,10 +457,11 @@ def test_a_process_with_the_maps_that_does_not_answer_is_replaced(
     service: Service, place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("bidnerf_core.service.pool.FORK_SECONDS", 0.5)
-    maps = holder_of_maps()
+    maps, before = holder_of_maps(), service.metric("worker_restarts_total", reason="maps")
     maps.suspend()
     with stopped(service) as process:
         os.kill(process, signal.SIGKILL)
+        quickly(lambda: service.metric("worker_restarts_total", reason="maps") > before)
         monkeypatch.setattr("bidnerf_core.service.pool.FORK_SECONDS", 60.0)
         assert request(service, place).result(150).status == 200
     assert not maps.is_running()
@@ -470,10 +469,9 @@ def test_a_process_with_the_maps_that_does_not_answer_is_replaced(
 
 def test_maps_are_kept_while_a_worker_cannot_begin(monkeypatch: pytest.MonkeyPatch) -> None:
     """An accelerator whose memory is full now is no reason to load the maps again."""
-    pool, tried, held = Pool({"maps": {}}, LIMITS), list[int](), object()
-    worker = SimpleNamespace(ended=False, pid=1)
+    pool, tried, held, worker = Pool({"maps": {}}, LIMITS), list[int](), object(), object()
 
-    def fork() -> Any:
+    async def fork() -> Any:
         tried.append(len(tried))
         if len(tried) < 3:
             raise InputError("out of memory")
@@ -482,8 +480,8 @@ def test_maps_are_kept_while_a_worker_cannot_begin(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(pool, "_maps", held)
     monkeypatch.setattr(pool, "_fork", fork)
     monkeypatch.setattr("bidnerf_core.service.pool.PAUSE", 0.0)
-    pool._replace(0, "ended")
-    assert (tried, pool._maps, pool.alive) == ([0, 1, 2], held, [1])
+    assert asyncio.run(pool._replacement()) is worker
+    assert (tried, pool._maps) == ([0, 1, 2], held)
 
 
 def test_a_temporary_folder_that_is_removed_is_made_anew(service: Service, place: Place) -> None:
@@ -671,33 +669,6 @@ def test_a_body_without_end_and_a_client_without_haste_are_cut_off(
     quickly(lambda: client.ask("/health")["waiting"] == 0)
 
 
-def test_a_connection_that_only_dribbles_after_an_answer_is_closed(
-    address: tuple[str, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("bidnerf_core.service.server.IDLE_SECONDS", 0.1)
-    monkeypatch.setattr("bidnerf_core.service.server.HEAD_SECONDS", 0.2)
-    with socket.create_connection(address, timeout=20) as connection:
-        connection.sendall(b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        assert connection.recv(65536).startswith(b"HTTP/1.1 200")
-        began = time.monotonic()
-        with contextlib.suppress(ConnectionError):
-            while time.monotonic() - began < 10:
-                connection.sendall(b"G")
-                connection.settimeout(0.1)
-                with contextlib.suppress(TimeoutError):
-                    if not connection.recv(1):
-                        break
-        assert time.monotonic() - began < 5
-
-
-def test_idle_connections_shut_nobody_out(address: tuple[str, int], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bidnerf_core.service.server.CONNECTIONS", 20)
-    with contextlib.ExitStack() as idle:
-        for _ in range(50):
-            idle.enter_context(socket.create_connection(address, timeout=20))
-        assert spoken(address, b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\n").startswith(b"HTTP/1.1 200")
-
-
 @pytest.mark.slow
 def test_strangers_who_read_the_description_find_it_true(
     place: Place, address: tuple[str, int], monkeypatch: pytest.MonkeyPatch
@@ -749,8 +720,15 @@ def test_startup_of_another_server_starts_the_pool(monkeypatch: pytest.MonkeyPat
     """An ASGI server starts the workers and ends them by events, which are not requests and carry no token."""
     app, told = service_app("MAP", token="0123456789abcdef"), list[str]()
     events = [{"type": "lifespan.startup"}, {"type": "lifespan.shutdown"}]
-    monkeypatch.setattr(app.state.pool, "start", lambda: told.append("started"))
-    monkeypatch.setattr(app.state.pool, "close", lambda: told.append("ended"))
+
+    async def started() -> None:
+        told.append("started")
+
+    async def ended() -> None:
+        told.append("ended")
+
+    monkeypatch.setattr(app.state.pool, "start", started)
+    monkeypatch.setattr(app.state.pool, "close", ended)
 
     async def receive() -> Any:
         return events.pop(0)

@@ -159,14 +159,16 @@ def test_closing_ends_the_localization_at_work(room: Map, method: str) -> None:
     localizer = Localizer(room, method, settings_of(method, LONG[method]), warm_up=False)
     start = viewed.walk(15)[6]
     jobs = Jobs(localizer)
-    running, waiting = (
-        jobs.put(jobs.queue.enter(name), lambda name=name: (viewed.query(name), start, 0))
-        for name in ("a", "b")
-    )
+    entered = []
+    for name in ("a", "b"):
+        with jobs.place(name) as job:
+            jobs.put(job, lambda name=name: (viewed.query(name), start, 0))
+            entered.append(job)
+    running, waiting = entered
     until(lambda: running.state == "searching")
     time.sleep(0.3)
     began = time.monotonic()
-    jobs.queue.close()
+    jobs.close()
     until(lambda: running.state == "done")
     assert time.monotonic() - began < 20  # of hours; a busy machine takes seconds to end a step
     assert running.answer is not None
