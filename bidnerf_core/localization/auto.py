@@ -149,10 +149,8 @@ def within_risk(found: Localization, risk: float | None) -> Localization:
     """Return the answer, rejected as ``uncertain`` if landmarks did not find it, or its confidence is lower than the risk requires."""
     if risk is None or not found.converged:
         return found
-    least, known = (
-        least_confidence(risk),
-        found.confidence if isinstance(found.diagnostics, Evidence) else None,
-    )
+    least = least_confidence(risk)
+    known = found.confidence if isinstance(found.diagnostics, Evidence) else None
     if known is not None and known >= least:
         return found
     why = f"the confidence is {'unknown' if known is None else format(known, '.3f')}, a risk of {risk:g} requires {least:.3f}"

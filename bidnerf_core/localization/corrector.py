@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from concurrent.futures import Future, ThreadPoolExecutor
-from threading import Lock
-from types import TracebackType
+from contextlib import suppress
+from queue import Empty, Full, Queue
+from threading import Lock, Thread
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame
@@ -29,8 +29,10 @@ class Corrector:
         self.T_world_odom: SE3 | None = None  # the correction from the last accepted answer
         self.found: Localization | None = None  # the last answer, accepted or not
         self._localizer, self._errors = localizer, deque[BaseException](maxlen=1)
-        self._pool, self._lock = ThreadPoolExecutor(1, "bidnerf-corrector"), Lock()
-        self._last: Future[None] | None = None  # of the last frame that was taken
+        self._waiting: Queue[tuple[Frame, SE3] | None] = Queue(1)  # None ends the thread
+        self._closed, self._lock = False, Lock()
+        self._thread = Thread(target=self._run, name="bidnerf-corrector", daemon=True)
+        self._thread.start()
 
     def corrected(self, T_odom_camera: SE3) -> SE3 | None:
         """Return T_world_camera for a pose in the odometry's frame; None until an answer has been accepted."""
@@ -44,41 +46,44 @@ class Corrector:
         """
         self._raise_error()
         with self._lock:
-            if self._last is not None and not (self._last.running() or self._last.done()):
-                return False
-            try:
-                self._last = self._pool.submit(self._localize, frame, T_odom_camera)
-            except RuntimeError as error:
-                raise InputError("the corrector is closed and takes no more frames") from error
-        return True
+            if self._closed:
+                raise InputError("the corrector is closed and takes no more frames")
+            with suppress(Full):
+                self._waiting.put_nowait((frame, T_odom_camera))
+                return True
+        return False
 
     def close(self) -> None:
         """End the thread after the current localization, whose answer still counts; a waiting frame is dropped.
 
         Raises the error of a localization that has not been raised yet.
         """
-        self._pool.shutdown(cancel_futures=True)
+        with self._lock:
+            self._closed = True
+            with suppress(Empty):
+                self._waiting.get_nowait()
+            self._waiting.put_nowait(None)
+        self._thread.join()
         self._raise_error()
 
     def __enter__(self) -> Corrector:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _raise_error(self) -> None:
-        try:
-            error = self._errors.pop()
-        except IndexError:
-            return
-        raise error
+        with self._lock:
+            error = self._errors.pop() if self._errors else None
+        if error is not None:
+            raise error
 
-    def _localize(self, frame: Frame, T_odom_camera: SE3) -> None:
-        try:
-            self.found = found = self._localizer(frame, start=self.corrected(T_odom_camera))
-            if found.converged:
-                self.T_world_odom = found.T_world_camera @ T_odom_camera.inverse()
-        except BaseException as error:  # raised in the caller's thread
-            self._errors.append(error)
+    def _run(self) -> None:
+        while (given := self._waiting.get()) is not None:
+            frame, T_odom_camera = given
+            try:
+                self.found = found = self._localizer(frame, start=self.corrected(T_odom_camera))
+                if found.converged:
+                    self.T_world_odom = found.T_world_camera @ T_odom_camera.inverse()
+            except BaseException as error:  # raised in the caller's thread
+                self._errors.append(error)

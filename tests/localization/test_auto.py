@@ -74,24 +74,6 @@ def test_measured_points_do_not_tell_an_approximate_focal_length() -> None:
     assert found_for(lidar).converged
 
 
-@pytest.mark.slow
-def test_a_rejection_says_that_the_map_has_no_landmarks() -> None:
-    view = baked.unseen()[0]
-    noise = torch.rand(view.frame.rgb.shape, generator=torch.Generator().manual_seed(0))
-    blank = torch.full_like(noise, 0.5)
-    rejected = [
-        localize(
-            baked.problem(replace(view, frame=replace(view.frame, rgb=rgb, depth=None))),
-            "auto",
-            replace(QUICK, hypotheses=32, rounds=1),
-        )
-        for rgb in (noise, blank)
-    ]
-    assert not any(found.converged for found in rejected)
-    advice = "; the map has no landmarks ('bidnerf bake' makes them)"
-    assert [found.reason.endswith(advice) for found in rejected] == [True, False]
-
-
 def test_a_start_helps_where_the_map_has_no_view_alike() -> None:
     view = baked.unseen()[0]
     aside = replace(baked.toy(), keyframes=torch.eye(4, dtype=torch.float64)[None])
