@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import json
 import logging
+import shutil
 import time
 import warnings
-from collections.abc import Iterator
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +17,28 @@ import torch
 from bidnerf_core.camera import UPRIGHT, Intrinsics
 from bidnerf_core.datasets import is_video
 from bidnerf_core.errors import Cancelled, InputError, InputWarning, amount
-from bidnerf_core.io import output_folder, write_file
+from bidnerf_core.io import output_folder, to_plain, write_file
 from bidnerf_core.progress import Cancel, ProgressCallback, job_context
-from bidnerf_core.structure.agreement import agreement
-from bidnerf_core.structure.keypoints import Described, described, write_cameras, write_keypoints
-from bidnerf_core.structure.library import pycolmap_for
-from bidnerf_core.structure.mapping import LEAST_PHOTOS, full_size, left_out, reconstructed, turn_upright
-from bidnerf_core.structure.matching import Overlaps, match
-from bidnerf_core.structure.pairs import Pairs, chosen_pairs, few
+from bidnerf_core.structure.colmap import (
+    Described,
+    described,
+    match,
+    pycolmap_for,
+    similar_pairs,
+    write_cameras,
+    write_keypoints,
+)
+from bidnerf_core.structure.model import (
+    LEAST_PHOTOS,
+    agreement,
+    full_size,
+    left_out,
+    reconstructed,
+    relative,
+    turn_upright,
+    write_dataset,
+)
 from bidnerf_core.structure.record import (
-    DATABASE,
     FRAMES,
     RECORD,
     FoundPoses,
@@ -35,17 +47,17 @@ from bidnerf_core.structure.record import (
     begun,
     clear,
     digest,
-    give_up,
     is_ours,
     read_found,
-    relative,
-    stored_rows,
-    without_damage,
-    write_dataset,
-    write_found,
 )
-from bidnerf_core.structure.sources import SourceImage, photos_of, refuse_panoramas
-from bidnerf_core.structure.video_frames import chosen, measured, write_frames
+from bidnerf_core.structure.sources import (
+    SourceImage,
+    chosen,
+    measured,
+    photos_of,
+    refuse_panoramas,
+    write_frames,
+)
 
 log = logging.getLogger("bidnerf")
 
@@ -82,197 +94,113 @@ def find_poses(
     if not images and not source.is_file():
         raise InputError("no such file", where=source, expected="a video or a folder of photos")
     inputs = digest([image.file for image in images] or [source], camera)
-    known = found_before(folder, inputs, overwrite) if reuse or not overwrite else None
-    if known is not None:
+    known = None
+    if reuse or not overwrite:
+        try:
+            known = read_found(folder)
+        except InputError:  # a damaged record
+            if not overwrite:
+                raise
+    if known is not None and known.inputs == inputs:
         log.info(f"{folder}: already has the poses of these photos")
         return known
     refuse_panoramas(images)
-    with job_context(progress, cancel), _folder(folder, inputs, overwrite):
+    goes_on = begun(folder).get("inputs") == inputs
+
+    def described_folder(place: Path) -> str | None:
+        if (place / RECORD).exists():
+            return "holds the poses of other photos"
+        return "holds interrupted work on other photos" if begun(place) else None
+
+    with (
+        job_context(progress, cancel),
+        output_folder(folder, overwrite, lambda file: goes_on and is_ours(file), described_folder),
+    ):
         if overwrite and not reuse:
             clear(folder)
-        work = begin(folder, inputs, video=is_video(source))
+        work = begin(folder, inputs, video=not images)
         try:
-            return _Search(source, folder, work, inputs, camera, pycolmap).run(images)
+            found = _search(source, images, work, inputs, camera, pycolmap)
         except Cancelled as stopped:
             raise Cancelled(f"{folder}: {stopped}; the same command resumes from there") from stopped
         except InputError:
-            give_up(folder)
+            clear(folder)
             raise
+        write_file(folder / RECORD, json.dumps(to_plain(found), indent=1, allow_nan=False).encode())
+        shutil.rmtree(work, ignore_errors=True)
+    for line in str(found).splitlines():
+        log.info(f"{source}: {line}")
+    if found.doubt is not None:
+        warnings.warn(f"{source}: {found.doubt}", InputWarning, stacklevel=2)
+    return found
 
 
-def found_before(folder: Path, inputs: str, overwrite: bool) -> FoundPoses | None:
-    """Return the poses in a folder if they were found for the photos with the digest ``inputs``.
-
-    Raises ``InputError`` for a damaged record, unless the folder may be overwritten.
-    """
-    try:
-        known = read_found(folder)
-    except InputError as error:
-        if not overwrite:
-            raise
-        log.info(f"{error}; finding the poses again")
-        return None
-    return known if known is not None and known.inputs == inputs else None
-
-
-@contextlib.contextmanager
-def _folder(out: Path, inputs: str, overwrite: bool) -> Iterator[None]:
-    """Hold the lock of the pose folder, which is empty, or holds interrupted work on the same photos."""
-    goes_on = begun(out).get("inputs") == inputs or begun(out).get("failed") is True
-
-    def describe(folder: Path) -> str | None:
-        if (folder / RECORD).exists():
-            return "holds the poses of other photos"
-        return "holds interrupted work on other photos" if begun(folder).get("inputs") else None
-
-    with output_folder(out, overwrite, lambda file: goes_on and is_ours(file), describe):
-        yield
-
-
-class _Search:
-    """A single search for the poses of some photos."""
-
-    def __init__(
-        self,
-        source: Path,
-        folder: Path,
-        work: Path,
-        inputs: str,
-        camera: Intrinsics | str | Path | None,
-        pycolmap: Any,
-    ) -> None:
-        self._source, self._folder, self._work, self._inputs = source, folder, work, inputs
-        self._camera, self._pycolmap, self._began = camera, pycolmap, time.monotonic()
-        self._database = without_damage(work / DATABASE)
-        self._threads = max(1, torch.get_num_threads())
-
-    def run(self, images: list[SourceImage]) -> FoundPoses:
-        ordered = not images
-        if ordered:
-            images = self._frames()
-        found = self._described(images)
-        keypoints = self._keypoints(found)
-        numbers = [photo.number for photo in found.photos]
-        pairs = self._pairs(numbers, ordered)
-        pairs = [(i, j) for i, j in pairs if keypoints[numbers[i]] and keypoints[numbers[j]]]
-        match(self._database, numbers, pairs, self._threads, self._pycolmap)
-        models = reconstructed(
-            self._database,
-            self._work / "models",
-            found,
-            self._camera is not None,
-            self._threads,
-            self._pycolmap,
-        )
-        with self._pycolmap.Database.open(self._database) as database:
-            overlaps = Overlaps(database, self._pycolmap)
+def _search(
+    source: Path, images: list[SourceImage], work: Path, inputs: str, camera: Intrinsics | str | Path | None, pycolmap: Any,
+) -> FoundPoses:  # fmt: skip
+    """Find the poses of ``images``, or of frames of a video if there are none, and write the dataset beside the ``work`` folder."""
+    began, folder, database, video = time.monotonic(), work.parent, work / "database.db", not images
+    fixed, threads = camera is not None, max(1, torch.get_num_threads())
+    if video:
+        images = write_frames(source, folder / FRAMES, chosen(measured(source)))
+    found = described(images, camera)
+    with pycolmap.Database.open(database) as opened:
+        _require_enough(found, source)
+        if not opened.num_images():
+            write_cameras(opened, found, fixed, pycolmap)
+        write_keypoints(opened, found, pycolmap)
+        _require_enough(found, source)
+        keypoints = {photo.number: opened.num_keypoints_for_image(photo.number) for photo in found.photos}
+        numbers = [number for number, count in keypoints.items() if count]
+        pairs = list(itertools.combinations(numbers, 2))
+        # Beyond so many photos, matching all pairs would take hours.
+        if len(numbers) > (60 if video else 150):
+            similar = similar_pairs([opened.read_descriptors(number).data for number in numbers])
+            pairs = [(numbers[i], numbers[j]) for i, j in similar]
+    match(database, pairs, threads, pycolmap)
+    models = reconstructed(database, work / "models", found, fixed, threads, pycolmap)
+    with pycolmap.Database.open(database) as opened:
+        matched = zip(*opened.read_two_view_geometries(), strict=True)
+        overlapping = [
+            pycolmap.pair_id_to_image_pair(pair) for pair, seen in matched if len(seen.inlier_matches)
+        ]
         if not models:
+            why = "no two of them overlap enough"
+            if overlapping:
+                why = f"although {amount(len(overlapping), 'pair')} overlap; from one place, they do not determine distances"
             raise InputError(
-                f"{_unplaced(found, overlaps)};",
-                where=self._source,
+                f"no three of {amount(len(found.photos), 'photo')} could be placed: {why};",
+                where=source,
                 expected="photos that overlap by two thirds, taken while moving sideways",
             )
-        return self._written(images, found, models, left_out(found, models, overlaps, keypoints))
+        model, photos = models[0], {photo.number: photo for photo in found.photos}
+        sure, contradicting = agreement(model, opened, pycolmap)
+    error = model.compute_mean_reprojection_error()
+    turn_upright(model, photos, pycolmap)
+    full_size(model, photos)
+    write_dataset(folder, photos, model, folder / FRAMES if video else source)
+    reasons = left_out(found, models, Counter(itertools.chain(*overlapping)), keypoints)
+    left = [
+        LeftOut(image.name, relative(image.file, folder), reasons[image.name])
+        for image in images
+        if image.name in reasons
+    ]
+    turned = sum(photos[number].exif.orientation != UPRIGHT for number in model.reg_image_ids())
+    return FoundPoses(
+        source=source.name, photos=len(images), placed=model.num_reg_images(),
+        models=tuple(each.num_reg_images() for each in models), left_out=tuple(left), points=model.num_points3D(),
+        reprojection_error=error, seconds=round(time.monotonic() - began, 1), inputs=inputs, pycolmap=pycolmap.__version__,
+        video=video, sure_pairs=sure, contradicting=contradicting, turned=turned,
+    )  # fmt: skip
 
-    def _frames(self) -> list[SourceImage]:
-        """Return the chosen frames of a video, written as images unless that was done before."""
-        listed = self._work / "frames.json"
-        known = stored_rows(listed, tuple[str, str, float])
-        if known is not None and all(Path(file).is_file() for _, file, _ in known):
-            return [SourceImage(name, Path(file), at) for name, file, at in known]
-        measures = measured(self._source)
-        wanted = chosen(measures)
-        log.info(
-            f"{self._source}: {len(wanted)} of {amount(len(measures), 'frame')} chosen by motion and sharpness"
+
+def _require_enough(found: Described, source: Path) -> None:
+    if len(found.photos) < LEAST_PHOTOS:
+        why = "".join(
+            f" that can be read ({name}: {reason})" for name, reason in [*found.unusable.items()][:1]
         )
-        images = write_frames(self._source, self._folder / FRAMES, wanted)
-        rows = [[image.name, str(image.file), image.time] for image in images]
-        write_file(listed, json.dumps(rows).encode())
-        return images
-
-    def _described(self, images: list[SourceImage]) -> Described:
-        found = described(images, self._camera)
-        self._require_enough(found, len(images))
-        sizes = {photo.size for photo in found.photos}
-        size = "x".join(map(str, next(iter(sizes)))) if len(sizes) == 1 else f"{len(sizes)} sizes"
-        focal = "from EXIF" if all(found.known_focal.values()) else "to be estimated"
-        if self._camera is not None:
-            focal = "as given"
-        log.info(
-            f"{self._source}: no known poses; finding them for {amount(len(found.photos), 'photo')} of"
-            f" {size}, {amount(len(found.cameras), 'camera')}, focal length {focal}"
-        )
-        return found
-
-    def _require_enough(self, found: Described, total: int) -> None:
-        if len(found.photos) >= LEAST_PHOTOS:
-            return
-        first = next(iter(found.unusable.items()), None)
-        why = "" if first is None else f" that can be read, of {total} ({first[0]}: {first[1]})"
         raise InputError(
             f"{amount(len(found.photos), 'photo')}{why}",
-            where=self._source,
+            where=source,
             expected=f"at least {LEAST_PHOTOS} of one scene, taken from different places",
         )
-
-    def _keypoints(self, found: Described) -> dict[int, int]:
-        """Fill the database, and return the number of keypoints of each photo by its number."""
-        with self._pycolmap.Database.open(self._database) as database:
-            if not database.num_images():
-                write_cameras(database, found, self._camera is not None, self._pycolmap)
-            found.unusable.update(write_keypoints(database, found, self._pycolmap))
-            found.photos[:] = [photo for photo in found.photos if photo.image.name not in found.unusable]
-            self._require_enough(found, len(found.photos) + len(found.unusable))
-            return {photo.number: database.num_keypoints_for_image(photo.number) for photo in found.photos}
-
-    def _pairs(self, numbers: list[int], ordered: bool) -> Pairs:
-        if few(len(numbers), ordered):
-            return list(itertools.combinations(range(len(numbers)), 2))
-        stored = self._work / "pairs.json"
-        pairs = stored_rows(stored, tuple[int, int])
-        if pairs is None:
-            with self._pycolmap.Database.open(self._database) as database:
-                pairs = chosen_pairs([database.read_descriptors(number).data for number in numbers])
-            log.info(f"{self._source}: {len(pairs)} pairs of neighbours and similar photos")
-            write_file(stored, json.dumps(pairs).encode())
-        return pairs
-
-    def _written(
-        self, images: list[SourceImage], found: Described, models: list[Any], reasons: dict[str, str]
-    ) -> FoundPoses:
-        photos, model = {photo.number: photo for photo in found.photos}, models[0]
-        error = model.compute_mean_reprojection_error()
-        with self._pycolmap.Database.open(self._database) as database:
-            sure, contradicting = agreement(model, database, self._pycolmap)
-        turn_upright(model, photos, self._pycolmap)
-        full_size(model, photos)
-        base = self._folder / FRAMES if is_video(self._source) else self._source
-        names = {number: relative(photo.image.file, base) for number, photo in photos.items()}
-        write_dataset(self._folder, photos, model, names)
-        left = [
-            LeftOut(image.name, relative(image.file, self._folder), reasons[image.name])
-            for image in images
-            if image.name in reasons
-        ]
-        result = FoundPoses(
-            self._source.name, len(images), model.num_reg_images(), tuple(each.num_reg_images() for each in models), tuple(left), model.num_points3D(),
-            error, round(time.monotonic() - self._began, 1), self._inputs, self._pycolmap.__version__,
-            is_video(self._source), sure, contradicting,
-            sum(photos[number].exif.orientation != UPRIGHT for number in model.reg_image_ids()),
-        )  # fmt: skip
-        write_found(self._folder, result)
-        for line in str(result).splitlines():
-            log.info(f"{self._source}: {line}")
-        if result.doubt is not None:
-            warnings.warn(f"{self._source}: {result.doubt}", InputWarning, stacklevel=2)
-        return result
-
-
-def _unplaced(found: Described, overlaps: Overlaps) -> str:
-    """Return why no three photos could be registered."""
-    of = f"no three of {amount(len(found.photos), 'photo')} could be placed"
-    if not overlaps.pairs:
-        return f"{of}: no two of them overlap enough"
-    if overlaps.from_one_place > overlaps.pairs / 2:  # as if the camera had only rotated
-        return f"{of}: they seem to be taken from one place, which does not determine distances"
-    return f"{of}, although {amount(overlaps.pairs, 'pair')} overlap"

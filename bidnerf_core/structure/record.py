@@ -1,36 +1,23 @@
-"""The result for photos without poses, and the files of a pose folder."""
+"""The record of poses found for photos, and the files of a pose folder."""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
 import json
-import logging
-import os
 import re
 import shutil
-import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
-
-import torch
+from typing import Any
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets import frame_entry
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.geometry import SE3
-from bidnerf_core.io import from_plain, read_json, to_plain, write_file
-from bidnerf_core.structure.keypoints import DETECTOR, ListedPhoto
-from bidnerf_core.structure.library import from_colmap
+from bidnerf_core.io import from_plain, read_json, write_file
+from bidnerf_core.structure.colmap import DETECTOR
 
-log = logging.getLogger("bidnerf")
-
-Row = TypeVar("Row")
 RECORD, TRANSFORMS, WORK, MODEL, FRAMES = "poses.json", "transforms.json", "work", "sparse/0", "images"
-DATABASE = "database.db"
-"""The file of keypoints and matches in the work folder."""
 
 
 @dataclass(frozen=True)
@@ -121,57 +108,12 @@ def read_found(folder: Path) -> FoundPoses | None:
     )
 
 
-def give_up(folder: Path) -> None:
-    """Mark the work in a folder as failed: its keypoints and matches are kept for another attempt with the same photos.
-
-    A folder without any is cleared.
-    """
-    if not (folder / WORK / DATABASE).exists():
-        clear(folder)
-        return
-    content = json.dumps(begun(folder) | {"failed": True})
-    write_file(folder / WORK / "begun.json", content.encode())
-
-
-def without_damage(database: Path) -> Path:
-    """Return the path of a database; the database is removed if it is damaged."""
-    if not database.exists():
-        return database
-    try:
-        with contextlib.closing(sqlite3.connect(database)) as opened:
-            (found,) = opened.execute("PRAGMA quick_check(1)").fetchone()
-    except sqlite3.DatabaseError as error:
-        found = str(error)
-    if found != "ok":
-        log.info(f"{database}: damaged ({found}); finding its keypoints again")
-        for file in database.parent.glob(f"{database.name}*"):  # with SQLite's journals
-            file.unlink()
-    return database
-
-
-def stored_rows(file: Path, kind: type[Row]) -> list[Row] | None:
-    """Return the rows in a work file; None if there is no such file, or a damaged one, which must be recreated."""
-    if not file.exists():
-        return None
-    try:
-        rows: list[Row] = from_plain(list[kind], read_json(file, "a list"), str(file))  # type: ignore[valid-type]
-    except InputError as error:
-        log.info(f"{error}; recreating it")
-        return None
-    return rows
-
-
 def begun(folder: Path) -> dict[str, Any]:
-    """Return the state of interrupted work in a folder.
-
-    It is the digest of its ``inputs``, whether they are a ``video``, and whether it ``failed``, so that work on other photos may
-    replace it.
-    """
-    try:
+    """Return the state of interrupted work in a folder: the digest of its ``inputs``, and whether they are a ``video``."""
+    with contextlib.suppress(InputError):
         found = read_json(folder / WORK / "begun.json", "the state of interrupted work")
-    except InputError:
-        return {}
-    return found if isinstance(found, dict) else {}
+        return found if isinstance(found, dict) else {}
+    return {}
 
 
 def begin(folder: Path, inputs: str, video: bool) -> Path:
@@ -188,7 +130,7 @@ def begin(folder: Path, inputs: str, video: bool) -> Path:
                 where=folder / FRAMES,
             )
         work.mkdir(parents=True, exist_ok=True)
-    write_file(work / "begun.json", json.dumps({"inputs": inputs, "video": video}).encode())
+        write_file(work / "begun.json", json.dumps({"inputs": inputs, "video": video}).encode())
     return work
 
 
@@ -215,41 +157,3 @@ def clear(folder: Path) -> None:
     shutil.rmtree(folder / WORK, ignore_errors=True)
     for name in ("cameras", "frames", "images", "points3D", "rigs"):
         (folder / MODEL / f"{name}.bin").unlink(missing_ok=True)
-
-
-def write_dataset(
-    folder: Path, photos: Mapping[int, ListedPhoto], model: Any, names: Mapping[int, str]
-) -> None:
-    """Write a model, with cameras for the photos as stored, and its ``transforms.json``.
-
-    ``photos`` and ``names`` (for the model) are keyed by image number.
-    """
-    entries = []
-    for number in sorted(model.reg_image_ids()):
-        photo, image = photos[number], model.image(number)
-        image.name = names[number]
-        camera = from_colmap(model.camera(image.camera_id))
-        matrix = torch.from_numpy(image.cam_from_world().matrix()).double()
-        T_world_camera = SE3(matrix[:, :3].clone(), matrix[:, 3].clone()).inverse()
-        place = relative(photo.image.file, folder)
-        entries.append(frame_entry(place, photo.image.name, camera, T_world_camera, photo.image.time))
-    (folder / MODEL).mkdir(parents=True, exist_ok=True)
-    model.write_binary(folder / MODEL)
-    content = json.dumps(
-        {"camera_model": "OPENCV", "unit": "units", "frames": entries}, indent=1, allow_nan=False
-    )
-    write_file(folder / TRANSFORMS, content.encode())
-
-
-def write_found(folder: Path, found: FoundPoses) -> None:
-    """Write the record, and remove what the work left behind."""
-    write_file(folder / RECORD, json.dumps(to_plain(found), indent=1, allow_nan=False).encode())
-    shutil.rmtree(folder / WORK, ignore_errors=True)
-
-
-def relative(file: Path, folder: Path) -> str:
-    """Return the path of a file relative to a folder; an absolute one if they are on different drives."""
-    try:
-        return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
-    except ValueError:
-        return file.resolve().as_posix()

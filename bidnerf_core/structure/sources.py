@@ -1,4 +1,10 @@
-"""The input of structure from motion: photos of a folder and its subfolders, and videos."""
+"""The input of structure from motion: photos of a folder and its subfolders, and frames of a video.
+
+As many frames are chosen as the image motion requires, each the sharpest among its neighbours. The image motion is the displacement
+of tracked corners, accumulated along the video. A shaking camera does not add to it, since corners are tracked from one anchor frame
+until they have moved by a few percent of the image. Frames are chosen at equal steps of the accumulated motion: none while the camera
+rests, many while it turns.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +13,35 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
-from bidnerf_core.datasets import VIDEO_SUFFIXES, find_reader, is_video, no_dataset, remark, unique_names
+import cv2
+import numpy as np
+from PIL import Image
+
+from bidnerf_core.camera import reduced_size
+from bidnerf_core.captures import sharpness
+from bidnerf_core.datasets import (
+    VIDEO_SUFFIXES,
+    Video,
+    find_reader,
+    is_video,
+    no_dataset,
+    remark,
+    unique_names,
+)
 from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.frames import natural_order, photos_in
 from bidnerf_core.io import open_binary, read_header
+from bidnerf_core.progress import counter
+
+STEP = 0.04
+"""Image motion between chosen frames, in diagonals."""
+MOST = 400
+"""Largest number of chosen frames: longer videos use longer steps."""
+
+Measure: TypeAlias = tuple[float, float]
+"""The accumulated motion (diagonals) until a frame, and its sharpness (octaves)."""
 
 
 @dataclass(frozen=True)
@@ -73,20 +103,18 @@ def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
     groups: dict[Path, list[Path]] = {}
     for photo in photos:
         groups.setdefault(photo.parent, []).append(photo)
-    sizes = dict[Path, tuple[int, int]]()
+    copies, alike = list[Path](), dict[tuple[Path, frozenset[str]], list[tuple[int, int, Path]]]()
     for place, group in groups.items():
         with contextlib.suppress(InputError):  # raised again when that photo is read
             header = read_header(group[0])
-            sizes[place] = header.width, header.height
-
-    def is_copy(place: Path, other: Path) -> bool:
-        (width, height), (whole_width, whole_height) = sizes[place], sizes[other]
-        # Sizes are rounded.
-        smaller = width < whole_width and abs(height - width * whole_height / whole_width) <= 1
-        names = [{photo.stem for photo in groups[each]} for each in (place, other)]
-        return smaller and place.parent == other.parent and names[0] == names[1]
-
-    copies = [place for place in sizes if any(is_copy(place, other) for other in sizes)]
+            key = place.parent, frozenset(photo.stem for photo in group)
+            alike.setdefault(key, []).append((header.width, header.height, place))
+    for sized in alike.values():
+        whole_width, whole_height, _ = max(sized)
+        for width, height, place in sized:
+            # Sizes are rounded.
+            if width < whole_width and abs(height - width * whole_height / whole_width) <= 1:
+                copies.append(place)
     if copies:
         names = enumeration([str(place.relative_to(folder)) for place in copies])
         remark(folder, f"{names}: smaller copies of the photos beside them, which are left out")
@@ -94,16 +122,8 @@ def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
 
 
 def refuse_panoramas(photos: Sequence[SourceImage]) -> None:
-    """Raise ``InputError`` for panoramas, which no pinhole camera takes; photos that are twice as wide as high cause a remark."""
-    wide = 0
+    """Raise ``InputError`` for photos whose XMP says that they are panoramas, which no pinhole camera takes."""
     for photo in photos:
-        try:
-            header = read_header(photo.file)
-        except InputError:  # left out later
-            continue
-        if header.width != 2 * header.height:
-            continue
-        wide += 1
         with open_binary(photo.file, "a photo") as file:
             # So many bytes contain the XMP: a segment has at most 64 KiB, and EXIF precedes it.
             if b"equirectangular" in file.read(2**18):
@@ -111,9 +131,6 @@ def refuse_panoramas(photos: Sequence[SourceImage]) -> None:
                     "poses with camera_model EQUIRECTANGULAR in transforms.json, or pinhole views cut from it"
                 )
                 raise InputError("is a panorama (equirectangular)", where=photo.file, expected=expected)
-    if photos and wide == len(photos):
-        text = "photos are twice as wide as high; if they are panoramas, they are no pinhole images and no poses fit them"
-        remark(photos[0].file.parent, text)
 
 
 def _below(folder: Path, out: Path | None) -> Iterator[Path]:
@@ -131,3 +148,70 @@ def _below(folder: Path, out: Path | None) -> Iterator[Path]:
                 inside.clear()
                 continue
             yield from photos_in(place)[0]
+
+
+def measured(video: Path) -> list[Measure]:
+    """Measure each frame of a video.
+
+    Up to 200 corners (Shi and Tomasi 1994) are tracked in images of at most 320 pixels a side, from an anchor frame until they have
+    moved by two percent of the diagonal or half of them are lost.
+    """
+    count = counter("measuring frames", "frames")
+    frames, found = Video(video), list[Measure]()
+    total = len(frames)
+    before: np.ndarray | None = None
+    points = start = np.zeros((0, 1, 2), np.float32)
+    corners, until_anchor, motion = 0, 0.0, 0.0
+    for _, pixels in frames:
+        whole = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+        size = reduced_size(whole.shape[1], whole.shape[0], 320)
+        grey = whole if size == whole.shape[::-1] else cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
+        is_anchor = not len(points)
+        if before is not None and is_anchor:  # nothing to track: unknown motion, assumed to be one step
+            motion += STEP
+        elif before is not None:
+            moved, kept, _ = cv2.calcOpticalFlowPyrLK(before, grey, points, np.empty_like(points))
+            ok = kept.reshape(-1) == 1
+            points, start = moved[ok], start[ok]
+            if len(points):
+                away = float(np.median(np.linalg.norm(points - start, axis=-1))) / float(
+                    np.hypot(*grey.shape)
+                )
+                motion = max(motion, until_anchor + away)
+                is_anchor = away > 0.02 or len(points) < 0.5 * corners
+        if is_anchor:
+            until_anchor = motion
+            detected = cv2.goodFeaturesToTrack(grey, 200, 0.01, 7)  # corners, quality, and distance in pixels
+            points = start = np.zeros((0, 1, 2), np.float32) if detected is None else np.asarray(detected)
+            corners = len(points)
+        before = grey
+        found.append((motion, sharpness(whole.astype(np.float32) / 255)))
+        count(min(len(found), total), total)
+    return found
+
+
+def chosen(frames: Sequence[Measure]) -> list[int]:
+    """Return the indices of the frames to place: one for each step of motion, the sharpest near it."""
+    motion, sharp = np.array(frames).T
+    step = max(STEP, float(motion[-1]) / (MOST - 1))
+    found = set[int]()
+    for place in np.arange(round(float(motion[-1]) / step) + 1) * step:
+        away = np.abs(motion - place)
+        near = np.flatnonzero(away <= 0.3 * step)
+        found.add(int(near[sharp[near].argmax()]) if len(near) else int(away.argmin()))
+    return sorted(found)
+
+
+def write_frames(video: Path, folder: Path, wanted: Sequence[int]) -> list[SourceImage]:
+    """Write the frames with indices ``wanted`` to ``folder`` as NUMBER.jpg, and return them with their times."""
+    folder.mkdir(parents=True, exist_ok=True)
+    asked, found, count = set(wanted), list[SourceImage](), counter("writing frames", "frames")
+    for number, (time, pixels) in enumerate(Video(video)):
+        if number in asked:
+            image = SourceImage(f"{number:06d}", folder / f"{number:06d}.jpg", time)
+            Image.fromarray(pixels).save(image.file, quality=95, subsampling=0)
+            found.append(image)
+            count(len(found), len(asked))
+        if len(found) == len(asked):
+            break
+    return found

@@ -1,0 +1,245 @@
+"""COLMAP's database of photos: their cameras, keypoints, and the pairs of photos that match.
+
+Photos of the same size whose EXIF states the same lens share a camera. Its initial focal length is that of
+EXIF, or a typical one, and is estimated with the poses. A given camera is kept fixed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+
+from bidnerf_core.camera import (
+    UPRIGHT,
+    CameraSource,
+    Exif,
+    Intrinsics,
+    Raster,
+    camera_from_exif,
+    colmap_model,
+    read_exif,
+    reduced_size,
+)
+from bidnerf_core.errors import InputError
+from bidnerf_core.io import read_header, read_image
+from bidnerf_core.mapping import Keypoints, Sift, Vocabulary
+from bidnerf_core.progress import counter
+from bidnerf_core.structure.sources import SourceImage
+
+LARGEST = 1600
+"""Pixels along the longer side to which photos are downscaled: more give slightly more accurate poses, but
+take far longer."""
+DETECTOR = Sift(count=4096, largest=LARGEST)
+NEIGHBOURS = 10
+"""Number of photos on either side, in order of name or time, with which each is matched."""
+
+Pairs: TypeAlias = list[tuple[int, int]]
+"""Pairs (i < j) of photos."""
+
+
+def pycolmap_for(what: str) -> Any:
+    """Import pycolmap, silenced. Raises ``InputError``, whose message begins with ``what``, if it is not installed."""
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise InputError(
+            "finding the poses of photos needs the extra 'sfm' (pip install 'bidnerf[sfm]')", where=what
+        ) from error
+    if not hasattr(pycolmap, "CancellationToken"):  # a name that exists from 4.2 on
+        raise InputError(
+            f"pycolmap is {pycolmap.__version__}",
+            where=what,
+            expected="4.2 or later (pip install -U 'bidnerf[sfm]')",
+        )
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    return pycolmap
+
+
+@dataclass(frozen=True)
+class ListedPhoto:
+    """A readable photo: its size as stored, the size at which its keypoints are found, and the number of its camera."""
+
+    image: SourceImage
+    number: int  # in the database, from 1
+    size: tuple[int, int]  # width and height as stored
+    reduced: tuple[int, int]
+    exif: Exif
+    camera: int  # in the database, from 1
+
+
+@dataclass(frozen=True)
+class Described:
+    """The readable photos, and why the others cannot be read."""
+
+    photos: list[ListedPhoto]
+    cameras: dict[int, Intrinsics]  # of reduced photos, by number
+    known_focal: dict[int, bool]  # whether EXIF or the user states the focal length
+    unusable: dict[str, str]  # reasons by name
+
+
+def described(images: Sequence[SourceImage], given: Intrinsics | str | Path | None) -> Described:
+    """Read the headers of photos, and group the photos by camera.
+
+    Raises ``InputError`` for a ``given`` camera that does not fit.
+    """
+    found, numbers = Described([], {}, {}, {}), dict[Any, int]()
+    for number, image in enumerate(images, start=1):
+        try:
+            header, exif = read_header(image.file), read_exif(image.file)
+        except InputError as error:
+            found.unusable[image.name] = _without_file(error, image)
+            continue
+        size = (header.width, header.height)
+        camera = numbers.setdefault((size, replace(exif, orientation=UPRIGHT)), len(numbers) + 1)
+        photo = ListedPhoto(image, number, size, reduced_size(*size, LARGEST), exif, camera)
+        found.photos.append(photo)
+        if camera not in found.cameras:
+            first, found.known_focal[camera] = _first_guess(photo, given)
+            found.cameras[camera] = first.resized(*photo.reduced)
+    return found
+
+
+def _first_guess(photo: ListedPhoto, given: Intrinsics | str | Path | None) -> tuple[Intrinsics, bool]:
+    raster, exif = Raster(*photo.size), replace(photo.exif, orientation=UPRIGHT)
+    if given is not None:
+        return CameraSource(given).find(photo.image.file, raster).intrinsics, True
+    if exif.has_focal_length:
+        with contextlib.suppress(InputError):  # cropped after it was taken
+            return camera_from_exif(str(photo.image.file), raster, exif).intrinsics, True
+    return Intrinsics.from_focal(1.2 * max(photo.size), *photo.size), False  # as COLMAP assumes
+
+
+def key(number: int) -> str:
+    """Return the name in the database of the photo with this number.
+
+    Its file name may contain spaces, which COLMAP's pair lists do not allow.
+    """
+    return f"{number:06d}"
+
+
+def to_colmap(intrinsics: Intrinsics, number: int, pycolmap: Any) -> Any:
+    """Convert to a pycolmap camera, whose pixel coordinates follow the same convention as ``Intrinsics``.
+
+    Raises ``InputError`` for a lens without a COLMAP model.
+    """
+    model, parameters = colmap_model(intrinsics)
+    return pycolmap.Camera(
+        camera_id=number, model=model, width=intrinsics.width, height=intrinsics.height, params=parameters
+    )
+
+
+def write_cameras(database: Any, found: Described, fixed: bool, pycolmap: Any) -> None:
+    """Write cameras and photos to an empty database. A camera that is not ``fixed`` has one radial coefficient."""
+    with pycolmap.DatabaseTransaction(database):
+        for number, intrinsics in found.cameras.items():
+            size = intrinsics.width, intrinsics.height
+            camera = (
+                to_colmap(intrinsics, number, pycolmap)
+                if fixed
+                else pycolmap.Camera.create_from_model_name(number, "SIMPLE_RADIAL", intrinsics.fx, *size)
+            )
+            camera.has_prior_focal_length = found.known_focal[number]
+            database.write_camera(camera, use_camera_id=True)
+            rig = pycolmap.Rig(rig_id=number)
+            rig.add_ref_sensor(camera.sensor_id)
+            database.write_rig(rig, use_rig_id=True)
+        for photo in found.photos:
+            image = pycolmap.Image(name=key(photo.number), camera_id=photo.camera, image_id=photo.number)
+            database.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame(frame_id=photo.number, rig_id=photo.camera)
+            frame.add_data_id(image.data_id)
+            database.write_frame(frame, use_frame_id=True)
+
+
+def write_keypoints(database: Any, found: Described, pycolmap: Any) -> None:
+    """Find the keypoints missing from the database; photos that cannot be decoded become unusable.
+
+    Keypoints found until the job is cancelled are stored.
+    """
+    count, total = counter("finding keypoints", "photos"), len(found.photos)
+    missing = [photo for photo in found.photos if not database.exists_keypoints(photo.number)]
+    with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
+        try:
+            for done, (photo, keypoints) in enumerate(
+                zip(missing, pool.map(_keypoints, missing), strict=True)
+            ):
+                if isinstance(keypoints, InputError):
+                    found.unusable[photo.image.name] = _without_file(keypoints, photo.image)
+                    found.photos.remove(photo)
+                else:
+                    described = pycolmap.FeatureDescriptors(
+                        pycolmap.FeatureExtractorType.SIFT, keypoints.descriptors.numpy()
+                    )
+                    with pycolmap.DatabaseTransaction(database):
+                        database.write_keypoints(photo.number, keypoints.pixels.float().numpy())
+                        database.write_descriptors(photo.number, described)
+                count(total - len(missing) + done + 1, total)
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _keypoints(photo: ListedPhoto) -> Keypoints | InputError:
+    """Return the keypoints of the downscaled photo, without those on its background."""
+    try:
+        rgb, alpha = read_image(photo.image.file, size=photo.reduced)
+    except InputError as error:
+        return error
+    found = DETECTOR(rgb)
+    if alpha is None:
+        return found
+    columns, rows = found.pixels.long().unbind(-1)
+    inside = alpha[rows.clamp(0, alpha.shape[0] - 1), columns.clamp(0, alpha.shape[1] - 1)] > 0.5
+    return found[inside]
+
+
+def _without_file(error: InputError, image: SourceImage) -> str:
+    """Return a message without the leading file path, which is shown next to it anyway."""
+    return str(error).removeprefix(f"{image.file}: ")
+
+
+def similar_pairs(descriptors: Sequence[np.ndarray]) -> Pairs:
+    """Return the pairs of photos that are neighbours or among the twenty most similar, given the descriptors (n, 128) of each.
+
+    Neighbours are likely to overlap since photos and frames are taken one after another. Similar photos close loops, and connect
+    photos in arbitrary order. The similarity of two photos is the product of their vectors of locally aggregated descriptors (VLAD,
+    Jégou et al. 2010), whose words are found in the photos themselves.
+    """
+    count, known = len(descriptors), [torch.from_numpy(own) for own in descriptors]
+    pairs = {(i, j) for i in range(count) for j in range(i + 1, min(count, i + NEIGHBOURS + 1))}
+    vocabulary = Vocabulary.of(known)
+    vectors = torch.stack([vocabulary.pooled(own) for own in known])
+    for i, vector in enumerate(vectors):
+        likeness = vectors @ vector
+        likeness[i] = -torch.inf
+        pairs |= {(min(i, j), max(i, j)) for j in likeness.topk(min(20, count - 1)).indices.tolist()}
+    return sorted(pairs)
+
+
+def match(database: Path, pairs: Pairs, threads: int, pycolmap: Any) -> None:
+    """Match the ``pairs`` of photos, by number, that are missing from the database, and verify the matches by two-view geometry.
+
+    Matches found until the job is cancelled are stored. A batch of pairs cannot be interrupted.
+    """
+    count = counter("matching photos", "pairs")
+    with pycolmap.Database.open(database) as stored:
+        todo = [pair for pair in pairs if not stored.exists_two_view_geometry(*pair)]
+    matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0
+    listed, size = database.with_name("pairs.txt"), 16
+    count(len(pairs) - len(todo), len(pairs))
+    for start in range(0, len(todo), size):
+        batch = todo[start : start + size]
+        listed.write_text("".join(f"{key(i)} {key(j)}\n" for i, j in batch))
+        pycolmap.match_image_pairs(
+            database, matching, pycolmap.ImportedPairingOptions(match_list_path=listed), verification,
+            device=pycolmap.Device.cpu,
+        )  # fmt: skip
+        count(len(pairs) - len(todo) + start + len(batch), len(pairs))

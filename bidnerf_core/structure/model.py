@@ -1,0 +1,185 @@
+"""The model of photos: registration by COLMAP's incremental mapper, its orientation and check, and the dataset written of it."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from bidnerf_core.camera import Intrinsics, colmap_camera
+from bidnerf_core.captures import up_direction
+from bidnerf_core.datasets import frame_entry
+from bidnerf_core.errors import amount
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import write_file
+from bidnerf_core.progress import counter
+from bidnerf_core.structure.colmap import Described, ListedPhoto
+from bidnerf_core.structure.record import MODEL, TRANSFORMS
+
+LEAST_PHOTOS = 3
+"""Photos in the smallest model: two have a single baseline, which allows no check."""
+
+
+def reconstructed(
+    database: Path, folder: Path, found: Described, fixed: bool, threads: int, pycolmap: Any
+) -> list[Any]:
+    """Reconstruct the photos of a database, keeping their cameras if ``fixed``; models are written to ``folder``.
+
+    Returns the models, largest first; parts without overlap have one each. There may be no model at all.
+    """
+    options = pycolmap.IncrementalPipelineOptions(
+        num_threads=threads,
+        random_seed=0,
+        extract_colors=False,
+        min_model_size=LEAST_PHOTOS,
+        max_num_models=20,
+    )
+    if fixed:
+        options.constant_cameras = set(found.cameras)
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    total, count, placed = len(found.photos), counter("placing photos", "photos"), itertools.count(1)
+    folder.mkdir(parents=True, exist_ok=True)
+    models = pycolmap.incremental_mapping(
+        database, folder, folder, options, next_image_callback=lambda: count(min(next(placed), total), total)
+    )
+    # COLMAP also registers photos by matches without depth, which occur between photos from one place.
+    for model in models.values():
+        for number in list(model.reg_image_ids()):
+            if model.image(number).num_points3D < 15:
+                model.deregister_frame(model.image(number).frame_id)
+    good = [model for model in models.values() if model.num_reg_images() >= LEAST_PHOTOS]
+    return sorted(good, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+
+
+def turn_upright(model: Any, photos: Mapping[int, ListedPhoto], pycolmap: Any) -> None:
+    """Rotate the world of a model so that z points up, and move its origin to the middle of the cameras."""
+    rotations, centres = [], []
+    for number in model.reg_image_ids():
+        image = model.image(number)
+        R_world_camera = image.cam_from_world().inverse().rotation.matrix()
+        right, above = _upright_axes(photos[number])
+        upright = np.stack([right, -above, np.cross(right, -above)], axis=1)
+        rotations.append(R_world_camera @ upright)
+        centres.append(image.projection_center())
+    poses = SE3(torch.from_numpy(np.stack(rotations)), torch.from_numpy(np.stack(centres)))
+    rotation, _ = Rotation.align_vectors([[0, 0, 1]], [up_direction(poses).direction])
+    R = rotation.as_matrix()
+    centre = np.mean(centres, axis=0)
+    model.transform(pycolmap.Sim3d(np.concatenate([R, -(R @ centre)[:, None]], axis=1)))
+
+
+def _upright_axes(photo: ListedPhoto) -> tuple[np.ndarray, np.ndarray]:
+    """Return the right and up axes of the upright photo, in the camera of the photo as stored (x right, y down)."""
+    turned = photo.exif.orientation
+    x, y = (-1.0 if flips else 1.0 for flips in (turned.mirrors_columns, turned.mirrors_rows))
+    if turned.transposes:
+        return np.array([0.0, y, 0.0]), np.array([-x, 0.0, 0.0])
+    return np.array([x, 0.0, 0.0]), np.array([0.0, -y, 0.0])
+
+
+def full_size(model: Any, photos: Mapping[int, ListedPhoto]) -> None:
+    """Scale the cameras and keypoints of a model from downscaled photos to photos as stored."""
+    sizes = {photo.camera: photo for photo in photos.values()}
+    for number, photo in sizes.items():
+        if model.exists_camera(number):
+            model.camera(number).rescale(*photo.size)
+    for number in model.reg_image_ids():
+        photo = photos[number]
+        scale = np.array(photo.size) / np.array(photo.reduced)
+        if (scale != 1).any():
+            for point in model.image(number).points2D:
+                point.xy = point.xy * scale
+
+
+def agreement(model: Any, database: Any, pycolmap: Any) -> tuple[int, int]:
+    """Compare the verified pairs of a database with the poses and cameras of a model.
+
+    Places that look alike, such as the doors of a corridor, can be taken for one place. The model is then folded, although its points
+    project where they should. It contradicts other pairs of photos, whose many matches cannot be due to chance.
+
+    Returns the number of pairs of registered photos with at least a hundred verified matches, since pairs of different places
+    with repeated details have up to 80, and the number of those that contradict the model's poses: fewer than half of their
+    matches are within four pixels of their epipolar lines, in the photos in which keypoints were found.
+    """
+    placed, keypoints = set(model.reg_image_ids()), dict[int, np.ndarray]()
+    pairs = contradicting = 0
+    for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
+        i, j = pycolmap.pair_id_to_image_pair(pair)
+        if i not in placed or j not in placed or len(geometry.inlier_matches) < 100:
+            continue
+        rays = []
+        for number, column in ((i, 0), (j, 1)):
+            if number not in keypoints:
+                keypoints[number] = database.read_keypoints(number)[:, :2].astype(np.float64)
+            camera = model.camera(model.image(number).camera_id)
+            seen = camera.cam_from_img(keypoints[number][geometry.inlier_matches[:, column]])
+            rays.append(np.column_stack([seen, np.ones(len(seen))]))
+        T = (model.image(j).cam_from_world() * model.image(i).cam_from_world().inverse()).matrix()
+        t = T[:, 3] / max(np.linalg.norm(T[:, 3]), 1e-12)
+        lines = np.cross(t, rays[0] @ T[:, :3].T)
+        away = np.abs((lines * rays[1]).sum(-1)) / np.linalg.norm(lines[:, :2], axis=-1).clip(1e-12)
+        pairs += 1
+        contradicting += int(np.mean(away * camera.mean_focal_length() < 4) < 0.5)
+    return pairs, contradicting
+
+
+def left_out(
+    found: Described, models: list[Any], partners: Counter[int], keypoints: Mapping[int, int]
+) -> dict[str, str]:
+    """Return by name why photos are in no model, or not in the largest.
+
+    ``partners`` are the numbers of photos that each overlaps with, and ``keypoints`` its numbers of keypoints.
+    """
+    of_model = {number: model for model in reversed(models) for number in model.reg_image_ids()}
+    reasons = dict(found.unusable)
+    for photo in found.photos:
+        model, other = of_model.get(photo.number), amount(partners[photo.number], "other photo")
+        if model is models[0]:
+            continue
+        reason = f"overlaps with {other}, judging by its {amount(keypoints[photo.number], 'keypoint')}, but too little with the placed ones"
+        if model is not None:
+            size = amount(model.num_reg_images(), "photo")
+            reason = f"belongs to another model, with {size}, that has no connection to the largest"
+        reasons[photo.image.name] = reason
+    return reasons
+
+
+def write_dataset(folder: Path, photos: Mapping[int, ListedPhoto], model: Any, base: Path) -> None:
+    """Write a model, with cameras for the ``photos`` (by number) as stored in ``base``, and its ``transforms.json``."""
+    entries = []
+    for number in sorted(model.reg_image_ids()):
+        photo, image = photos[number], model.image(number)
+        image.name = relative(photo.image.file, base)
+        camera = from_colmap(model.camera(image.camera_id))
+        matrix = torch.from_numpy(image.cam_from_world().matrix()).double()
+        T_world_camera = SE3(matrix[:, :3].clone(), matrix[:, 3].clone()).inverse()
+        place = relative(photo.image.file, folder)
+        entries.append(frame_entry(place, photo.image.name, camera, T_world_camera, photo.image.time))
+    (folder / MODEL).mkdir(parents=True, exist_ok=True)
+    model.write_binary(folder / MODEL)
+    content = {"camera_model": "OPENCV", "unit": "units", "frames": entries}
+    write_file(folder / TRANSFORMS, json.dumps(content, indent=1, allow_nan=False).encode())
+
+
+def from_colmap(camera: Any) -> Intrinsics:
+    """Return the intrinsics of a pycolmap camera with a perspective lens."""
+    found = colmap_camera("COLMAP", camera.model.name, camera.width, camera.height, list(camera.params))
+    assert isinstance(found, Intrinsics)
+    return found
+
+
+def relative(file: Path, folder: Path) -> str:
+    """Return the path of a file relative to a folder; an absolute one if they are on different drives."""
+    try:
+        return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
+    except ValueError:
+        return file.resolve().as_posix()
