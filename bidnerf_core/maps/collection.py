@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -63,11 +63,6 @@ class Placement:
             }  # fmt: skip
         return {"map": self.map, "similarity": similarity[self.map], "runner_up": runner_up}
 
-    @property
-    def rival(self) -> str | None:
-        """The runner-up if it accepts the image as well: both maps show the place, or the place exists twice."""
-        return self.runner_up[0] if self.runner_up is not None and self.runner_up[1].converged else None
-
 
 class MapCollection:
     """Finds the map that an image shows, and its pose there.
@@ -97,8 +92,10 @@ class MapCollection:
             raise InputError(f"asked is {asked}", expected="1 or more")
         self.method, self.config, self.asked = method, config, asked
         self._maps = _named([scenes] if isinstance(scenes, str | Path) else scenes)
-        self._localizers: OrderedDict[str, Localizer] = OrderedDict()
         self._given_localizers = localizers or {}
+        self._localizer = functools.lru_cache(maxsize=6)(
+            self._loaded
+        )  # so many maps stay in memory after use
         self._infos = {
             name: scene.info if isinstance(scene, Map) else load_info(scene)
             for name, scene in self._maps.items()
@@ -128,16 +125,12 @@ class MapCollection:
         """
         if name not in self._maps:
             raise InputError(f"no map {name!r}", expected=f"one of {', '.join(self._maps)}")
-        if name in self._given_localizers:
-            return self._given_localizers[name]
-        if name not in self._localizers:
-            scene = self._maps[name]
-            stored = scene if isinstance(scene, Map) else load_map(scene)
-            self._localizers[name] = Localizer(stored, self.method, self.config, warm_up=False)
-            while len(self._localizers) > 6:  # so many maps stay in memory after use
-                self._localizers.popitem(last=False)
-        self._localizers.move_to_end(name)
-        return self._localizers[name]
+        return self._given_localizers.get(name) or self._localizer(name)
+
+    def _loaded(self, name: str) -> Localizer:
+        scene = self._maps[name]
+        stored = scene if isinstance(scene, Map) else load_map(scene)
+        return Localizer(stored, self.method, self.config, warm_up=False)
 
     def ranked(self, frame: Frame) -> dict[str, float]:
         """Return the similarity of each map to an image, most similar first; it is -1 for a map without landmarks."""
@@ -190,8 +183,7 @@ class MapCollection:
 
     def _indexed(self) -> dict[str, tuple[str, int]]:
         """Pool the descriptors of all maps; return the detector and the length of the descriptors of those with landmarks."""
-        count = counter("reading", "maps")
-        landmarks: dict[str, LandmarkMap] = {}
+        count, landmarks = counter("reading", "maps"), dict[str, LandmarkMap]()
         for number, (name, scene) in enumerate(self._maps.items(), start=1):
             check_cancelled("reading maps")
             found = scene.landmarks if isinstance(scene, Map) else load_landmarks(scene, self._infos[name])

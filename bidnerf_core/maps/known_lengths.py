@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,10 +93,9 @@ def place_of(scene: Map, place: Place) -> Float[Tensor, "3"]:
     if (camera := _camera_of(scene, place)) is not None:
         return camera.pose.translation + origin_of(scene)
     name, at, pixel = place.rpartition("@")
-    try:
+    numbers = list[float]()
+    with contextlib.suppress(ValueError):
         numbers = [float(word) for word in pixel.split(",")]
-    except ValueError:
-        numbers = []
     if not all(map(math.isfinite, numbers)):
         numbers = []
     if at and len(numbers) == 2 and (camera := _camera_of(scene, name)) is not None:
@@ -129,18 +128,12 @@ def _camera_of(scene: Map, name: str) -> StoredCamera | None:
 def _no_camera(scene: Map, name: str) -> str:
     """Return why a map has no camera of a photo, and what else names a place."""
     names = [camera.name for camera in scene.info.cameras]
-    others = "NAME@U,V for what a camera shows at a pixel, or coordinates X,Y,Z"
     if not names:
         return "it has no cameras; expected coordinates X,Y,Z"
-    # The names of photos of one capture differ only in numbers and file extensions.
-    digits = re.compile(r"\d+|\.\w+$")
-    alike = [each for each in names if digits.sub("", each) == digits.sub("", name)]
-    if not alike:
-        hint = spelling_hint(name, names, f", expected a name such as {names[0]!r}")
-        return f"none of its {len(names)} cameras is called {name!r}{hint}; or give {others}"
+    hint = spelling_hint(name, names, f", expected a name such as {names[0]!r}")
     return (
-        f"it has no camera of {name!r}; photos held out for tests are not in the map (every eighth, unless trained with --split"
-        f" all), so take another, such as {alike[0]!r}, {others}"
+        f"none of its {len(names)} cameras is called {name!r}{hint} (photos held out for tests, every eighth unless trained with"
+        " --split all, are not in the map); or give NAME@U,V for what a camera shows at a pixel, or coordinates X,Y,Z"
     )
 
 

@@ -263,13 +263,6 @@ def test_a_description_is_for_people_and_for_json(scene: bn.Map) -> None:
     assert facts["surfels"] == len(scene.surface.surfels) > 0
 
 
-def test_a_notebook_shows_a_map_in_a_line(scene: bn.Map) -> None:
-    shown = repr(scene)
-    assert scene.surface is not None
-    assert len(shown) < 200
-    assert f"{len(scene.surface.surfels)} surfels" in shown
-
-
 @pytest.mark.usefixtures("unchecked")
 def test_a_rendering_is_scored_against_the_photo(scene: bn.Map) -> None:
     (view,) = tiny.views(1, seed=1)

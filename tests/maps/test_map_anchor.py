@@ -6,7 +6,7 @@ import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import pytest
 from hypothesis import given
@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 from torch import nn
 
 import tiny
-from bidnerf_core import resume, train
+from bidnerf_core import InputError, resume, train
 from bidnerf_core.captures import CaptureReport, CoverageRecord
+from bidnerf_core.fields import SceneBounds
 
 # Inside: writes are counted and stopped at each
-from bidnerf_core.maps import Anchor, Map, TrainOptions, load_info, load_map, store, write_parts
+from bidnerf_core.maps import Anchor, Map, MapInfo, TrainOptions, load_info, load_map, store, write_parts
 from bidnerf_core.progress import Progress
 from bidnerf_core.training import TrainingState
 from drawn import poses, record, shares
@@ -127,3 +128,24 @@ def test_a_training_that_goes_on_keeps_the_anchor(tmp_path: Path) -> None:
     tiny.write_anchor(tmp_path, anchor := Anchor(47.0, 19.0, 100.0))
     assert resume(tmp_path, tiny.views(3), bake=False).info.complete
     assert load_map(tmp_path).anchor == anchor
+
+
+def test_damaged_anchors_are_refused(tmp_path: Path) -> None:
+    bounds = SceneBounds((0, 0, 0), (1, 1, 1), 0, 1)
+    write_parts(tmp_path, MapInfo("hashgrid", {}, bounds, 1, True), TrainingState(1, {}, {}))
+    assert load_info(tmp_path).anchor is None
+    good: dict[str, Any] = {"latitude": 47.0, "longitude": 19.0, "height": 100.0}
+    (tmp_path / "anchor.json").write_text(json.dumps(good))
+    assert load_info(tmp_path).anchor == Anchor(**good)
+    for change, part in (
+        ({"latitude": 91.0}, "latitude is 91"),
+        ({"longitude": None}, "longitude"),
+        ({"T_enu_world": [[1.0]]}, "4 rows"),
+        ({"T_enu_world": [[2.0, 0.0, 0.0, 0.0], *[[0.0] * 4] * 3]}, "T_enu_world"),
+        ({"metres_per_unit": 0.0}, "metres_per_unit is 0"),
+        ({"position_sigma": -1.0}, "expected 0 or more"),
+        ({"lattitude": 1.0}, "lattitude"),
+    ):
+        (tmp_path / "anchor.json").write_text(json.dumps(good | change))
+        with pytest.raises(InputError, match=r"anchor\.json: .*" + part):
+            load_info(tmp_path)
