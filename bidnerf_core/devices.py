@@ -78,8 +78,6 @@ def may_wait(device: torch.device) -> bool:
 # for the device, has the same shapes each time, and reads and writes the same tensors. Numbers computed in Python
 # keep their values from the capture.
 
-MOST_GRAPHS = 128
-"""Number of functions with different shapes whose graphs a thread can use, the least recently used being discarded."""
 _capturing = Lock()
 """Allows one capture at a time: a capture begins by waiting for the device, which is forbidden during another."""
 _ALIGNMENT = 16
@@ -174,7 +172,7 @@ def run_on(device: torch.device, function: Callable[..., T], *values: Any) -> T:
         if key not in lane.remotes:
             lane.remotes[key] = _Remote(function, values, tensors, lane)
         lane.remotes.move_to_end(key)
-        while len(lane.remotes) > MOST_GRAPHS:
+        while len(lane.remotes) > 128:  # functions of different shapes; the least recently used is discarded
             lane.remotes.popitem(last=False)
         found: T = lane.remotes[key](tensors)
         return found

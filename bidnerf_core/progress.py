@@ -52,14 +52,13 @@ def job_context(progress: ProgressCallback | None = None, cancel: Cancel | None 
     stops by ``check_cancelled``. What is None remains as the enclosing block has it. Raises ``InputError`` if ``cancel`` is not callable
     (an event itself, say).
     """
-    if cancel is not None and not callable(cancel):
-        raise InputError(
-            f"cancel is a {type(cancel).__name__}", expected="a function, such as the is_set of an event"
-        )
-    if progress is not None and not callable(progress):
-        raise InputError(
-            f"progress is a {type(progress).__name__}", expected="a function that takes a Progress"
-        )
+    kinds = {
+        "cancel": "a function, such as the is_set of an event",
+        "progress": "a function that takes a Progress",
+    }
+    for (name, expected), given in zip(kinds.items(), (cancel, progress), strict=True):
+        if given is not None and not callable(given):
+            raise InputError(f"{name} is a {type(given).__name__}", expected=expected)
     outer = _JOB.get()
     token = _JOB.set(Job(progress or outer.progress, cancel or outer.cancel))
     try:

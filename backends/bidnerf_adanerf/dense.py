@@ -11,9 +11,6 @@ from torch import Generator, Tensor
 from bidnerf_adanerf.field import AdaNerfField
 from bidnerf_core.fields import FieldValues, OccupancyMask, Rays, RaySamples, Rendering
 
-PROBED = 1 / 16
-"""Fraction of the bins known to be empty that are shaded anyway, so that the field learns that they are empty."""
-
 
 def dense_samples(
     field: AdaNerfField, rays: Rays, room: OccupancyMask | None, generator: Generator
@@ -23,10 +20,11 @@ def dense_samples(
     if room is None:
         return samples, torch.zeros_like(samples.valid)
     held = room.holds(rays.at(samples.middles))
+    # A sixteenth of the bins known to be empty is shaded anyway, so that the field learns that they are empty.
     probed = (
         samples.valid
         & ~held
-        & (torch.rand(held.shape, generator=generator, device=generator.device) < PROBED).to(held.device)
+        & (torch.rand(held.shape, generator=generator, device=generator.device) < 1 / 16).to(held.device)
     )
     return replace(samples, valid=samples.valid & held | probed), probed
 

@@ -94,18 +94,10 @@ class HashGridField(nn.Module):
         return CoarseField(self), self
 
     def upgraded_state(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Rename a stored state's tensors to the present names.
-
-        In earlier versions the occupancy grid was called ``sampler``, and it observed no densities: only
-        contracted scenes need them, which did not exist then. Raises ``InputError`` for infinite densities.
-        """
-        old = "sampler."
-        state = {f"occupancy.{k.removeprefix(old)}" if k.startswith(old) else k: v for k, v in state.items()}
-        for name in ("occupancy", "coarse_sampler"):
-            if (peak := state.get(f"{name}.peak")) is not None:
-                state.setdefault(f"{name}.density", torch.zeros_like(peak))
-                if not bool(state[f"{name}.density"].isfinite().all()):
-                    raise InputError(f"tensor '{name}.density' holds infinity", expected="densities")
+        """Return a stored state. Raises ``InputError`` for infinite densities."""
+        for name in ("occupancy.density", "coarse_sampler.density"):
+            if name in state and not bool(state[name].isfinite().all()):
+                raise InputError(f"tensor '{name}' holds infinity", expected="densities")
         return state
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
@@ -200,8 +192,7 @@ def _hidden(widths: Sequence[int]) -> list[nn.Module]:
 def limited(grid: OccupancyGrid, count: int) -> RaySampler:
     """Return a sampler of at most ``count`` intervals per ray, concentrated where the grid has observed density.
 
-    With a count of 0, or if the grid has observed nothing, as in maps stored by earlier versions, it is the
-    grid itself, which samples all occupied cells.
+    With a count of 0, or if the grid has observed nothing, it is the grid itself, which samples all occupied cells.
     """
     return ConcentratedInGrid(GridDensity(grid), count) if count and grid.observed else grid
 

@@ -39,8 +39,6 @@ log = logging.getLogger("bidnerf")
 
 SETTLED = 10
 """Step up to which the number of samples per ray changes so much that it is read in each step."""
-NEGLIGIBLE = 0.1
-"""Weight of a sample, relative to that up to which a cell is empty, up to which it does not count, once cells are pruned."""
 SPARE = 1.25
 """Room for the samples of a step on a GPU, relative to their expected number: its standard deviation is a few per cent."""
 
@@ -142,7 +140,8 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
         samples = level.sampler(batch.rays, generator)
         if may_wait(device) and step >= config.prune_from:
             active = config.coarse_levels if is_coarse(step) else None
-            least = NEGLIGIBLE * config.prune_threshold
+            # A sample whose weight is a tenth of that up to which a cell is empty does not count, once cells are pruned.
+            least = 0.1 * config.prune_threshold
             values, seen, density = _visible(field, active, batch.rays, samples, least)
         else:
             if may_wait(device):

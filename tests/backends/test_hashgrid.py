@@ -265,20 +265,6 @@ def test_a_scene_of_another_size_is_the_same_scene() -> None:
     torch.testing.assert_close(opacity[0], opacity[1], atol=2e-3, rtol=1e-2)
 
 
-def test_a_state_without_densities_is_taken_and_samples_as_it_did(field: HashGridField) -> None:
-    """Maps were stored when the occupancy grid was the sampler itself and observed no densities."""
-    stored = {
-        name.replace("occupancy.", "sampler."): value
-        for name, value in field.state_dict().items()
-        if not name.endswith("density")
-    }
-    loaded = copy.deepcopy(field)
-    loaded.load_state_dict(field.upgraded_state(stored))
-    assert loaded.sampler is loaded.occupancy
-    samples, before = loaded.sampler(random_rays()), field.occupancy(random_rays())
-    assert torch.equal(samples.starts, before.starts)
-
-
 def test_a_ray_has_no_more_samples_than_the_limit_once_density_was_observed(field: HashGridField) -> None:
     """The intervals of rays that cross few occupied cells stay what they are; those of others keep their total length."""
     limited = backend.build(replace(field.config, samples_per_ray=12), BOUNDS)

@@ -196,13 +196,11 @@ def test_several_cameras_are_refused(arguments: dict[str, Any]) -> None:
     ("arguments", "value", "expected"),
     [
         *(({"focal": x}, f"fx is {x}", "positive") for x in (0.0, -3.0, math.nan)),
-        *(
-            ({"focal": x}, f"focal length is {x} px", "1000 times its longer side")
-            for x in (math.inf, 1e300, 1001 * max(SIZE))
-        ),
+        *(({"focal": x}, f"fx is {x}", "at most 1e+09 pixels") for x in (math.inf, 1e300)),
+        ({"focal": 1001 * max(SIZE)}, f"focal length is {1001 * max(SIZE)} px", "1000 times its longer side"),
         *(({"focal": x}, f"fx is {x}", "at least 1e-06 pixels") for x in (1e-9, 1e-308)),
         *(({"hfov": x}, x, "degrees between 0 and 180") for x in (0.0, 180.0, -20.0, math.nan, 360.0)),
-        ({"hfov": 0.0001}, "px for an image of 4032x3024", "1000 times its longer side"),
+        ({"hfov": 0.01}, "px for an image of 4032x3024", "1000 times its longer side"),
     ],
 )
 def test_numbers_that_no_camera_has_are_refused(
