@@ -252,7 +252,6 @@ class Capture:
 
     @property
     def names(self) -> list[str]:
-        """The names of the frames."""
         return [shot.name for shot in self.shots]
 
     @property
@@ -285,9 +284,8 @@ class Capture:
         if name not in self.splits:
             known = ", ".join(self.splits) or "none, since only images with poses are in a split"
             raise InputError(f"no split {name!r}", where=self.path, expected=f"one of {known}")
-        return replace(
-            self, shots=_named([shot for shot in self.shots if name in shot.splits], one_split=True)
-        )
+        own = [shot for shot in self.shots if name in shot.splits]
+        return replace(self, shots=_named(own, one_split=True))
 
     def in_time_order(self) -> Capture:
         """Return all frames in chronological order; if any lacks a time, in natural order of names and without times."""
@@ -449,13 +447,7 @@ def hold_out(
 
 def of_views(views: Sequence[View], path: Path, splits: tuple[str, ...] = SPLITS) -> Capture:
     """Return views in memory as a capture, each of whose ``splits`` has all of them."""
-    return Capture(
-        path,
-        [
-            _ViewShot(view=view, stem=view.frame.name, T_world_camera=view.T_ref_camera, splits=splits)
-            for view in views
-        ],
-    )
+    return Capture(path, [_ViewShot(view=v, stem=v.frame.name, T_world_camera=v.T_ref_camera, splits=splits) for v in views])  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
