@@ -183,7 +183,7 @@ def test_an_evaluation_killed_at_random_moments_equals_one_never_killed(
     tmp_path: Path, evaluate: Evaluate
 ) -> None:
     whole, killed = tmp_path / "whole.jsonl", tmp_path / "killed.jsonl"
-    more = ("--trials", 10, "--size", "0.3")
+    more = ("--trials", 6, "--size", "0.3")
     assert evaluate(*more, out=whole)[0] == 0
     began = time.monotonic()
     assert evaluate(*more, out=tmp_path / "again.jsonl")[0] == 0  # what is imported first is there by now

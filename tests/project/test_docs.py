@@ -258,7 +258,8 @@ def test_the_backend_of_the_documentation_trains_and_localizes(inside: Path) -> 
 class TestFog(BackendContract):
     """The backend of the documentation, as it stands there, keeps the contract."""
 
-    backend = executed(ROOT / "docs" / "extend.md", "backend = Fog()")["backend"]
+    page = executed(ROOT / "docs" / "extend.md", "backend = Fog()")
+    backend, config = page["backend"], page["FogConfig"](cells=16, steps=40)
 
 
 def test_readme_is_short() -> None:

@@ -48,7 +48,18 @@ def test_an_image_is_localized_by_the_method(
 
 
 def test_a_fault_is_evaluated(trained: Path, capture: Path, tmp_path: Path) -> None:
-    words = ["--split", "train", "--protocol", "none", "--method", "landmarks-alone", "--trials", "1"]
+    words = [
+        "--split",
+        "train",
+        "--protocol",
+        "none",
+        "--method",
+        "landmarks-alone",
+        "--trials",
+        "1",
+        "--workers",
+        "1",
+    ]
     out = tmp_path / "results.jsonl"
     faults = ["--fault", "none", "--fault", "stripes:0.3"]
     assert main(["evaluate", str(trained), str(capture), *words, *faults, "--out", str(out)]) == 0
