@@ -57,6 +57,9 @@ from bidnerf_core.localization.terms.sampled import SampledLoss
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 from bidnerf_core.settings import Settings, from_flat
 
+RAYS = 1024
+"""Number of rays on which the pose that a first-order method found is judged."""
+
 
 @dataclass(frozen=True)
 class SharedSettings:
@@ -205,7 +208,7 @@ def descended(
     by_depth = (
         None if depth is None else DepthLossSettings(depth.depth_weight, depth.depth_loss, depth.depth_scale)
     )
-    rays = RayTerms(config.colour, by_depth, False).term(problem, 1024, seed, config.descent.level)
+    rays = RayTerms(config.colour, by_depth, False).term(problem, RAYS, seed, config.descent.level)
     middle = middle_of_view(problem, T if bool(T.matrix().isfinite().all()) else None)
     found = support(lambda T: rays.costs(states_at(T)), T, middle, rays.plain_costs())
     most = config.adam.converged_loss
