@@ -39,8 +39,5 @@ def recipe(field, views, config, report):
 
 bn.register("backends", "fog", RecipeBackend("a grid of coloured fog", FogConfig, Fog, recipe))
 scene = bn.train(data := closed_form_data("demo:object"), "fog", bake=False)
-print(
-    bn.evaluate(
-        scene, data, bn.Plan(protocol="bid", sizes=[0.4], method="bid", config={"max_steps": 100}, trials=1)
-    )
-)
+plan = bn.Plan(protocol="bid", sizes=[0.4], method="bid", config={"max_steps": 100}, trials=1)
+print(bn.evaluate(scene, data, plan))
