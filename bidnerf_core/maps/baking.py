@@ -47,17 +47,13 @@ def bake_surface(
     if not cameras:
         raise _no_cameras(where)
     measured = [view for view in views if view.frame.has_depth]
-    if any(view.frame.has_dense_depth for view in measured):
-        cameras = []
-    else:
+    if not any(view.frame.has_dense_depth for view in measured):
         measured = []  # a few points do not make a surface
-    surface = bake(field, info.bounds, cameras, measured, config)
+    surface = bake(field, info.bounds, [] if measured else cameras, measured, config)
     source = f"{len(measured)} measured" if measured else f"{len(cameras)} rendered"
     log.info(
         f"{where}: surface of {len(surface.surfels)} surfels from {source} views, {time.monotonic() - began:.1f} s"
     )
-    size = f"{surface.stored_cells} cells with a side of {surface.cell:.3g}, {surface.mebibytes:.1f} MiB"
-    log.info(f"{where}: the surface is indexed by {size}")
     return surface
 
 

@@ -159,12 +159,8 @@ def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> li
 
 def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], list[LeftOut]]:
     """Read photos, downscaled to the size of the map's largest image; also return those that cannot be read."""
-    side, frames, unread, background = (
-        longest_side(scene.info),
-        list[Frame](),
-        list[LeftOut](),
-        scene.bounds.background,
-    )
+    side, background = longest_side(scene.info), scene.bounds.background
+    frames, unread = list[Frame](), list[LeftOut]()
     source: Sequence[Frame] | Sequence[View] | Capture
     if not isinstance(photos, str | Path):
         source = photos.split(split) if isinstance(photos, Capture) else photos
@@ -350,7 +346,5 @@ def _present(landmarks: LandmarkMap, more: LandmarkMap) -> Bool[Tensor, "n"]:
 
 def _names_like(name: str, taken: Container[str]) -> list[str]:
     """Return the names taken by photos called ``name``: the name itself, and those that were derived from it."""
-    found = itertools.takewhile(
-        lambda each: each in taken, itertools.chain([name], (f"{name}_{n}" for n in itertools.count(2)))
-    )
-    return list(found)
+    derived = itertools.chain([name], (f"{name}_{n}" for n in itertools.count(2)))
+    return list(itertools.takewhile(lambda each: each in taken, derived))
