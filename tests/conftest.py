@@ -118,12 +118,6 @@ def map_folder(shared: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def quick_trials(monkeypatch: pytest.MonkeyPatch, small_images: None) -> None:
-    """Trials of this process take a tenth of the usual time: small images, and few rays on which a pose is judged."""
-    monkeypatch.setattr("bidnerf_core.localization.methods.RAYS", 64)
-
-
-@pytest.fixture
 def small_images(monkeypatch: pytest.MonkeyPatch) -> None:
     """Closed-form data have images as small as those of the tiny dataset: a thirtieth of the usual pixels."""
     import tiny

@@ -47,7 +47,7 @@ QUICK = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--workers", "1"
 BLOBS = "demo:blobs"
 Evaluate = Callable[..., tuple[int, str]]
 
-pytestmark = pytest.mark.usefixtures("quick_trials")
+pytestmark = pytest.mark.usefixtures("small_images")
 
 
 @pytest.fixture

@@ -56,7 +56,7 @@ QUICK: dict[str, Any] = {
 WORDS = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--size", "0.3", "--workers", "1"]
 BLOBS = "demo:blobs"
 
-pytestmark = pytest.mark.usefixtures("quick_trials")
+pytestmark = pytest.mark.usefixtures("small_images")
 
 
 def quick(**more: Any) -> Plan:

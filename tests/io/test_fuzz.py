@@ -302,7 +302,7 @@ def test_wrong_usage_repeats_no_control_characters(words: list[str], bidnerf: Ru
     assert printable(words[-1])[:4] in err
 
 
-@pytest.mark.usefixtures("quick_trials")
+@pytest.mark.usefixtures("small_images")
 def test_results_and_reports_go_into_odd_names_and_not_into_pipes(bidnerf: Run, tmp_path: Path) -> None:
     """A name could control the terminal, and a pipe in the place of a page could hang the report."""
     out = tmp_path / "\x1b[2Jr.jsonl"

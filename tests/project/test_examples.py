@@ -20,7 +20,7 @@ EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
 QUICK = {"--steps": ["4"], "--descent": ["3"], "--trials": ["2"], "--backends": ["hashgrid", "vanilla"]}
 
 
-@pytest.mark.usefixtures("quick_trials")
+@pytest.mark.usefixtures("small_images")
 @pytest.mark.parametrize("example", EXAMPLES, ids=[path.stem for path in EXAMPLES])
 def test_example_runs(
     example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
