@@ -104,7 +104,11 @@ def _dispatch(given: list[str]) -> int:
         raise UsageError("an argument holds a NUL character", expected="text")
     from bidnerf_core.cli.parser import parse  # imported here for the sake of a quick --version
 
-    parse(given[0], importlib.import_module(f"bidnerf_core.cli.{given[0]}").run, given[1:])
+    if given[0] == "backends":
+        from bidnerf_core.cli.plugins import run_backends as run
+    else:
+        run = importlib.import_module(f"bidnerf_core.cli.{given[0]}").run
+    parse(given[0], run, given[1:])
     return DONE
 
 

@@ -11,11 +11,18 @@ from typing import TYPE_CHECKING, Annotated
 
 from bidnerf_core.cli.folders import check_folder, check_output
 from bidnerf_core.cli.interruptions import uninterrupted
-from bidnerf_core.cli.options import TEST_IMAGES, Json, MapFolder, MethodOptions, Seed, require_one
+from bidnerf_core.cli.options import (
+    TEST_IMAGES,
+    Json,
+    MapFolder,
+    MethodOptions,
+    QueryOptions,
+    Seed,
+    require_one,
+)
 from bidnerf_core.cli.output import print_json, say, show
 from bidnerf_core.cli.parser import FLAG, Option, Without
 from bidnerf_core.cli.progress import displayed
-from bidnerf_core.cli.queries import QueryOptions
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount, enumeration
 
@@ -219,10 +226,9 @@ class Run:
     answers: Answers
     total: int  # queries
     start: Callable[[Query], SE3 | None]
-    not_drawn: int = 0
 
     def show(self, query: Query, answer: Answer | Failure) -> None:
-        """Print an answer and draw it; a picture that cannot be written does not end the run."""
+        """Print an answer and draw it."""
         from bidnerf_core.io import png_bytes, write_file
         from bidnerf_core.maps import MapCollection
         from bidnerf_core.results import Failure, overlay
@@ -236,24 +242,19 @@ class Run:
         if not self.output.json:
             for line in answer_lines(answer, self.start(query), self.total == 1):
                 show(line)
-        if self.output.draw is None:
-            return
-        file, scene = self.output.picture(query.name), self.answers.scene
-        assert scene is not None
-        assert not isinstance(scene, MapCollection)
-        picture = overlay(scene, query.frame, answer.found, self.start(query))
-        try:
-            write_file(file, png_bytes(picture))
-        except OSError as error:
-            self.not_drawn += 1
-            say(f"{file}: not drawn: {error.strerror or error}")
+        if self.output.draw is not None:
+            scene = self.answers.scene
+            assert scene is not None
+            assert not isinstance(scene, MapCollection)
+            picture = overlay(scene, query.frame, answer.found, self.start(query))
+            write_file(self.output.picture(query.name), png_bytes(picture))
 
     @contextlib.contextmanager
     def saved(self) -> Iterator[None]:
         """Write the pose file at the end, and print how many of several queries converged.
 
         A run that is stopped early writes the answers so far. Raises ``InputError`` if a file of accepted poses would be
-        empty, if a query failed, and if a picture is missing.
+        empty, and if a query failed.
         """
         from bidnerf_core.maps import MapCollection
         from bidnerf_core.results import pose_format
@@ -283,8 +284,6 @@ class Run:
                 answers.save(out)
         if failed := len(answers) - len(answers.answers):
             raise InputError(f"{failed} of {total} queries could not be read or localized, see above")
-        if self.not_drawn:
-            raise InputError(f"{amount(self.not_drawn, 'picture')} could not be written, see above")
 
 
 def answer_lines(answer: Answer, start: SE3 | None, full: bool) -> list[str]:

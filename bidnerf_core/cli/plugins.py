@@ -1,4 +1,4 @@
-"""``bidnerf plugins``."""
+"""``bidnerf plugins`` and ``bidnerf backends``."""
 
 from __future__ import annotations
 
@@ -19,10 +19,15 @@ def run(
 ) -> None:
     """List everything registered by name: backends, readers, methods, features, faults, writers, importers and exporters."""
     groups = list(GROUPS) if group is None else [group]
-    print_infos([info for of in groups for info in list_plugins(of)], json, "group", all_kinds=group is None)
+    _print_infos([info for of in groups for info in list_plugins(of)], json, "group", all_kinds=group is None)
 
 
-def print_infos(infos: list[PluginInfo], json: bool, *more: str, all_kinds: bool = False) -> None:
+def run_backends(json: Json = False) -> None:
+    """List the installed kinds of field."""
+    _print_infos(list_plugins("backends"), json)
+
+
+def _print_infos(infos: list[PluginInfo], json: bool, *more: str, all_kinds: bool = False) -> None:
     """Print plugins as a table, with their faults if any, or as a JSON list whose entries also have the keys ``more``."""
     if json:
         keys = (*more, "name", "summary", "distribution", "version", "value", "fault")

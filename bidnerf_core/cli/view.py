@@ -8,11 +8,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from bidnerf_core.cli.folders import check_output
-from bidnerf_core.cli.options import TEST_IMAGES, USUAL_METHOD, Device, Host, MapFolder, Method, Names, Port
+from bidnerf_core.cli.options import (
+    TEST_IMAGES,
+    USUAL_METHOD,
+    Device,
+    Host,
+    MapFolder,
+    Method,
+    Names,
+    Port,
+    QueryOptions,
+)
 from bidnerf_core.cli.output import console, say, show
 from bidnerf_core.cli.parser import Option, Without
 from bidnerf_core.cli.progress import displayed
-from bidnerf_core.cli.queries import QueryOptions
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, spelling_hint
 from bidnerf_core.progress import counter

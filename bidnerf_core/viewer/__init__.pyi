@@ -1,9 +1,9 @@
 from .app import LiveView as LiveView
-from .saving import MapView as MapView
+from .pages import MapView as MapView
+from .pages import page_of as page_of
+from .pages import read_and_localized as read_and_localized
+from .pages import shown_row as shown_row
+from .pages import view as view
 from .server import PORT as PORT
 from .server import serve_view as serve_view
 from .trajectories import shown_trajectory as shown_trajectory
-from .view import page_of as page_of
-from .view import read_and_localized as read_and_localized
-from .view import shown_row as shown_row
-from .view import view as view

@@ -28,18 +28,17 @@ from bidnerf_core.localization import (
 from bidnerf_core.mapping import project
 from bidnerf_core.registry import PluginError
 from bidnerf_core.results import pose_error
-from bidnerf_core.viewer.explanations import (
+from bidnerf_core.viewer.evidence import (
     APART,
     HERE,
     TURNED_DEG,
+    acceptance_figures,
     contests,
     earlier,
     last_answer,
     probable_poses,
 )
-from bidnerf_core.viewer.figures import acceptance_figures
-from bidnerf_core.viewer.packing import Json, drawing, packed, photograph
-from bidnerf_core.viewer.rendering import quick_image
+from bidnerf_core.viewer.pictures import Json, drawing, packed, photograph, quick_image
 from bidnerf_core.viewer.scene import frustum, rows_of
 
 MOST_MATCHES, MOST_STEPS = 600, 200

@@ -15,8 +15,15 @@ from bidnerf_core.devices import moved
 from bidnerf_core.fields import SplatField
 from bidnerf_core.geometry import SE3, symbol
 from bidnerf_core.maps import Map
-from bidnerf_core.viewer.packing import Json, jpeg, packed, packed_colours, packed_points, photograph
-from bidnerf_core.viewer.rendering import quick_image
+from bidnerf_core.viewer.pictures import (
+    Json,
+    jpeg,
+    packed,
+    packed_colours,
+    packed_points,
+    photograph,
+    quick_image,
+)
 
 MOST_SURFELS, MOST_LANDMARKS = 120_000, 20_000
 """Maximum numbers of points in a page; larger sets are subsampled at random."""

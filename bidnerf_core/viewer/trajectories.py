@@ -16,7 +16,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3, LengthUnit, pose_from_matrix
 from bidnerf_core.io import read_file
 from bidnerf_core.results import pose_entries, standard_deviations
-from bidnerf_core.viewer.packing import Json, packed
+from bidnerf_core.viewer.pictures import Json, packed
 
 log = logging.getLogger("bidnerf")
 

@@ -38,13 +38,10 @@ from bidnerf_core.viewer import shown_trajectory
 
 # Inside: what a page states of one answer is read from its parts, without a browser
 from bidnerf_core.viewer.answer import MOST_STEPS, depth_difference, ellipsoid, shown_answer
-from bidnerf_core.viewer.explanations import EARLIER, HERE, contests
-from bidnerf_core.viewer.figures import MEASURES, acceptance_figures, bar
-from bidnerf_core.viewer.packing import packed_points
-from bidnerf_core.viewer.rendering import field_image, quick_image
-from bidnerf_core.viewer.saving import MODULES, MapView
+from bidnerf_core.viewer.evidence import EARLIER, HERE, MEASURES, acceptance_figures, bar, contests
+from bidnerf_core.viewer.pages import MODULES, MapView, localized
+from bidnerf_core.viewer.pictures import field_image, packed_points, quick_image
 from bidnerf_core.viewer.scene import shown_map, towards
-from bidnerf_core.viewer.view import localized
 from commands import Run, assert_refused
 
 

@@ -28,7 +28,7 @@ from bidnerf_core.viewer import page_of, shown_trajectory
 
 # Inside: an answer whose descent is given, and the page as a saved file
 from bidnerf_core.viewer.answer import shown_answer
-from bidnerf_core.viewer.view import localized
+from bidnerf_core.viewer.pages import localized
 from viewer_client import serving
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
