@@ -20,8 +20,15 @@ from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
 
 # Inside: the size of cells and the noise of depth are compared with those of the scene
-from bidnerf_core.mapping.surface.cell_size import chosen_grid, depth_noise, footprint, spacing, surface_bytes
-from bidnerf_core.mapping.surface.posed_depth import PosedDepthImage, measured_image
+from bidnerf_core.mapping.surface.posed_depth import (
+    PosedDepthImage,
+    chosen_grid,
+    depth_noise,
+    footprint,
+    measured_image,
+    spacing,
+    surface_bytes,
+)
 from bidnerf_core.progress import job_context
 from bidnerf_core.scenes import Box, HomogeneousBall, Sphere, blotches, orbit
 

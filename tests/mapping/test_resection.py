@@ -23,7 +23,7 @@ from bidnerf_core.mapping import (
 )
 
 # Inside: the size of the batches, on which nothing may depend
-from bidnerf_core.mapping.resection.resection import BATCH
+from bidnerf_core.mapping.resection.reprojection import BATCH
 
 TRUE = SE3.exp(torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0.3], dtype=torch.float64))
 OFF = torch.full((6,), 0.03, dtype=torch.float64)

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import STILL, MotionPrior, poses_of_rows
 from bidnerf_core.geometry import SE3, cauchy_loss, inlier_weight
-from bidnerf_core.mapping.geometry.observations import Sightings, summed
+from bidnerf_core.mapping.geometry.triangulation import Sightings, summed
 from bidnerf_core.mapping.resection.states import by_camera_point, by_update, pinhole
 
 SMALL_DECREASE = 1e-4

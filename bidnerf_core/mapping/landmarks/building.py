@@ -15,11 +15,24 @@ from torch import Tensor
 from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.frames import SeenLandmarks, View
 from bidnerf_core.geometry import SE3, chi_squared_quantile, inlier_weight
-from bidnerf_core.mapping.geometry.observations import Sightings, summed
-from bidnerf_core.mapping.geometry.triangulation import fitting, intersected, noise, parallax, refined_points
-from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES, Features, FoundOnce, Sift, find_features
-from bidnerf_core.mapping.landmarks.image_keypoints import ImageKeypoints, image_keypoints
-from bidnerf_core.mapping.landmarks.keypoint_depth import keypoint_depth_noise, placed
+from bidnerf_core.mapping.geometry.triangulation import (
+    Sightings,
+    fitting,
+    intersected,
+    noise,
+    parallax,
+    refined_points,
+    summed,
+)
+from bidnerf_core.mapping.landmarks.features import (
+    USUAL_FEATURES,
+    Features,
+    FoundOnce,
+    ImageKeypoints,
+    Sift,
+    find_features,
+    image_keypoints,
+)
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, concatenated
 from bidnerf_core.mapping.landmarks.tracks import (
     Matches,
@@ -27,10 +40,12 @@ from bidnerf_core.mapping.landmarks.tracks import (
     epipolar_matches,
     fused_landmarks,
     joined_tracks,
+    keypoint_depth_noise,
     likely_pairs,
+    placed,
     seen_landmarks,
 )
-from bidnerf_core.mapping.resection.resection import resections
+from bidnerf_core.mapping.resection.reprojection import resections
 from bidnerf_core.progress import counter
 from bidnerf_core.registry import PluginError
 from bidnerf_core.settings import Above, Range, Settings

@@ -18,8 +18,16 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields import RadianceField, SceneBounds, VoxelGrid, device_of, render, render_image
 from bidnerf_core.frames import Frame, View, draw, uniform
 from bidnerf_core.geometry import SE3
-from bidnerf_core.mapping.surface.cell_size import chosen_grid, comparison_noise, finest_cell, spacing
-from bidnerf_core.mapping.surface.posed_depth import WITNESSES, agreed, measured_image, rendered_image
+from bidnerf_core.mapping.surface.posed_depth import (
+    WITNESSES,
+    agreed,
+    chosen_grid,
+    comparison_noise,
+    finest_cell,
+    measured_image,
+    rendered_image,
+    spacing,
+)
 from bidnerf_core.mapping.surface.surface_map import SurfaceMap, fused_surfels, merged
 from bidnerf_core.mapping.surface.surfel_index import MOST_CELLS, SurfelIndex
 from bidnerf_core.progress import counter
