@@ -257,26 +257,21 @@ def _described(structure: Structure, features: str, origin: Origin) -> tuple[Rea
 
 def _report_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
     """Log how large the scene is, and warn if its lengths are hardly in metres."""
-    if found.points is None or not len(found.points):
-        size = found.bounds.size
-    else:
+    size: Sequence[float] = found.bounds.size
+    if found.points is not None and len(found.points):
         lower, upper = robust_box(found.points, margin=0.0)
-        a, b, c = (upper - lower).tolist()
-        size = (a, b, c)
+        size = (upper - lower).tolist()
     extent = " x ".join(f"{side:.3g}" for side in size)
     log.info(
         f"{where}: extent {extent}"
         + (" metres" if unit == "metres" else "; its unit is not stored (--scale gives its length in metres)")
     )
     # The longest side of a plausible scene is between 5 cm and 500 m; other lengths are probably in another unit.
-    doubt = ""
+    doubt = "tiny in metres; are its lengths kilometres or an arbitrary unit?"
     if max(size) > 500:
         doubt = "very large in metres; are its lengths millimetres?"
-    elif not max(size) >= 0.05:
-        doubt = "tiny in metres; are its lengths kilometres or an arbitrary unit?"
-    if doubt:
-        text = f"{where}: {extent} would be {doubt} --scale changes them"
-        warnings.warn(text, InputWarning, stacklevel=3)
+    if not 0.05 <= max(size) <= 500:
+        warnings.warn(f"{where}: {extent} would be {doubt} --scale changes them", InputWarning, stacklevel=3)
 
 
 @torch.no_grad()

@@ -214,13 +214,6 @@ def test_errors_within_their_bound_are_as_frequent_as_the_covariance_says() -> N
     assert not bool(within(T, T, torch.zeros(6, 6).double()))
 
 
-def test_what_a_notebook_prints_is_one_line() -> None:
-    frame = Frame("a", torch.zeros((3, 4, 3)), CAMERA, torch.ones((3, 4)))
-    assert repr(frame) == "<Frame a: 4x3, colour, depth, focal length 4 px>"
-    assert repr(FOUND).startswith("<Localization ambiguous at (")
-    assert repr(FOUND).endswith("two places fit>")
-
-
 # Several queries.
 
 
