@@ -77,7 +77,11 @@ def _listed(counts: dict[str, int]) -> str:
 def colours_of(rows: NDArray, *names: tuple[str, str, str]) -> NDArray[np.float32] | None:
     """Return the colours (n, 3) in [0, 1] of points with any of ``names``; None if they have none."""
     found = next((three for three in names if set(three) <= set(rows.dtype.names or ())), None)
-    return None if found is None else in_unit_range(np.stack([rows[name] for name in found], axis=-1))
+    if found is None:
+        return None
+    rgb = np.stack([rows[name] for name in found], axis=-1)
+    # The type states the range, however dark the colours are.
+    return rgb.astype(np.float32) / np.float32(65535) if rgb.dtype == np.uint16 else in_unit_range(rgb)
 
 
 def in_unit_range(rgb: NDArray) -> NDArray[np.float32]:

@@ -160,6 +160,22 @@ def test_clouds(tmp_path: Path) -> None:
     assert not read_scan(tmp_path / "bare.ply").has_colours
 
 
+def test_dark_colours_of_16_bits_stay_dark(tmp_path: Path) -> None:
+    names = [f"float {axis}" for axis in "xyz"] + [f"ushort {colour}" for colour in ("red", "green", "blue")]
+    head = [
+        "ply",
+        "format ascii 1.0",
+        "element vertex 3",
+        *(f"property {name}" for name in names),
+        "end_header",
+    ]
+    rows = ["0 0 0 255 128 0", "1 0 0 0 0 0", "0 1 0 0 0 0"]
+    (tmp_path / "dark.ply").write_text("\n".join([*head, *rows, ""]))
+    rgb = read_scan(tmp_path / "dark.ply").rgb
+    assert rgb is not None
+    assert np.allclose(rgb, np.array([[255, 128, 0], [0, 0, 0], [0, 0, 0]]) / 65535, atol=1e-7)
+
+
 def test_surveyors_formats(tmp_path: Path) -> None:
     points = np.array(
         [[500000.25, 4200000.5, 100.125], [500001.0, 4200002.0, 101.0], [500003.0, 4200001.0, 99.0]]
