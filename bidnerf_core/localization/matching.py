@@ -47,7 +47,7 @@ class LandmarkMatcher:
 
     Above some thousand landmarks, it uses an inverted file: k-means divides the landmarks into sqrt(n) cells (more in large
     maps), and only the cells nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). Threads may share
-    a matcher.
+    a matcher. It also prepares ``LandmarkMap.cells`` for guided matching.
 
     Descriptors are compared on the device of those of ``landmarks``; all other computations with landmarks run on the CPU. On an
     accelerator the search is always exhaustive.
@@ -55,6 +55,7 @@ class LandmarkMatcher:
 
     def __init__(self, landmarks: LandmarkMap, seed: int = 0) -> None:
         self.landmarks = landmarks.to("cpu")
+        _ = self.landmarks.cells
         self._descriptors = landmarks.descriptors
         self._index: _Products | _Cells | None = None  # None: all are compared
         self._found_once: FoundOnce | None = None

@@ -25,6 +25,7 @@ from bidnerf_core.mapping import (
 
 # Inside: triangulation, tracks and cells, each against an exhaustive computation
 from bidnerf_core.mapping.geometry.triangulation import intersected, parallax, refined_points
+from bidnerf_core.mapping.landmarks.landmark_cells import MOST_IN_CELL, LandmarkCells
 from bidnerf_core.mapping.landmarks.tracks import Matches, _mean_descriptors, joined_tracks
 from bidnerf_core.progress import Progress, job_context
 from landmark_scene import PINHOLE, Points, looking_in, ring
@@ -281,3 +282,26 @@ def shown(
         & (sizes >= SIZE * local[:, 2])
         & (angle <= cones + OBLIQUE)
     )
+
+
+@pytest.mark.parametrize("count", [1, MOST_IN_CELL + 1, 20_000])
+def test_no_landmark_in_the_image_is_left_out(count: int) -> None:
+    landmarks, slopes = some(count), torch.tensor([0.7, 0.5])
+    cells, looked_at = LandmarkCells.of(*landmarks), 0
+    for number in range(40):
+        T = poses(40)[number]
+        found = cells.seen_from(T, slopes, OBLIQUE, SIZE)
+        assert len(found.unique()) == len(found)
+        assert not torch.isin(shown(T, slopes, *landmarks).nonzero()[:, 0], found, invert=True).any()
+        looked_at += len(found)
+    assert looked_at < 0.25 * 40 * count or count < 20_000  # a few cells are hardly smaller than the scene
+
+
+def test_each_landmark_is_in_one_cell_which_holds_it() -> None:
+    positions, *others = some(5000)
+    cells = LandmarkCells.of(positions, *others)
+    assert torch.equal(cells.order.sort().values, torch.arange(5000))
+    assert int(cells.counts.max()) <= MOST_IN_CELL
+    cell = torch.arange(len(cells.counts)).repeat_interleave(cells.counts)
+    apart = (positions[cells.order] - cells.centres[cell]).norm(dim=-1)
+    assert bool((apart <= cells.radii[cell] + 1e-4).all())
