@@ -36,6 +36,7 @@ from .methods import matches_landmarks as matches_landmarks
 from .methods import require_start as require_start
 from .methods import require_use_of_depth as require_use_of_depth
 from .methods import settings_of as settings_of
+from .picture import picture_at as picture_at
 from .pivots import Pivot as Pivot
 from .pivots import pivot as pivot
 from .posterior import Posterior as Posterior

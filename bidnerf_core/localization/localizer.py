@@ -27,6 +27,7 @@ from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.io import LARGEST_INTEGER
 from bidnerf_core.localization.matching import LandmarkMatcher
 from bidnerf_core.localization.methods import USUAL_METHOD, find_method, require_use_of_depth, settings_of
+from bidnerf_core.localization.picture import shown_in
 from bidnerf_core.localization.problem import (
     Problem,
     SceneMap,
@@ -113,7 +114,8 @@ class Localizer:
         origin = origin_of(self.scene)
         near = None if start is None else start_pose(start).translated(-origin)
         problem = self.problem(query, near, depth_rays)
-        return self.solved(problem, seed).translated(origin)
+        found = replace(self.solved(problem, seed), shown=shown_in(self.scene, problem.views[-1].frame))
+        return found.translated(origin)
 
     def many(
         self,

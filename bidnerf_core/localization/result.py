@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import html
 import json
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -83,6 +85,16 @@ class Localization:
     diagnostics: Any = None  # the measures by which the pose was accepted or rejected, a dataclass of numbers
     intrinsics: Intrinsics | None = None  # of the last image, if other than the given ones were used
     unit: LengthUnit = "units"  # of the position and its covariance: that of the map
+    shown: Callable[[Localization], str] | None = None  # returns the picture for a notebook; not stored
+
+    def _repr_html_(self) -> str:
+        """The answer in a notebook: the photo, the map at the pose found, and both blended, above a line of text."""
+        picture = "" if self.shown is None else self.shown(self)
+        return f"{picture}<div>{html.escape(repr(self))}</div>"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the map, which other processes have no need of."""
+        return self.__dict__ | {"shown": None}
 
     def __repr__(self) -> str:
         """A one-line description, without the steps and the covariance."""

@@ -72,7 +72,9 @@ class Answer:
         Only the final pose is kept: intermediate ones take up a lot of memory in long sequences.
         """
         intrinsics = found.frame_as_taken(frame).intrinsics
-        return Answer(frame.name, number, intrinsics, replace(found, poses=found.poses[-1:]), **about)
+        return Answer(
+            frame.name, number, intrinsics, replace(found, poses=found.poses[-1:], shown=None), **about
+        )
 
     @property
     def accepted(self) -> bool:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import functools
+import html
 import math
+import pickle
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -78,6 +82,32 @@ def test_several_views_give_the_pose_of_the_last() -> None:
 )
 def test_a_start_of_any_kind_is_the_same_start(start: Any) -> None:
     torch.testing.assert_close(poses(FRAME, start=start)[0], START.matrix(), rtol=0, atol=1e-6)
+
+
+def test_an_answer_shows_the_photo_beside_the_map_in_a_notebook() -> None:
+    """The picture is that of the pose: it holds the rendering there, small, and needs neither the file nor the frame."""
+    found = localizer()(FRAME, START)
+    text = found._repr_html_()
+    png = base64.b64decode(re.search(r"data:image/png;base64,([^\"]+)", text)[1])  # type: ignore[index]
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].copy()
+    photo, rendered, both = torch.from_numpy(picture).float().chunk(3, dim=1)
+    small = FRAME.at_most(photo.shape[1])
+    torch.testing.assert_close(photo / 255, small.rgb, rtol=0, atol=0.01)
+    torch.testing.assert_close(both, (photo + rendered) / 2, rtol=0, atol=1.1)
+    assert html.escape(repr(found)) in text
+    assert (
+        localizer()
+        .solved(localizer().problem(FRAME, START))
+        ._repr_html_()
+        .startswith("<div>&lt;Localization")
+    )
+
+
+def test_an_answer_is_sent_to_another_process_without_its_map() -> None:
+    found = localizer()(FRAME, START)
+    again = pickle.loads(pickle.dumps(found))
+    assert again.plain() == found.plain()
+    assert again.shown is None
 
 
 def test_a_localizer_opens_a_folder_and_names_its_map_in_one_line(tmp_path: Path) -> None:

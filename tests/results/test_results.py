@@ -161,7 +161,7 @@ FOUND = Localization(
 @given(
     found=record(
         Localization, T_world_camera=drawn.poses(), outcome=st.sampled_from(Outcome), poses=st.just(FOUND.poses),
-        losses=st.just(FOUND.losses), loss=st.floats(), focal_factor=st.floats(), diagnostics=st.none(),
+        losses=st.just(FOUND.losses), loss=st.floats(), focal_factor=st.floats(), diagnostics=st.none(), shown=st.none(),
         covariance=st.none() | st.floats(0.01, 1).map(lambda x: x * torch.eye(6).double()),
     )
 )  # fmt: skip
