@@ -17,7 +17,7 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import has_field, render_image
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import SceneMap, surface_renderer
+from bidnerf_core.localization import SceneMap, picture_at, surface_renderer
 from bidnerf_core.results import as_picture
 
 JPEG_QUALITY = 85
@@ -85,14 +85,7 @@ def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Flo
     beyond = bounds.far if bounds.contracted else math.hypot(*bounds.size) / 2
     bounds = replace(bounds, far=max(bounds.far, distance + beyond))
     if not has_field(scene.field):
-        image = torch.ones((camera.height, camera.width, 3))
-        if scene.landmarks is not None:
-            points = scene.landmarks.positions.cpu().double()
-            rows, columns, inside = camera.cells(
-                T_world_camera.to("cpu", torch.float64).inverse().apply(points)
-            )
-            image[rows[inside], columns[inside]] = torch.tensor((0.0, 0.75, 0.43))  # green dots
-        return image
+        return picture_at(scene, camera, T_world_camera)
     # After each 4,096 pixels, it is checked whether the rendering is still wanted, see ``job_context``.
     return render_image(scene.field, camera, T_world_camera, bounds, 4096).rgb
 
