@@ -84,7 +84,7 @@ def bake(
     """Bake the surface on which measured depth of ``views`` and depth rendered from ``cameras`` (T_world_camera) agree.
 
     Points confirmed by several of these images are fused into surfels and indexed by a grid whose cells are as fine as the
-    images and their noise allow (see ``cell_size``). Measured depth is more accurate than a field trained on it, so render
+    images and their noise allow (see ``finest_cell``). Measured depth is more accurate than a field trained on it, so render
     depth only where none was measured. Raises ``InputError`` if there are no images, or no points on which they agree.
     """
     total = len(views) + len(cameras)
