@@ -6,4 +6,4 @@ from bidnerf_gaussians import GaussiansConfig
 
 class TestGaussians(BackendContract):
     name = "gaussians"
-    config = GaussiansConfig(gaussians=600, steps=40, rays_per_step=512, relocate_every=15, degree=1)
+    config = GaussiansConfig(gaussians=400, steps=40, rays_per_step=256, relocate_every=15, degree=1)

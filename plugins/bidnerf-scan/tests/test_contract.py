@@ -6,4 +6,4 @@ from bidnerf_scan import ScanConfig
 
 class TestScan(BackendContract):
     name = "scan"
-    config = ScanConfig(pieces=600, steps=40, rays_per_step=512)
+    config = ScanConfig(pieces=400, steps=40, rays_per_step=256)
