@@ -1,4 +1,4 @@
-"""The command line ``bidnerf COMMAND ...``, with one module per command."""
+"""The command line ``bidnerf COMMAND ...``, with a module for each command or a few small ones."""
 
 from __future__ import annotations
 
@@ -37,6 +37,13 @@ COMMANDS = {
     "report": "make one page of tables, figures and tests from an evaluation",
 }
 
+FUNCTIONS = {
+    "backends": ("plugins", "run_backends"),
+    "info": ("maps", "info"),
+    "export": ("maps", "export"),
+    "scale": ("maps", "scale"),
+}
+"""The module and the function of a command, where these are not its own module and ``run``."""
 DONE, BAD_INPUT, WRONG_USAGE, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
 """Exit statuses; the last two are 128 plus the number of the signal, as is customary for shells. For SIGTERM and SIGHUP the
 status is 143 and 129."""
@@ -104,11 +111,8 @@ def _dispatch(given: list[str]) -> int:
         raise UsageError("an argument holds a NUL character", expected="text")
     from bidnerf_core.cli.parser import parse  # imported here for the sake of a quick --version
 
-    if given[0] == "backends":
-        from bidnerf_core.cli.plugins import run_backends as run
-    else:
-        run = importlib.import_module(f"bidnerf_core.cli.{given[0]}").run
-    parse(given[0], run, given[1:])
+    module, function = FUNCTIONS.get(given[0], (given[0], "run"))
+    parse(given[0], getattr(importlib.import_module(f"bidnerf_core.cli.{module}"), function), given[1:])
     return DONE
 
 

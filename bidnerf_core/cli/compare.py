@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Annotated
 
 from bidnerf_core.cli.evaluate import TrialOptions
-from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import TEST_IMAGES, Json, MethodOptions
-from bidnerf_core.cli.output import print_json, say, show
+from bidnerf_core.cli.output import check_folder, print_json, say, show
 from bidnerf_core.cli.parser import Flag, Option, Without
 from bidnerf_core.cli.progress import displayed
 from bidnerf_core.datasets import DatasetOptions

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from bidnerf_core.cli.folders import require_outside_maps
 from bidnerf_core.cli.options import TEST_IMAGES, Device, MethodOptions, Names, wrong_usage
-from bidnerf_core.cli.output import show
+from bidnerf_core.cli.output import require_outside_maps, show
 from bidnerf_core.cli.parser import Option, Without
 from bidnerf_core.cli.progress import working
 from bidnerf_core.datasets import DatasetOptions

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import MapOptions, wrong_usage
+from bidnerf_core.cli.output import check_folder
 from bidnerf_core.cli.parser import Option, Settings, Without
 from bidnerf_core.cli.progress import working
 from bidnerf_core.datasets import DatasetOptions

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from bidnerf_core.cli.folders import check_folder, check_output
 from bidnerf_core.cli.interruptions import uninterrupted
 from bidnerf_core.cli.options import (
     TEST_IMAGES,
@@ -20,7 +19,7 @@ from bidnerf_core.cli.options import (
     Seed,
     require_one,
 )
-from bidnerf_core.cli.output import print_json, say, show
+from bidnerf_core.cli.output import check_folder, check_output, print_json, say, show
 from bidnerf_core.cli.parser import FLAG, Option, Without
 from bidnerf_core.cli.progress import displayed
 from bidnerf_core.datasets import DatasetOptions

@@ -1,15 +1,18 @@
-"""Output of commands: progress and remarks on stderr, results on stdout."""
+"""Output of commands: progress and remarks on stderr, results on stdout, and the files and folders that they write."""
 
 from __future__ import annotations
 
 import json
+import os
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from bidnerf_core.errors import printable
+from bidnerf_core.errors import InputError, UsageError, printable
 
 
 class _Progress(Console):
@@ -51,3 +54,69 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], wide: str
     with screen.capture() as drawn:  # written below, since rich handles a closed pipe in its own way
         screen.print(table)
     sys.stdout.write(drawn.get())
+
+
+# Files and folders are checked before any work, and never replace an input.
+
+
+def check_output(out: Path, inputs: Iterable[Path | str | None]) -> None:
+    """Raise, before any work is done, if the file ``out`` cannot be written or would replace an input.
+
+    Inputs are the files of any map, the ``inputs``, and files in folders among them. Raises ``UsageError``
+    for these, and ``InputError`` for a folder, and for a name in a folder that does not exist.
+    """
+    # os.path functions return False for a name that is too long, which is reported when it is written.
+    if os.path.isdir(out) or not os.path.isdir(out.parent):
+        what = "is a folder" if os.path.isdir(out) else f"no folder {out.parent}"
+        raise InputError(what, where=out, expected="a file in an existing folder")
+    require_outside_maps(out.parent, out)
+    _require_writable(out.parent, out)
+    if not os.path.exists(out):
+        return
+    for given in [Path(each) for each in inputs if each is not None]:
+        if given.exists() and out.samefile(given):
+            raise UsageError("is an input of this command", where=out, expected="another name for its output")
+        if given.is_dir() and out.resolve().is_relative_to(given.resolve()):
+            raise UsageError(
+                f"is a file in the input {given};", where=out, expected="a new name, or remove the file first"
+            )
+
+
+def check_folder(
+    out: Path, inputs: Iterable[Path | str | None], may_be_map: bool = False, create: bool = False
+) -> None:
+    """Raise ``UsageError`` if an output folder lies inside a map, is one of the inputs, or is a map.
+
+    With ``create``, the folder is created; raises ``InputError`` if it or files in it cannot be.
+    """
+    require_outside_maps(out.parent, out)
+    if not may_be_map:
+        require_outside_maps(out, out)
+    for given in [Path(each) for each in inputs if each is not None]:
+        if out.exists() and given.exists() and out.samefile(given):
+            raise UsageError(
+                "is an input of this command", where=out, expected="another folder for its output"
+            )
+    if create:
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(error.strerror, where=out, expected="a folder that can be created") from error
+        _require_writable(out, out)
+
+
+def require_outside_maps(folder: Path, out: Path) -> None:
+    """Raise ``UsageError`` if ``folder``, which is the output ``out`` or would hold it, is a map."""
+    from bidnerf_core.maps import DESCRIPTION
+
+    if (folder / DESCRIPTION).exists():
+        found = "exists already, as a map" if folder == out else "lies in the folder of a map"
+        raise UsageError(found, where=out, expected="a name outside of it")
+
+
+def _require_writable(folder: Path, out: Path) -> None:
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        reason = f"cannot be written: {error.strerror}"
+        raise InputError(reason, where=out, expected="a folder in which files can be created") from error

@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import Json
-from bidnerf_core.cli.output import print_json
+from bidnerf_core.cli.output import check_folder, print_json
 from bidnerf_core.cli.parser import Flag, Option
 from bidnerf_core.cli.progress import working
 

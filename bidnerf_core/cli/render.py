@@ -8,9 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import TEST_IMAGES, MapFolder, Names
-from bidnerf_core.cli.output import say, show
+from bidnerf_core.cli.output import check_folder, say, show
 from bidnerf_core.cli.parser import Flag, Option, Without
 from bidnerf_core.cli.progress import displayed
 from bidnerf_core.datasets import DatasetOptions

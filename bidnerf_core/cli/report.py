@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import quote
 
-from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import Names, wrong_usage
-from bidnerf_core.cli.output import console, show
+from bidnerf_core.cli.output import check_folder, console, show
 from bidnerf_core.cli.parser import Option
 from bidnerf_core.errors import InputError, UsageError
 

@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from bidnerf_core import localization  # its parts are loaded when they are used
-from bidnerf_core.cli.folders import check_output
 from bidnerf_core.cli.interruptions import uninterrupted
 from bidnerf_core.cli.options import USUAL_METHOD, CameraOptions, MapFolder
-from bidnerf_core.cli.output import print_json, print_table, say
+from bidnerf_core.cli.output import check_output, print_json, print_table, say
 from bidnerf_core.cli.parser import Flag, Option, Settings, Without
 from bidnerf_core.cli.progress import displayed
 from bidnerf_core.datasets import DatasetOptions

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import (
     DEFAULT_BACKEND,
     USUAL_FEATURES,
@@ -15,6 +14,7 @@ from bidnerf_core.cli.options import (
     PointChoice,
     wrong_usage,
 )
+from bidnerf_core.cli.output import check_folder
 from bidnerf_core.cli.parser import Flag, Option, Settings
 from bidnerf_core.cli.progress import working
 from bidnerf_core.datasets import DatasetOptions

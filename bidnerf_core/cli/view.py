@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from bidnerf_core.cli.folders import check_output
 from bidnerf_core.cli.options import (
     TEST_IMAGES,
     USUAL_METHOD,
@@ -19,7 +18,7 @@ from bidnerf_core.cli.options import (
     Port,
     QueryOptions,
 )
-from bidnerf_core.cli.output import console, say, show
+from bidnerf_core.cli.output import check_output, console, say, show
 from bidnerf_core.cli.parser import Option, Without
 from bidnerf_core.cli.progress import displayed
 from bidnerf_core.datasets import DatasetOptions

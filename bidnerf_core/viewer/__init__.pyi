@@ -4,6 +4,6 @@ from .pages import page_of as page_of
 from .pages import read_and_localized as read_and_localized
 from .pages import shown_row as shown_row
 from .pages import view as view
+from .scene import shown_trajectory as shown_trajectory
 from .server import PORT as PORT
 from .server import serve_view as serve_view
-from .trajectories import shown_trajectory as shown_trajectory

@@ -25,8 +25,7 @@ from bidnerf_core.maps import Map
 from bidnerf_core.results import BAD_INPUT
 from bidnerf_core.viewer.answer import no_answer, shown_answer
 from bidnerf_core.viewer.pictures import Json
-from bidnerf_core.viewer.scene import shown_map
-from bidnerf_core.viewer.trajectories import shown_trajectory
+from bidnerf_core.viewer.scene import shown_map, shown_trajectory
 
 MODULES = ("data", "space", "compare", "panel", "table", "track", "live", "main")
 """The modules of the page, each after those that it imports. They share one scope, so their names must differ."""

@@ -1,18 +1,72 @@
-"""``bidnerf scale``."""
+"""``bidnerf info``, ``export`` and ``scale``: what is done with a map alone."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated
 
-from bidnerf_core.cli.folders import check_folder
-from bidnerf_core.cli.options import MapFolder, require_one
-from bidnerf_core.cli.output import say, show
-from bidnerf_core.cli.parser import Option
-from bidnerf_core.errors import UsageError
+from bidnerf_core.cli.options import Json, MapFolder, require_one
+from bidnerf_core.cli.output import check_folder, check_output, print_json, say, show
+from bidnerf_core.cli.parser import Flag, Option
+from bidnerf_core.errors import InputError, UsageError
 
 
-def run(
+def info(
+    map: MapFolder,
+    json: Json = False,
+    draw: Annotated[
+        Path | None, Option("PNG", "file for a picture of the capture from above", "no picture")
+    ] = None,
+) -> None:
+    """Describe a map and the photos it was built from. The whole map is loaded, so that damage is detected."""
+    from bidnerf_core.maps import load_map
+    from bidnerf_core.results import draw_capture
+
+    if draw is not None:
+        if draw.suffix.lower() != ".png":
+            raise InputError(where=draw, expected="the name of a PNG file")
+        check_output(draw, ())
+    scene = load_map(map)
+    summary = scene.describe()
+    if draw is not None:
+        if scene.capture is None:
+            raise InputError(
+                "has no record of its photos to draw; 'bidnerf bake MAP --data DATA' creates one", where=map
+            )
+        seen_by = None if scene.landmarks is None else scene.landmarks.views
+        points = None if scene.landmarks is None else scene.landmarks.positions
+        draw_capture(scene.capture, points, seen_by, draw, scene.unit)
+        say(f"{draw}: written")
+    if json:
+        print_json(summary.plain())
+        return
+    for line in str(summary).splitlines():
+        show(line)
+
+
+def export(
+    map: MapFolder,
+    to: Annotated[
+        str,
+        Option(
+            "FORMAT",
+            "ply: surface, landmarks and cameras as point clouds and meshes; colmap: a text model of cameras and landmarks;"
+            " transforms.json: cameras in nerfstudio's format, with landmarks as sparse points; or another one of"
+            " 'bidnerf plugins exporters'",
+        ),
+    ],
+    out: Annotated[Path, Option("DIR", "folder for the files")],
+    overwrite: Annotated[Flag, Option(None, "write into a non-empty folder")] = False,
+) -> None:
+    """Export the surface, landmarks and cameras of a map for other software, in the map's frame and unit."""
+    from bidnerf_core.results import export_map
+
+    check_folder(out, (map,))
+    for file in export_map(map, out, to, overwrite):
+        show(f"{file}: {file.stat().st_size / 1e6:.2f} MB")
+
+
+def scale(
     map: MapFolder,
     distance: Annotated[
         tuple[str, str, str] | None,
