@@ -264,6 +264,36 @@ class Answers:
             poses = amount(len(accepted), "pose")
             log.info("%s: %s; %d without an accepted pose are left out", path, poses, left_out)
 
+    def to_pandas(self) -> Any:
+        """Return the answers as a table (a pandas ``DataFrame``): a row for each image, in order.
+
+        Its columns are those of ``plain`` that hold one value, the camera's position (``x``, ``y``, ``z``) and its unit quaternion
+        (``qx`` ...), the standard deviations ``sigma_translation`` and ``sigma_rotation_deg``, and, where the truth is known, the
+        errors ``error_translation`` and ``error_rotation_deg``. Raises ``InputError`` if pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise InputError("a table needs pandas (pip install pandas)") from error
+        rows = []
+        for each in self.given:
+            row = {k: v for k, v in self.plain(each).items() if not isinstance(v, list | dict)}
+            rows.append(row)
+            if isinstance(each, Failure):
+                continue
+            T, found = each.found.T_world_camera.to("cpu", torch.float64), each.found
+            row |= zip(("x", "y", "z"), T.translation.tolist(), strict=True)
+            row |= zip(("qx", "qy", "qz", "qw"), T.quaternion("xyzw").tolist(), strict=True)
+            if found.covariance is not None:
+                position, rotation = standard_deviations(found.covariance)
+                row |= {"sigma_translation": position, "sigma_rotation_deg": math.degrees(rotation)}
+            if (off := each.error) is not None:
+                row |= {
+                    "error_translation": float(off.translation),
+                    "error_rotation_deg": float(off.rotation_deg),
+                }
+        return pandas.DataFrame(rows)
+
     @property
     def lost(self) -> list[tuple[int, int]]:
         """The first and the last index of each run of frames without an accepted pose."""
