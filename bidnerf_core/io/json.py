@@ -261,16 +261,14 @@ def _first_error(errors: Sequence[Any], where: str, of: Any) -> InputError:
         return InputError(first["ctx"]["error"], where=": ".join(path))
     if kind == "unexpected_keyword_argument":
         known = [f.name for f in dataclasses.fields(of) if f.init] if len(first["loc"]) == 2 else []
-        return InputError(
-            f"no field {path[-1]!r}{spelling_hint(path[-1], known)}", where=": ".join(path[:-1])
-        )
+        hint = spelling_hint(path[-1], known)
+        expected = f"any of {', '.join(known)}" if known and not hint else None
+        return InputError(f"no field {path[-1]!r}{hint}", where=": ".join(path[:-1]), expected=expected)
     if kind == "missing" and isinstance(first["loc"][-1], str):
         return InputError("missing", where=": ".join(path))
     texts = {e["type"]: e["msg"].removeprefix("Input should be ") for e in errors if e["loc"] == first["loc"]}
-    expected = dict.fromkeys(EXPECTED.get(kind, text) for kind, text in texts.items())
-    return InputError(
-        f"found {_shown(first['input'])}", where=": ".join(path), expected=" or ".join(expected)
-    )
+    kinds = dict.fromkeys(EXPECTED.get(kind, text) for kind, text in texts.items())
+    return InputError(f"found {_shown(first['input'])}", where=": ".join(path), expected=" or ".join(kinds))
 
 
 def parse_yaml(content: bytes, where: str, expected: str) -> Any:

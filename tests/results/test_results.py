@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import logging
 import math
+import sys
 import threading
+import types
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

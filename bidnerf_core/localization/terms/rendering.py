@@ -25,6 +25,8 @@ from bidnerf_core.fields import (
     render_values,
 )
 
+LEAST_WEIGHT = 0.01
+"""Rendering weight of a sample below which its derivatives are neglected: most samples lie in empty space."""
 Derivatives = tuple[Float[Tensor, "r c"], Float[Tensor, "r c 3"], Float[Tensor, "r c 3"]]
 """Channels of r rendered rays, and their gradients by the rays' origins and by their directions."""
 
@@ -51,8 +53,7 @@ def differentiate(
     samples = field.sampler(rays)
     values = query_samples(field, rays, samples)
     rendering = render_values(values, samples, background)
-    # The derivatives of samples of smaller weight are neglected: most lie in empty space.
-    matters = (rendering.weights > 0.01).reshape(-1)
+    matters = (rendering.weights > LEAST_WEIGHT).reshape(-1)
     # Where the host must not wait to count them, all samples are passed on, with those that matter marked.
     index = matters.nonzero()[:, 0] if may_wait(matters.device) else None
 
