@@ -83,7 +83,7 @@ class Lens(ABC):
     @property
     @abstractmethod
     def flat(self) -> Intrinsics:
-        """The pinhole camera of the resampled image before that is turned upright."""
+        """The pinhole camera of the resampled image, before the image is turned upright."""
 
     @property
     def pinhole(self) -> Intrinsics:

@@ -149,7 +149,7 @@ class Protocol:
     fixed: bool = False  # whether it always chooses from all frames of a split
 
     def cases(self, frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
-        """Return the cases for one size. A larger number of trials begins with the same cases."""
+        """Return the cases for one size. More trials append cases, and leave the first ones as they are."""
         if frames < 1:
             raise InputError("nothing to try:", expected="at least one frame")
         if trials > MOST_TRIALS:

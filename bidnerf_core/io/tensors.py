@@ -152,9 +152,8 @@ def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
 
     ``expected`` briefly describes what the file should be. With ``mapped``, tensors stay in the file until they are used, so that
     one of any size is recognised quickly; files in the format of torch before version 1.6, which are not zip archives,
-    cannot be mapped and are read. Raises a one-line ``InputError`` if there is no such file, it is damaged, it would
-    run code, it unpacks to more than its size or, unless ``mapped``, it holds a tensor that does, such as an expanded one
-    (stride 0).
+    cannot be mapped and are read. Raises a one-line ``InputError`` if the file is missing or damaged, or would run code or unpack to
+    more than its own size. Unless ``mapped``, it is refused, too, if a tensor's storage is smaller than its shape (stride 0).
     """
     open_binary(
         path, expected

@@ -358,9 +358,11 @@ class Loop:
             # If less than a tenth of the points lies on the surface, depth is in another unit or of another scene, and is left
             # out. No pose on record with fewer was right, nor would any have been accepted without depth.
             points = replace(points, noise=noise) if float(near) >= 0.1 else None
+        # Only landmarks are matched at another place and in a mirror image.
         if points is not None and found.mode == 0:
             terms.append(points)
             fused.append("depth")
+        if len(terms) > 1:
             best, minima = run_on(self.device, fit, best, terms, given, 5)
             found = self._posterior(minima, landmarks)
         before = found  # rays about one camera's pose must not decide between cameras

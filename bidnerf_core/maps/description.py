@@ -133,7 +133,7 @@ class MapInfo:
 
     @property
     def interruption(self) -> str | None:
-        """A clause about the interrupted training, if it is not complete."""
+        """Where training stopped and how to resume it, as a clause; None if it is complete."""
         if self.complete:
             return None
         if not self.step:

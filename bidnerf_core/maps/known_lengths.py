@@ -126,7 +126,7 @@ def _camera_of(scene: Map, name: str) -> StoredCamera | None:
 
 
 def _no_camera(scene: Map, name: str) -> str:
-    """Return why a map has no camera of a photo, and what else names a place."""
+    """Return the error text for a photo without a camera in the map, with other ways to name a point."""
     names = [camera.name for camera in scene.info.cameras]
     if not names:
         return "it has no cameras; expected coordinates X,Y,Z"

@@ -141,7 +141,7 @@ def check_position_derivatives(field: RadianceField, dtype: torch.dtype) -> None
 def check_direction_derivatives(field: RadianceField, dtype: torch.dtype) -> None:
     """Check the derivative with respect to direction.
 
-    It is that along a random great circle through each direction, since directions are unit vectors.
+    It is taken along a random great circle through each direction, since directions are unit vectors.
     """
     positions, directions = (x.to(dtype) for x in points(COUNT))
     along = points(COUNT, seed=1)[1].to(dtype)

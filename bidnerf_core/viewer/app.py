@@ -318,7 +318,7 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
 
 
 def _index(text: str, count: int, what: str) -> int:
-    """Return a number in a path. Raises ``Refused`` for one that is none of ``count``: no request names a file."""
+    """Parse an index in a URL. Raises ``Refused`` unless it is less than ``count``; a request can name no file."""
     if not re.fullmatch("[0-9]{1,9}", text) or int(text) >= count:
         raise Refused(404, f"no {what} has that number, expected less than {count}")
     return int(text)

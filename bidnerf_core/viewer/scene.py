@@ -136,7 +136,7 @@ def _surface(scene: Map) -> Json | None:
     if scene.surface is None:
         return None
     surfels = scene.surface.surfels
-    some = _some(len(surfels), MOST_SURFELS)  # in random order, so that the first ones show the whole
+    some = _subset(len(surfels), MOST_SURFELS)  # in random order, so that the first ones show the whole
     radius = scene.surface.cell * max(1.0, (len(surfels) / max(len(some), 1)) ** 0.5) / 2
     positions, keyframes = surfels.positions[some].cpu(), scene.surface.keyframes[:, :3, 3].cpu()
     normals = towards(positions, surfels.normals[some].cpu(), keyframes)
@@ -160,7 +160,7 @@ def towards(
 def _landmarks(scene: Map) -> Json | None:
     if scene.landmarks is None:
         return None
-    some = _some(len(scene.landmarks), MOST_LANDMARKS)
+    some = _subset(len(scene.landmarks), MOST_LANDMARKS)
     return _points(scene.landmarks.positions[some], len(scene.landmarks), 0.0)
 
 
@@ -170,14 +170,15 @@ def _splats(scene: Map) -> Json | None:
         return None
     splats = moved(scene.field.splats(), "cpu")
     seen = (splats.opacity >= 0.2).nonzero()[:, 0]
-    some = seen[_some(len(seen), MOST_SURFELS)]
+    some = seen[_subset(len(seen), MOST_SURFELS)]
     return _points(
         splats.positions[some], len(splats.positions), 1.0, packed_colours(splats.rgb[some]),
         packed(splats.radius[some].float().numpy()),
     )  # fmt: skip
 
 
-def _some(count: int, most: int) -> Tensor:
+def _subset(count: int, most: int) -> Tensor:
+    """Return the indices of at most ``most`` of ``count`` elements, drawn at random, the same each time."""
     return torch.randperm(count, generator=torch.Generator().manual_seed(0))[:most]
 
 
@@ -190,7 +191,7 @@ def _framing(scene: Map) -> tuple[tuple[float, float, float], float]:
     else:
         x, y, z = scene.bounds.centre
         return (x, y, z), max(scene.bounds.size)
-    points = points[_some(len(points), 20_000)].cpu().double()
+    points = points[_subset(len(points), 20_000)].cpu().double()
     if scene.info.cameras:  # weighted so that all cameras together count as a hundredth of the points
         places = poses_of(scene.info.cameras).translation
         points = torch.cat([points, places.repeat(1 + len(points) // (100 * len(places)), 1)])
