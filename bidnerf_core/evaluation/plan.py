@@ -152,8 +152,6 @@ class Protocol:
         """Return the cases for one size. More trials append cases, and leave the first ones as they are."""
         if frames < 1:
             raise InputError("nothing to try:", expected="at least one frame")
-        if trials > MOST_TRIALS:
-            raise InputError(f"{trials} trials", expected=f"at most {MOST_TRIALS} per size")
         return self.cases_of(frames, trials, seed)
 
     def check_size(self, size: Size) -> None:

@@ -30,16 +30,12 @@ from bidnerf_core.evaluation.summary import (
     succeeded,
 )
 from bidnerf_core.evaluation.trial import TrialResult, open_data, trial_views
-from bidnerf_core.io import is_temporary, open_binary, output_folder, write_file
+from bidnerf_core.io import is_temporary, output_folder, write_file
 from bidnerf_core.results import CRITERIA, CRITERION_NAMES, as_picture, require_matplotlib
 from bidnerf_core.scenes import is_closed_form
 
 MARK = '<meta name="generator" content="bidnerf report">'
 """Marks a page as a report, which a later report may replace."""
-UNFINISHED = (
-    f"<!doctype html>{MARK}<title>Unfinished report</title><p>This report was interrupted; the same command"
-    " rewrites it.</p>\n"
-)
 LISTED_FRAMES = 24
 """Number of trials that a report lists."""
 
@@ -66,20 +62,19 @@ def write_report(
     folder = Path(folder)
     chosen = chosen_criterion(criterion, table.groups)
     require_matplotlib()
-    try:
-        with open_binary(folder / "index.html", "the page of a report") as file:
-            is_ours = MARK.encode() in file.read(4096)  # bytes that contain the mark of a report
-    except InputError:
-        is_ours = False
+    path = folder / "index.html"
+    is_ours = (
+        path.is_file() and MARK.encode() in path.read_bytes()[:4096]
+    )  # bytes that contain the mark of a report
     if folder.is_dir() and not is_ours and not all(is_temporary(file.name) for file in folder.iterdir()):
         raise InputError(
             "holds something other than a bidnerf report; name another --out or remove it", where=folder
         )
     shown = thumbnails(worst(table.rows)[:LISTED_FRAMES], data)
-    path = folder / "index.html"
     with output_folder(folder, overwrite=True):
         if not path.exists():  # so that an interrupted report is recognized as one
-            write_file(path, UNFINISHED.encode())
+            text = "This report was interrupted; the same command rewrites it."
+            write_file(path, f"<!doctype html>{MARK}<title>Unfinished report</title><p>{text}</p>\n".encode())
         figures = Figures(table.groups, folder, chosen).all()
         write_file(path, page(title, table, figures, chosen, runs, view, shown).encode())
     return path

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from jaxtyping import Bool, Float
@@ -92,39 +92,14 @@ NO_FAULT = "none"
 """The name that leaves a view unchanged."""
 
 
-@dataclass(frozen=True)
-class AppliedFault:
-    """A fault by name, with its size. Raises ``InputError`` for an unknown name and a size out of range."""
+class AppliedFault(NamedTuple):
+    """A fault by name, with its size."""
 
     name: str
     size: float
 
-    def __post_init__(self) -> None:
-        allowed = FAULTS.load(self.name).allowed
-        if self.size not in allowed:
-            raise InputError(f"size is {self.size:.12g}", where=f"fault {self.name}", expected=allowed)
-
     def __str__(self) -> str:
         return f"{self.name}:{self.size:.12g}"
-
-    def __call__(self, view: View, seed: int) -> View:
-        """Return the view with this fault. Raises ``InputError`` if it is a fault of depth and none was measured."""
-        fault = FAULTS.load(self.name)
-        if self.size == fault.neutral:
-            return view
-        # Each fault on each frame has a seed of its own for its random choices.
-        text = f"{seed}\n{view.frame.name}\n{self.name}".encode(errors="surrogatepass")
-        stream = int.from_bytes(hashlib.blake2b(text, digest_size=7).digest(), "big")
-        generator = torch.Generator().manual_seed(stream)
-        T_ref_camera = view.T_ref_camera
-        if fault.T_true_faulty is not None:
-            T_ref_camera = T_ref_camera.to(dtype=torch.float64) @ fault.T_true_faulty
-        changed = fault.change(view.frame, self.size, generator)
-        if not isinstance(changed, Frame):
-            raise InputError(
-                f"returned a {type(changed).__name__}", where=f"fault {self}", expected="a Frame"
-            )
-        return View(changed, T_ref_camera)
 
 
 def expand_faults(words: Iterable[str]) -> tuple[str, ...]:
@@ -146,25 +121,51 @@ def expand_faults(words: Iterable[str]) -> tuple[str, ...]:
 
 
 def parse_faults(text: str) -> tuple[AppliedFault, ...]:
-    """Parse a text such as ``depth-scale:1.02+exposure:0.7``; the result is empty for ``NO_FAULT``."""
-    if text == NO_FAULT:
-        return ()
-    faults = tuple(_parsed(part) for part in text.split("+"))
-    names = [fault.name for fault in faults]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(f"fault {text} has {twice} twice", expected="each once")
-    return faults
+    """Parse a text such as ``depth-scale:1.02+exposure:0.7``; the result is empty for ``NO_FAULT``.
+
+    Raises ``InputError`` for an unknown name, a missing size or one out of range, and a fault that is there twice.
+    """
+    faults: list[AppliedFault] = []
+    for part in [] if text == NO_FAULT else text.split("+"):
+        name, colon, size = part.partition(":")
+        fault = FAULTS.load(name)
+        if not size and (colon or not fault.is_switch):
+            example = "NAME:SIZE such as depth-scale:1.02"
+            raise InputError(f"fault {name} has no size", expected=f"{example}; its unit is: {fault.unit}")
+        try:
+            number = float(size or 1)
+        except ValueError:
+            number = math.nan
+        if number not in fault.allowed:
+            shown = f"{number:.12g}" if math.isfinite(number) else repr(size)
+            raise InputError(f"size is {shown}", where=f"fault {name}", expected=fault.allowed)
+        if name in (other.name for other in faults):
+            raise InputError(f"fault {text} has {name} twice", expected="each once")
+        faults.append(AppliedFault(name, number))
+    return tuple(faults)
 
 
-def faulty(view: View, faults: str | Sequence[AppliedFault], seed: int) -> View:
+def faulty(view: View, faults: str, seed: int) -> View:
     """Return the view with all faults, applied in order.
 
     ``T_ref_camera`` is the true pose of the faulty image. The random choices of a fault depend only on the
-    seed, the frame and the fault, regardless of other faults.
+    seed, the frame and the fault, regardless of other faults. Raises ``InputError`` for a fault of depth if none was
+    measured.
     """
-    for fault in parse_faults(faults) if isinstance(faults, str) else faults:
-        view = fault(view, seed)
+    for applied in parse_faults(faults):
+        fault, T_ref_camera = FAULTS.load(applied.name), view.T_ref_camera
+        if applied.size == fault.neutral:
+            continue
+        # Each fault on each frame has a seed of its own for its random choices.
+        text = f"{seed}\n{view.frame.name}\n{applied.name}".encode(errors="surrogatepass")
+        stream = int.from_bytes(hashlib.blake2b(text, digest_size=7).digest(), "big")
+        changed: Any = fault.change(view.frame, applied.size, torch.Generator().manual_seed(stream))
+        if not isinstance(changed, Frame):
+            found = f"returned a {type(changed).__name__}"
+            raise InputError(found, where=f"fault {applied}", expected="a Frame")
+        if fault.T_true_faulty is not None:
+            T_ref_camera = T_ref_camera.to(dtype=torch.float64) @ fault.T_true_faulty
+        view = View(changed, T_ref_camera)
     return view
 
 
@@ -173,20 +174,3 @@ def check_depth(faults: Iterable[str], depth: bool) -> None:
     for part in (part for text in faults for part in parse_faults(text)):
         if FAULTS.load(part.name).needs_depth and not depth:
             raise InputError(f"fault {part} changes the measured depth, which the method does not receive")
-
-
-def _parsed(text: str) -> AppliedFault:
-    name, colon, size = text.partition(":")
-    fault = FAULTS.load(name)
-    if not size:
-        if fault.is_switch and not colon:
-            return AppliedFault(name, 1.0)
-        example = "NAME:SIZE such as depth-scale:1.02"
-        raise InputError(f"fault {name} has no size", expected=f"{example}; its unit is: {fault.unit}")
-    try:
-        number = float(size)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise InputError(f"size is {size!r}", where=f"fault {name}", expected=fault.allowed)
-    return AppliedFault(name, number)
