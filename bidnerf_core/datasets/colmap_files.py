@@ -193,7 +193,7 @@ def _binary(path: Path, columns: _Columns) -> Iterator[_Entry]:
     file = io.BytesIO(content)
 
     def take(size: int) -> bytes:
-        if len(found := file.read(size)) < size:
+        if len(found := file.read(min(size, len(content)))) < size:  # a false size may be beyond any memory
             found_end = f"ends too early, at byte {len(content)};"
             raise InputError(found_end, where=path, expected="a complete COLMAP file")
         return found

@@ -104,7 +104,7 @@ def read_ply(path: Path, expected: str = "a PLY file") -> dict[str, np.ndarray]:
                     )
                 elif kind.itemsize:
                     found[name] = np.frombuffer(file.read(element.count * kind.itemsize), kind)
-            except (ValueError, TypeError) as error:
+            except (ValueError, TypeError, OverflowError) as error:
                 numbers = f"{element.count:,} rows of {len(element.properties)} numbers ({error})"
                 raise InputError(where=path, expected=numbers) from error
     return found

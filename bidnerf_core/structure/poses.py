@@ -144,7 +144,12 @@ def _search(
     if video:
         images = write_frames(source, folder / FRAMES, chosen(measured(source)))
     found = described(images, camera)
-    with pycolmap.Database.open(database) as opened:
+    try:
+        stored = pycolmap.Database.open(database)
+    except RuntimeError as damage:
+        expected = "the same command once more, which begins anew"
+        raise InputError("cannot be read, perhaps damaged;", where=database, expected=expected) from damage
+    with stored as opened:
         _require_enough(found, source)
         if not opened.num_images():
             write_cameras(opened, found, fixed, pycolmap)

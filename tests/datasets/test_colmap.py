@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -101,6 +102,19 @@ def test_every_truncation_of_a_binary_model_is_refused(model: Path) -> None:
             told = rf"too early, at byte {length};|declares \d+ entries in {length - 8} bytes"
             assert re.search(told, caught.error.found)
         file.write_bytes(whole)
+
+
+@pytest.mark.parametrize("length", [100, 2**64 - 1])
+def test_an_image_that_declares_more_keypoints_than_its_file_holds_is_refused(
+    model: Path, length: int
+) -> None:
+    pytest.importorskip("pycolmap")
+    sparse_model.to_binary(model)
+    pose = struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 1)
+    content = struct.pack("<Q", 1) + pose + b"a.png\0" + struct.pack("<Q", length)
+    (model / "images.bin").write_bytes(content)
+    with refused(where=model / "images.bin", found=f"ends too early, at byte {len(content)}"):
+        read_model(model)
 
 
 @pytest.mark.parametrize(

@@ -130,6 +130,13 @@ def test_dialects_give_the_same_views(dialect: str, capture: Path) -> None:
         )
 
 
+def test_depth_has_the_unit_of_either_program(capture: Path) -> None:
+    usual = read_all(capture)
+    each_frame(lambda frame: frame.pop("depth_unit_scale_factor", None), integer_depth_scale=0.0005)(capture)
+    for name, view in read_all(capture).items():
+        torch.testing.assert_close(view.frame.depth * 2, usual[name].frame.depth)
+
+
 def test_depth_that_is_switched_off_is_not_read(capture: Path) -> None:
     instant_ngp(enable_depth_loading=False)(capture)
     assert remarks_of(capture) == []

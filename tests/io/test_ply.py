@@ -59,3 +59,11 @@ def test_more_elements_than_the_file_has_room_for_are_refused(
 def test_a_line_of_the_header_that_means_nothing_is_named(tmp_path: Path, line: str) -> None:
     with refused(where=tmp_path / "a.ply", found=f"its header has the line {line[:60]!r}"):
         read_ply(ply(tmp_path / "a.ply", line))
+
+
+@pytest.mark.parametrize("row", ["0 0 300", "0 0 -1", "0 a 1"])
+def test_a_text_row_that_does_not_fit_its_properties_is_refused(tmp_path: Path, row: str) -> None:
+    lines = ["element vertex 1", "property float x", "property float y", "property uchar red"]
+    path = ply(tmp_path / "a.ply", *lines, form="ascii", content=row.encode())
+    with refused(where=path, expected="1 rows of 3 numbers"):
+        read_ply(path)

@@ -30,7 +30,7 @@ from bidnerf_core.results import pose_error
 from bidnerf_core.structure import FoundPoses, lacks_poses
 from bidnerf_core.structure.colmap import NEIGHBOURS, described, similar_pairs, to_colmap
 from bidnerf_core.structure.model import agreement, from_colmap
-from bidnerf_core.structure.record import begin, clear
+from bidnerf_core.structure.record import begin, clear, digest
 from bidnerf_core.structure.sources import (
     MOST,
     STEP,
@@ -245,6 +245,16 @@ def test_too_few_photos_and_photos_without_overlap(tmp_path: Path) -> None:
     with refused(where=apart, found="no three of 3 photos could be placed: no two of them overlap"):
         bn.find_poses(apart, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_damaged_database_is_refused_and_removed(tmp_path: Path) -> None:
+    photos, out = tmp_path / "photos", tmp_path / "out"
+    write_photos(photos, walk(3))
+    files = [image.file for image in photos_of(photos)]
+    (begin(out, digest(files, None), video=False) / "database.db").write_bytes(b"no database" * 100)
+    with refused(where=out / "work" / "database.db", found="cannot be read", expected="begins anew"):
+        bn.find_poses(photos, out)
+    assert not (out / "work").exists()
 
 
 def test_a_damaged_record_is_replaced_only_on_request(search: Search) -> None:

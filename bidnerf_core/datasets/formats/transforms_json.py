@@ -163,11 +163,16 @@ def _depth(record: Record, own: Record) -> tuple[PurePosixPath | None, float]:
     nerfstudio and instant-ngp use different keys for both; ``enable_depth_loading`` disables instant-ngp's.
     """
     for key, unit_key in UNIT_KEYS.items():
-        path, unit = own.text(key), record.number(unit_key)
-        if unit is not None and unit <= 0:
-            raise record.error(f"{unit_key} is {unit:g}", expected="a positive number of metres")
+        path, keys = (
+            own.text(key),
+            (unit_key, *UNIT_KEYS.values()),
+        )  # the other program's if its own is missing
+        units = [(name, unit) for name in keys if (unit := record.number(name)) is not None]
+        name, unit = units[0] if units else (unit_key, METRES_PER_DEPTH_UNIT)
+        if unit <= 0:
+            raise record.error(f"{name} is {unit:g}", expected="a positive number of metres")
         if path and (key == "depth_file_path" or record.value("enable_depth_loading") is not False):
-            return posix_name(path), METRES_PER_DEPTH_UNIT if unit is None else unit
+            return posix_name(path), unit
     return None, METRES_PER_DEPTH_UNIT
 
 
