@@ -15,6 +15,7 @@ import torch
 from bidnerf_core import SE3, Frame, Intrinsics, View
 from bidnerf_core.captures import (
     CaptureReport,
+    CoverageRecord,
     UpDirection,
     given_up,
     sentences,
@@ -130,6 +131,12 @@ def test_one_side_is_no_gap() -> None:
     assert report.coverage.open_side.degrees == pytest.approx(360 - 11 * math.degrees(0.105), abs=3)
 
 
+def test_a_few_photos_that_overlap_are_not_isolated() -> None:
+    views = ring(points := Points(), 4)
+    report = surveyed(tracked_views(views, points), views)
+    assert [(photo.group, photo.problems) for photo in report.photos] == [(0, ())] * 4
+
+
 def towards(eye: tuple[float, float, float], forward: tuple[float, float, float]) -> SE3:
     return look_at(eye, [e + f for e, f in zip(eye, forward, strict=True)])
 
@@ -231,12 +238,19 @@ def test_a_dark_scene_and_a_light_one_have_the_same_sharpness() -> None:
 
 
 @pytest.mark.parametrize("size", [(5, 1), (1, 5), (5, 5)])
-def test_blur_in_any_direction_costs_sharpness(size: tuple[int, int]) -> None:
-    view = photos()[0]
-    soft = replace(
-        view, frame=replace(view.frame, rgb=torch.from_numpy(cv2.blur(view.frame.rgb.numpy(), size)))
-    )
-    before, after = photo_measures([view, soft])[0].tolist()
+@pytest.mark.parametrize("hidden", [False, True])
+def test_blur_in_any_direction_costs_sharpness(
+    size: tuple[int, int], hidden: bool, generator: torch.Generator
+) -> None:
+    """Also if all but the middle is hidden, is not blurred, and has twice the contrast."""
+    noise = torch.rand((120, 160, 3), generator=generator).numpy() / 2
+    images, around = [noise, cv2.blur(noise, size)], torch.zeros((120, 160), dtype=torch.bool)
+    if hidden:
+        around[:30] = around[90:] = around[:, :30] = around[:, 130:] = True
+        images = [np.where(around[..., None].numpy(), 2 * noise, image) for image in images]
+    frames = [Frame("a", torch.from_numpy(image), CAMERA).with_hidden(around) for image in images]
+    views = [View(frame, SE3.identity()) for frame in frames]
+    before, after = photo_measures(views)[0].tolist()
     assert after < before - 0.3
 
 
@@ -247,6 +261,12 @@ def test_exposure_of_photos_without_landmarks_is_that_of_the_whole_image() -> No
     nothing = seen[seen.image != 3].compacted()[0]
     found = exposures(views, nothing, photo_measures(views)[1], nearby(views))
     assert float(found[3]) == pytest.approx(-2, abs=0.6)
+
+
+@pytest.mark.parametrize(("stops", "remarked"), [(1.0, False), (1.01, True)])
+def test_exposure_that_varies_by_more_than_a_stop_is_remarked(stops: float, remarked: bool) -> None:
+    lines = sentences(CaptureReport((), CoverageRecord(), exposure_range=stops))
+    assert any("exposure varies" in line for line in lines) is remarked
 
 
 def test_groups_are_numbered_by_size() -> None:

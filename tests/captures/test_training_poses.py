@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidnerf_core import SE3, View
+from bidnerf_core import SE3, Frame, Intrinsics, View
 from bidnerf_core.captures import (
     PoseRefinement,
     TrainingPoses,
@@ -22,9 +22,9 @@ from bidnerf_core.captures import (
     stored_cameras,
 )
 
-# Inside: how far each pose was refined, and the checks of depth that precede a training
+# Inside: how far each pose was refined, and the checks of poses and depth that precede a training
 from bidnerf_core.captures.cameras import moved_from
-from bidnerf_core.captures.training_views import adjusted_poses, check_depth_unit, training_poses
+from bidnerf_core.captures.training_views import adjusted_poses, check_depth_unit, prepared, training_poses
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import LandmarkConfig, Sift, TrackedViews, tracked_views
@@ -129,6 +129,19 @@ def test_nothing_in_common_leaves_the_poses_alone() -> None:
     points.seen.append(points.seen[0][torch.zeros(0, dtype=torch.long)])
     found = training_poses(tracked_views(blank, points), blank)
     assert (found.refined, found.consistency, found.replaced) == (False, None, [])
+
+
+@pytest.mark.parametrize("count", [7, 60, 61, 130])
+def test_poses_that_are_not_refined_are_checked_by_at_most_sixty_views(
+    count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = Intrinsics(4.0, 4.0, 2.0, 1.5, 4, 3)
+    frame = Frame("a", torch.zeros(3, 4, 3), camera, torch.ones(3, 4))
+    checked = list[View]()
+    module = "bidnerf_core.captures.training_views"
+    monkeypatch.setattr(f"{module}.posed_keypoints", lambda views, _: checked.extend(views) or [])
+    prepared([View(frame, looking_in(0.01 * i)) for i in range(count)], "never")
+    assert min(count, 30) <= len(checked) <= 60
 
 
 def test_stored_cameras_hold_both_poses_and_how_far_they_are_apart() -> None:

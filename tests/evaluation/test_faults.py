@@ -313,6 +313,11 @@ def test_wrong_intrinsics_leave_the_image_alone(view: View) -> None:
         assert dataclasses.replace(camera, cx=own.cx, cy=own.cy) == own
 
 
+def test_of_the_smallest_image_a_crop_leaves_a_pixel() -> None:
+    tiny = plain(camera=Intrinsics(1.0, 1.0, 0.5, 0.5, 2, 1))
+    assert faulty(tiny, "crop:0.9", 0).frame.rgb.shape == (1, 1, 3)
+
+
 @pytest.mark.parametrize("k1", [0.3, -0.1])
 def test_distortion_is_that_of_opencv(k1: float) -> None:
     """Each pixel shows what OpenCV says that an undistorted camera shows there."""

@@ -197,6 +197,8 @@ def test_frames_take_masks_as_arrays() -> None:
     assert made.hidden is not None
     assert torch.equal(made.hidden, torch.from_numpy(left() == 0))
     assert Frame.from_numpy(rgb, camera, hidden=left() < 0).hidden is None
+    for nothing in (None, torch.from_numpy(left() < 0)):
+        assert made.with_hidden(nothing) is made
 
 
 def hiding(view: View, content: torch.Tensor) -> View:

@@ -104,8 +104,9 @@ def test_a_corrected_camera_projects_as_the_true_one_or_there_is_no_correction(
     assert float(error.median()) < 1.0
 
 
-def test_lenses_that_no_correction_describes_are_not_compared() -> None:
-    fisheye = Intrinsics(150.0, 150.0, 200.0, 150.0, 400, 300, (-0.5, 0.0, 0.0, 0.0))
+@pytest.mark.parametrize(("focal", "k"), [(150.0, (-0.5, 0.0)), (200.0, (-0.28, 0.07))])
+def test_lenses_that_no_correction_describes_are_not_compared(focal: float, k: tuple[float, float]) -> None:
+    fisheye = Intrinsics(focal, focal, 200.0, 150.0, 400, 300, (*k, 0.0, 0.0))
     assert correction_between(PINHOLE, fisheye) is None
     assert cameras_of_map(query(PINHOLE), landmarks(fisheye)) == []
 

@@ -156,6 +156,16 @@ def term_of_landmarks(rig: bool, moving: bool = False) -> tuple[Landmarks, State
     return term, replace(at, mode=torch.tensor([0, 1, 0]), z=truth.z + 0.1 * at.z)
 
 
+def test_points_behind_the_camera_have_no_influence() -> None:
+    term, at = term_of_landmarks(rig=False)
+    behind, without = term.points.clone(), term.valid.clone()
+    behind[:, 7] = at.T.apply(torch.tensor([0.1, 0.1, -3.0], dtype=torch.float64))[:2]
+    without[:, 7] = 0
+    found, expected = replace(term, points=behind)(at), replace(term, valid=without)(at)
+    for name in ("cost", "gradient", "hessian"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name))
+
+
 def term_of_the_surface(rig: bool) -> tuple[Surface, States]:
     view, others = unseen(), training_views()[:2] if rig else ()
     surface = textured_map(surface=True).surface

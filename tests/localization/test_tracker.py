@@ -320,6 +320,13 @@ def test_a_map_without_landmarks_is_tracked_by_depth() -> None:
     )
 
 
+def test_the_right_shape_with_other_colours_is_not_accepted() -> None:
+    tracker = Tracker(localizer(landmarks=False), start=flight_pose(0))
+    (time, right, _), (later, other, _) = flight()[:2]
+    assert tracker(right, time).converged
+    assert tracker(replace(other, rgb=1 - other.rgb), later).outcome is Outcome.COLOUR_MISMATCH
+
+
 def depth_only(frame: Frame) -> Frame:
     return replace(frame, rgb=torch.zeros_like(frame.rgb), has_colour=False)
 

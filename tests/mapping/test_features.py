@@ -18,6 +18,7 @@ from bidnerf_core.mapping import (
     Sift,
     byte_of_zero,
     detected,
+    nearest_centre,
     paired_squared_distances,
     quantized,
     squared_distances,
@@ -63,6 +64,25 @@ def test_distances_of_bytes_are_exact(generator: torch.Generator) -> None:
     assert torch.equal(squared_distances(a, b).long(), expected)
     rows, columns = torch.tensor([0, 3, 6]), torch.tensor([8, 1, 0])
     assert torch.equal(paired_squared_distances(a, b, rows, columns).long(), expected[rows, columns])
+
+
+@pytest.mark.parametrize(("block", "rows"), [(65, [3, 3, 1]), (10, [1] * 7)])
+def test_nearest_centres_are_found_in_blocks_that_bound_the_memory(
+    block: int, rows: list[int], generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    descriptors, centres = (torch.rand((n, 8), generator=generator) for n in (7, 20))
+    parts = list[int]()
+
+    def counted(part: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
+        parts.append(len(part))
+        return squared_distances(part, others)
+
+    module = "bidnerf_core.mapping.landmarks.vocabulary"
+    monkeypatch.setattr(f"{module}.BLOCK", block)
+    monkeypatch.setattr(f"{module}.squared_distances", counted)
+    found = nearest_centre(descriptors, centres)
+    assert torch.equal(found, torch.cdist(descriptors, centres).argmin(1))
+    assert parts == rows
 
 
 def test_root_normalised_descriptors_are_unit() -> None:

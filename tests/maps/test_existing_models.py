@@ -23,7 +23,7 @@ import tiny
 from bidnerf_core import SE3, Frame, View
 from bidnerf_core.backend import load_backend, quick_config
 from bidnerf_core.cli import main
-from bidnerf_core.datasets import read_posed_images
+from bidnerf_core.datasets import read_posed_images, stored_keypoints
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, Keypoints, tracked_views
 from bidnerf_core.maps import IMPORTERS
@@ -51,8 +51,11 @@ class Model:
         files = sorted(path for path in self.folder.rglob("*") if path.is_file())
         return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
-    def write_database(self, path: Path, drop: int = 0) -> None:
-        """Write the keypoints as COLMAP does, without the last ``drop`` of each image."""
+    def write_database(self, path: Path, drop: int = 0, shape: tuple[float, ...] = (1.0, 0.0)) -> None:
+        """Write the keypoints as COLMAP does, without the last ``drop`` of each image.
+
+        ``shape`` is what is stored of a keypoint of scale 1 besides its place: scale and orientation, or an affine matrix.
+        """
         with contextlib.closing(sqlite3.connect(path)) as opened, opened:
             opened.execute("CREATE TABLE images (image_id INTEGER, name TEXT, camera_id INTEGER)")
             for name in ("keypoints", "descriptors"):
@@ -62,9 +65,11 @@ class Model:
             for number, found in enumerate(self.keypoints):
                 count = len(found) - drop
                 scale = (found.sizes[:count, None] / 2).numpy()
-                rows = np.concatenate([found.pixels[:count].numpy(), scale, 0 * scale], axis=1).astype("<f4")
+                rows = np.concatenate([found.pixels[:count].numpy(), scale * shape], axis=1).astype("<f4")
                 opened.execute("INSERT INTO images VALUES (?, ?, 1)", (number, f"{number:03d}.png"))
-                opened.execute("INSERT INTO keypoints VALUES (?, ?, 4, ?)", (number, count, rows.tobytes()))
+                opened.execute(
+                    "INSERT INTO keypoints VALUES (?, ?, ?, ?)", (number, *rows.shape, rows.tobytes())
+                )
                 descriptors = found.descriptors[:count].numpy().tobytes()
                 opened.execute("INSERT INTO descriptors VALUES (?, ?, 128, ?)", (number, count, descriptors))
 
@@ -133,6 +138,21 @@ def error_of(found: bn.Localization, true: SE3) -> float:
 
 def unseen() -> Frame:
     return Frame.from_numpy(photograph(UNSEEN).round().clip(0, 255).astype(np.uint8), CAMERA)
+
+
+@pytest.mark.parametrize("shape", [(1.0, 0.3), (2.0, 1.0, 0.5, 0.75), (0.0, -1.0, 1.0, 0.0)])
+def test_an_affine_shape_has_the_scale_of_a_circle_of_its_area(
+    shape: tuple[float, ...], tmp_path: Path
+) -> None:
+    keypoints = Keypoints(
+        torch.tensor([[3.0, 4.0], [5.0, 6.0]]),
+        torch.tensor([4.0, 7.0]),
+        torch.zeros((2, 128), dtype=torch.uint8),
+    )
+    Model(tmp_path, [], [keypoints]).write_database(tmp_path / "database.db", shape=shape)
+    ((_, found),) = stored_keypoints(tmp_path / "database.db")
+    torch.testing.assert_close(found.sizes, keypoints.sizes)
+    assert torch.equal(found.pixels, keypoints.pixels)
 
 
 @pytest.mark.parametrize("source", ["photos", "database"])

@@ -186,6 +186,13 @@ def test_bounds_hold_nearly_all_matter() -> None:
     assert wide.far > 100
 
 
+def test_bounds_move_with_matter() -> None:
+    points = torch.rand((4000, 3), generator=torch.Generator().manual_seed(0))
+    here, there = (bounds_about(points + offset) for offset in (-0.5, 7.5))
+    assert (there.near, there.far) == pytest.approx((here.near, here.far), rel=1e-5)
+    assert there.lower == pytest.approx([x + 8 for x in here.lower], abs=1e-5)
+
+
 @dataclass(frozen=True)
 class Shell:
     """A sphere of radius 1 that is opaque from inside and from outside."""

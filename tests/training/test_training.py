@@ -265,8 +265,14 @@ def drawn(views: list[View], count: int = 400) -> tuple[TrainingBatch, list[Tens
 
 @pytest.mark.parametrize("alpha", [True, False])
 @pytest.mark.parametrize("depth", [True, False])
-def test_rays_are_those_of_the_pixels(alpha: bool, depth: bool) -> None:
-    batch, (origins, directions, rgb, distance), cover = drawn(random_views(5, alpha, depth))
+@pytest.mark.parametrize("moving", [True, False])
+def test_rays_are_those_of_the_pixels(alpha: bool, depth: bool, moving: bool) -> None:
+    """Also of landscape and portrait images whose rows are exposed one after another."""
+    views = random_views(5, alpha, depth)
+    if moving:
+        motion = torch.tensor([0.2, -0.1, 0.3, 0.1, 0.3, -0.2], dtype=torch.float64)
+        views[1:] = [replace(view, motion=motion) for view in views[1:]]
+    batch, (origins, directions, rgb, distance), cover = drawn(views)
     expected = BOUNDS.rays(origins, directions)
     for name in ("origins", "directions", "near", "far"):
         torch.testing.assert_close(getattr(batch.rays, name), getattr(expected, name), atol=2e-6, rtol=2e-6)
