@@ -14,10 +14,14 @@ import torch
 import sparse_model
 import tiny
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.datasets import SparseChoice, SparsePoints, read_model
+from bidnerf_core.fields import render
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.scenes import orbit
+from bidnerf_core.scenes import demo_object, orbit
+from bidnerf_core.training import RayBank, Silent, ray_termination
+from bidnerf_hashgrid import backend as hashgrid
 from refusals import refused
 from sparse_model import Known
 
@@ -294,3 +298,38 @@ def test_of_points_at_one_pixel_the_nearest_is_seen(model: Path, scene: Known) -
     depth = opened(model, scene).onto(View(frame, scene.views[0].T_ref_camera), "train").frame.depth
     assert depth is not None
     assert float(depth) == pytest.approx(float(scene.truth(0)[:, 2].min()))
+
+
+# What it is good for.
+
+
+def test_the_scene_is_bounded_by_points_where_there_is_nothing_better(model: Path, scene: Known) -> None:
+    """Silhouettes bound the scene where there are any; a box of points alone gets a wide margin."""
+    sparse = opened(model, scene)
+    outlined = [sparse.onto(bare(view), "train") for view in scene.views]
+    assert estimate_bounds(outlined) == estimate_bounds([bare(view) for view in scene.views])
+    plain = [replace(view, frame=replace(view.frame, alpha=None)) for view in outlined]
+    bounds = estimate_bounds(plain)
+    good = scene.points[: scene.good]
+    assert bool((good > torch.tensor(bounds.lower)).all() and (good < torch.tensor(bounds.upper)).all())
+    assert max(bounds.size) < 3
+
+
+def test_training_is_supervised_by_the_points(model: Path, scene: Known) -> None:
+    """Matter of pixels that no point tells of comes nearer to where it is, too."""
+    dense = scene.views
+    views = [opened(model, scene).onto(bare(view), "train") for view in dense]
+    bounds = demo_object().bounds
+    assert not any(view.frame.has_dense_depth for view in views)
+
+    def misplaced(weight: float) -> float:
+        config = tiny.config(steps=40, depth_weight=weight, carve=False)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            field = hashgrid.build(config, bounds)
+            hashgrid.train(field, views, config, Silent())
+        batch = RayBank(dense, bounds).draw(3000, torch.Generator().manual_seed(1))
+        with torch.no_grad():
+            return float(ray_termination(render(field, batch.rays, batch.background), batch))
+
+    assert misplaced(1.0) < 0.9 * misplaced(0.0)
