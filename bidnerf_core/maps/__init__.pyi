@@ -1,3 +1,4 @@
+from .checkpoints import Checkpoints as Checkpoints
 from .collection import MapCollection as MapCollection
 from .collection import Placement as Placement
 from .collection import maps_in as maps_in
@@ -30,7 +31,6 @@ from .store import write_parts as write_parts
 from .summary import MapSummary as MapSummary
 from .summary import RenderingScores as RenderingScores
 from .summary import rendering_scores as rendering_scores
-from .training import Checkpoints as Checkpoints
 from .training import MapOptions as MapOptions
 from .training import OtherSettings as OtherSettings
 from .training import TrainOptions as TrainOptions

@@ -45,9 +45,9 @@ from bidnerf_core.mapping import (
     tracked_views,
 )
 from bidnerf_core.maps.baking import bake_landmarks, with_tracks_in
+from bidnerf_core.maps.checkpoints import Checkpoints
 from bidnerf_core.maps.description import load_info, longest_side
 from bidnerf_core.maps.map import USUAL_BAKE, Map, load_map
-from bidnerf_core.maps.training import Checkpoints
 from bidnerf_core.maps.views import Images, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context
 from bidnerf_core.training import TrainingStopped

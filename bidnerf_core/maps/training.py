@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,33 +30,31 @@ from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.datasets import HOLD_OUT_EVERY, DatasetOptions, SparseChoice
 from bidnerf_core.devices import moved, working_device
 from bidnerf_core.errors import Cancelled, InputError, amount, enumeration
-from bidnerf_core.fields import NoField, RadianceField, device_of, trained_field
+from bidnerf_core.fields import NoField, device_of, trained_field
 from bidnerf_core.frames import View
 from bidnerf_core.io import from_plain, packed, to_plain
 from bidnerf_core.mapping import (
     USUAL_FEATURES,
     BakeConfig,
-    LandmarkMap,
     TrackedViews,
     find_features,
     tracked_views,
 )
+from bidnerf_core.maps.checkpoints import USUAL_SECONDS, Checkpoints
 from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info, longest_side
 from bidnerf_core.maps.map import USUAL_BAKE, Map, build_field, frozen_field, load_map
 from bidnerf_core.maps.store import load_landmarks, load_state, map_folder, write_parts
 from bidnerf_core.maps.views import Images, ReadViews, chosen_origin, read_views
 from bidnerf_core.progress import (
     Cancel,
-    Progress,
     ProgressCallback,
     counter,
-    current_job,
     duration_text,
     job_context,
 )
 from bidnerf_core.registry import PluginError
 from bidnerf_core.structure import lacks_poses
-from bidnerf_core.training import TrainingState, TrainingStep, TrainingStopped
+from bidnerf_core.training import TrainingState, TrainingStopped
 
 log = logging.getLogger("bidnerf")
 
@@ -100,7 +96,7 @@ class TrainOptions(MapOptions):
     point_choice: SparseChoice = SparseChoice()
     """which of these points are used"""
 
-    checkpoint_seconds: float = 60.0
+    checkpoint_seconds: float = USUAL_SECONDS
     """time between checkpoints: the most work lost if the program is killed"""
 
     def __post_init__(self) -> None:
@@ -113,68 +109,6 @@ class TrainOptions(MapOptions):
 
 
 USUAL = TrainOptions()
-
-
-class Checkpoints:
-    """The ``Report`` of a training run.
-
-    States are saved to ``folder``, unless that is None; ``info`` describes the last one. Progress goes to the
-    current job, which may also stop the training. ``state`` is the one to resume from, ``seconds`` the time
-    between checkpoints, and ``landmarks`` are stored with the first if they are not in the folder yet.
-    """
-
-    def __init__(
-        self,
-        info: MapInfo,
-        folder: Path | None = None,
-        state: TrainingState | None = None,
-        seconds: float = TrainOptions.checkpoint_seconds,
-        landmarks: LandmarkMap | None = None,
-    ) -> None:
-        self.info, self.folder = info, folder
-        self._state, self._seconds, self._job = state, seconds, current_job()
-        self._step = self._total = info.step
-        self._landmarks = landmarks
-        self._earlier, self._began = info.seconds, time.monotonic()
-        self._saved = self._began
-
-    @property
-    def stopping(self) -> bool:
-        return self._job.cancel is not None and self._job.cancel()
-
-    def resume(self) -> TrainingState | None:
-        return self._state
-
-    def step(self, progress: TrainingStep) -> None:
-        self._state = None  # free it: it is as large as the field and its optimizer
-        self._step, self._total = progress.step, progress.total
-        if self._job.progress is None:
-            return
-        figures = f"loss {progress.loss:.5f}  PSNR {progress.psnr:.2f} dB"
-        if not math.isnan(progress.samples_per_ray):  # not every recipe reports it
-            figures += f"  {progress.samples_per_ray:.1f} samples per ray"
-        self._job.progress(Progress("training", progress.step, progress.total, "steps", figures))
-
-    def due(self, step: int) -> bool:
-        waited = self.folder is not None and time.monotonic() - self._saved > self._seconds
-        return step == self._total or waited
-
-    def save(self, state: TrainingState) -> None:
-        seconds = self._earlier + time.monotonic() - self._began
-        info = replace(self.info, step=state.step, complete=state.step >= self._total, seconds=seconds)
-        if self.folder is not None:
-            if info.weights:  # the first save may replace another map, whose anchor does not count
-                info = replace(info, anchor=load_info(self.folder).anchor)
-            info = write_parts(self.folder, info, state, landmarks=self._landmarks, keep=True)
-            self._landmarks = None
-        self.info = info
-        self._saved = time.monotonic()
-
-    def finish(self, field: RadianceField) -> None:
-        """Save once more if the backend ended without reporting its last step."""
-        if not self.info.complete and isinstance(field, nn.Module):
-            self._total = self._step
-            self.save(TrainingState(self._step, field.state_dict(), {}))
 
 
 class OtherSettings(InputError):

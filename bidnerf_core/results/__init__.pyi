@@ -4,7 +4,6 @@ from .answers import Answers as Answers
 from .answers import Failure as Failure
 from .answers import localize_each as localize_each
 from .answers import plain_localization as plain_localization
-from .answers import track as track
 from .colmap_poses import check_pose_file as check_pose_file
 from .errors import CRITERIA as CRITERIA
 from .errors import PoseError as PoseError
@@ -49,3 +48,4 @@ from .pose_files import read_pose as read_pose
 from .pose_files import read_poses as read_poses
 from .pose_files import read_positions as read_positions
 from .pose_files import write_poses as write_poses
+from .tracking import track as track

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,9 +15,9 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import UpDirection, as_given
-from bidnerf_core.datasets import BreaksOff, Capture, Query, QuerySource, open_sequence
+from bidnerf_core.datasets import Query, QuerySource
 from bidnerf_core.depth import noise_remark
-from bidnerf_core.errors import InputError, InputWarning, UsageError, amount
+from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3, LengthUnit, fit_similarity, symbol
 from bidnerf_core.io import write_file
@@ -27,8 +26,6 @@ from bidnerf_core.localization import (
     Localizer,
     Outcome,
     SceneMap,
-    Tracker,
-    landmark_cameras,
     unit_of,
 )
 from bidnerf_core.mapping import SurfaceMap
@@ -460,66 +457,3 @@ def _log_depth(query: Query, sensor: str) -> None:
         remark = noise_remark(shown.depth, shown.intrinsics, sensor)
         if remark is not None:
             log.info("%s: %s", query.name, remark)
-
-
-def track(
-    scene: SceneMap | Localizer | Tracker,
-    sequence: Capture | str | Path,
-    *,
-    every: int = 1,
-    depth: bool = True,
-    answers: Answers | None = None,
-    each: Callable[[Frame, Answer], None] | None = None,
-    progress: ProgressCallback | None = None,
-    cancel: Cancel | None = None,
-) -> Answers:
-    """Find the poses of a sequence's frames in a map, in chronological order.
-
-    ``scene``: a map, a localizer with its own settings, or a tracker with its own settings and start. ``sequence``: the
-    result of ``open_sequence``, or the path of a dataset, a folder of images or a video, whose images use the map's
-    cameras if they have none of their own. ``every``: use only every n-th frame. ``depth``: whether measured depth is
-    used. ``answers``: collects the answers, by default a new object; it holds those so far if an error ends the
-    tracking. ``each`` is called with each frame and its answer, ``progress`` after each frame.
-
-    A frame whose files cannot be read is left out with an ``InputWarning`` and counted in ``unread``. Raises
-    ``InputError`` if none of the first frames can be read, and ``Cancelled`` once ``cancel`` returns True.
-    """
-    if every < 1:
-        raise InputError(f"every is {every}", expected="1 or more")
-    tracker = scene
-    if not isinstance(tracker, Tracker):
-        tracker = Tracker(tracker if isinstance(tracker, Localizer) else Localizer(tracker))
-    if not isinstance(sequence, Capture):
-        stored = tracker.localizer.scene
-        sequence = open_sequence(
-            sequence, assumed=landmark_cameras(stored), background=stored.bounds.background
-        )
-    if answers is None:
-        answers = Answers(tracker.localizer.scene, is_sequence=True)
-    total = -(-len(sequence) // every)
-    with job_context(progress, cancel):
-        count = counter("tracking", "frames")
-        for number, place in enumerate(range(0, len(sequence), every)):
-            try:
-                timed = sequence[place]
-            except BreaksOff:
-                raise
-            except InputError as error:
-                # If none of the first three frames can be read, probably none can.
-                if not answers.answers and number + 1 >= min(3, total):
-                    many = (
-                        "the first frame cannot"
-                        if number == 0
-                        else f"none of the first {number + 1} frames can"
-                    )
-                    raise InputError(f"{many} be read: {error}") from error
-                warnings.warn(f"{error}; left out", InputWarning, stacklevel=2)
-                answers.unread += 1
-            else:
-                frame = timed.frame if depth else timed.frame.replace(depth=None)
-                found = tracker(frame, timed.time)
-                answer = answers.add(frame, found, timed.time, timed.truth, every * number)
-                if each is not None:
-                    each(timed.frame, answer)
-            count(number + 1, total)
-    return answers

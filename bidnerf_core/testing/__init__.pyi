@@ -2,7 +2,6 @@ from .contract import BackendContract as BackendContract
 from .contracts import FaultContract as FaultContract
 from .contracts import FeaturesContract as FeaturesContract
 from .contracts import MethodContract as MethodContract
-from .contracts import ReaderContract as ReaderContract
 from .device import DEVICE as DEVICE
 from .device import DeviceFault as DeviceFault
 from .device import Elsewhere as Elsewhere
@@ -15,6 +14,7 @@ from .field_checks import check_ranges as check_ranges
 from .field_checks import check_rays_alone as check_rays_alone
 from .field_checks import check_repeatable as check_repeatable
 from .field_checks import check_shapes as check_shapes
+from .reader_contract import ReaderContract as ReaderContract
 from .recipes import Recorder as Recorder
 from .recipes import colour_error as colour_error
 from .scene import SCENE_BOUNDS as SCENE_BOUNDS

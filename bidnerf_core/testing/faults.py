@@ -43,6 +43,21 @@ def calling(doing: str, passing: type[Exception] = AssertionError) -> Iterator[N
         raise AssertionError(f"{doing} raised {type(error).__name__}: {error}") from error
 
 
+def equal(a: Tensor | None, b: Tensor | None) -> bool:
+    """Return whether two optional tensors are the same."""
+    return a is b or (a is not None and b is not None and torch.equal(a, b))
+
+
+def are_colours(rgb: Tensor) -> bool:
+    """Return whether all values are from 0 to 1."""
+    return bool(rgb.isfinite().all() and (rgb >= 0).all() and (rgb <= 1).all())
+
+
+def is_depth(depth: Tensor | None) -> bool:
+    """Return whether a depth image, if there is one, is finite and not negative."""
+    return depth is None or bool(depth.isfinite().all() and (depth >= 0).all())
+
+
 class Named:
     """The base of contracts of parts that are registered by ``name``."""
 
