@@ -181,7 +181,7 @@ def test_mistakes_are_refused_with_the_remedy_that_works(mistake: str) -> None:
     assert found.reading is not None
     assert words in found.sentence
     assert found.agreeing >= 0.9 * found.pairs
-    assert found.agreeing_as_given < 0.5 * found.pairs
+    assert found.agreeing_as_given < 0.3 * found.pairs
     corrected = found.reading.understand(given)
     known = corrected.translation.isfinite().all(-1).tolist()
     seen = seen_from(truth, corrected, COUNT)
