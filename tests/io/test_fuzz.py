@@ -170,6 +170,23 @@ def refused(read: Callable[[], object]) -> bool:
     return True
 
 
+WORDS = st.text(max_size=6) | st.sampled_from([
+    "info", "train", "render", "localize", "evaluate", "compare", "report", "bake", "backends", "--out", "--seed", "--json",
+    "--size", "--trials", "--nothing", "--frame", "--help", "--split", "--method", "--level", "\x1b[2J", "�", "1e400",
+    "-1", "nan", "a/b",
+])  # fmt: skip
+
+
+@settings(max_examples=30)
+@given(words=st.lists(WORDS, max_size=4))
+def test_any_words_end_in_a_status_and_printable_text(words: list[str], bidnerf: Run) -> None:
+    status, out, err = bidnerf(*words)
+    assert status in (0, 1, 2)
+    assert "Traceback" not in out + err
+    assert all(c == "\n" or c.isprintable() or c == "\udcff" for c in out + err)
+    assert status == 0 or err
+
+
 # Files in the place of which something else stands.
 
 

@@ -7,8 +7,10 @@ import struct
 import subprocess
 import sys
 import tracemalloc
+import warnings
 import zlib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -327,6 +329,16 @@ def test_resampling_takes_the_nearest_and_invents_nothing() -> None:
     assert resampled(image, 8, 6).equal(image.repeat_interleave(2, 0).repeat_interleave(2, 1))
     assert resampled(resampled(image, 12, 9), 4, 3).equal(image)
     assert set(resampled(image, 7, 5).flatten().tolist()) <= set(image.flatten().tolist())
+
+
+def test_threads_that_read_images_leave_warnings_as_they_were(tmp_path: Path) -> None:
+    """Filters of warnings belong to the process: one that stays behind would silence all later warnings of an application."""
+    Image.fromarray(noise(300, 400)).save(tmp_path / "a.png")
+    before = list(warnings.filters)
+    with ThreadPoolExecutor(4) as pool:
+        for _ in pool.map(read_image, [tmp_path / "a.png"] * 400):
+            pass
+    assert warnings.filters == before
 
 
 def test_oddities_of_a_file_cause_no_warning(tmp_path: Path) -> None:
