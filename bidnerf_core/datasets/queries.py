@@ -197,10 +197,10 @@ class DatasetFrames:
         self._rigs = [names] if names else [(name,) for name in listed]
         if window > 1 and self._rigs[0][0] in listed:  # an unknown name is rejected on reading
             self._rigs = [windowed(listed, listed.index(rig[0]), window) for rig in self._rigs]
-        for rig in self._rigs:
-            if window > len(rig):
-                before = f"{rig[-1]} has only {len(rig) - 1} before it in split {split!r}"
-                log.info("--window %d: %s; a rig of %d", window, before, len(rig))
+            for rig in self._rigs:
+                if window > len(rig):
+                    before = f"{rig[-1]} has only {len(rig) - 1} before it in split {split!r}"
+                    log.info("--window %d: %s; a rig of %d", window, before, len(rig))
 
     @property
     def names(self) -> Sequence[str]:

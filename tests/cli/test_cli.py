@@ -234,7 +234,7 @@ FAULTS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     "another format": (described(lambda c: c.update(format="x")), ("map.json", "bidnerf map")),
     "newer": (described(lambda c: c.update(version=99)), ("map.json", "version 99", "upgrade bidnerf")),
     "older": (described(lambda c: c.update(version=0)), ("map.json", "version 0", "retrain")),
-    "missing field": (described(lambda c: c.pop("bounds")), ("map.json", "'bounds'")),
+    "missing field": (described(lambda c: c.pop("bounds")), ("map.json", "bounds: missing")),
     "setting": (described(lambda c: c["config"].update(width=0)), ("map.json: config", "width is 0", "1 to")),
     "bounds": (described(lambda c: c["bounds"].update(lower=[9, 9, 9])), ("map.json: bounds", "9", "upper")),
     "unknown backend": (described(lambda c: c.update(backend="hashgird")), ("'hashgird'", "hashgrid")),
@@ -530,8 +530,6 @@ def test_each_frame_of_a_rig_counts_once(bidnerf: Run, shared: Path, photos_only
     assert (several.status, several.err) == (0, "t_0000, t_0001, t_0002: no measured depth; colour only\n")
     for twice in (["t_0001", "t_0001"], ["t_0000", "t_0001", "--frame", "t_0001"]):
         assert_refused(bidnerf(*place, "--frame", *twice), 2, "--frame", "t_0001")
-    bench = ["evaluate", "demo:blobs", "demo:blobs", "--out", shared / "never.jsonl"]
-    assert_refused(bidnerf(*bench, "--frame", "0001", "0001"), 2, "0001 more than once")
 
 
 def test_a_window_is_the_frame_and_those_before_it(bidnerf: Run, shared: Path, photos_only: Path) -> None:

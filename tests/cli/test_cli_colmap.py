@@ -148,4 +148,4 @@ def test_a_model_that_is_of_no_use_is_told_in_a_line(
     refused = bidnerf(*place, given / "training")
     assert_refused(refused, 1, "no points observed by t_0001", "6 images", after_remarks=True)
     (tmp_path / "sparse").symlink_to(given / "sparse")
-    assert_refused(bidnerf(*place, tmp_path), 1, "did you mean", tmp_path / "sparse")
+    assert_refused(bidnerf(*place, tmp_path), 1, tmp_path, "as in sparse/0 of a project")
