@@ -203,6 +203,11 @@ def seen_from(truth: SE3, given: SE3, count: int) -> list[ImageKeypoints]:
     return [replace(image, T_ref_camera=given[i]) for i, image in enumerate(found)]
 
 
+def test_positions_that_are_scaled_along_one_axis_are_refused() -> None:
+    truth = SE3.stack(irregular_poses())
+    assert pose_contradiction(seen_from(truth, positions(truth, 1, 1, 2), COUNT)) is not None
+
+
 def test_images_in_no_order_are_judged_as_well() -> None:
     """Neither order nor wrong poses propose pairs that show the same; the images do."""
     points = Points(COUNT, 0.4, 0.1)
