@@ -142,14 +142,19 @@ def _declared(group: str) -> tuple[PluginInfo, ...]:
 
     Of several versions of one, the first on ``sys.path`` counts.
     """
-    infos = list[PluginInfo]()
-    for p in entry_points(group=f"bidnerf.{group}"):
+    infos, points = list[PluginInfo](), list[tuple[EntryPoint, str, str, str]]()
+    try:
+        for p in entry_points(group=f"bidnerf.{group}"):
+            dist: Any = p.dist
+            points.append((p, dist.name, dist.version, dist.metadata.get("Summary", "")))
+    except Exception as error:
+        why = f"the metadata of an installed package cannot be read ({_described(error)})"
+        raise PluginError(why, expected="a sound one; reinstall or remove it") from error
+    for p, *source in points:
         try:
             names = p.load() if p.name == TABLE else [p.name]
         except Exception as error:
             raise PluginError(f"{p.value}: the table cannot be imported ({_described(error)})") from error
-        dist: Any = p.dist
-        source = dist.name, dist.version, dist.metadata.get("Summary", "")
         infos += [PluginInfo(group, name, p.value, *source) for name in names]
     found = []
     for info in infos:

@@ -291,7 +291,8 @@ def _opencv_camera(where: str, K: Any, lens: tuple[float, ...], model: str, size
 
 
 def _first(values: Mapping[str, Any], what: str) -> Any:
-    return next((values[key] for key in KEYS[what] if values.get(key) is not None), None)
+    nothing = (None, "", "~", "null")  # YAML is read as text
+    return next((values[key] for key in KEYS[what] if values.get(key) not in nothing), None)
 
 
 def _array(where: str, given: Any) -> np.ndarray:

@@ -124,13 +124,18 @@ def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
 def refuse_panoramas(photos: Sequence[SourceImage]) -> None:
     """Raise ``InputError`` for photos whose XMP says that they are panoramas, which no pinhole camera takes."""
     for photo in photos:
-        with open_binary(photo.file, "a photo") as file:
-            # So many bytes contain the XMP: a segment has at most 64 KiB, and EXIF precedes it.
-            if b"equirectangular" in file.read(2**18):
-                expected = (
-                    "poses with camera_model EQUIRECTANGULAR in transforms.json, or pinhole views cut from it"
-                )
-                raise InputError("is a panorama (equirectangular)", where=photo.file, expected=expected)
+        try:
+            with open_binary(photo.file, "a photo") as file:
+                head = file.read(
+                    2**18
+                )  # contains the XMP: a segment has at most 64 KiB, and EXIF precedes it
+        except InputError:  # left out later
+            continue
+        if b"equirectangular" in head:
+            expected = (
+                "poses with camera_model EQUIRECTANGULAR in transforms.json, or pinhole views cut from it"
+            )
+            raise InputError("is a panorama (equirectangular)", where=photo.file, expected=expected)
 
 
 def _below(folder: Path, out: Path | None) -> Iterator[Path]:

@@ -193,6 +193,13 @@ def test_focal_lengths_in_millimetres_are_questioned(tmp_path: Path) -> None:
         Frame.open(path, camera=camera)
 
 
+@pytest.mark.parametrize("nothing", ["", "~", "null", "[]"])
+def test_no_coefficients_are_no_distortion(nothing: str, tmp_path: Path) -> None:
+    before, _ = ros_info(CAMERA).split("distortion_coefficients:")
+    (tmp_path / "c.yaml").write_text(f"{before}distortion_coefficients: {nothing}\n")
+    assert read_camera(tmp_path / "c.yaml", SIZE) == replace(CAMERA, distortion=())
+
+
 @pytest.mark.parametrize(
     "content",
     [

@@ -186,7 +186,7 @@ def test_lists_of_names_that_no_frame_has(capture: Path) -> None:
     listed = ["images/r_1.png", "images/nix.png", "images\\r_2.png", 7]
     edit_keys(capture / "transforms.json", train_filenames=listed)
     (remark,) = remarks_of(capture)
-    assert "list 2 names that no frame has, first: 'images/nix.png'" in remark
+    assert "have 2 that no frame has, the first of them 'images/nix.png'" in remark
     with pytest.warns(match="nix"):
         dataset = open_dataset(capture)
     assert dataset.splits == ("train",)

@@ -330,6 +330,15 @@ def test_of_two_versions_the_first_on_the_path_wins_as_for_import(
     assert listed("mist") == []  # which only the hidden version has
 
 
+@pytest.mark.parametrize("file", ["entry_points.txt", "METADATA"])
+def test_a_package_with_malformed_metadata_is_named_in_one_line(site: Site, file: str) -> None:
+    info = site.metadata("unrelated", "1.0", "[bidnerf.backends]\nbroken = unrelated:backend\n")
+    (info / file).write_bytes(b"[bidnerf.backends]\nnonsense\nName: \xff\n")
+    site.backend()
+    with refused(found="metadata of an installed package cannot be read", error=PluginError):
+        load_backend("fog")
+
+
 def test_metadata_without_the_bundled_plugins_is_to_be_renewed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bidnerf_core.registry._declared", lambda group: ())
     with refused(found="lists no plugins at all; reinstall bidnerf", error=PluginError):

@@ -28,5 +28,8 @@ def test_smaller_copies_of_photos_are_left_out(tmp_path: Path) -> None:
 def test_panoramas_are_not_taken_for_pinhole_images(tmp_path: Path) -> None:
     image = Image.fromarray(np.zeros((20, 40, 3), np.uint8))
     image.save(tmp_path / "1.jpg", xmp=b'<x:xmpmeta GPano:ProjectionType="equirectangular"/>')
+    image.save(tmp_path / "0.jpg")
+    photos = photos_of(tmp_path)
+    (tmp_path / "0.jpg").unlink()  # a photo that cannot be read is left out later
     with refused(where=tmp_path / "1.jpg", found="is a panorama", expected="EQUIRECTANGULAR"):
-        refuse_panoramas(photos_of(tmp_path))
+        refuse_panoramas(photos)

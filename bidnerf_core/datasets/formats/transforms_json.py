@@ -82,7 +82,9 @@ def read_splits(path: Path) -> list[tuple[FrameRecord, tuple[str, ...]]]:
         else:
             unknown.append(name)
     if unknown:
-        found = f"{SPLITS[0]}_filenames and the like list {len(unknown)} names that no frame has, first: {unknown[0]!r}"
+        found = (
+            f"the lists of filenames have {len(unknown)} that no frame has, the first of them {unknown[0]!r}"
+        )
         if not splits:
             raise record.error(found, expected=f"the file_path of one of its {len(by_path)} frames")
         remark(record.where, found)
