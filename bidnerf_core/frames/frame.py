@@ -76,7 +76,7 @@ class Frame:
     # the scene covers the pixel and 0 where the background shows. All are dense tensors of the camera's image
     # size with finite floats, which is checked here. Colours are stored as bytes (uint8), to which floats are
     # rounded, and converted whenever they are read.
-    rgb: Float[Tensor, "h w channels"] = _Colours()  # type: ignore[assignment]
+    rgb: Shaped[Tensor, "h w channels"] = _Colours()  # type: ignore[assignment]
     intrinsics: Intrinsics  # type: ignore[misc]
     depth: Float[Tensor, "dh dw"] | None = None
     alpha: Float[Tensor, "ah aw"] | None = None

@@ -60,7 +60,7 @@ def refusal(path: Path) -> str:
 
 def test_no_such_file(tmp_path: Path) -> None:
     assert "no such file" in refusal(tmp_path / "none.ckpt")
-    assert "no such file" in refusal(tmp_path)
+    assert "is a folder" in refusal(tmp_path)
 
 
 @pytest.mark.parametrize(
