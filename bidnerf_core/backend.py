@@ -1,6 +1,6 @@
 """The interface of a backend, the object that an entry point of ``bidnerf.backends`` names, and the usual way to make one.
 
-What backends are written with is found here, too: the contract of fields and samplers, rendering, and supervision.
+It also re-exports what a backend is written with: the contract of fields and samplers, rendering, and supervision.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Backend(Protocol):
 
         One of its fields is ``steps``, an int above 0: the number of training steps. A map is complete once
         its field has been trained for that many steps, and the command line shows progress as a fraction of
-        them.
+        ``steps``.
         """
         ...
 
@@ -62,8 +62,8 @@ class Backend(Protocol):
     def train(self, field: RadianceField, views: Sequence[View], config: Any, report: Report) -> None:
         """Fit the field to views whose reference frame is the world, and report each step's progress to ``report``.
 
-        Photos of one place differ in exposure, some are blurred, and landmarks provide depth where no sensor
-        did; ``training.Supervision`` handles all of this.
+        Photos of the same scene differ in exposure, some are blurred, and landmarks provide depth where no
+        sensor did; ``training.Supervision`` handles all of this.
         """
         ...
 
@@ -78,7 +78,7 @@ BACKENDS: Plugins[Backend] = Plugins("backends", _defects)
 
 
 def load_backend(name: str, wanted_by: str = "") -> Backend:
-    """Return the backend of that name, imported and checked.
+    """Import the backend registered under ``name``, check it, and return it.
 
     Raises ``PluginError``, an ``InputError`` that names the entry point and, if given, the map that needs it
     (``wanted_by``).
@@ -88,17 +88,17 @@ def load_backend(name: str, wanted_by: str = "") -> Backend:
 
 @runtime_checkable
 class UpgradingField(Protocol):
-    """Optional part of a field that accepts states stored by earlier versions of its backend."""
+    """Optional interface of a field that accepts states stored by earlier versions of its backend."""
 
     def upgraded_state(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Convert a stored state, of this or an earlier version, to the field's present tensors."""
+        """Convert a stored state, of this or an earlier version, to the tensors of the current version."""
         ...
 
 
 def quick_config(backend: Backend) -> Any:
     """Return the config with which a backend trains a small and simple scene in about a minute, as in ``bidnerf demo``.
 
-    It is what the backend's optional method ``quick_config`` returns, or else its default config.
+    This is the result of the backend's optional method ``quick_config``, or else the backend's default config.
     """
     return getattr(backend, "quick_config", backend.config_type)()
 

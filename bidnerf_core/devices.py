@@ -1,5 +1,5 @@
-"""Torch devices and threads: where tensors reside, when the host may wait for them, work that is launched as
-one CUDA graph, and how many threads compute.
+"""Torch devices and threads: where tensors reside, when the host may wait for a device, capture of work as
+a CUDA graph, and the number of CPU threads.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def without_waiting() -> Iterator[None]:
 
 
 def may_wait(device: torch.device) -> bool:
-    """Return whether code may read values from tensors on ``device``; always True on the CPU, where nothing is queued."""
+    """Return whether code may read values from tensors on ``device``; always True for the CPU, which queues no work."""
     return device.type == "cpu" or _allowed.get()
 
 
@@ -100,8 +100,8 @@ def captured(
     """Return a callable equivalent to ``step``; on a GPU, it replays a CUDA graph.
 
     ``generator`` is the one from which the step draws, if any. Capturing does not execute the step. If the
-    capture fails, ``step`` itself is returned, with a warning. Take a step or two before: these fill caches and
-    load kernels, as a capture does not allow. Graphs that are never replayed at the same time may share their
+    capture fails, ``step`` itself is returned, with a warning. Run a step or two before capturing: they fill caches and
+    load kernels, which is not allowed during a capture. Graphs that are never replayed at the same time may share their
     temporary ``memory``, a pool and the stream of their captures.
     """
     if device.type != "cuda":
@@ -153,9 +153,9 @@ def run_on(device: torch.device, function: Callable[..., T], *values: Any) -> T:
     """Return ``function(*values)``, computed on ``device``, with all tensors of the result on the CPU.
 
     Tensors in ``values`` are found as by ``moved``, except in modules and in ``Resident`` objects, which must be on the
-    device. All that are on the CPU go there in one copy, and the results return in another, which is the only time
-    that the host waits. On a GPU, repeated calls with values of the same shapes replay a CUDA graph, so the
-    function must not draw random numbers, nor depend on the numbers in a tensor for what it computes.
+    device. Tensors on the CPU are all moved in one copy, and the results return in another, the only point at which
+    the host waits. On a GPU, repeated calls with values of the same shapes replay a CUDA graph, so the
+    function must not draw random numbers, nor let the contents of a tensor decide which operations it runs.
     """
     if device.type == "cpu":
         return function(*values)
@@ -182,7 +182,7 @@ def run_on(device: torch.device, function: Callable[..., T], *values: Any) -> T:
 
 
 class _Lane:
-    """Functions on a device that one thread at a time calls, so that their graphs share memory."""
+    """Functions on a device that only one thread calls at a time, so that their graphs can share memory."""
 
     def __init__(self, device: torch.device) -> None:
         self.device, self.remotes = device, OrderedDict[Hashable, _Remote]()
@@ -262,7 +262,7 @@ def _structure(value: Any, tensors: list[Tensor]) -> Hashable:
 
 
 def _rebuilt(value: Any, tensors: Iterator[Tensor]) -> Any:
-    """Return ``value`` with its tensors replaced by the next of ``tensors``."""
+    """Return ``value`` with its tensors replaced, in order, by the next ones from ``tensors``."""
     whole = nn.Module, Resident
     return _mapped(value, lambda part: next(tensors) if isinstance(part, Tensor) else part, whole)
 
@@ -271,9 +271,9 @@ def _rebuilt(value: Any, tensors: Iterator[Tensor]) -> Any:
 
 
 def working_device(device: torch.device | str) -> torch.device:
-    """Return a device after a test computation on it; a valid name does not mean that the device works on this machine.
+    """Return the named device after a test computation on it: a valid name does not mean that the device works here.
 
-    Raises ``InputError`` if it does not work.
+    Raises ``InputError`` if the device does not work.
     """
     try:
         found = torch.device(device)
@@ -307,7 +307,7 @@ def moved(value: T, device: torch.device | str) -> T:
 
 
 def _mapped(value: Any, change: Callable[[Any], Any], whole: tuple[type, ...]) -> Any:
-    """Return ``value`` with each tensor, and each part of a type in ``whole``, changed; itself if nothing changes."""
+    """Apply ``change`` to the tensors in ``value`` and the parts whose type is in ``whole``; return ``value`` itself if none changes."""
     if isinstance(value, (Tensor, *whole)):
         return change(value)
     if is_dataclass(value) and not isinstance(value, type):
@@ -343,8 +343,8 @@ _setting = Lock()
 def threads_at_most(count: int) -> Iterator[int]:
     """Run torch operators called from this Python thread on at most ``count`` threads within the block.
 
-    Yields the usual number. On one thread, sums are the same on any machine. Other Python threads are not
-    affected, and may be in such blocks too.
+    Yields the usual number of threads. With a single thread, sums are the same on any machine. Other Python
+    threads are not affected, and may enter such blocks as well.
     """
     usual = torch.get_num_threads()
     if usual > count:

@@ -1,5 +1,5 @@
-"""Errors for a user's mistakes and warnings about assumptions: each is one line that names the file and the
-problem.
+"""Errors for a user's mistakes, and warnings about assumptions: each message is one line that names the file
+and the problem.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ class InputError(ValueError):
     """An input that cannot be used.
 
     The message is a single line that can be shown to the user unchanged, ``where: found, expected ...``, and its
-    parts are fields. Where ``found`` ends in a colon or a semicolon, no comma follows it. ``InputError(error,
-    where=path)`` is ``error`` in a wider context: ``where`` precedes its own, and the other parts stay as they are.
+    parts are attributes. Where ``found`` ends in a colon or a semicolon, no comma follows it. ``InputError(error,
+    where=path)`` adds context to ``error``: ``where`` is put before the error's own, and the other parts are unchanged.
     """
 
     where: str | None
@@ -43,7 +43,7 @@ class UsageError(InputError):
 
 
 class InputWarning(UserWarning):
-    """An input was ambiguous and a convention was assumed; the message is a single line that states which."""
+    """An input was ambiguous and a convention was assumed; the message is a single line that states the convention."""
 
 
 class Cancelled(Exception):

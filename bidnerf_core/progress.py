@@ -35,7 +35,7 @@ Cancel: TypeAlias = Callable[[], bool]
 
 @dataclass(frozen=True)
 class Job:
-    """Who receives the progress of the work at hand, and who may stop it."""
+    """The callbacks of the current work: one receives its progress, the other may cancel it."""
 
     progress: ProgressCallback | None = None
     cancel: Cancel | None = None
@@ -46,11 +46,11 @@ _JOB: ContextVar[Job] = ContextVar("job", default=Job())  # noqa: B039 (it is fr
 
 @contextmanager
 def job_context(progress: ProgressCallback | None = None, cancel: Cancel | None = None) -> Iterator[None]:
-    """Set who receives the progress of this thread's work within the block, and who may stop it.
+    """Set the callbacks that receive the progress of this thread's work within the block and that may cancel it.
 
-    Functions that take ``progress`` and ``cancel`` from users open this block once; what they call reports by ``counter`` and
-    stops by ``check_cancelled``. What is None remains as the enclosing block has it. Raises ``InputError`` if ``cancel`` is not callable
-    (an event itself, say).
+    Functions that take ``progress`` and ``cancel`` from users open this block once; the functions that they call report by
+    ``counter`` and stop by ``check_cancelled``. A callback that is None is inherited from the enclosing block. Raises ``InputError``
+    if ``cancel`` is not callable (for example, if it is an event rather than its ``is_set``).
     """
     kinds = {
         "cancel": "a function, such as the is_set of an event",
@@ -68,7 +68,7 @@ def job_context(progress: ProgressCallback | None = None, cancel: Cancel | None 
 
 
 def current_job() -> Job:
-    """Return the job of this thread's work, for those who hand its functions to another thread or call them in their own way."""
+    """Return the job of this thread's work, for code that passes the callbacks to another thread or calls them itself."""
     return _JOB.get()
 
 

@@ -53,7 +53,7 @@ class PluginError(InputError):
 
 @dataclass(frozen=True)
 class PluginInfo:
-    """Information about a plugin that is available without importing it, but for the summary of a bundled one."""
+    """Information about a plugin, available without importing it (except for the summary of a bundled plugin)."""
 
     group: str
     name: str
@@ -69,9 +69,9 @@ class PluginInfo:
 
     @property
     def summary(self) -> str:
-        """One line that describes the plugin: its own if it is bundled or registered in this process, else its distribution's.
+        """A one-line description: the plugin's own if it is bundled or registered in this process, else its distribution's.
 
-        A bundled plugin is imported for it.
+        Reading the summary of a bundled plugin imports the plugin.
         """
         if self.fault is None and (self.is_bundled or not self.version):
             with contextlib.suppress(PluginError):  # reported when the plugin is loaded for use
@@ -111,7 +111,7 @@ def registered_names() -> list[tuple[str, str]]:
 def require_registered(names: Iterable[tuple[str, str]]) -> None:
     """Raise ``PluginError`` for a group and name that another process registered and this one did not.
 
-    An installed plugin may have the same name, but it is not the one the other process refers to.
+    An installed plugin of the same name does not count: the other process refers to its own.
     """
     for group, name in names:
         if (group, name) not in registered:
@@ -138,9 +138,9 @@ def list_plugins(group: str) -> list[PluginInfo]:
 
 @functools.cache
 def _declared(group: str) -> tuple[PluginInfo, ...]:
-    """Return what installed distributions declare in a group.
+    """Return the entry points that installed distributions declare in a group.
 
-    Of several versions of one, the first on ``sys.path`` counts.
+    If several versions of a distribution are installed, the first on ``sys.path`` counts.
     """
     infos, points = list[PluginInfo](), list[tuple[EntryPoint, str, str, str]]()
     try:
@@ -168,7 +168,7 @@ def _declared(group: str) -> tuple[PluginInfo, ...]:
 
 
 def load_plugin(group: str, name: str, defects: Defects | None = None, wanted_by: str = "") -> Any:
-    """Return the plugin of that name, imported and, if ``defects`` is given, checked with it.
+    """Import the plugin called ``name``, check it with ``defects`` if given, and return it.
 
     Raises ``PluginError``, which names the plugin and, if given, what needs it (``wanted_by``).
     """

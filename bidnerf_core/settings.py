@@ -1,4 +1,4 @@
-"""Settings as frozen dataclasses, each field with its range, and the flat names by which users set them.
+"""Settings as frozen dataclasses: the range of each field, and the flat names by which users set them.
 
 A method's settings are composed of small groups shared by several methods (`Annotated` fields of nested
 dataclasses). On the command line and in JSON they all have flat names, ``{"rays": 512, "depth_weight": 3}``:
@@ -67,7 +67,7 @@ class WholeNumbers(Range):
 
 
 def _written(limit: float) -> str:
-    """Format a limit for messages, the same for 1 and 1.0: ``Annotated`` does not distinguish equal ranges."""
+    """Format a limit for messages. The result is the same for 1 and 1.0, since ``Annotated`` does not distinguish equal ranges."""
     return f"{int(limit) if float(limit).is_integer() else limit:,}"
 
 
@@ -135,7 +135,7 @@ def _allowed(kind: Any) -> dict[str, tuple[Range | OneOf, bool]]:
 
 
 def to_flat(settings: Any) -> dict[str, Any]:
-    """Return all settings by their flat names, as JSON-serializable values."""
+    """Return a dictionary from the flat names of all settings to JSON-serializable values."""
     flat: dict[str, Any] = {}
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)

@@ -1,4 +1,4 @@
-"""Bins, the equal parts of a ray's segment in the scene's box, and the selection of a few of them."""
+"""Bins (equal parts of a ray's segment in the scene's box), and the selection of a few bins per ray."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from bidnerf_core.fields import Rays, RaySamples, SceneBounds, Stratified
 class Bins:
     """A ``RaySampler`` that returns all bins of each ray, as dense training needs them.
 
-    A ray's bins depend only on the box. They are truncated if the ray's own [near, far] is narrower, and do
-    not extend beyond the box if it is wider.
+    A ray's bins depend only on the box. The bins are truncated if the ray's own [near, far] is
+    narrower, and do not extend beyond the box if [near, far] is wider.
     """
 
     bounds: SceneBounds
@@ -72,7 +72,7 @@ def ray_logits(oracle: Oracle, bins: Bins, rays: Rays) -> Float[Tensor, "*r n"]:
 
 
 def chosen(samples: RaySamples, scores: Float[Tensor, "*r n"], threshold: float, most: int) -> RaySamples:
-    """Return the at most ``most`` samples of each ray that score highest above ``threshold``.
+    """Return, for each ray, up to ``most`` samples with the highest scores above ``threshold``.
 
     The best sample of a ray is kept even below the threshold, provided that it is valid.
     """

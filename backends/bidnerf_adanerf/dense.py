@@ -30,10 +30,10 @@ def dense_samples(
 
 
 def soft_weights(scores: Float[Tensor, "r n"], threshold: float) -> Float[Tensor, "r n"]:
-    """Return the weights of bins in the soft phase: 1 above the threshold, as afterwards, and proportional to the score below.
+    """Return the weights of bins in the soft phase: 1 above the threshold, as in later phases, and proportional to the score below it.
 
-    In the paper the weight is the score itself. Intermediate scores then drive the density too high, and it
-    stays too high once those bins count fully: on Lego the dense rendering lost 1 dB in this phase.
+    In the paper the weight is the score itself. Intermediate scores then drive the density too high, and the
+    density stays too high once those bins count fully: on Lego the dense rendering lost 1 dB in this phase.
     """
     return (scores / max(threshold, 1e-6)).clamp(max=1)
 

@@ -1,4 +1,4 @@
-"""The field of AdaNeRF (Kurz et al. 2022): a shading network that is evaluated where a sampling network chooses."""
+"""The field of AdaNeRF (Kurz et al. 2022): a shading network, evaluated at points that a sampling network chooses."""
 
 from __future__ import annotations
 

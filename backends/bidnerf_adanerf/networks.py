@@ -13,7 +13,7 @@ from bidnerf_core.fields import encoded_width, frequency_encoding, octaves
 
 
 def encode(points: Float[Tensor, "*p 3"], frequencies: int) -> Float[Tensor, "*p f"]:
-    """Return the encoding of points of the cube [-1, 1], in the order of the inputs of stored networks."""
+    """Return the encoding of points in the cube [-1, 1], in the input order of stored networks."""
     return frequency_encoding(points, octaves(frequencies, points), sines_first=True)
 
 
@@ -25,7 +25,7 @@ def trunk(inputs: int, width: int, layers: int) -> nn.Sequential:
 
 
 class ShadingNetwork(nn.Module):
-    """The MLP of NeRF, without its skip connection: position to density; with the direction, to colour."""
+    """The MLP of NeRF without its skip connection: maps position to density and, with the direction, to colour."""
 
     def __init__(
         self, width: int, layers: int, position_frequencies: int, direction_frequencies: int
@@ -48,9 +48,9 @@ class ShadingNetwork(nn.Module):
 
 
 class Oracle(nn.Module):
-    """The sampling network: scores all bins of a ray in one evaluation, from the ray alone.
+    """The sampling network: scores all bins of a ray in one evaluation, given only the ray.
 
-    Its inputs are points evenly spaced along the ray's segment in the scene, from where it enters to where it leaves. Rays
+    Its inputs are points evenly spaced along the ray's segment in the scene, from entry to exit. Rays
     that see the same part of the scene thus have similar inputs, whether their camera is outside or inside.
     """
 

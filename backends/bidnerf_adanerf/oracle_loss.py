@@ -24,7 +24,7 @@ def oracle_loss(
 ) -> Float[Tensor, ""]:
     """Return the cross entropy of the scores with soft targets in [0, 1], averaged over the rays that meet the scene.
 
-    ``samples`` are all bins, ``weights`` their volume rendering weights without scores. A network that classifies bins
+    ``samples`` are all bins, and ``weights`` are the bins' volume rendering weights without scores. A network that classifies bins
     learns faster than one that is trained through the rendered colour alone (Neff et al. 2021, DONeRF, section 4).
     """
     target = torch.maximum(by_weight(weights.detach()), by_depth(samples, batch))
@@ -34,7 +34,7 @@ def oracle_loss(
 
 
 def by_weight(weights: Float[Tensor, "r n"]) -> Float[Tensor, "r n"]:
-    """Return targets from the mean of a bin's weight and the largest weight around it: a surface may lie between bins."""
+    """Return targets from the mean of a bin's weight and the largest weight around the bin, as a surface may lie between bins."""
     beside = functional.max_pool1d(weights[:, None], 3, stride=1, padding=1)[:, 0]
     return ((weights + beside) / 2 / ENOUGH).clamp(max=1)
 

@@ -1,4 +1,4 @@
-"""Training of an AdaNeRF: first with all bins, then with fewer and fewer, then only with those the oracle keeps."""
+"""Training of an AdaNeRF: first with all bins, then with fewer and fewer, and finally with only the bins that the oracle keeps."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ def phase_at(step: int, config: AdaNerfConfig) -> Phase:
 
 
 def sparsity(step: int, config: AdaNerfConfig) -> float:
-    """Return the weight of the mean score in the loss: 0 before the soft phase, then growing until that phase is half over."""
+    """Return the weight of the mean score in the loss: 0 before the soft phase, then increasing until halfway through that phase."""
     begin, length = config.dense_part * config.steps, config.soft_part * config.steps
     return config.sparsity_weight * min(1.0, max(0.0, (step - begin) / max(1.0, length / 2)))
 
 
 def train(field: AdaNerfField, views: Sequence[View], config: AdaNerfConfig, report: Report) -> None:
-    """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
+    """Fit ``field`` to ``views``; see ``fit`` for checkpoints and stopping."""
     room = room_for_matter(views, field.bounds, config.room_resolution) if config.carve else None
     room = moved(room, device_of(field))
     supervision = Supervision(views, field.bounds, config, device_of(field))
@@ -96,7 +96,7 @@ def dense_step(
     field: AdaNerfField, supervision: Supervision, batch: TrainingBatch, room: OccupancyMask | None,
     phase: Phase, sparsity_weight: Float[Tensor, ""], generator: Generator,
 ) -> StepOutcome:  # fmt: skip
-    """Return the loss with all bins shaded; they count in full or, in the soft phase, according to their scores."""
+    """Return the loss with all bins shaded, each weighted fully or, in the soft phase, according to its score."""
     config = supervision.config
     assert isinstance(config, AdaNerfConfig)
     samples, empty = dense_samples(field, batch.rays, room, generator)

@@ -4,8 +4,8 @@ Pure torch, laid out for the cores of a CPU; on a GPU, ``fused`` has a kernel fo
 
 * arrays are (corner, point), so that all arithmetic runs along contiguous points;
 * a pair of features is read and accumulated as one complex number (a "unit" below): one memory access per corner;
-* the points go through a level in chunks whose temporaries stay in the cache, and so does the table of the level;
-* levels are computed on several threads at once, because torch gathers and scatters on one;
+* the points go through a level in chunks whose temporaries stay in the cache, as does the table of the level;
+* levels are computed on several threads at once, because torch gathers and scatters on a single thread;
 * the backward pass is written by hand: gradients to a table are scattered to recomputed corner indices, and the
   derivative with respect to position is kept from the forward pass, where the corner values are at hand anyway.
 """
@@ -71,7 +71,7 @@ def _unit(features: int) -> int:
 
 
 def _as_units(values: Float[Tensor, "*shape w"], unit: int) -> Shaped[Tensor, "*shape n"]:
-    """Return a view of adjacent pairs of floats as complex numbers, if the unit is a pair."""
+    """View adjacent pairs of floats as complex numbers if the unit is a pair; otherwise return the values unchanged."""
     return torch.view_as_complex(values.unflatten(-1, (-1, 2))) if unit == 2 else values
 
 
@@ -151,10 +151,10 @@ def _write_table_gradient(
 
 
 class _Encode(torch.autograd.Function):
-    """The encoding by all active levels at once.
+    """Autograd function of the encoding by all active levels at once.
 
-    Internally, each unit of each level is a contiguous row: one transposition at the end costs less than each level writing
-    into the columns of the result.
+    Internally, each unit of each level is a contiguous row: a single transposition at the end costs less than
+    having each level write to the columns of the result.
     """
 
     @staticmethod
@@ -219,8 +219,8 @@ class HashEncoding(nn.Module):
     """Maps positions in the unit cube to the concatenated features of all levels (figure 3 of the paper).
 
     Positions outside [0, 1] are clamped to it: their encoding is that of the nearest point of the cube, and a
-    clamped coordinate gets no gradient. Gradients are computed only for what requires them. They cannot be
-    differentiated again: double backward raises an error.
+    clamped coordinate gets no gradient. Gradients are computed only for inputs that require them. They
+    cannot be differentiated again: double backward raises an error.
     """
 
     def __init__(self, config: HashEncodingConfig) -> None:
@@ -237,13 +237,13 @@ class HashEncoding(nn.Module):
 
     @property
     def width(self) -> int:
-        """Length of the encoding of a point."""
+        """The number of features in a point's encoding."""
         return self.config.levels * self.config.features
 
     def forward(
         self, positions: Float[Tensor, "n 3"], active_levels: int | None = None
     ) -> Float[Tensor, "n {self.width}"]:
-        """Encode positions; levels from ``active_levels`` on are not evaluated and come back as zeros."""
+        """Encode positions; levels from ``active_levels`` on are not evaluated, and their features are zeros."""
         levels = self.levels if active_levels is None else self.levels[: max(active_levels, 0)]
         if not levels:
             return self.tables[0].new_zeros(len(positions), self.width)

@@ -60,7 +60,7 @@ class FieldConfig(Settings):
 
 
 class HashGridField(nn.Module):
-    """Density and colour in a scene's box. Its ``levels`` are the field with its fine encoding levels masked, and itself."""
+    """Density and colour in a scene's box. Its ``levels`` are the field with its fine encoding levels masked, and the full field."""
 
     def __init__(self, config: FieldConfig, bounds: SceneBounds) -> None:
         super().__init__()
@@ -94,7 +94,7 @@ class HashGridField(nn.Module):
         return CoarseField(self), self
 
     def upgraded_state(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return a stored state. Raises ``InputError`` for infinite densities."""
+        """Return a stored state unchanged. Raises ``InputError`` if it holds densities that are not finite."""
         for name in ("occupancy.density", "coarse_sampler.density"):
             if name in state and not bool(state[name].isfinite().all()):
                 raise InputError(f"tensor '{name}' holds infinity", expected="densities")
@@ -152,7 +152,7 @@ class HashGridField(nn.Module):
         return FieldDerivatives(FieldValues(values[:, 0], values[:, 1:]), *by_both.split(3, -1))
 
     def _kernel(self, active: int | None) -> tuple[Any, ...] | None:
-        """Return the arguments of ``fused.query`` if a kernel computes the field; it gives no gradients of the parameters."""
+        """Return the arguments of ``fused.query`` if a kernel can compute the field; the kernel gives no gradients of the parameters."""
         encoding = self.encoding
         levels = encoding.levels[:active]
         if not (levels and fused.fits(list(encoding.tables))):
@@ -192,7 +192,7 @@ def _hidden(widths: Sequence[int]) -> list[nn.Module]:
 def limited(grid: OccupancyGrid, count: int) -> RaySampler:
     """Return a sampler of at most ``count`` intervals per ray, concentrated where the grid has observed density.
 
-    With a count of 0, or if the grid has observed nothing, it is the grid itself, which samples all occupied cells.
+    If the count is 0, or the grid has observed nothing, the sampler is the grid itself, which samples all occupied cells.
     """
     return ConcentratedInGrid(GridDensity(grid), count) if count and grid.observed else grid
 

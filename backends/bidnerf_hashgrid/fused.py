@@ -1,7 +1,7 @@
-"""The encoding, the whole field and its sampler in one kernel each, where torch brings Triton and the field is on a GPU.
+"""The encoding, the whole field and its sampler as one kernel each, used where Triton is installed and the field is on a GPU.
 
 Kernels are imported where they are launched, since Triton may be missing.
-Triton launches on the current device, which may be another than that of the field.
+Triton launches on the current device, which may differ from the field's device.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ POINTS = 64
 
 @lru_cache(maxsize=4)
 def available(device: torch.device) -> bool:
-    """Return whether the kernels run on ``device``."""
+    """Return whether the kernels can run on ``device``."""
     return device.type == "cuda" and find_spec("triton") is not None
 
 
 def fits(tables: Sequence[Tensor]) -> bool:
-    """Return whether the kernels compute an encoding by these tables, whose numbers they count in 32 bits."""
+    """Return whether the kernels can encode by these tables: float32, on a suitable GPU, and small enough for 32-bit indices."""
     small = all(table.dtype == torch.float32 and table.numel() < 2**31 for table in tables)
     return small and available(tables[0].device)
 
@@ -48,7 +48,7 @@ def _power_of_two(size: int) -> int:
 
 
 def _launched(levels: Sequence[Level], tables: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the numbers of the levels, the first table, and where the tables begin relative to it, in elements."""
+    """Return the levels' constants, the first table, and the offset of each table from the first, in elements."""
     columns = zip(*((a.resolution, a.entries, int(a.hashed), *a.strides[1:]) for a in levels), strict=True)
     first, size = tables[0].data_ptr(), tables[0].element_size()
     offsets = tuple((table.data_ptr() - first) // size for table in tables)
@@ -62,7 +62,7 @@ def _blocks(count: int, size: int) -> tuple[int]:
 
 
 class Encode(torch.autograd.Function):
-    """The encoding of points (3 n) in the unit cube by some levels, with zeros for the others."""
+    """Autograd function that encodes points (3 n) in the unit cube by some levels, with zeros for the others."""
 
     @staticmethod
     def forward(
@@ -120,7 +120,7 @@ class PackedNetworks:
 
     @staticmethod
     def of(geometry: nn.Sequential, colour: nn.Sequential) -> PackedNetworks | None:
-        """Return the packed networks; None if the kernel cannot compute them: it has one or two hidden layers of colour."""
+        """Return the packed networks, or None if the kernel cannot compute them: it supports one or two hidden layers of colour."""
         first, out_of, into, *between, last = (
             part for part in (*geometry, *colour) if isinstance(part, nn.Linear)
         )
@@ -159,10 +159,10 @@ def query(
     positions: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], derivatives: bool, wanted: Bool[Tensor, "n"] | None,
     packed: PackedNetworks, levels: tuple[Level, ...], tables: Sequence[Tensor], smooth: bool, limits: tuple[SceneBounds, float],
 ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, "n 4 6"]]:  # fmt: skip
-    """Return density and colour at points (metres, world) along unit directions and, with ``derivatives``, theirs by both.
+    """Return density and colour at points (metres, world) along unit directions.
 
-    ``limits`` are the scene's bounds and the largest log density per side of the scene. At points that are not ``wanted``,
-    everything is 0.
+    With ``derivatives``, also return the derivatives of density and colour by position and by direction. ``limits`` are the
+    scene's bounds and the largest log density per side of the scene. At points that are not ``wanted``, all results are 0.
     """
     from bidnerf_hashgrid.kernels import field_kernel
 
@@ -196,10 +196,10 @@ def sampled(
     rays: Rays, bounds: SceneBounds, occupied: Bool[Tensor, "n n n"], density: Float[Tensor, "n n n"], step: float,
     count: int, most: int, jitter: Generator | None,
 ) -> RaySamples:  # fmt: skip
-    """Return ``count`` intervals of each ray (r) that are concentrated where a grid of cells has its ``density``.
+    """Return ``count`` intervals of each ray (r), concentrated where the ``density`` of a grid's cells is high.
 
-    They divide the ray's first ``most`` steps in ``occupied`` cells; with a count of ``most`` they are these steps. The values are
-    those of ``OccupancyGrid`` and ``Concentrated``.
+    The intervals divide the ray's first ``most`` steps in ``occupied`` cells; if ``count`` is ``most``, they are these steps. The
+    result is that of ``OccupancyGrid`` and ``Concentrated``.
     """
     from bidnerf_hashgrid.march import concentrate_kernel, march_kernel
 

@@ -1,8 +1,8 @@
 """Triton kernels for a GPU: the encoding with its derivatives, and the whole field with its derivatives.
 
-On a GPU, the pure-torch path takes hundreds of launches, each of which takes longer to start than to compute. Each kernel here
-does in one launch what dozens of operations do there; the torch path is the reference that they are tested against, on a CPU by
-Triton's interpreter. Triton comes with torch's CUDA build. A tile is (points, columns), where a column is a feature of a level.
+On a GPU, the pure-torch path needs hundreds of launches, each of which takes longer to start than to compute. Each kernel here
+replaces dozens of torch operations by one launch. The torch path is the reference against which the kernels are tested (on a
+CPU, by Triton's interpreter). Triton comes with torch's CUDA build. A tile is (points, columns), where a column is a feature of a level.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def _columns(meta, tables, offsets, LEVELS: tl.constexpr, F: tl.constexpr, C: tl
 def _encoded(
     x, y, z, inside, table, resolution, entries, hashed, stride_y, stride_z, F: tl.constexpr, SMOOTH: tl.constexpr
 ):  # fmt: skip
-    """Return the features at positions (points, 1) in the unit cube, and their derivatives by x, y and z: eight reads a column."""
+    """Return the features at positions (points, 1) in the unit cube, and their derivatives by x, y and z, with eight reads per column."""
     tx, ty, tz, fx, fy, fz = _cells(x, y, z, resolution, entries, hashed, stride_y, stride_z)
     wx, dx = _weight(fx, SMOOTH)
     wy, dy = _weight(fy, SMOOTH)
@@ -199,7 +199,7 @@ def _tile(start, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
 
 @triton.jit
 def _colour_layers(start, WIDTH: tl.constexpr, FEATURES: tl.constexpr, HIDDEN: tl.constexpr):
-    """Return where the weights of the colour network begin: of the features, the harmonics, hidden layers, and the output."""
+    """Return the offsets of the colour network's weights: those for the features, the harmonics, the hidden layers and the output."""
     of_harmonics = start + FEATURES * WIDTH
     of_hidden = of_harmonics + 16 * WIDTH
     return start, of_harmonics, of_hidden, of_hidden + HIDDEN * WIDTH * WIDTH
@@ -209,7 +209,7 @@ def _colour_layers(start, WIDTH: tl.constexpr, FEATURES: tl.constexpr, HIDDEN: t
 def _colour_tangent(
     tangent, first, second, weights, WIDTH: tl.constexpr, HIDDEN: tl.constexpr, PRECISION: tl.constexpr
 ):
-    """Carry the tangent (points, WIDTH) of the first hidden layer's inputs on to the logits."""
+    """Propagate the tangent (points, WIDTH) of the first hidden layer's inputs forward to the logits."""
     tangent = tl.where(first, tangent, 0.0)
     if HIDDEN:
         tangent = tl.dot(tangent, _tile(weights, WIDTH, WIDTH), input_precision=PRECISION)
@@ -226,7 +226,7 @@ def field_kernel(
 ):  # fmt: skip
     """Compute density and colour (n 4) at points (n 3, world) along directions (n 3) and, with ``DERIVATIVES``, (n 4 6).
 
-    Derivatives by position (three) and by direction (three) are carried forward with the values. ``box`` has the scene's centre,
+    Derivatives by position (three) and by direction (three) are propagated forward with the values. ``box`` has the scene's centre,
     the factor to the cube [-1, 1] and the factor of the density. Layers are padded with zeros to ``WIDTH`` and ``FEATURES``, whose
     first column is the log density; ``weights`` has them one after the other, each (inputs, outputs). With ``SOME``, only the
     first ``count`` points of ``index`` are computed.

@@ -25,7 +25,7 @@ class Level:
     hashed: bool
 
     def vertices(self, points: Float[Tensor, "3 m"]) -> tuple[Int[Tensor, "3 2 m"], Float[Tensor, "3 m"]]:
-        """Return each axis's terms of the corner indices, for its lower and upper vertex, and the position in the cell."""
+        """Return the terms of the corner indices for the lower and upper vertex of each axis, and the position in the cell."""
         scaled = points * self.resolution
         # A coordinate of exactly 1 belongs to the last cell, whose upper vertices exist.
         lower = scaled.to(torch.int32).clamp_(0, self.resolution - 1)

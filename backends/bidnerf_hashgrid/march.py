@@ -1,6 +1,6 @@
 """Triton kernels of the sampler: steps in occupied cells, and intervals concentrated where the cells are dense.
 
-One program takes one ray. See ``kernels`` for why they exist, and ``OccupancyGrid`` and ``Concentrated`` for what they compute.
+Each program handles one ray. See ``kernels`` for why kernels are used, and ``OccupancyGrid`` and ``Concentrated`` for the results.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def _placed(distance, leave, radius, CONTRACTED: tl.constexpr):
 
 @triton.jit
 def _slab(o, d, middle, half):
-    """Return where a line enters and leaves the slab ``middle`` - ``half`` to ``middle`` + ``half`` of one axis."""
+    """Return the distances at which a line enters and leaves the slab of one axis from ``middle`` - ``half`` to ``middle`` + ``half``."""
     tiny = 1.1754943508222875e-38
     slope = 1 / tl.where(tl.abs(d) < tiny, tiny, d)
     a, b = (middle - half - o) * slope, (middle + half - o) * slope
@@ -41,7 +41,7 @@ def _slab(o, d, middle, half):
 
 @triton.jit
 def _limits(rays, grid, ray, n, CONTRACTED: tl.constexpr):
-    """Return a ray's origin, direction, limits in the coordinate of ``RaySpacing``, and where it leaves and enters the cube.
+    """Return a ray's origin and direction, its limits in the coordinate of ``RaySpacing``, and where it leaves and enters the cube.
 
     ``rays`` are (8 n): origin, direction, near and far. ``grid`` has the cube's centre, half its side, the step, and the number of
     cells along a side.
@@ -84,7 +84,7 @@ def march_kernel(
 ):  # fmt: skip
     """Write the coordinates of the first ``MOST`` steps of each ray in occupied cells (r MOST), and how many there are.
 
-    One program takes one ray. ``counts`` may exceed ``MOST``; the farther steps are then not stored.
+    Each program handles one ray. ``counts`` may exceed ``MOST``; the farther steps are then not stored.
     """
     ray = tl.program_id(0)
     ox, oy, oz, dx, dy, dz, near, far, leave, enter = _limits(rays, grid, ray, n, CONTRACTED)
@@ -131,7 +131,7 @@ def _joined(middles, at, count, near, far, leave, grid, MOST: tl.constexpr, CONT
 
 @triton.jit
 def _absorbed(start, end, there, ox, oy, oz, dx, dy, dz, grid, density, thickest, CONTRACTED: tl.constexpr):
-    """Return the optical thickness of intervals by the grid's densities, limited to ``thickest``."""
+    """Return the optical thickness of intervals according to the grid's densities, limited to ``thickest``."""
     middle = (start + end) / 2
     cell, _inside = _cell_at(ox + middle * dx, oy + middle * dy, oz + middle * dz, grid, CONTRACTED)
     thickness = tl.load(density + cell, mask=there, other=0.0) * (end - start)
@@ -140,7 +140,7 @@ def _absorbed(start, end, there, ox, oy, oz, dx, dy, dz, grid, density, thickest
 
 @triton.jit
 def _neighbour(values, by, J: tl.constexpr):
-    """Return each value's neighbour, ``by`` places on; 0 where there is none."""
+    """Return the value ``by`` elements after each value; 0 where there is none."""
     here, other = tl.arange(0, J)[:, None], tl.arange(0, J)[None, :]
     return tl.sum(tl.where(other == here + by, values[None, :], 0.0), 1)
 
@@ -150,9 +150,10 @@ def concentrate_kernel(
     rays, grid, middles, counts, density, shift, starts, ends, valid, n, thickest, tail,
     COUNT: tl.constexpr, EVEN: tl.constexpr, MOST: tl.constexpr, S: tl.constexpr, J: tl.constexpr, CONTRACTED: tl.constexpr,
 ):  # fmt: skip
-    """Write ``COUNT`` intervals of each ray (r COUNT), concentrated where ``density`` has its weight, see ``Concentrated``.
+    """Write ``COUNT`` intervals of each ray (r COUNT), concentrated where ``density`` gives large weights, see ``Concentrated``.
 
-    ``shift`` (r COUNT + 1) is added to the levels of the borders, by weight and then ``EVEN`` by length. One program takes one ray.
+    ``shift`` (r COUNT + 1) is added to the levels of the borders: first those by weight, then ``EVEN`` by length. Each program
+    handles one ray.
     """
     ray = tl.program_id(0).to(tl.int64)
     ox, oy, oz, dx, dy, dz, near, far, leave, _enter = _limits(rays, grid, ray, n, CONTRACTED)

@@ -1,7 +1,7 @@
 """The two networks of a field (Mueller et al. 2022, section 5.4), evaluated and differentiated in chunks of points on a CPU.
 
-The hidden units of a whole batch take tens of megabytes. In chunks they are computed, rectified and differentiated while they
-are in the cache, and no large blocks of memory need to be allocated and freed in each step. Chunks run on several threads. The
+The hidden units of a whole batch take tens of megabytes. In chunks, they are computed, rectified and differentiated while
+still in the cache, and no large blocks of memory need to be allocated and freed in each step. Chunks run on several threads. The
 gradients of the weights are summed in the order of the chunks, so that they do not depend on the number of threads.
 """
 
@@ -28,7 +28,7 @@ Layers = list[tuple[Tensor, Tensor]]
 def log_density_and_rgb(
     geometry: nn.Sequential, colour: nn.Sequential, encoded: Float[Tensor, "n e"], harmonics: Float[Tensor, "n h"]
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:  # fmt: skip
-    """Return the first output of ``geometry``, and the output of ``colour`` for its other outputs and ``harmonics``.
+    """Return the first output of ``geometry`` (log density), and the output of ``colour`` given the other outputs and ``harmonics``.
 
     Both networks are linear layers with ReLUs between them; ``colour`` ends with a sigmoid. On a CPU, the results cannot be
     differentiated twice.
@@ -50,7 +50,7 @@ def _networks(flat: Sequence[Tensor], geometry_layers: int) -> tuple[Layers, Lay
 
 
 def _forward(x: Float[Tensor, "m i"], layers: Layers) -> tuple[list[Tensor], Float[Tensor, "m o"]]:
-    """Return the inputs of all layers, and the output of the last."""
+    """Return the inputs of all layers, and the output of the last layer."""
     inputs: list[Tensor] = []
     for weight, bias in layers:
         inputs.append(x.relu_() if inputs else x)
@@ -61,7 +61,7 @@ def _forward(x: Float[Tensor, "m i"], layers: Layers) -> tuple[list[Tensor], Flo
 def _backward(
     gradient: Float[Tensor, "m o"], inputs: list[Tensor], layers: Layers, to_layers: Layers | None
 ) -> Float[Tensor, "m i"]:
-    """Return the gradient with respect to the first input, and write those of the layers to ``to_layers``."""
+    """Return the gradient with respect to the first input, and write the layers' gradients to ``to_layers``."""
     for k in reversed(range(len(layers))):
         if to_layers is not None:
             torch.mm(gradient.t(), inputs[k], out=to_layers[k][0])

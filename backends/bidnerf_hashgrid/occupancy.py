@@ -30,8 +30,8 @@ BLOCK = 8
 class OccupancyGrid(nn.Module):
     """A cube of cells around the scene, and a ``RaySampler`` of equal steps within its occupied cells.
 
-    A cell is occupied while some training ray has weight in it: matter that no ray sees, such as the inside of a solid, is
-    not sampled. ``peak`` is the largest rendering weight observed in a cell; it decays with each step in which a ray visits
+    A cell is occupied while some training ray has rendering weight in it; matter that no ray sees, such as the inside of a
+    solid, is not sampled. ``peak`` is the largest rendering weight observed in a cell; it decays with each step in which a ray visits
     the cell and otherwise stays the same. Occupied cells are those whose peak is above a threshold and, while surfaces may
     still move, their neighbours.
     """
@@ -101,8 +101,8 @@ class OccupancyGrid(nn.Module):
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
         """Return the intervals of the rays in occupied cells, equally long in the coordinate of ``SceneBounds.spacing``.
 
-        If the host must not wait, only the first ``MOST`` of a ray count, except in training, when cells that are empty are still
-        occupied.
+        If the host must not wait, only the first ``MOST`` intervals of a ray are kept, except in training, when empty cells are
+        still marked as occupied.
         """
         if (found := self.by_kernel(rays, self._most, jitter)) is not None:
             return found
@@ -126,7 +126,7 @@ class OccupancyGrid(nn.Module):
         )
 
     def by_kernel(self, rays: Rays, count: int, jitter: Generator | None) -> RaySamples | None:
-        """Return ``count`` concentrated intervals of each ray, or those in occupied cells if there are no more; None without a kernel."""
+        """Return up to ``count`` intervals per ray in occupied cells, concentrated if there are more; None where no kernel is used."""
         device = rays.near.device
         if may_wait(device) or not fused.available(device) or count > MOST:
             return None
@@ -138,7 +138,7 @@ class OccupancyGrid(nn.Module):
     def _steps(self) -> int:
         """The largest number of steps along a ray in the grid.
 
-        They fit into a cube's diagonal; before contracted space, a camera may be as far away again.
+        The steps cover the cube's diagonal; in front of contracted space, a camera may be that far away again.
         """
         sides = 4 if self.bounds.contracted else math.sqrt(3)
         return math.ceil(sides * self.bounds.side / self.step) + 1
@@ -150,7 +150,7 @@ class OccupancyGrid(nn.Module):
     def _all_steps(
         self, rays: Rays, spacing: RaySpacing, near: Float[Tensor, "r"], far: Float[Tensor, "r"], offset: Float[Tensor, "r"]
     ) -> tuple[Float[Tensor, "r s"], Bool[Tensor, "r s"]]:  # fmt: skip
-        """Return the coordinates of each ray's steps in occupied cells, padded to the length of the longest row, and which are steps."""
+        """Return the coordinates of each ray's steps in occupied cells, padded to the longest row, and the mask of real steps."""
         length = BLOCK * self.step
         count = int(((far - near).amax() / length).ceil()) if near.numel() else 0
         starts = near[:, None] + length * torch.arange(count, dtype=near.dtype, device=near.device)
@@ -171,7 +171,7 @@ class OccupancyGrid(nn.Module):
     def _first_steps(
         self, rays: Rays, spacing: RaySpacing, near: Float[Tensor, "r"], far: Float[Tensor, "r"], offset: Float[Tensor, "r"]
     ) -> tuple[Float[Tensor, "r s"], Bool[Tensor, "r s"]]:  # fmt: skip
-        """Return each ray's first steps in occupied cells, as ``_all_steps`` does, without waiting for the device."""
+        """Return each ray's first steps in occupied cells in the form of ``_all_steps``, without waiting for the device."""
         box = self.grid.rays(rays.origins, rays.directions)
         # Steps are counted from ``near``, as everywhere, and those before the grid are skipped; contracted space has none.
         skipped = ((box.near - near) / self.step).floor().clamp(min=0) * (not self.bounds.contracted)
@@ -187,7 +187,7 @@ class OccupancyGrid(nn.Module):
         return middles, pad(kept, (0, missing))
 
     def _occupied_at(self, positions: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
-        """Return whether positions (metres, world) are within the grid, in an occupied cell."""
+        """Return whether positions (metres, world) lie in an occupied cell of the grid."""
         grid = self.grid
         if grid.contracted is not None:  # contract once, not in each look-up
             positions = grid.contracted.normalized(positions)
@@ -229,9 +229,9 @@ class ConcentratedInGrid(Concentrated):
 def _at(
     rays: Rays, distance: Float[Tensor, "b s"], ray: Int[Tensor, "b"] | None = None
 ) -> Float[Tensor, "b s 3"]:
-    """Return the positions at distances along the rays, or along those with the given numbers.
+    """Return the positions at distances along the rays, or along the rays with the indices ``ray``.
 
-    In memory, the positions along an axis are contiguous: sums over rows of three numbers take ten times as long.
+    Each coordinate of the positions is contiguous in memory: sums over rows of three numbers take ten times as long.
     """
     origins, directions = (part.t().contiguous() for part in (rays.origins, rays.directions))
     if ray is not None:
@@ -240,7 +240,7 @@ def _at(
 
 
 def _dilated(cells: Bool[Tensor, "n n n"], reach: int) -> Bool[Tensor, "n n n"]:
-    """Return the cells within a cube of ``reach`` cells around any of ``cells``; the cube is the product of three lines."""
+    """Return the cells at most ``reach`` cells away from any of ``cells`` along each axis; the cube is dilated one axis at a time."""
     grown = cells.clone()
     for axis in range(3):
         for _ in range(reach):

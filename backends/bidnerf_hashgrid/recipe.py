@@ -79,8 +79,8 @@ class HashGridConfig(FieldConfig, SupervisionConfig):
 def adapted(config: HashGridConfig, bounds: SceneBounds) -> HashGridConfig:
     """Return the config with slower pruning, and half the learning rate, if the scene is contracted.
 
-    There, a ray crosses many cells, hardly any of which depth or silhouettes have shown to be empty, and a
-    cell that is pruned too early is rarely found again. Training at the full rate was less stable there: of
+    In a contracted scene, a ray crosses many cells, hardly any of which depth or silhouettes have shown to be empty, and a
+    cell that is pruned too early is rarely found again. Training at the full rate was less stable: of
     twelve unseen photos of a phone capture, one lost 5 dB.
     """
     if not bounds.contracted:
@@ -92,7 +92,7 @@ def adapted(config: HashGridConfig, bounds: SceneBounds) -> HashGridConfig:
 
 
 def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, report: Report) -> None:
-    """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
+    """Fit ``field`` to ``views``; see ``fit`` for checkpoints and stopping."""
     if config.carve and report.resume() is None:
         allowed = occupied_voxels(views, field.occupancy.grid, device=device_of(field))
         field.occupancy.restrict(allowed)
@@ -186,10 +186,10 @@ def _update(
 def _visible(
     field: HashGridField, active: int | None, rays: Rays, samples: RaySamples, least: float
 ) -> tuple[FieldValues, RaySamples, Float[Tensor, "r s"]]:
-    """Return the values at the samples whose weight is above ``least``, these samples, and the densities at all.
+    """Return the values at the samples whose weight is above ``least``, these samples, and the densities at all samples.
 
-    The other samples hardly change the colours, nor would their gradients, which are about as small, change the field.
-    They cost only the density (as in NerfAcc, Li et al. 2023).
+    The other samples hardly affect the colours, and their gradients, which are about as small, would hardly change the
+    field. Only their density is computed (as in NerfAcc, Li et al. 2023).
     """
     valid = samples.valid.reshape(-1)
     index = valid.nonzero()[:, 0]

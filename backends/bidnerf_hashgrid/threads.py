@@ -22,7 +22,7 @@ _for_pools: ContextVar[int | None] = ContextVar("for_pools", default=None)  # th
 
 @contextmanager
 def pools_only(device: torch.device) -> Iterator[None]:
-    """Within the block, only ``concurrently`` uses several threads: torch's own operators use one. On a GPU, it does nothing.
+    """Restrict torch's own operators to one thread within the block, so that only ``concurrently`` uses several; no effect on a GPU.
 
     A training step consists of hundreds of short operators. On two cores, waking threads for each of them
     took longer than they saved.
@@ -39,7 +39,7 @@ def pools_only(device: torch.device) -> Iterator[None]:
 
 
 def threads_for(points: int, device: torch.device) -> int:
-    """Return how many threads to use for ``points`` points: one on a GPU, and if there is too little work for more."""
+    """Return how many threads to use for ``points`` points: one on a GPU, or if there is too little work for more."""
     worth = device.type == "cpu" and points >= THREADED
     return (_for_pools.get() or torch.get_num_threads()) if worth else 1
 
@@ -70,7 +70,7 @@ def _run(task: Callable[[], None], inference: bool) -> None:
 
 
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Return a pool whose threads are all running, each limited to one core, so that a fork finds none of them starting."""
+    """Return a pool whose threads are all running, each limited to one core, so that none is still starting when the process forks."""
     with _opening:
         if threads in _pools:
             return _pools[threads]

@@ -1,4 +1,4 @@
-"""The radiance field of NeRF (Mildenhall et al. 2020): two networks, the second sampled where the first finds matter."""
+"""The radiance field of NeRF (Mildenhall et al. 2020): two networks, of which the second is sampled where the first finds matter."""
 
 from __future__ import annotations
 

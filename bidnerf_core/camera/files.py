@@ -126,7 +126,7 @@ def camera_record(record: Record) -> CameraRecord:
 def _focal(record: Record, axis: str) -> tuple[float, bool] | None:
     """Return the focal length of an axis and ``False``, or its field of view and ``True``.
 
-    A frame's own value takes precedence over the file's, and pixels over radians.
+    A frame's own value takes precedence over the file's, and a value in pixels over one in radians.
     """
     for scope in record.scopes():
         focal, angle = scope.number(f"fl_{axis}"), scope.number(f"camera_angle_{axis}")

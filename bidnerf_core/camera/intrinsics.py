@@ -176,12 +176,12 @@ class Intrinsics:
         )
 
     def quarter_turns(self) -> tuple[Intrinsics, ...]:
-        """Return this camera rotated by 90 degrees to either side; none if its sensor is tilted (14 coefficients)."""
+        """Return two cameras: this one turned 90 degrees to either side. Returns none for a tilted sensor (14 coefficients)."""
         tilted = any(self.distortion[12:])
         return () if tilted else tuple(self.upright(Orientation.from_exif(code)) for code in (6, 8))
 
     def centre_crop(self, width: int, height: int) -> Intrinsics:
-        """Return the camera of the largest centred crop with the aspect ratio of the given size, resized to that size."""
+        """Return the camera of the largest centre crop that has the aspect ratio of the given size, resized to that size."""
         scale = max(width / self.width, height / self.height)
         return replace(
             self, fx=self.fx * scale, fy=self.fy * scale, cx=width / 2 + (self.cx - self.width / 2) * scale,
@@ -242,8 +242,8 @@ class CameraBatch:
 def question_focal(focal: float, width: int, height: int) -> None:
     """Raise ``InputError`` for a focal length that cannot be in pixels because no lens has such a wide view.
 
-    Below a tenth of the image's longer side, that is a view of 157 degrees. A shorter one, from 1 on, is probably given in
-    millimetres: a phone's lens has about 4.2 mm. Images of less than 240 pixels may have any.
+    A focal length below a tenth of the image's longer side means a field of view of over 157 degrees; such a value, if at
+    least 1, is probably in millimetres: a phone's lens has about 4.2 mm. Images of less than 240 pixels are not checked.
     """
     side = max(width, height)
     if 1 <= focal < side / 10 and side >= 240:
@@ -265,7 +265,7 @@ def _numbers(name: str, given: Any) -> np.ndarray:
 
 
 def check_number(what: str, value: Any, kind: type, least: float, most: float, expected: str) -> None:
-    """Raise ``InputError`` for anything but a number of that kind within the limits."""
+    """Raise ``InputError`` unless ``value`` is a number of type ``kind`` from ``least`` to ``most``."""
     if isinstance(value, bool) or not isinstance(value, kind) or not least <= value <= most:  # type: ignore[operator]
         raise InputError(f"{what} is {value!r:.60}", expected=expected)
 
@@ -299,7 +299,7 @@ CameraGroup = tuple[Intrinsics, ...]
 def cameras_at_size(
     cameras: CameraGroup, width: int, height: int, fit: Literal["whole", "cropped", "stretched"] = "whole"
 ) -> tuple[CameraGroup, ...]:
-    """Return ``cameras`` resized to an image of another size, in groups of the same turn.
+    """Return ``cameras`` resized to an image of another size, grouped by the turn applied to them.
 
     By default, only those are returned whose images have its aspect ratio, or else those that match after a quarter turn, in
     two groups: turned to one side, and to the other; possibly none. With another ``fit``, all are returned, centre-cropped to

@@ -1,6 +1,6 @@
 """COLMAP's camera models (https://colmap.github.io/cameras.html), whose pixel centres are at +0.5, like ours.
 
-Perspective ones are ``Intrinsics``. Images of the others are resampled to pinhole cameras on reading: fisheye and
+Perspective models are ``Intrinsics``. Images of the other models are resampled to pinhole cameras on reading: fisheye and
 division lenses become one pinhole camera each, panoramas (equirectangular images) six, see ``PANORAMA_FACES``. The
 four-coefficient fisheye model is OpenCV's (Kannala and Brandt 2006).
 """
@@ -83,7 +83,7 @@ class Lens(ABC):
     @property
     @abstractmethod
     def flat(self) -> Intrinsics:
-        """The pinhole camera of the resampled image, before the image is turned upright."""
+        """The pinhole camera of the resampled image before it is turned upright."""
 
     @property
     def pinhole(self) -> Intrinsics:
@@ -97,8 +97,8 @@ class Lens(ABC):
     def resampled(self, image: np.ndarray, nearest: bool = False) -> np.ndarray:
         """Resample an upright image (h, w) or (h, w, c) to the ``pinhole`` camera.
 
-        Values are interpolated, and replicated beyond the borders; with ``nearest``, they are those of the
-        nearest pixel, and 0 beyond.
+        Values are interpolated, and replicated beyond the borders. With ``nearest``, the nearest pixel's value
+        is taken, and 0 beyond the borders.
         """
         u, v = _lookup(self)
         method = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
@@ -107,7 +107,7 @@ class Lens(ABC):
         return found
 
     def unseen(self) -> np.ndarray:
-        """Return which pixels of the resampled image the lens did not see."""
+        """Return a mask of the pixels of the resampled image that the lens did not see."""
         u, v = _lookup(self)
         return ~((u >= -0.5) & (u <= self.width - 0.5) & (v >= -0.5) & (v <= self.height - 0.5))
 
@@ -168,7 +168,7 @@ class CentralLens(Lens):
         return tuple(self._angle(radius) for radius in sides)
 
     def _angle(self, radius: float) -> float:
-        """Return the angle at which rays meet the image ``radius`` (over the focal length) from the principal point."""
+        """Return the angle of the rays that meet the image at ``radius`` (in focal lengths) from the principal point."""
         if radius <= 0:
             return math.nan
         if MODELS[self.model][1] == DIVISION:
@@ -208,7 +208,7 @@ class CentralLens(Lens):
 
 @dataclass(frozen=True)
 class PanoramaFace(Lens):
-    """One of ``PANORAMA_FACES`` of an equirectangular image, whose middle shows what is in front of the camera."""
+    """One of the ``PANORAMA_FACES`` of an equirectangular image; the middle of that image is straight ahead of the camera."""
 
     face: str
     stored_size: tuple[int, int]

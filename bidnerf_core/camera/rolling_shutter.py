@@ -30,7 +30,7 @@ class MotionPrior:
 
     @staticmethod
     def usual(distance: float) -> MotionPrior:
-        """Return the prior of a hand-held camera whose scene is at ``distance`` (metres).
+        """Return the prior for a hand-held camera at ``distance`` (metres) from the scene.
 
         The readout takes a few hundredths of a second.
         """

@@ -49,7 +49,7 @@ class FoundCamera:
 
 
 def checked_side(largest: int | None) -> int | None:
-    """Return ``largest``, the most pixels along an image's longer side. Raises ``InputError`` unless it is a positive integer."""
+    """Return ``largest``, a limit on an image's longer side (pixels). Raises ``InputError`` unless it is a positive integer."""
     if largest is not None and (isinstance(largest, bool) or not isinstance(largest, int) or largest < 1):
         raise InputError(f"largest is {largest!r}", expected="a positive whole number of pixels")
     return largest
@@ -87,9 +87,9 @@ class Raster:
     def turned(
         self, image: Shaped[Tensor, "mh mw"], what: str, where: object = None
     ) -> Shaped[Tensor, "h w"]:
-        """Return a mask or depth of the image, at any resolution, upright: one that fits the stored image is turned with it.
+        """Return the image's mask or depth, at any resolution, upright; it is turned if its aspect ratio is the stored image's.
 
-        Raises ``InputError`` about ``what``, at ``where``, for another aspect ratio.
+        Raises ``InputError``, which names ``what`` and ``where``, if the aspect ratio fits neither orientation.
         """
         given = image.shape[1], image.shape[0]
         if same_aspect(given, self.size):
@@ -103,7 +103,7 @@ class Raster:
 
 @dataclass(frozen=True)
 class CameraSource:
-    """All that is known about the camera of some images, apart from their EXIF.
+    """What is known about the camera of a set of images, apart from their EXIF.
 
     At most one of these is given: intrinsics or a file with them, a focal length, a field of view.
     ``assumed`` are candidate cameras for images whose focal length is unknown.
@@ -116,7 +116,7 @@ class CameraSource:
 
     @property
     def is_given(self) -> bool:
-        """Whether the camera is given, as opposed to found in EXIF or assumed."""
+        """Whether the camera is given, rather than found in EXIF or assumed."""
         return any(given is not None for given in (self.camera, self.focal, self.hfov))
 
     def require(self, path: Path, why: str) -> None:
@@ -157,7 +157,7 @@ class CameraSource:
         return _fitted(str(where), raster, read_camera(Path(camera), size, str(where)), f"camera of {camera}")
 
     def at(self, image: Path) -> Callable[[int, int], Camera]:
-        """Return a function of width and height that finds the camera of the file ``image`` without EXIF."""
+        """Return a function that finds the camera of the file ``image`` from its width and height, without EXIF."""
         return lambda width, height: self.find(image, Raster(width, height)).camera
 
 
@@ -213,7 +213,7 @@ def _focal(camera: Intrinsics) -> str:
 def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: bool = False) -> FoundCamera:
     """Return the camera that EXIF describes, accurate to a few percent and assumed to be free of distortion.
 
-    An image that was cropped after it was taken, if it may be, is assumed to have kept its resolution unless its size
+    If ``may_be_cropped``, an image cropped after it was taken is assumed to have kept its resolution unless its size
     differs by more than half; then it is treated as a resized centre crop. Raises ``InputError`` if there is no focal length,
     and for any other cropped image.
     """
@@ -250,7 +250,7 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: boo
 
 
 def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> FoundCamera | None:
-    """Return the camera with the median focal length among those of the same size, or else of the same aspect
+    """Return the camera with the median focal length among the cameras of the same size, or else of the same aspect
     ratio, or else among centre crops.
 
     If it is unknown to which side the camera was turned, only the focal length is used.

@@ -1,4 +1,4 @@
-"""The cameras of a map's training images, as ``map.json`` and the ``cameras.json`` of 3D Gaussian splatting store them."""
+"""Cameras of a map's training images, as stored in ``map.json`` and in the ``cameras.json`` of 3D Gaussian splatting."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ class StoredCamera:
         return _pose(self.T_world_camera)
 
     def translated(self, offset: Float[Tensor, "3"]) -> StoredCamera:
-        """Return the camera in a parallel world frame in which positions have ``offset`` added."""
+        """Return the camera in a parallel world frame, in which ``offset`` is added to all positions."""
         return self._mapped(lambda rows: _rows(_pose(rows).translated(offset)))
 
     def scaled(self, factor: float) -> StoredCamera:
-        """Return the camera in a world with lengths multiplied by ``factor``."""
+        """Return the camera in a world frame in which lengths are multiplied by ``factor``."""
         motion = self.motion and (*multiplied(self.motion[:3], factor), *self.motion[3:])
         scaled = self._mapped(lambda rows: (*((a, b, c, t * factor) for a, b, c, t in rows[:3]), rows[3]))
         return replace(scaled, motion=motion)
@@ -96,12 +96,12 @@ class PoseRefinement:
 
     @property
     def inconsistency(self) -> float:
-        """Standard deviation (pixels) that errors of the given poses add to the keypoints' own noise."""
+        """Standard deviation (pixels) that errors of the given poses add to the keypoint noise."""
         return max(0.0, self.noise_before**2 - self.noise_after**2) ** 0.5
 
 
 def poses_of(cameras: Sequence[StoredCamera]) -> SE3:
-    """Return T_world_camera of all cameras (n), float64."""
+    """Return T_world_camera of all n cameras, float64."""
     return _pose([camera.T_world_camera for camera in cameras])
 
 
@@ -119,7 +119,7 @@ def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
 
 
 def as_given(cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
-    """Return the cameras with the dataset's poses."""
+    """Return the cameras with their poses as given in the dataset."""
     return tuple(
         StoredCamera(c.name, c.intrinsics, c.given_T_world_camera or c.T_world_camera) for c in cameras
     )
@@ -169,7 +169,7 @@ def moved_cameras(cameras: Sequence[StoredCamera]) -> list[MovedCamera]:
 
 
 def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> list[str]:
-    """Return a sentence or two on the consistency of the given poses and how far they were moved."""
+    """Return a sentence or two on how consistent the given poses are and how far refinement moved them."""
     moved = sorted(moved_cameras(cameras), key=lambda m: m.pixels, reverse=True)
     wrong = [m for m in moved if m.name in found.replaced]
     motions = torch.tensor([camera.motion for camera in cameras if camera.motion], dtype=torch.float64)
@@ -226,7 +226,7 @@ def _pose(rows: MatrixRows | Sequence[MatrixRows]) -> SE3:
 def write_inria_cameras(folder: Path, cameras: Sequence[StoredCamera]) -> list[Path]:
     """Write a ``cameras.json``, unless there are no cameras, and return it.
 
-    The principal points become the middles of the images, as the format does not have any.
+    Principal points become the image centres, since the format cannot store principal points.
     """
     if not cameras:
         return []
@@ -250,7 +250,7 @@ def write_inria_cameras(folder: Path, cameras: Sequence[StoredCamera]) -> list[P
 def cameras_beside(path: Path, placement: Similarity) -> tuple[StoredCamera, ...]:
     """Return the cameras in the ``cameras.json`` beside a file or up to two folders above, transformed by ``placement``.
 
-    There are none if there is no such file, or it is damaged or another program's, which is a warning.
+    Returns no cameras if the file does not exist. A file that is damaged or written by another program is ignored with a warning.
     """
     folders = [path.parent, *list(path.parent.parents)[:2]]
     file = next((folder / INRIA_CAMERAS for folder in folders if (folder / INRIA_CAMERAS).is_file()), None)

@@ -1,9 +1,9 @@
-"""The coverage of a capture: the directions from which its scene was photographed, those missing, and which one is up.
+"""The coverage of a capture: the viewing directions that it covers, those that are missing, and the upward direction.
 
-People hold cameras level, but they look down on desks and objects, so the mean of the cameras' upward axes is
-tilted as much as the cameras are. Two cues do not suffer from this: the horizontal image axes of level
+People hold cameras level but point them down at desks and objects, so the mean of the cameras' upward axes is
+tilted as much as the cameras are. Two cues do not suffer from this tilt: the horizontal image axes of level
 cameras are perpendicular to the vertical, and floors, ceilings and tables are horizontal planes. The upward
-direction is that of gravity if the capture measured it, else the one with the most support from both.
+direction is opposite to gravity if the capture measured gravity, else the direction best supported by both cues.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class UpDirection:
 
 
 def given_up(direction: Sequence[float]) -> UpDirection:
-    """Return the upward direction that a capture measured; its length does not matter."""
+    """Return the measured upward direction of a capture; the length of the vector does not matter."""
     unit = normalize(torch.tensor(tuple(direction), dtype=torch.float64), dim=0)
     return UpDirection((*unit.tolist(),), "gravity")
 
@@ -60,7 +60,7 @@ def coverage(
     views: Sequence[View], matched: TrackedKeypoints, seen: TrackedKeypoints, positions: Float[Tensor, "n 3"],
     least_parallax: float, up: UpDirection | None = None,
 ) -> CoverageRecord:  # fmt: skip
-    """Return how well the views cover their scene.
+    """Measure how well the views cover their scene.
 
     ``matched`` are all matched keypoints, ``seen`` those consistent with a triangulated point,
     ``positions`` these points, and ``least_parallax`` is the angle (degrees) between rays below which a point cannot be
@@ -95,7 +95,7 @@ def coverage(
 def _around(
     views: Sequence[View], directions: Float[Tensor, "v 3"], up: Float[Tensor, "3"]
 ) -> tuple[Arrangement, Gap | None, tuple[Gap, ...], tuple[float, float]]:
-    """Return how the ``directions`` of the cameras from the centre are arranged about the vertical.
+    """Return how the ``directions`` from the scene centre to the cameras are distributed about the vertical.
 
     Also returns the open side, the gaps and the range of elevations (degrees) for a ``CoverageRecord``.
     """
@@ -130,7 +130,7 @@ def _range_deg(sines: Float[Tensor, "v"]) -> tuple[float, float]:
 
 
 def horizontal_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Return two unit axes that make a right-handed frame with ``up``."""
+    """Return two unit axes that form a right-handed frame with ``up``."""
     helper = torch.eye(3, dtype=up.dtype)[int(up.abs().argmin())]
     first = normalize(helper - up * (helper @ up), dim=0)
     return first, torch.linalg.cross(up, first)
@@ -139,10 +139,10 @@ def horizontal_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[T
 def _meeting_point(
     centres: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3"], depth: float
 ) -> tuple[Float[Tensor, "3"], bool]:
-    """Return the point nearest to the optical axes, and whether they converge there, at what the cameras see.
+    """Return the point nearest to all optical axes, and whether the axes converge there, within the depth of the scene.
 
-    ``depth`` is the median distance of what they see, infinite if it is unknown. Cameras whose axes meet far beyond it look along
-    a corridor.
+    ``depth`` is the median distance of the visible surfaces, infinite if unknown. Cameras whose axes meet far beyond
+    this distance look along a corridor.
     """
     across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None]
     matrix = across.sum(0) + 1e-9 * len(axes) * torch.eye(3, dtype=axes.dtype)  # parallel axes never converge
@@ -156,10 +156,10 @@ def _meeting_point(
 
 
 def shows_distances(views: Sequence[View], tracked: TrackedViews | None) -> bool:
-    """Return whether views determine distances: by measured depth, or by enough parallax.
+    """Return whether the views determine distances, either by measured depth or by sufficient parallax.
 
-    They do not if hardly any point can be triangulated for lack of parallax, or if all cameras are in exactly
-    one place.
+    Without depth, distances are undetermined if hardly any point can be triangulated for lack of parallax, or if
+    all cameras are at exactly the same position.
     """
     if any(view.frame.has_depth for view in views):
         return True
@@ -217,10 +217,10 @@ def up_direction(poses: SE3, normals: Float[Tensor, "n 3"] | None = None) -> UpD
 
 
 def _level(up_axis: Float[Tensor, "v 3"], level_axis: Float[Tensor, "v 3"]) -> Float[Tensor, "3"]:
-    """Return the direction most nearly perpendicular to all horizontal image axes, nearest to the mean upward axis.
+    """Return the direction closest to perpendicular to all horizontal image axes, with a prior for the mean upward axis.
 
-    If all cameras face the same way, only the plane of such directions is known, and the one nearest to the mean is
-    chosen; the deviation of the tilt is about 20 degrees.
+    If all cameras face the same way, only the plane of such directions is known, and the direction in it nearest to the
+    mean is chosen; its tilt has a standard deviation of about 20 degrees.
     """
     mean = normalize(up_axis.mean(0), dim=0)
     spread = level_axis.mT @ level_axis / len(level_axis)
@@ -229,7 +229,7 @@ def _level(up_axis: Float[Tensor, "v 3"], level_axis: Float[Tensor, "v 3"]) -> F
 
 
 def _planes(normals: Float[Tensor, "n 3"] | None) -> list[tuple[Tensor, float, UpSource]]:
-    """Return up to six directions with which most normals agree, and the fraction of normals, beyond chance, that do."""
+    """Return up to six directions that most normals agree with, and the fraction of agreeing normals in excess of chance."""
     if normals is None or not len(normals):
         return []
     some = normals.detach().cpu().double()[:: max(1, len(normals) // 20_000)]

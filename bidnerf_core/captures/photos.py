@@ -34,9 +34,9 @@ def photo_measures(views: Sequence[View]) -> Float[Tensor, "4 v"]:
 
 
 def detail_kept(views: Sequence[View]) -> Float[Tensor, "v"]:
-    """Return the energy of each photo's fine detail relative to nearby photos.
+    """Return the energy of each photo's fine detail relative to that of nearby photos.
 
-    It is 1 for all photos except outliers that are blurred.
+    The value is 1 for all photos except blurred outliers.
     """
     found = torch.tensor([sharpness(_clean(v.frame.rgb).mean(-1), v.frame.hidden) for v in views])
     lacking = -excess(found, nearby(views))
@@ -44,12 +44,12 @@ def detail_kept(views: Sequence[View]) -> Float[Tensor, "v"]:
 
 
 def blurred(lacking: Float[Tensor, "v"]) -> Bool[Tensor, "v"]:
-    """Return which photos lack fine detail (octaves of its energy) compared with nearby ones, and with most others."""
+    """Return which photos lack more fine detail (energy in octaves, relative to nearby photos) than most others do."""
     return standing_out(lacking, 0.5)
 
 
 def standing_out(values: Float[Tensor, "v"], least: float) -> Bool[Tensor, "v"]:
-    """Return which values exceed both ``least`` and four robust standard deviations (about zero) of all values."""
+    """Return which values exceed both ``least`` and four times the robust standard deviation (about zero) of all values."""
     return values > max(least, 4 * mad_deviation(values))
 
 
@@ -68,16 +68,16 @@ def _measured(frame: Frame) -> tuple[float, float, float, float]:
 def log_light(values: np.ndarray) -> np.ndarray:
     """Return log2 of the linear light of image values in [0, 1].
 
-    The exponent is approximately that of sRGB. Quantization makes the darkest pixels incomparable: they count as equal.
+    The exponent is approximately that of sRGB. The darkest pixels count as equal, since quantization makes them incomparable.
     """
     return 2.2 * np.log2(np.maximum(values, 2 / 255))
 
 
 def sharpness(grey: np.ndarray, hidden: Bool[Tensor, "h w"] | None = None) -> float:
-    """Return log2 of the ratio of fine to coarse energy, in which contrast cancels.
+    """Return log2 of the ratio of fine-scale to coarse-scale energy, in which contrast cancels out.
 
-    It is the smallest of four directions, as motion blur affects only one of them. Pixels affected by ``hidden`` ones are
-    ignored, unless hardly any others are left.
+    The minimum over four directions is returned, as motion blur affects only one of them. Pixels affected by ``hidden``
+    pixels are ignored, unless hardly any others remain.
     """
     size = reduced_size(grey.shape[1], grey.shape[0], LARGEST)
     if size != grey.shape[::-1]:
@@ -116,9 +116,9 @@ Nearby: TypeAlias = Int[Tensor, "p 2"]
 
 
 def nearby(views: Sequence[View], group: Int[Tensor, "v"] | None = None) -> Nearby:
-    """Return which photos were taken from nearby places in similar directions: up to eight for each.
+    """Return, for each photo, about eight others taken from nearby positions in similar directions, as pairs of indices.
 
-    Of photos with any of them in their own ``group``, only those are returned.
+    If any of these are in the photo's own ``group``, only those are returned.
     """
     pairs = likely_pairs([view.T_ref_camera for view in views], 8)
     pairs = torch.cat([pairs, pairs.flip(1)])
@@ -130,7 +130,7 @@ def nearby(views: Sequence[View], group: Int[Tensor, "v"] | None = None) -> Near
 
 
 def excess(values: Float[Tensor, "v"], near: Nearby) -> Float[Tensor, "v"]:
-    """Return how much each photo's value exceeds the median of those near it; 0 if there are none."""
+    """Return how much each photo's value exceeds the median of the photos near it; 0 if there are no such photos."""
     photo, other = near.unbind(1)
     found = torch.bincount(photo, minlength=len(values)) > 0
     return torch.where(found, values - _medians(values[other], photo, len(values)), 0.0)
@@ -142,8 +142,8 @@ def exposures(
     """Return the exposure of each photo (stops) relative to the median of all.
 
     The brightness of a landmark in a photo is the landmark's own brightness times the photo's exposure. Both
-    are estimated alternately, as medians. Photos that show fewer than ten landmarks are compared with those
-    ``near`` them as a whole.
+    are estimated alternately, as medians. Photos that show fewer than ten landmarks are compared with the photos
+    ``near`` them by overall brightness.
     """
     image, point, count = seen.image, seen.point, len(views)
     light = torch.zeros(len(image), dtype=torch.float64)  # log2 of the linear light around each keypoint
@@ -163,7 +163,7 @@ def exposures(
 
 
 def _medians(values: Float[Tensor, "m"], index: Int[Tensor, "m"], count: int) -> Float[Tensor, "n"]:
-    """Return the lower median of the values with each index; 0 if there are none."""
+    """Return the lower median of the values with each index; 0 for an index without values."""
     if not len(values):
         return torch.zeros(count, dtype=torch.float64)
     order = torch.from_numpy(np.lexsort((values.numpy(), index.numpy())))

@@ -1,10 +1,10 @@
-"""Detection of poses that contradict their images, and of conventions under which they would agree.
+"""Detection of poses that contradict their images, and of pose conventions that would resolve the contradiction.
 
-The keypoints of two images that show the same point are found from the images alone (RANSAC with an essential
+Keypoint matches between two images are found from the images alone (RANSAC with an essential
 matrix, Nistér, PAMI 2004). Under correct poses these matches lie on their epipolar lines, and their points in
 front of both cameras; the lines alone do not determine the sign of a baseline (Hartley, Cheirality, IJCV
-1998). Poses are wrong if they disagree with most pairs of images. Each reading of them, as another convention or
-after a common mistake, is a transformation of all poses of a capture, and is tested in the same way.
+1998). Poses are wrong if they disagree with most pairs of images. Each reading of the poses (another convention, or
+a common mistake undone) is a transformation of all poses of a capture, and is tested in the same way.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ SWAP = "multiply each from the right by diag(1, -1, -1, 1)"
 
 @dataclass(frozen=True)
 class Reading:
-    """One interpretation of given poses, in words and as a transformation."""
+    """One interpretation of the given poses, in words and as a transformation."""
 
     clause: str  # completes "the poses would agree if ..."
     remedy: str  # what to do about it
@@ -57,7 +57,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class PoseContradiction:
-    """Poses that disagree with the images, and the reading under which they would agree, if there is one."""
+    """A contradiction between poses and images, and the reading of the poses that would resolve it, if any."""
 
     pairs: int  # of images with matches
     agreeing_as_given: int
@@ -83,7 +83,7 @@ class PoseContradiction:
 
 
 def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | None:
-    """Return how the poses of ``images`` contradict them; None if they agree, or if the images do not determine it."""
+    """Return how the poses of ``images`` contradict the images; None if they agree, or if the images are inconclusive."""
     proposed = _pairs(images)
     pairs = [pair for i, j in proposed if (pair := matched_pair(images, i, j)) is not None]
     if len(pairs) < MOST_PAIRS / 2:
@@ -133,9 +133,9 @@ class MatchedPair:
     pixel: float  # size on the plane z = 1
 
     def agreeing(self, T: SE3) -> Bool[Tensor, "h"]:
-        """Return for which poses T_world_camera (h n) the matches are near their epipolar lines and in front of both cameras.
+        """Return which pose hypotheses T_world_camera (h n) put matches near their epipolar lines and in front of both cameras.
 
-        Only points with enough parallax show on which side of the cameras they are. Their depths solve
+        Only points with enough parallax reveal whether they are in front of the cameras. Their depths solve
         ``a seen = b rays + moved`` in the least-squares sense along the common normal of both rays.
         """
         R_second_world = T.rotation[:, self.second].mT
@@ -161,9 +161,9 @@ class MatchedPair:
 
 
 def _pairs(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
-    """Return pairs that probably show the same things.
+    """Return pairs of images that probably overlap.
 
-    They are nearby according to the poses, which may be wrong, or in the given order.
+    The images of a pair are neighbours according to the poses, which may be wrong, or in the given order.
     """
     count = len(images)
     pairs = {(i, i + step) for step in (1, 3) for i in range(count - step)}
@@ -174,10 +174,10 @@ def _pairs(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
 
 
 def _similar(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
-    """Return pairs of images that probably show the same things, most similar first.
+    """Return pairs of images that probably overlap, most similar first.
 
-    Each of up to 60 images is paired with the two that have most matches with it, twelve at least, among the 300 strongest
-    keypoints.
+    Each of up to 60 images is paired with the two images that share the most matches with it (at least twelve) among the
+    300 strongest keypoints.
     """
     chosen = range(0, len(images), max(1, -(-len(images) // 60)))
     strongest = [images[i].keypoints.descriptors[:300] for i in chosen]
@@ -203,7 +203,7 @@ def _mutual(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tuple[Int[Tenso
 
 
 def matched_pair(images: Sequence[ImageKeypoints], i: int, j: int) -> MatchedPair | None:
-    """Return two images' inlier matches to an essential matrix; None if these are too few."""
+    """Return the matches of two images that are inliers of an essential matrix; None if there are too few."""
     a, b = images[i], images[j]
     if min(len(a.keypoints), len(b.keypoints)) < ENOUGH_MATCHES:
         return None
@@ -238,7 +238,7 @@ def changed(
     mirror: Float[Tensor, "3 3"] = AS_GIVEN,
     inverted: bool = False,
 ) -> SE3:
-    """Return poses with rotations ``mirror R axes`` and translations ``positions t``; first inverted if ``inverted``.
+    """Return poses with rotations ``mirror R axes`` and translations ``positions t``, after inverting them if ``inverted``.
 
     The columns of ``axes`` are the true camera's axes in the given camera's frame.
     """
@@ -247,7 +247,7 @@ def changed(
 
 
 def _of_axes() -> Iterator[Reading]:
-    """Yield readings with other camera axes, starting with y and z reversed; then those as inverse matrices, too."""
+    """Yield readings with other camera axes, starting with y and z reversed; then the same readings of inverted matrices."""
     yield Reading(
         "their cameras' y and z axes are reversed (OpenCV's and COLMAP's axes where OpenGL's and Blender's are expected, or the"
         " other way round)",
@@ -315,7 +315,7 @@ def _of_quaternions() -> Iterator[Reading]:
 
 
 def _of_worlds() -> Iterator[Reading]:
-    """Yield readings of left-handed worlds, as in Unity and Unreal. Mirrored along another axis, a world is merely turned."""
+    """Yield readings of left-handed worlds, as in Unity and Unreal. Mirroring another axis instead merely rotates the world."""
     mirror = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
     for axes in sorted(signed_permutations(-1), key=lambda axes: not torch.equal(axes, mirror)):
         yield Reading(
@@ -326,7 +326,7 @@ def _of_worlds() -> Iterator[Reading]:
 
 
 def _of_positions() -> Iterator[Reading]:
-    """Yield readings in which positions have different axes from the rotations."""
+    """Yield readings in which positions use different axes from rotations."""
     for D in (*signed_permutations(-1), *signed_permutations(1)[1:]):
         order = ", ".join(("-" if row.sum() < 0 else "") + "xyz"[int(row.abs().argmax())] for row in D)
         clause = f"x, y and z of their positions are the given ones' {order}"
@@ -336,7 +336,7 @@ def _of_positions() -> Iterator[Reading]:
 
 
 def _of_orders(count: int) -> Iterator[Reading]:
-    """Yield readings in which poses belong to other images."""
+    """Yield readings in which the poses are assigned to different images."""
 
     def understand(T: SE3, order: Sequence[int]) -> SE3:
         index = torch.tensor([i if 0 <= i < count else -1 for i in order])
@@ -359,7 +359,7 @@ def _of_orders(count: int) -> Iterator[Reading]:
 
 
 def _in_file_axes(clause: str, remedy: str, understand: Callable[[SE3], SE3]) -> Iterator[Reading]:
-    """Yield a reading of matrices as they are here, and as they were in a file that had the y and z axes reversed."""
+    """Yield a reading of the matrices as they are here, and as they were in a file with reversed y and z axes."""
 
     def whole(T: SE3, before: Tensor, after: Tensor) -> SE3:
         return changed(understand(changed(T, before)), after)

@@ -74,7 +74,7 @@ class PhotoRecord:
 
 @dataclass(frozen=True)
 class Gap:
-    """A range of directions, seen from the middle of the scene, without any camera."""
+    """A range of directions from the centre of the scene in which there is no camera."""
 
     degrees: float
     after: str  # names of the photos on either side
@@ -114,7 +114,7 @@ class CaptureReport:
     exposure_range: float = 0.0  # stops between the darkest and the brightest tenth of the photos
 
     def scaled(self, factor: float) -> CaptureReport:
-        """Return the report on the capture with lengths multiplied by ``factor``."""
+        """Return the report with all lengths multiplied by ``factor``."""
         photos = tuple(
             replace(
                 photo,
@@ -132,7 +132,7 @@ class CaptureReport:
 
 
 def summary(report: CaptureReport) -> list[str]:
-    """Return at most ``SUMMARY_LINES`` lines; the last one says how many were left out, if any."""
+    """Return at most ``SUMMARY_LINES`` lines of the report; the last one says how many were left out, if any."""
     lines = sentences(report)
     left = len(lines) - SUMMARY_LINES + 1
     more = f"{left} more remarks: 'bidnerf info' prints them all, and --draw plots the capture"

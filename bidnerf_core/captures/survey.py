@@ -1,7 +1,7 @@
 """Survey of a capture: measure its photos, find those with problems, and localize the suspects among them.
 
-Photos are linked if they show the same things. Those whose poses no group of linked photos supports are localized with the
-landmarks of the others.
+Photos are linked if they share landmarks. Photos whose poses are not supported by any group of linked photos are
+localized with the landmarks of the others.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def surveyed(
 ) -> CaptureReport:
     """Return the report on a capture whose keypoints are matched in ``tracked``, in the order of ``views``.
 
-    Photos whose poses the others do not support are localized with the landmarks of those, both as they are
+    Photos whose poses the others do not support are localized with the landmarks of the others, both unchanged
     and mirrored; this distinguishes a wrong pose from a photo of something else. ``trial``
     holds the errors of held-out photos, and ``up`` is the upward direction of the scene if known.
     """
@@ -110,7 +110,7 @@ def surveyed(
 def _by_own_landmarks(
     seen: TrackedKeypoints, positions: Float[Tensor, "n 3"], views: Sequence[View]
 ) -> dict[int, Relocation]:
-    """Compare the poses that fit the photos' own landmarks with the given ones, relative to the scatter in this capture.
+    """Compare the poses that best fit the photos' own landmarks with the given poses, relative to the scatter in this capture.
 
     Poses from fewer landmarks scatter more: the variance is inversely proportional to their number.
     """
@@ -157,7 +157,7 @@ def groups(links: csr_array) -> Int[Tensor, "v"]:
 
 @dataclass(frozen=True, eq=False)
 class Relocation:
-    """A photo's pose from other photos' landmarks, compared with the given one."""
+    """A photo's pose estimated from other photos' landmarks, compared with the given pose."""
 
     update: Float[Tensor, "6"]  # right update from the given pose, translation (metres) first
     deviations: float  # length of the update, in standard deviations
@@ -168,8 +168,8 @@ class Relocation:
     def problem(self) -> PhotoProblem | None:
         """What is wrong with the given pose, or None.
 
-        It is right if the photo is not mirrored and it is off by less than six standard deviations, or by less than four pixels,
-        which is twice as far as a match may lie from its epipolar line.
+        The given pose is right if the photo is not mirrored and the pose is off by less than six standard deviations or less
+        than four pixels, which is twice the distance allowed between a match and its epipolar line.
         """
         angle = float(torch.linalg.vector_norm(self.update[3:]))
         if self.mirrored:
@@ -184,10 +184,10 @@ class Relocation:
 def suspects(seen: TrackedKeypoints, links: csr_array) -> list[int]:
     """Return the photos whose given poses the others do not support, 32 at most; ``links`` are those of ``linked``.
 
-    A photo is suspect if it belongs to no group, or fewer of its keypoints are landmarks than half the fraction that is usual
-    in its group, unless enough photos agree with its pose. Photos that agree among themselves are not suspect even if they
-    are linked to none of the others: a place that looks like another is more likely than the same error in
-    all of them.
+    A photo is suspect if it belongs to no group, or if the fraction of its keypoints that are landmarks is less than half of
+    what is usual in its group, unless enough photos agree with its pose. Photos that agree among themselves are not
+    suspect even if they are linked to none of the others: a place that looks like another is more likely than the
+    same error in all of them.
     """
     group = groups(links)
     if not bool((group >= 0).any()):
@@ -203,9 +203,9 @@ def suspects(seen: TrackedKeypoints, links: csr_array) -> list[int]:
 
 
 def _has_support(images: Sequence[ImageKeypoints], links: csr_array, number: int) -> bool:
-    """Return whether a photo's given pose agrees with as many linked photos as make a group with it.
+    """Return whether a photo's given pose agrees with enough linked photos to form a group with it.
 
-    Their matches are found without the poses, so that wrong ones agree with none of them.
+    Matches are found without using the poses, so that a wrong pose agrees with none of the linked photos.
     """
     poses, needed = SE3.stack([image.T_ref_camera for image in images]), LEAST_GROUP - 1
     for other in links.indices[links.indptr[number] : links.indptr[number + 1]].tolist():
@@ -250,6 +250,6 @@ def relocated(
 
 
 def image_motion(update: Float[Tensor, "6"], view: View, distance: float) -> float:
-    """Return how far (pixels, at most) an update of the pose moves the image of a point at ``distance`` (metres)."""
+    """Return the maximum shift (pixels) that a pose update causes in the image of a point at ``distance`` (metres)."""
     translation, rotation = (float(torch.linalg.vector_norm(part)) for part in update.split(3))
     return view.frame.intrinsics.fx * (rotation + translation / max(distance, 1e-9))

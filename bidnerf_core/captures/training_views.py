@@ -1,4 +1,4 @@
-"""The views for training: with poses corrected where the photos contradict them, and with the landmarks they show."""
+"""Views prepared for training: poses are corrected where the photos contradict them, and visible landmarks are added."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def prepared(
     views: Sequence[View], refinement: RefinementChoice = "auto",
     features: str = USUAL_FEATURES, trust_poses: bool = False, depth_unit: float | None = None,
 ) -> TrainingViews:  # fmt: skip
-    """Refine the poses of the views if requested, and find the landmarks that they show.
+    """Refine the poses of the views if requested, and find the landmarks visible in the views.
 
     ``features`` is the name of the keypoint detector. Raises ``InputError`` if the poses contradict most
     pairs of images, unless ``trust_poses`` is set, and if depth is clearly in another unit than
@@ -134,8 +134,8 @@ def located(
 ) -> tuple[TrackedViews | None, list[View]]:
     """Track the keypoints of the views, unless all have dense depth or a silhouette.
 
-    Returns the tracks, from which baking builds the map's landmarks, and the views with the landmarks that
-    each shows, from which training takes distances.
+    Returns the tracks, from which baking builds the map's landmarks, and the views with the landmarks visible
+    in each, which provide distances for training.
     """
     if not any(map(_lacks_distances, views)):
         return None, list(views)
@@ -144,7 +144,7 @@ def located(
 
 
 def _lacks_distances(view: View) -> bool:
-    """Return whether a view has neither dense depth nor a silhouette to show training where matter is."""
+    """Return whether a view has neither dense depth nor a silhouette, so that training gets no cue about where the geometry is."""
     return not (view.frame.has_dense_depth or has_outline(view))
 
 
@@ -170,9 +170,9 @@ def _check_poses(images: Sequence[ImageKeypoints]) -> None:
 
 
 def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> None:
-    """Raise ``InputError`` if measured depth is in another unit than the poses; log a scale that is a few percent off.
+    """Raise ``InputError`` if measured depth is in a different unit from the poses; only log a smaller scale difference.
 
-    ``depth_unit`` is the one with which depth images were read, if another can be given.
+    ``depth_unit`` is the unit with which depth images were read, or None if the user cannot set another.
     """
     seen, points = tracked.triangulated(DEFAULT_LANDMARKS)
     ratio = depth_ratio(seen, points)
@@ -196,7 +196,7 @@ def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> 
 
 
 def _with_landmarks(views: Sequence[View], tracked: TrackedViews) -> list[View]:
-    """Return the views with the landmarks that each shows, unless no view needs them for distances."""
+    """Return the views with the landmarks visible in each, or unchanged if no view needs landmarks for distances."""
     if not any(map(_lacks_distances, views)):
         return list(views)
     seen = tracked.seen(DEFAULT_LANDMARKS)
@@ -207,7 +207,7 @@ def _with_landmarks(views: Sequence[View], tracked: TrackedViews) -> list[View]:
 
 @dataclass(frozen=True, eq=False)
 class TrainingPoses:
-    """The poses to train with, and how far they are from the given ones."""
+    """The poses used for training, and how far they are from the given poses."""
 
     tracked: TrackedViews  # with these poses
     pixels: Float[Tensor, "v"]  # median shift of the points in an image; 0 if its pose was kept
@@ -224,9 +224,9 @@ def training_poses(
 ) -> TrainingPoses:
     """Return the poses to train with, for ``views`` whose keypoints are ``tracked``.
 
-    A photo whose given pose no group of photos supports is moved to where the landmarks of the others place
-    it. All poses are refined if errors of the given ones add at least ``least`` pixels to the deviation of the
-    keypoints; otherwise they are kept.
+    A photo whose given pose no group of photos supports gets the pose at which the landmarks of the others
+    localize it. All poses are refined if errors of the given poses add at least ``least`` pixels to the
+    standard deviation of the keypoints; otherwise they are kept.
     """
     seen, _ = tracked.triangulated(config)
     elsewhere = relocated(tracked, views, suspects(seen, linked(seen)), config)
@@ -254,10 +254,10 @@ def training_poses(
 def adjusted_poses(
     tracked: TrackedViews, config: LandmarkConfig, least: float = 0.0
 ) -> tuple[TrackedViews, Float[Tensor, "v"], PoseRefinement] | None:
-    """Adjust the poses of ``tracked`` images and the points that they show; None if there are too few of either.
+    """Bundle-adjust the poses and points of the ``tracked`` images; None if there are too few images or points.
 
-    Returns the tracks with these poses, rematched with them; the median shift (pixels) in each image of the points that it
-    shows, 0 without points; and how well the given poses and these fit the keypoints.
+    Returns the tracks with the adjusted poses, rematched using these; the median shift (pixels) of the points in each
+    image, 0 without points; and how well the given and the adjusted poses fit the keypoints.
 
     The errors of the given poses are assumed to be independent, and as large as resection of the images
     suggests. This prior alone fixes the gauge (position, orientation and scale of the whole), so the mean
@@ -308,7 +308,7 @@ def _deviations(updates: Float[Tensor, "v 6"]) -> tuple[float, float]:
 def _image_motion(
     seen: TrackedKeypoints, points: Float[Tensor, "n 3"], given: SE3, found: SE3
 ) -> Float[Tensor, "v"]:
-    """Return the median shift (pixels) of each image's points between its given and its found pose."""
+    """Return the median shift (pixels) of each image's points between its given and estimated pose."""
     shown, image = points[seen.point], seen.image
     focal = seen.sightings.focal[:, None]
     places = [pinhole(T[image].inverse().apply(shown))[0] * focal for T in (given, found)]
@@ -320,11 +320,11 @@ def _image_motion(
 
 
 def common_motion(seen: TrackedKeypoints, points: Float[Tensor, "n 3"], correlation: float) -> MotionPrior:
-    """Return the prior of the cameras' motions if a rolling shutter is more probable, else ``STILL``.
+    """Return the prior of the camera motions if a rolling shutter is more probable than none, else ``STILL``.
 
     The hypotheses concern the capture as a whole: either all images have a rolling shutter, or none. Each of up to 60
-    images is resected from ``points`` with and without a motion. ``correlation`` is the number of keypoints
-    that count as one.
+    images is resected from ``points`` with and without motion. ``correlation`` is the number of keypoints
+    that count as one independent measurement.
     """
     sightings = seen.sightings
     numbers = (torch.bincount(seen.image) >= LEAST_VISIBLE_POINTS).nonzero()[:, 0]

@@ -43,7 +43,7 @@ def tried_landmarks(
     """Return the landmarks of ``views``, whose keypoints were ``tracked``, after a trial on held-out images.
 
     The trial sets ``correlation``, ``usual_matches``, ``calibration_scatter`` and ``trial`` of the landmarks,
-    and enlarges ``pose_covariance`` if errors are larger than any ``correlation`` explains, for instance
+    and enlarges ``pose_covariance`` if errors are larger than any ``correlation`` can explain, for instance
     because many given poses are wrong. Raises ``InputError`` if there are no landmarks.
     """
     landmarks = tracked.landmarks(config, report)
@@ -78,10 +78,10 @@ def _answers(
     config: LandmarkConfig,
     landmarks: LandmarkMap,
 ) -> tuple[list[Answer], Float[Tensor, "n 6"]]:
-    """Localize the held-out images by the landmarks of the others.
+    """Localize the held-out images with the landmarks of the others.
 
-    Returns the accepted answers, and the right updates from the given poses to them. In a map of many images, those of its
-    ``landmarks`` that the held-out images do not show are not built anew.
+    Returns the accepted answers, and the right updates from the given poses to the answers. In a map of many images,
+    ``landmarks`` that are not visible in the held-out images are not rebuilt.
     """
     answers, updates = list[Answer](), [torch.zeros((0, 6), dtype=torch.float64)]
     if not held_out:
@@ -115,7 +115,7 @@ def _answers(
 def _correlation(
     answers: Sequence[Answer], updates: Float[Tensor, "n 6"], matches: Sequence[int], landmarks: LandmarkMap
 ) -> float:
-    """Return the ``correlation`` for which the errors are as large as the covariances of the fits predict."""
+    """Return the ``correlation`` at which the errors match the covariances predicted by the fits."""
     covariances = torch.stack([answer.covariance / HEAVY_TAILS for answer in answers])
 
     def are_larger(correlation: Tensor) -> Tensor:
@@ -131,7 +131,7 @@ def _correlation(
 def _bisected(
     low: Float[Tensor, "*n"], high: Float[Tensor, "*n"], is_above: Callable[[Tensor], Tensor]
 ) -> Float[Tensor, "*n"]:
-    """Return, by geometric bisection, where ``is_above`` becomes false between ``low`` and ``high``."""
+    """Return the point between ``low`` and ``high`` at which ``is_above`` becomes false, found by geometric bisection."""
     for _ in range(30):
         middle = (low * high).sqrt()
         above = is_above(middle)
@@ -140,12 +140,12 @@ def _bisected(
 
 
 def _factors(matches: Sequence[int], landmarks: LandmarkMap) -> Float[Tensor, "n"]:
-    """Return the factors that scale the covariances of answers that treat keypoints as independent."""
+    """Return the factors that correct the covariances of answers for treating keypoints as independent."""
     return torch.tensor([landmarks.correlation_of(count) for count in matches], dtype=torch.float64)
 
 
 def _calibration_scatter(answers: Sequence[Answer], factors: Float[Tensor, "n"]) -> Float[Tensor, "4"]:
-    """Return the standard deviations of the corrections estimated for intrinsics that are in fact right.
+    """Return the standard deviations of the corrections estimated for intrinsics that are in fact correct.
 
     The part explained by the uncertainty of each fit is subtracted.
     """

@@ -1,5 +1,5 @@
-"""Carving: where matter can be according to the views alone, before any field is trained. When in doubt,
-matter is assumed.
+"""Carving: which space may be occupied according to the views alone, before any field is trained. When in doubt,
+space counts as occupied.
 """
 
 from lazy_loader import attach_stub

@@ -43,7 +43,7 @@ def rays_of(
 
 
 def has_outline(view: View) -> bool:
-    """Return whether the image shows background; alpha that is 1 everywhere carries no information."""
+    """Return whether the image shows background; an alpha channel that is 1 everywhere carries no information."""
     frame = view.frame
     return frame.alpha is not None and bool(
         (frame.alpha if frame.hidden is None else frame.alpha[~frame.hidden]).amin() <= 0
@@ -53,9 +53,9 @@ def has_outline(view: View) -> bool:
 def carved_box(box: AxisBox, views: Sequence[View]) -> AxisBox:
     """Return the box of the cells that no two views see through and at which many views see something.
 
-    The threshold on that number, relative to the largest of any cell, is the largest for which the box still meets 99.9 % of
-    the rays to pixels with matter: so few views see peripheral cells that hardly any could have emptied them. Each of three
-    rounds carves the box that the previous one found.
+    The threshold on that number of views, as a fraction of its maximum over all cells, is the largest for which the box
+    still meets 99.9 % of the rays to pixels with matter. It removes peripheral cells, which so few views see that hardly
+    any could have emptied them. Each of three rounds carves the box that the previous round found.
     """
     side = 64
     origins, directions = _rays_to_matter(views)
@@ -113,7 +113,7 @@ def estimate_bounds(
     guess: for cameras that look inward, a cube around the point they look at, as large as the visible region
     there; otherwise (a room), the box of the cameras and of everything they see within four times the
     extent of their positions. Unless half of the views have dense depth or silhouettes, there may be matter
-    beyond the box, and the scene is contracted. Images from exactly one place do not determine a scale; the
+    beyond the box, and the scene is contracted. Images from a single position do not determine a scale; the
     extent of their positions is then taken to be one. The footprint of a pixel refers to the median
     distance of the data that gave the box: measured depth, landmarks, or else the box's middle, for which at
     least half the longest side is assumed. Raises ``InputError`` if there are no views.
@@ -160,7 +160,7 @@ def estimate_bounds(
 
 
 def _middle(points: Float[Tensor, "n 3"], left_out: float) -> AxisBox:
-    """Return the box of the points along each axis, without this fraction of them at either end."""
+    """Return the bounding box of the points, leaving out the fraction ``left_out`` of them at either end of each axis."""
     ordered, first = points.sort(dim=0).values, round(left_out * (len(points) - 1))
     return ordered[first], ordered[len(points) - 1 - first]
 
@@ -183,7 +183,7 @@ def measured_points(view: View, share: int) -> tuple[Float[Tensor, "n 3"], Float
 
 
 def _guessed_box(views: Sequence[View], places: Float[Tensor, "v 3"]) -> AxisBox:
-    """Return the box that the cameras alone suggest, see ``estimate_bounds``."""
+    """Return the box suggested by the cameras alone, see ``estimate_bounds``."""
     corners = torch.stack([_corner_rays(view) for view in views])
     # The tangent of the farthest corner's angle
     tangents = torch.linalg.vector_norm(corners[..., :2], dim=-1).amax(dim=-1)
@@ -214,6 +214,6 @@ def _corner_rays(view: View) -> Float[Tensor, "4 3"]:
 
 
 def _farthest(places: Float[Tensor, "v 3"], box: AxisBox) -> float:
-    """Return the largest distance of a corner of the box from a camera (metres)."""
+    """Return the largest distance (metres) between a corner of the box and a camera."""
     across = torch.maximum((places - box[0]).abs(), (places - box[1]).abs())
     return torch.linalg.vector_norm(across, dim=-1).amax().item()

@@ -25,8 +25,8 @@ def occupied_voxels(
     """Return which cells of ``grid`` may hold matter, see ``occupied_cells``.
 
     The relative tolerance of depth is 5 %, since sensors err by a few per cent, and an emptied cell is never filled again.
-    Contracted cells always may hold matter. In contracted space, the inner half of the grid, whose shape is divisible by 4, is
-    the box.
+    In contracted space, the inner half of the grid, whose shape is divisible by 4, is the box; cells outside of the box
+    are always kept.
     """
     inner, middle = grid, [slice(None)] * 3
     if grid.contracted is not None:
@@ -52,7 +52,7 @@ def occupied_cells(
     """Return on ``device`` which cells of the box ``lower``..``upper`` (metres, world) may hold matter.
 
     A cell is emptied when two views (one, if there is only one) see all of it as free: as background (alpha 0), or nearer
-    than the measured depth by more than the fraction ``tolerance`` of it. Pixels without a measurement empty nothing, nor
+    than the measured depth by more than a fraction ``tolerance`` of that depth. Pixels without a measurement empty nothing, nor
     does a view in which the cell's radius is over ``footprint`` pixels.
 
     Cells are processed in blocks, which may reach beyond the box.

@@ -1,7 +1,7 @@
 """The free space of a view: how far its pixels see before any matter, and which spheres lie entirely within it.
 
-When in doubt, space counts as occupied: where nothing was measured, and wherever a neighbouring pixel sees
-less far.
+When in doubt, space counts as occupied: where nothing was measured, and beyond the depth that
+any neighbouring pixel sees.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class FreeSpace:
     def seen_by(view: View, tolerance: float = 0.02, footprint: int = 8) -> FreeSpace:
         """Return the free space of a view.
 
-        Its image is shrunk by a whole factor to at most 400 pixels a side, which suffices for coarse cells and bounds the time.
-        The smallest depth of a block of pixels counts.
+        Its depth image is downsampled by an integer factor to at most 400 pixels a side, keeping the minimum depth of each
+        block; that suffices for coarse cells and bounds the time.
         """
         free, camera = _free_depth(view.frame, tolerance), view.frame.intrinsics
         height, width = free.shape
@@ -70,7 +70,7 @@ class FreeSpace:
         return known & (deepest < least)
 
     def _footprint(self, points: Float[Tensor, "3 n"], radius: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return column, row and radius of each sphere's image in whole pixels; out of view, the radius is infinite."""
+        """Return the column, row and radius, in whole pixels, of each sphere's image; the radius is infinite for spheres out of view."""
         camera = self.intrinsics
         inverse = 1 / points[2]
         x, y = points[0] * inverse, points[1] * inverse
@@ -90,7 +90,7 @@ class FreeSpace:
 
 
 def _free_depth(frame: Frame, tolerance: float) -> Float[Tensor, "h w"]:
-    """Return the planar z (metres) up to which each pixel is free: infinite over background, 0 where nothing is known."""
+    """Return the planar z (metres) up to which space is free at each pixel: infinite for background, 0 where nothing is known."""
     free = torch.zeros(frame.rgb_bytes.shape[:2])
     if frame.depth is not None:
         free = frame.depth.float() * (1 - tolerance)
@@ -102,7 +102,7 @@ def _free_depth(frame: Frame, tolerance: float) -> Float[Tensor, "h w"]:
 
 
 def _edges(camera: Intrinsics) -> Float[Tensor, "4 3"]:
-    """Return the inward normals of the planes through the axis-aligned bounding box, at z = 1, of the (distorted) border."""
+    """Return the inward normals of the frustum whose section at z = 1 is the bounding box of the (distorted) image border."""
     w, h = camera.width, camera.height
     along = torch.linspace(0, 1, 33, dtype=torch.float64)
     still = torch.zeros_like(along)

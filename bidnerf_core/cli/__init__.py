@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _guarded(name: str, given: list[str]) -> int:
-    """Run a command and return its exit status; a user's mistake is reported in one line instead of a traceback."""
+    """Run a command and return its exit status; a user error is reported in one line instead of a traceback."""
     try:
         with interruptions(), _warnings_as_lines(name), _remarks_as_lines():
             return _dispatch(given)
@@ -118,7 +118,7 @@ def _dispatch(given: list[str]) -> int:
 
 @contextlib.contextmanager
 def _warnings_as_lines(name: str) -> Iterator[None]:
-    """Print each ``InputWarning`` as one line on stderr, once, without the source line that Python would print."""
+    """Print each distinct ``InputWarning`` once, as one line on stderr, without the source line that Python would add."""
     told = set[str]()
     with warnings.catch_warnings():
 
@@ -137,7 +137,7 @@ def _warnings_as_lines(name: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _remarks_as_lines() -> Iterator[None]:
-    """Print each remark that the library logs as one line on stderr."""
+    """Print each remark logged by the library as one line on stderr."""
     logger, handler = logging.getLogger("bidnerf"), _Lines()
     before = logger.level, logger.propagate
     logger.addHandler(handler)
@@ -160,7 +160,7 @@ class _Lines(logging.Handler):
 
 
 def _failed(name: str, message: str, status: int, more: str = "") -> int:
-    """Print why a command failed, or a warning, on one line, and return ``status``, even if stderr is closed."""
+    """Print the reason for a failure, or a warning, on one line, and return ``status``, even if stderr is closed."""
     with contextlib.suppress(OSError):
         print(f"{name}: {printable(' '.join(message.splitlines()))}", file=sys.stderr)
         print(more, end=more and "\n", file=sys.stderr, flush=True)
@@ -171,7 +171,7 @@ def _open_streams() -> None:
     """Make stdout and stderr accept every character.
 
     Streams that the shell closed (``>&-``), which are None in Python, are replaced by streams that discard
-    everything; characters that a stream's encoding lacks are written as backslash escapes.
+    everything. Characters that a stream cannot encode are written as backslash escapes.
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
@@ -182,7 +182,7 @@ def _open_streams() -> None:
 
 
 def _discard(stream: TextIO) -> None:
-    """Discard the rest of a stream's buffer, since flushing it when Python exits would fail again."""
+    """Discard the remaining buffer of a stream, since flushing it when Python exits would fail again."""
     with contextlib.suppress(OSError, ValueError):
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())

@@ -34,7 +34,7 @@ class Trial(NamedTuple):
     bid: Localization  # from it
 
     def errors(self, poses: SE3) -> PoseError:
-        """Return the errors of poses."""
+        """Return the errors of poses relative to the true pose of the frame."""
         from bidnerf_core.results import pose_error
 
         return pose_error(poses, self.view.T_ref_camera, self.auto.unit)

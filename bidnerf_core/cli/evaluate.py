@@ -42,7 +42,7 @@ class TrialOptions:
     frame: Annotated[Names, Option("NAME...", "try only these frames", "all of the split")] = ()
 
     def plan(self, method: MethodOptions, dataset: DatasetOptions, **more: Any) -> Plan:
-        """Return the plan of the trials; ``more`` holds its other fields."""
+        """Return the plan of the trials; ``more`` holds the fields of the plan that these options do not set."""
         from bidnerf_core.evaluation import Plan
         from bidnerf_core.localization import find_method
 

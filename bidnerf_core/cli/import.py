@@ -17,7 +17,7 @@ from bidnerf_core.settings import Above
 
 
 def _importer_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
-    """Return the default settings of the importer, if the arguments determine it."""
+    """Return the default settings of the importer that the arguments select, or None if they select none."""
     from bidnerf_core.maps import IMPORTERS, importer_of
 
     if values["as_"] is not None:

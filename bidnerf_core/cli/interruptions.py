@@ -14,7 +14,7 @@ ASKED_TO_STOP = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal asked the command to stop."""
+    """Raised when a signal asks the command to stop."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -22,7 +22,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 class _Handler:
-    """Raises ``Interrupted`` in the process that installed it, at once or once results are written."""
+    """A signal handler that raises ``Interrupted`` in the process that installed it; it can be deferred while results are written."""
 
     def __init__(self) -> None:
         self.process = os.getpid()
@@ -41,9 +41,9 @@ class _Handler:
 
 @contextlib.contextmanager
 def interruptions() -> Iterator[None]:
-    """Let SIGINT, SIGTERM and SIGHUP raise ``Interrupted``. Signals that are ignored, as under nohup, stay ignored.
+    """Make SIGINT, SIGTERM and SIGHUP raise ``Interrupted``. Signals that are ignored, as under nohup, stay ignored.
 
-    Outside the main thread, which alone may handle signals, nothing changes.
+    Has no effect outside the main thread, the only thread that may handle signals.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -63,7 +63,7 @@ def interruptions() -> Iterator[None]:
 
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Defer interruptions to the end of the context, in which results are written."""
+    """Defer interruptions to the end of the context, so that results are written completely."""
     handlers = [found for number in ASKED_TO_STOP if isinstance(found := signal.getsignal(number), _Handler)]
     for handler in handlers:
         handler.deferring = True

@@ -51,7 +51,7 @@ class StartOptions:
         require_one({"--start": self.start, "--perturb": self.perturb, "--no-start": self.no_start or None})
 
     def of_queries(self, seed: int) -> Callable[[Query], SE3 | None]:
-        """Return the function that gives the start of each query. Raises ``UsageError`` for a perturbation out of range."""
+        """Return a function that returns the start of a query, if any. Raises ``UsageError`` if the perturbation is out of range."""
         from bidnerf_core.evaluation import find_protocol, perturb
         from bidnerf_core.results import pose_of, read_poses
 
@@ -89,7 +89,7 @@ class OutputOptions:
     json: Json = False
 
     def check(self, inputs: Sequence[Path]) -> None:
-        """Check, before any work, that the outputs can be written."""
+        """Check that the outputs can be written, before any work is done."""
         from bidnerf_core.results import check_pose_file
 
         if self.out is not None:
@@ -99,7 +99,7 @@ class OutputOptions:
             check_folder(self.draw, inputs, create=True)
 
     def picture(self, name: str) -> Path:
-        """Return the file of a picture."""
+        """Return the path of the picture for the image ``name``."""
         assert self.draw is not None
         return self.draw / f"overlay-{name}.png"
 
@@ -187,7 +187,7 @@ def _holds_maps(path: Path) -> bool:
 
 
 def _no_query(maps: Sequence[Path]) -> UsageError:
-    """Return the error that says that no QUERY follows the maps."""
+    """Return the error to raise if no QUERY follows the maps."""
     from bidnerf_core.maps import maps_in
 
     expected = "image files, folders of photos, or a folder of a dataset"
@@ -202,7 +202,7 @@ def _no_query(maps: Sequence[Path]) -> UsageError:
 
 
 def _check_for_several(output: OutputOptions, queries: QueryOptions, start: StartOptions) -> None:
-    """Raise ``UsageError`` for options that apply only to one map."""
+    """Raise ``UsageError`` if an option is given that cannot be used with several maps."""
     from bidnerf_core.results import pose_format
 
     given = {
@@ -219,7 +219,7 @@ def _check_for_several(output: OutputOptions, queries: QueryOptions, start: Star
 
 @dataclass
 class Run:
-    """Answers as they come: printed, drawn, and written to the pose file however the run ends."""
+    """Prints and draws answers as they arrive, and writes them to the pose file however the run ends."""
 
     output: OutputOptions
     answers: Answers
@@ -250,10 +250,10 @@ class Run:
 
     @contextlib.contextmanager
     def saved(self) -> Iterator[None]:
-        """Write the pose file at the end, and print how many of several queries converged.
+        """Write the pose file at the end and, if there are several queries, print how many converged.
 
-        A run that is stopped early writes the answers so far. Raises ``InputError`` if a file of accepted poses would be
-        empty, and if a query failed.
+        If the run is stopped early, the answers so far are written. Raises ``InputError`` if no pose was accepted and
+        the file holds only accepted poses, and if a query failed.
         """
         from bidnerf_core.maps import MapCollection
         from bidnerf_core.results import pose_format
@@ -286,7 +286,7 @@ class Run:
 
 
 def answer_lines(answer: Answer, start: SE3 | None, full: bool) -> list[str]:
-    """Return an answer in words: one line, or with its errors if the truth is known, its uncertainty, and the matrix."""
+    """Return an answer as text: one line or, if ``full``, also its errors (if the truth is known), uncertainty and matrix."""
     from bidnerf_core.geometry import symbol
     from bidnerf_core.results import OPENCV_AXES, pose_error, standard_deviations
 

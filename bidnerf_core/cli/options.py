@@ -81,7 +81,7 @@ class MapOptions:
 
 
 def require_one(values: Mapping[str, object], required: bool = False) -> None:
-    """Raise ``UsageError`` if several options have a value or, where one is required, none has."""
+    """Raise ``UsageError`` if more than one option has a value, or if ``required`` is set and none has."""
     given = [option for option, value in values.items() if value is not None]
     if len(given) > 1:
         raise UsageError(f"{given[0]} and {given[1]} exclude each other", expected="only one of them")
@@ -91,7 +91,7 @@ def require_one(values: Mapping[str, object], required: bool = False) -> None:
 
 @contextlib.contextmanager
 def wrong_usage() -> Iterator[None]:
-    """Convert an ``InputError`` to a ``UsageError`` if the arguments are wrong regardless of the files' contents."""
+    """Convert ``InputError`` to ``UsageError``, for arguments that are wrong regardless of the contents of files."""
     try:
         yield
     except InputError as error:
@@ -109,7 +109,7 @@ class CameraOptions:
         require_one({"--focal": self.focal, "--hfov": self.hfov})
 
     def source(self, images: DatasetOptions, assumed: Sequence[Intrinsics] = ()) -> CameraSource:
-        """Return the source of the cameras of single images."""
+        """Return the camera source for single images."""
         from bidnerf_core.camera import CameraSource
 
         require_one({"--camera": images.camera, "--focal": self.focal, "--hfov": self.hfov})
@@ -164,10 +164,10 @@ class QueryOptions:
         assumed: Sequence[Intrinsics],
         scene: Map | None = None,
     ) -> QuerySource:
-        """Return the queries for the QUERY arguments: image files and folders of them, or one dataset.
+        """Return the queries named by the QUERY arguments: image files and folders of photos, or one dataset.
 
-        ``scene`` is the map, or None if there are several. Raises ``InputError`` if there is nothing of either kind, and
-        ``UsageError`` for options that belong to the other kind.
+        ``scene`` is the map, or None if there are several maps. Raises ``InputError`` if the arguments hold neither
+        photos nor a dataset, and ``UsageError`` for options that apply only to the other kind.
         """
         from bidnerf_core.datasets import (
             DatasetFrames,

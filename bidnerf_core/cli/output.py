@@ -16,7 +16,7 @@ from bidnerf_core.errors import InputError, UsageError, printable
 
 
 class _Progress(Console):
-    """A console that falls silent when its pipe is closed, so that work continues."""
+    """A console that stops printing when its pipe is closed, so that the work continues."""
 
     def on_broken_pipe(self) -> None:
         self.quiet = True
@@ -37,12 +37,12 @@ def show(line: str) -> None:
 
 
 def print_json(value: Any) -> None:
-    """Print one line of strict JSON, completely or not at all."""
+    """Print a value as one line of strict JSON, completely or not at all."""
     sys.stdout.write(json.dumps(value, allow_nan=False) + "\n")
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], wide: str | None = None) -> None:
-    """Print a table on stdout. On narrow terminals the column ``wide`` is folded, by words, and the others are kept whole."""
+    """Print a table on stdout. On narrow terminals, the column ``wide`` is wrapped at words and the other columns are kept whole."""
     from rich.table import Table
 
     screen = Console(highlight=False, markup=False)
@@ -62,8 +62,9 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], wide: str
 def check_output(out: Path, inputs: Iterable[Path | str | None]) -> None:
     """Raise, before any work is done, if the file ``out`` cannot be written or would replace an input.
 
-    Inputs are the files of any map, the ``inputs``, and files in folders among them. Raises ``UsageError``
-    for these, and ``InputError`` for a folder, and for a name in a folder that does not exist.
+    Inputs are the files of any map, the ``inputs``, and the files in folders among the ``inputs``. Raises
+    ``UsageError`` if ``out`` would replace an input, and ``InputError`` if ``out`` is a folder or cannot be written
+    in its folder.
     """
     # os.path functions return False for a name that is too long, which is reported when it is written.
     if os.path.isdir(out) or not os.path.isdir(out.parent):
@@ -85,9 +86,10 @@ def check_output(out: Path, inputs: Iterable[Path | str | None]) -> None:
 def check_folder(
     out: Path, inputs: Iterable[Path | str | None], may_be_map: bool = False, create: bool = False
 ) -> None:
-    """Raise ``UsageError`` if an output folder lies inside a map, is one of the inputs, or is a map.
+    """Raise ``UsageError`` if an output folder lies inside a map, is one of the inputs, or is a map and ``may_be_map`` is not set.
 
-    With ``create``, the folder is created; raises ``InputError`` if it or files in it cannot be.
+    If ``create`` is set, the folder is created. Raises ``InputError`` if the folder, or files in it, cannot be
+    created.
     """
     require_outside_maps(out.parent, out)
     if not may_be_map:
@@ -106,7 +108,7 @@ def check_folder(
 
 
 def require_outside_maps(folder: Path, out: Path) -> None:
-    """Raise ``UsageError`` if ``folder``, which is the output ``out`` or would hold it, is a map."""
+    """Raise ``UsageError`` if ``folder``, which is the output ``out`` or its parent folder, is a map."""
     from bidnerf_core.maps import DESCRIPTION
 
     if (folder / DESCRIPTION).exists():

@@ -1,7 +1,7 @@
-"""The parser of a command: its arguments are the parameters of a function, and the fields of dataclasses among these.
+"""The parser of a command, whose arguments are the parameters of a function and the fields of dataclasses among them.
 
-Options are named as the parameters are, ``--depth-unit`` for ``depth_unit``, whichever dataclass declares them. The help of each
-is its ``Option``, or the docstring or comment beside the field.
+Each option is named after its parameter, such as ``--depth-unit`` for ``depth_unit``, whichever dataclass declares
+it. Its help text is that of its ``Option``, or the docstring or comment beside the field.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Option:
-    """How an argument is called and described; without ``help``, by the docstring or the comment beside it."""
+    """The name and description of an argument; without ``help``, the docstring or comment beside the field describes it."""
 
     metavar: str | None = None
     help: str = ""
@@ -50,7 +50,7 @@ class Option:
 
 
 class Without(frozenset[str]):
-    """The options of a nested dataclass that a command does not take."""
+    """The options of a nested dataclass that a command leaves out."""
 
     def __new__(cls, *names: str) -> Without:
         return super().__new__(cls, names)
@@ -58,10 +58,11 @@ class Without(frozenset[str]):
 
 @dataclass(frozen=True)
 class Settings:
-    """A parameter that takes a dataclass of settings, known only once the other arguments are, or slow to import.
+    """Marks a parameter that takes a dataclass of settings, which depends on other arguments or is slow to import.
 
-    ``load`` returns the default settings, given the values of the options parsed so far, by parameter name, and all words.
-    ``--help-all`` describes the options of the settings; ``--help`` only mentions that there are some, as ``summary``.
+    ``load`` returns the default settings, given the values of the options parsed so far, by parameter name, and all
+    words of the command line. ``--help-all`` describes the options of the settings; ``--help`` only mentions them by
+    ``summary``.
     """
 
     load: Callable[[Mapping[str, Any], Sequence[str]], Any]
@@ -84,31 +85,31 @@ class Parameter:
     doc: str
 
     def note(self, kind: type[T]) -> T | None:
-        """Return the first annotation of a kind."""
+        """Return the first annotation of type ``kind``, or None if there is none."""
         return next((note for note in self.notes if isinstance(note, kind)), None)
 
     @property
     def option(self) -> Option:
-        """How it is called; a string among the annotations is the name of its value."""
+        """The ``Option`` among the annotations, or else one whose metavar is the string among the annotations."""
         return self.note(Option) or Option(
             next((n for n in self.notes if isinstance(n, str) and n != FLAG), None)
         )
 
     @property
     def flag(self) -> str:
-        """The option, such as --depth-unit."""
+        """The option string, such as --depth-unit."""
         return f"--{self.name.rstrip('_').replace('_', '-')}"
 
     @property
     def left_out(self) -> frozenset[str]:
-        """The fields of the dataclass, if it is one, that are no options."""
+        """The fields that are not options, if the parameter is a dataclass."""
         return self.note(Without) or frozenset()
 
 
 def parse(command: str, target: Callable[..., T], arguments: Sequence[str]) -> T:
     """Call ``target``, a function or a dataclass, with the parsed arguments.
 
-    Raises ``UsageError`` for arguments that do not fit, and ``SystemExit`` after help was printed.
+    Raises ``UsageError`` for invalid arguments, and ``SystemExit`` after printing help.
     """
     # The names of options may be written with underscores, as in Python.
     words = [re.sub("^--[^=]*", lambda name: name[0].replace("_", "-"), word) for word in arguments]
@@ -133,7 +134,7 @@ def _loaded(command: str, target: Callable[..., Any], words: Sequence[str]) -> d
 def _walk(
     target: Any, loaded: Mapping[str, Any], default: Any = None, left_out: frozenset[str] = frozenset()
 ) -> Iterator[tuple[Parameter, Any]]:
-    """Yield the parameters of ``target`` and of nested dataclasses, each with the default of the dataclass that it is, if any."""
+    """Yield the parameters of ``target`` and of nested dataclasses; a parameter that is a dataclass comes with its default instance."""
     for parameter in parameters_of(target):
         if parameter.name in left_out:
             continue
@@ -149,7 +150,7 @@ def _walk(
 def _built(
     target: Callable[..., T], given: Mapping[str, Any], loaded: Mapping[str, Any], default: Any = None
 ) -> T:
-    """Call ``target`` with the values given for its parameters, and for those of nested dataclasses."""
+    """Call ``target`` with the given values for its parameters and for the fields of nested dataclasses."""
     values = dict[str, Any]()
     for parameter in parameters_of(target):
         usual = parameter.default if default is None else getattr(default, parameter.name)
@@ -173,9 +174,10 @@ def _built(
 
 
 class _Parser(argparse.ArgumentParser):
-    """The options of a command.
+    """The argument parser of a command.
 
-    ``loaded`` holds the settings that depend on other arguments; None: they are only announced.
+    ``loaded`` holds the settings that depend on other arguments; if it is None, help only mentions that these
+    settings exist.
     """
 
     def __init__(
@@ -213,7 +215,7 @@ class _Parser(argparse.ArgumentParser):
         )
 
     def _filled(self, text: str, indent: int = 0) -> str:
-        """Return paragraphs with lines that fit the terminal."""
+        """Return paragraphs wrapped to the width of the terminal."""
         paragraphs = (" ".join(part.replace("``", "'").split()) for part in text.split("\n\n"))
         fill = functools.partial(textwrap.fill, width=self.width - indent, break_on_hyphens=False)
         return "\n\n".join(map(fill, paragraphs))
@@ -251,7 +253,7 @@ class _Parser(argparse.ArgumentParser):
         )  # fmt: skip
 
     def values(self, words: Sequence[str]) -> dict[str, Any]:
-        """Return the values of the arguments that were given. Raises ``UsageError``."""
+        """Parse words, and return the values of the arguments that were given. Raises ``UsageError``."""
         self._words = words
         found, more = self.parse_known_intermixed_args(_escaped(words))
         if more:
@@ -261,7 +263,7 @@ class _Parser(argparse.ArgumentParser):
         }
 
     def error(self, message: str) -> NoReturn:
-        """Raise ``UsageError``; an option that does not exist is named first, since it explains the rest."""
+        """Raise ``UsageError``. An unknown option is reported instead of ``message``, since it explains the other errors."""
         message = re.sub(r"^argument (\S+): ", r"\1 ", message)
         for word in getattr(self, "_words", ()):
             name = word.split("=")[0]
@@ -272,7 +274,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _description(parameter: Parameter) -> str:
-    """Return the help of a parameter, with its default."""
+    """Return the help text of a parameter, with its default."""
     option, default = parameter.option, parameter.default
     words = option.default
     if words is None and default is not MISSING and default not in (None, (), "") and default is not False:
@@ -284,7 +286,7 @@ def _description(parameter: Parameter) -> str:
 
 
 def _escaped(words: Sequence[str]) -> list[str]:
-    """Return the words such that values like -1,0,2 are not taken for options: argparse takes none with a space for one."""
+    """Return the words with a space before values like -1,0,2, since argparse would otherwise take these values for options."""
     return [f" {word}" if NEGATIVE.match(word) else word for word in words]
 
 
@@ -319,7 +321,7 @@ def parameters_of(target: Any) -> list[Parameter]:
 
 
 class _Names(dict[str, Any]):
-    """The names that annotations use; one that is imported for type checkers alone stands for any object."""
+    """Names for resolving annotations; a name that is imported only for type checkers resolves to ``object``."""
 
     def __missing__(self, name: str) -> Any:
         builtins = self["__builtins__"]
@@ -328,7 +330,7 @@ class _Names(dict[str, Any]):
 
 
 def _field_docs(kind: type) -> dict[str, str]:
-    """Return the text beside each field of a dataclass: the docstring after it, or the comment on its lines or above it."""
+    """Return the description of each field of a dataclass: the docstring after it, or the comment on its lines or above it."""
     try:
         source = textwrap.dedent(inspect.getsource(kind))
     except OSError:
@@ -353,7 +355,7 @@ def _field_docs(kind: type) -> dict[str, str]:
 
 
 def _bare(hint: Any) -> tuple[Any, tuple[Any, ...]]:
-    """Return a type without ``Annotated``, and the annotations."""
+    """Return a type without ``Annotated``, and its annotations."""
     if typing.get_origin(hint) is Annotated:  # typing flattens nested annotations
         kind, *notes = typing.get_args(hint)
         return kind, tuple(notes)
@@ -361,7 +363,7 @@ def _bare(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 def conversion(hint: Any) -> tuple[int | str | None, Callable[[str], Any], str]:
-    """Return argparse's ``nargs`` for a type (None: one word), the function that converts one word, and the name of the value."""
+    """Return argparse's ``nargs`` for a type (None for one word), the function that converts a word, and the metavar."""
     hint, _ = _bare(hint)
     is_union = typing.get_origin(hint) in (typing.Union, types.UnionType)
     members = [_bare(part)[0] for part in typing.get_args(hint)] if is_union else [hint]

@@ -28,7 +28,7 @@ def run_backends(json: Json = False) -> None:
 
 
 def _print_infos(infos: list[PluginInfo], json: bool, *more: str, all_kinds: bool = False) -> None:
-    """Print plugins as a table, with their faults if any, or as a JSON list whose entries also have the keys ``more``."""
+    """Print plugins as a table, with their faults if any, or as a JSON list whose entries also have the keys in ``more``."""
     if json:
         keys = (*more, "name", "summary", "distribution", "version", "value", "fault")
         print_json([{key: getattr(info, key) for key in keys} for info in infos])

@@ -1,4 +1,4 @@
-"""The progress display on stderr, and Ctrl-C."""
+"""The progress display on stderr, and the handling of Ctrl-C."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ STEP = "stopping after this step (Ctrl-C again: at once, back to the last checkp
 
 
 class Display:
-    """Displays progress when called with it: a bar for each stage on a terminal, else occasional lines.
+    """Displays the progress that it is called with: as a bar for each stage on a terminal, else as occasional lines.
 
-    A stage begins when it is first named, or named with nothing done. A stage with a single unit shows only
-    the elapsed time, and nothing if stderr is not a terminal.
+    A stage begins when its name first appears, or when it is reported with nothing done. A stage with a single unit
+    shows only the elapsed time, or nothing if stderr is not a terminal.
     """
 
     def __init__(self) -> None:
@@ -89,10 +89,10 @@ def displayed() -> Iterator[None]:
 
 @contextlib.contextmanager
 def stopped_by_ctrl_c(announcement: str = STEP) -> Iterator[Cancel]:
-    """Let Ctrl-C stop the work in the context once it can; a second Ctrl-C raises ``KeyboardInterrupt`` at once.
+    """Let Ctrl-C stop the work in the context at its next check; a second Ctrl-C raises ``KeyboardInterrupt`` at once.
 
-    Yields a function that returns whether Ctrl-C was pressed. Work that stopped for that reason ends as interrupted, after
-    the line that says what was kept.
+    Yields a function that returns whether Ctrl-C was pressed. If Ctrl-C stops the work, a line says what was kept,
+    and ``KeyboardInterrupt`` is raised.
     """
     pressed, announced = threading.Event(), threading.Event()
 

@@ -80,7 +80,7 @@ def run(
             raise InputError("is empty", where=token_file, expected="a token")
 
     def announce(address: str, token: str | None) -> None:
-        """Print where the service is, and a token that was generated; a given one must not be logged."""
+        """Print the address of the service and, if it was generated, the token; a token that the user gave must not be logged."""
         say(f"serving at {address}; Ctrl-C ends")
         if token is not None:
             shown = "TOKEN, the one that was given" if stated else token

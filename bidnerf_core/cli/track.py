@@ -51,7 +51,7 @@ class OutputOptions:
     ] = None
 
     def check(self, inputs: list[Path]) -> None:
-        """Check, before any work, that the outputs can be written."""
+        """Check that the outputs can be written, before any work is done."""
         from bidnerf_core.results import check_pose_file, check_video, require_matplotlib
 
         if self.out is not None:
@@ -186,7 +186,7 @@ def run(
 def _follow(
     source: str, images: DatasetOptions, depth: bool, tracker: Tracker, path: Answers, video: TrackingVideo | None
 ) -> None:  # fmt: skip
-    """Answer each frame on arrival with one JSON object on a line of its own."""
+    """Answer each frame on arrival with one line of JSON."""
     from bidnerf_core.results import BAD_INPUT
 
     sensor = images.sensor(source)
@@ -209,7 +209,7 @@ def _follow(
 
 
 def _summarize(path: Answers, seconds: float, frame_seconds: float) -> None:
-    """Print a summary of a recording."""
+    """Print a summary of a tracked recording."""
     print_table([""] * 2, path.summary(seconds))
     if path.lost and all(answer.time is None for answer in path.answers):
         say(
@@ -232,7 +232,7 @@ class FrameRequest:
 
     @staticmethod
     def parse(line: str) -> FrameRequest:
-        """Parse the request in a line ``{"image": path, "depth": path, "time": s}``; only the image is required."""
+        """Parse a line such as ``{"image": path, "depth": path, "time": s}``; only the image is required."""
         from bidnerf_core.io import parse_record
 
         request = parse_record("request", line, '{"image": path, "depth": path, "time": seconds}')
@@ -262,9 +262,9 @@ class FrameRequest:
 
 
 def requests(source: str) -> Iterator[FrameRequest | InputError]:
-    """Yield frames as they arrive: lines of stdin until it ends, or the images of a folder until the program is stopped.
+    """Yield frames as they arrive: from lines of stdin until it ends, or from the images of a folder until the program is stopped.
 
-    A line that is not a request is yielded as the error with which to answer it.
+    A line that is not a valid request yields the error to answer it with.
     """
     if source != STDIN:
         yield from _arriving(Path(source))
@@ -279,7 +279,7 @@ def requests(source: str) -> Iterator[FrameRequest | InputError]:
 
 
 def _arriving(folder: Path) -> Iterator[FrameRequest]:
-    """Yield the images of a folder in natural name order, and later ones as they arrive."""
+    """Yield the images of a folder in natural name order, and then new images as they arrive."""
     from bidnerf_core.frames import photos_in
     from bidnerf_core.io import IMAGE_SUFFIXES
 
@@ -305,7 +305,7 @@ def _arriving(folder: Path) -> Iterator[FrameRequest]:
 
 
 def _is_steady(file: Path, sizes: dict[Path, tuple[int, int]]) -> bool:
-    """Return whether the size of a file, which may still be being written, has stayed the same for two checks."""
+    """Return whether the size of a file has stayed the same for two checks, so that the file is probably written completely."""
     try:
         size = file.stat().st_size
     except OSError:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def _backend_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
-    """Return the default settings of the backend: the one named, or that of the map to resume."""
+    """Return the default settings of the named backend, or of the backend of the map to resume."""
     from bidnerf_core.backend import load_backend, quick_config
 
     name, out = values["backend"], values["out"]
@@ -38,7 +38,7 @@ def _backend_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
 
 
 def _resumed(out: Any) -> MapInfo | None:
-    """Return the description of the map to resume, None if there is none that can be read, which is reported later."""
+    """Return the description of the map to resume, or None if none can be read, which is reported later."""
     from bidnerf_core.maps import load_info
 
     try:
@@ -170,7 +170,7 @@ def _interrupted(
 ) -> MapInfo:  # fmt: skip
     """Return the description of the map to resume.
 
-    Raises ``UsageError`` for options that differ from the map's own, since they would be ignored.
+    Raises ``UsageError`` for options that differ from those of the map, since they would be ignored.
     """
     from bidnerf_core.backend import load_backend
     from bidnerf_core.io import from_plain

@@ -160,5 +160,5 @@ class Chosen:
         return [self._source.names[place] for place in self._places]
 
     def read(self, place: int) -> Query:
-        """Read the chosen query at an index."""
+        """Read the chosen query at index ``place``."""
         return self._source.read(self._places[place])

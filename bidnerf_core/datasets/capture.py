@@ -1,4 +1,4 @@
-"""Captures: images, each with all that is known of it, read one at a time. Every reader returns one.
+"""Captures: lists of images with their known metadata, read one at a time. Every reader returns a capture.
 
 A ``Capture`` is a list of ``Shot``s. Choosing a split, adding masks and ordering by time are operations on that list, and none
 of them opens an image. Photos without poses, the frames of a video and images in memory are captures too.
@@ -54,21 +54,21 @@ SPLITS = ("train", "val", "test")
 
 
 class BreaksOff(InputError):
-    """A recording that is decoded in order ends too early: none of the later frames can be read either."""
+    """Raised when a sequentially decoded recording ends early, so that none of the remaining frames can be read."""
 
 
 @runtime_checkable
 class Picture(Protocol):
-    """An image that is not a file of its own, such as a frame of a video."""
+    """An image that is not stored in a separate file, such as a frame of a video."""
 
     def pixels(self) -> Shaped[Tensor, "h w 3"]:
-        """Decode it. Raises ``InputError`` if that is impossible."""
+        """Decode the image. Raises ``InputError`` if it cannot be decoded."""
         ...
 
 
 @dataclass(frozen=True)
 class DepthFile:
-    """The depth image of a shot: ``read`` returns it in metres; it is registered to the image from ``sensor``, if given."""
+    """The depth image of a shot: ``read`` returns depth in metres, to be registered from ``sensor`` (if given) to the image."""
 
     path: Path | str  # for messages; a ``Path`` is a file, without which there is no depth
     read: Callable[[], DepthImage]
@@ -77,7 +77,7 @@ class DepthFile:
 
 @dataclass(frozen=True)
 class MaskFile:
-    """A mask of a shot, and the colour in it of the pixels that are ignored."""
+    """A mask of a shot, and the mask colour that marks pixels to ignore."""
 
     path: Path
     hides: HiddenColour = "black"
@@ -85,9 +85,9 @@ class MaskFile:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Shot:
-    """An image and what its format knows of it; nothing is decoded before ``frame`` is called.
+    """An image and its metadata from the capture format; nothing is decoded until ``frame`` is called.
 
-    Formats whose images are not stored in the usual way derive a class that overrides ``frame``.
+    Formats whose images are not stored in the usual way define a subclass that overrides ``frame``.
     """
 
     image: ImageSource | Picture | None = None
@@ -115,19 +115,19 @@ class Shot:
 
     @property
     def file(self) -> Path | None:
-        """The image file, if the image is one of its own."""
+        """The image file, if the image is stored in a separate file."""
         return self.image if isinstance(self.image, Path) else None
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """The folders, then the stem."""
+        """The folders of the image path, followed by its stem."""
         return *(self.folders or ()), self.stem
 
     def frame(self, background: Colour = BLACK, side: int | None = None) -> Frame:
         """Read the image, composited over ``background`` (rgb) if it has an alpha channel, and its depth.
 
         An image with more than ``side`` pixels along the longer side is downscaled to that. The camera of a file is checked
-        before a pixel is decoded. Registered depth may be of any size: each pixel has the depth of the nearest measurement.
+        before any pixel is decoded. Registered depth may be of any size: each pixel has the depth of the nearest measurement.
         Raises ``InputError`` for an unreadable file, and for a camera or registered depth of another aspect ratio.
         """
         assert self.image is not None  # else a subclass reads it
@@ -170,7 +170,7 @@ class Shot:
         return found
 
     def faces(self) -> list[Shot]:
-        """Return the pinhole views of a panorama with a pose; the shot itself if it is not one."""
+        """Return the pinhole views of a panorama with a known pose; for any other shot, return the shot itself."""
         if not isinstance(self.camera, PanoramaFace) or self.T_world_camera is None:
             return [self]
         faces = list[Shot]()
@@ -183,7 +183,7 @@ class Shot:
 
 
 def _hidden(mask: MaskFile, frame: Frame) -> Bool[Tensor, "h w"] | None:
-    """Return what a mask hides of a frame. A mask of the stored image is undistorted, or cut, with it."""
+    """Return the pixels of a frame that a mask hides. A mask of the stored image is undistorted or cropped like the image."""
     lens: Lens | None = frame.lens
     if isinstance(lens, PanoramaFace):
         header = read_header(mask.path)
@@ -199,7 +199,7 @@ def _hidden(mask: MaskFile, frame: Frame) -> Bool[Tensor, "h w"] | None:
 
 @dataclass(frozen=True, eq=False)
 class TimedFrame:
-    """A frame of a sequence, its time, and its true pose if known."""
+    """A frame of a sequence with its timestamp and, if known, its ground-truth pose."""
 
     time: float | None  # seconds, from an origin that depends on the recording
     frame: Frame  # without colours (``has_colour``) if only depth was recorded at this time
@@ -209,7 +209,7 @@ class TimedFrame:
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """Images with what is known of them. Poses are ``T_world_camera`` with OpenCV axes; depth is planar z in metres.
+    """Images with their known metadata. Poses are ``T_world_camera`` with OpenCV axes; depth is planar z in metres.
 
     A frame's name is the stem of its image file. If several files of a split share a stem, the names are prefixed
     with just enough folders to make them unique ("left_0001", "right_0001"); the bare stem is then rejected as
@@ -278,7 +278,7 @@ class Capture:
         return TimedFrame(shot.time, self._read(shot), shot.T_world_camera, next(iter(shot.splits), None))
 
     def split(self, name: str) -> Capture:
-        """Return the frames of a split; "all" has every frame that is in any. Raises ``InputError`` for an unknown split."""
+        """Return the frames of a split; "all" has every frame that is in a split. Raises ``InputError`` for an unknown split."""
         if name == "all" and name not in self.splits:
             return replace(self, shots=_named([shot for shot in self.shots if shot.splits]))
         if name not in self.splits:
@@ -288,16 +288,16 @@ class Capture:
         return replace(self, shots=_named(own, one_split=True))
 
     def in_time_order(self) -> Capture:
-        """Return all frames in chronological order; if any lacks a time, in natural order of names and without times."""
+        """Return all frames in chronological order, or, if any frame lacks a time, in natural name order and without times."""
         shots = sorted(self.shots, key=lambda shot: natural_order("/".join(shot.parts)))
         if any(shot.time is None for shot in shots):
             return replace(self, shots=[replace(shot, time=None) for shot in shots])
         return replace(self, shots=sorted(shots, key=lambda shot: shot.time or 0.0))
 
     def masked(self, folder: MaskFolder, by_stem: bool = False) -> Capture:
-        """Return the frames with what the masks in a folder hide; ``by_stem``, without regard to folders.
+        """Return the frames with the masks in a folder applied; with ``by_stem``, masks are matched regardless of folders.
 
-        Raises ``InputError`` if no frame has a mask by name.
+        Raises ``InputError`` if no frame has a mask with a matching name.
         """
         own = [[shot.name, *([shot.stem] if by_stem else [])] for shot in self.shots]
         for split in self.splits:  # where masks may be named as well
@@ -319,11 +319,11 @@ class Capture:
         return replace(self, largest=largest)
 
     def frame_names(self, split: str) -> list[str]:
-        """Return the names in a split, in order. Raises ``InputError`` for an unknown split."""
+        """Return the frame names of a split, in order. Raises ``InputError`` for an unknown split."""
         return self.split(split).names
 
     def select(self, split: str, names: Sequence[str] | None = None) -> list[Shot]:
-        """Return the frames ``names`` of a split, in that order, or all. Raises ``InputError`` for an unknown split or name."""
+        """Return the frames ``names`` of a split, in that order, or the whole split. Raises ``InputError`` for an unknown split or name."""
         chosen, where = list(self.split(split).shots), f"{self.path}: split {split!r}"
         if names is None:
             return chosen
@@ -350,7 +350,7 @@ class Capture:
         """Read the frames ``names``, in that order, or the whole split; no other image is opened.
 
         When reading a whole split, frames that a mask hides entirely are left out. Images with more than ``limit``
-        pixels along the longer side are downscaled to that, where the user asked for nothing else. Raises
+        pixels along the longer side are downscaled to that, unless the user set another size. Raises
         ``InputError`` for an unknown split or frame, and for a file that is missing or invalid.
         """
         shots, views = self.select(split, names), list[View]()
@@ -363,7 +363,7 @@ class Capture:
         return views
 
     def wholly_hidden(self, split: str) -> list[str]:
-        """Return the frames of a split of which a mask leaves nothing visible; only masks are read."""
+        """Return the frames of a split that are entirely hidden by a mask; only masks are read."""
         return [
             shot.name
             for shot in self.select(split)
@@ -371,7 +371,7 @@ class Capture:
         ]
 
     def require_poses(self) -> Capture:
-        """Return the capture; a remark counts frames without a pose. Raises ``InputError`` if no frame has one."""
+        """Return the capture, with a remark counting frames without a pose. Raises ``InputError`` if no frame has a pose."""
         posed = sum(shot.T_world_camera is not None for shot in self.shots)
         where, images = self.pose_file or self.path, amount(len(self), "image")
         if not posed:
@@ -382,7 +382,7 @@ class Capture:
         return self
 
     def view(self, shot: Shot, limit: int | None = None) -> View:
-        """Read a frame that has a pose, of at most ``limit`` pixels along the longer side as in ``views``."""
+        """Read a posed frame, downscaled to at most ``limit`` pixels along the longer side as in ``views``."""
         assert shot.T_world_camera is not None  # only frames with a pose are in splits
         return View(self._read(shot, limit), shot.T_world_camera)
 
@@ -394,7 +394,7 @@ class Capture:
 def unique_names(paths: Sequence[tuple[str, ...]]) -> list[str]:
     """Return a name for each path (folders, then stem): its stem, prefixed with just enough folders to make it unique.
 
-    Names that are still the same, such as those of a/b.png and a_b.png, get the endings "-2" and so on.
+    Names that still collide, such as those of a/b.png and a_b.png, get the suffixes "-2" and so on.
     """
     names = [path[-1] for path in paths]
     for depth in range(2, max(map(len, paths), default=0) + 1):
@@ -410,13 +410,13 @@ def unique_names(paths: Sequence[tuple[str, ...]]) -> list[str]:
 
 
 def in_other_split(name: str, splits: Mapping[str, Sequence[str]]) -> str | None:
-    """Return a clause that names the split of a frame, given the names in each, or None if it is in no split."""
+    """Return an error clause that says which of the ``splits`` contains the frame, or None if none does."""
     found = next((split for split, names in splits.items() if name in names), None)
     return found and f"no frame {name!r}, which is in split {found!r}; choose that split"
 
 
 def _named(shots: Sequence[Shot], one_split: bool = False) -> list[Shot]:
-    """Return the shots with names that are unique among them, and that name their split where nothing else tells."""
+    """Return the shots with unique names, which include the split only where needed to tell shots apart."""
     mixed = not one_split and len({shot.splits[:1] for shot in shots}) > 1
     paths = [(*(shot.splits[:1] or ("",) if mixed else ()), *shot.parts) for shot in shots]
     return [replace(shot, name=name) for shot, name in zip(shots, unique_names(paths), strict=True)]
@@ -425,11 +425,11 @@ def _named(shots: Sequence[Shot], one_split: bool = False) -> list[Shot]:
 def hold_out(
     shots: Sequence[Shot], where: Callable[[Shot], bool] = lambda shot: True, rate: float = math.inf
 ) -> list[Shot]:
-    """Return the shots in splits: every eighth with a pose (the first, the ninth ...) is "test", the others "train".
+    """Assign the shots to splits: every eighth posed shot (the first, the ninth ...) is "test", the others are "train".
 
-    A single one is in both splits. Shots for which ``where`` is false are in no split. If all shots have a time, in
-    chronological order, nor are those beyond ``rate`` per second, where times may be early by 5 ms as a result of
-    rounding.
+    A single posed shot is in both splits. Shots for which ``where`` is false are in no split. If all shots have times (in
+    chronological order), those in excess of ``rate`` per second are in no split either; to allow for rounding, a
+    time may be up to 5 ms early.
     """
     chosen, due = list[int](), -math.inf
     step = 0.0 if any(shot.time is None for shot in shots) else 1 / rate
@@ -446,7 +446,7 @@ def hold_out(
 
 
 def of_views(views: Sequence[View], path: Path, splits: tuple[str, ...] = SPLITS) -> Capture:
-    """Return views in memory as a capture, each of whose ``splits`` has all of them."""
+    """Return views in memory as a capture in which each of the ``splits`` contains all of the views."""
     return Capture(path, [_ViewShot(view=v, stem=v.frame.name, T_world_camera=v.T_ref_camera, splits=splits) for v in views])  # fmt: skip
 
 
@@ -467,7 +467,7 @@ def remark(where: Path | str, text: str) -> None:
 def with_files(capture: Capture) -> list[Shot]:
     """Return the shots whose image files exist, without masks and depth images that do not exist.
 
-    Remarks count what is missing. Raises ``InputError`` if all images are missing, or all masks.
+    Remarks count the missing files. Raises ``InputError`` if all images or all masks are missing.
     """
 
     def missing(noun: str, files: Sequence[object]) -> set[object]:

@@ -1,8 +1,8 @@
 """Points of a COLMAP sparse model observed by the frames of a dataset, in metres.
 
 Images of the model and frames of the dataset are matched by name. The model has its own world frame and
-length unit; the unit's length in metres is estimated from the positions of the training cameras, which both
-contain. No other pose is used.
+length unit; the length of this unit in metres is estimated from the training camera positions, which are in
+both the model and the dataset. No other pose is used.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ class SparseChoice:
 
 
 class SparsePoints:
-    """The points of the model in ``folder``, scaled with the training cameras ``places`` (frame name, T_world_camera).
+    """The points of the model in ``folder``, scaled to metres by the training poses ``places`` (frame name, T_world_camera).
 
-    The unit of the model is ``metres`` long, as found from ``cameras`` training cameras. ``misfit`` is the median
-    distance of these from the model's, relative to their spread.
+    The unit of the model is ``metres`` long, as estimated from ``cameras`` training cameras. ``misfit`` is the median
+    distance between these cameras and the model's, relative to their spread.
 
     Raises ``InputError`` if the folder holds no valid model, and if its cameras are not the training cameras.
     """
@@ -116,7 +116,7 @@ class SparsePoints:
 
     @property
     def summary(self) -> str:
-        """One line about the model's unit."""
+        """A one-line description of the model's unit."""
         checked = (
             f", positions agree to {self.misfit:.2%} of their spread" if self.cameras > 2 else ", unchecked"
         )
@@ -124,7 +124,7 @@ class SparsePoints:
         return f"{self.folder}: {unit}"
 
     def seen(self, name: str, split: str) -> Float[Tensor, "n 3"]:
-        """Return the points that a frame observes (metres, camera frame); none if the model lacks the frame."""
+        """Return the points that a frame observes (metres, camera frame); empty if the frame is not in the model."""
         image = self._image(name, split)
         if image is None:
             return torch.zeros((0, 3), dtype=torch.float64)
@@ -134,9 +134,9 @@ class SparsePoints:
         return points[points[:, 2] > 0]
 
     def rays(self, views: Sequence[View], split: str) -> Observations:
-        """Return the points that all ``views`` observe as rays in the last camera's frame.
+        """Return the points observed by the ``views``, as rays in the last camera's frame.
 
-        The views' relative poses bring them there. Raises ``InputError`` if they observe none.
+        The points are transformed by the relative poses of the views. Raises ``InputError`` if no point is observed.
         """
         T_last_ref = views[-1].T_ref_camera.to("cpu", torch.float64).inverse()
         found = [(view, self.seen(view.frame.name, split)) for view in views]

@@ -7,8 +7,8 @@ pose to ``images``. pycolmap is not used because it hangs on a truncated ``point
 where nothing was reconstructed.
 
 Keypoints with descriptors are in COLMAP's database or the features of hloc (.h5), in the order in which the model lists an
-image's observations. COLMAP's SIFT descriptors have the root normalisation and the layout of ours, so that they match; its
-scale is half of our diameter. hloc's keypoints are the first pixel's centre (0, 0), COLMAP's (0.5, 0.5).
+image's observations. COLMAP's SIFT descriptors have the same root normalisation and layout as ours, so the two can be matched; its
+scale is half of our diameter. The centre of the first pixel is (0, 0) in hloc's keypoints and (0.5, 0.5) in COLMAP's.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class ModelImage:
 
 @dataclass(frozen=True, eq=False)
 class ModelPoints:
-    """All triangulated points of a model, in the order of their ids."""
+    """All triangulated points of a model, ordered by id."""
 
     ids: Int[Tensor, "p"]
     positions: Float[Tensor, "p 3"]  # model frame, in units of the model
@@ -69,7 +69,7 @@ class ModelPoints:
 
 
 def read_model(folder: Path) -> tuple[list[ModelImage], ModelPoints]:
-    """Read the model in ``folder``. Raises ``InputError`` if there is none, or if a file is damaged."""
+    """Read the model in ``folder``. Raises ``InputError`` if there is no model, or if a file is damaged."""
     images, points = files_of(folder, "images", "points3D") or (None, None)
     if images is None or points is None:
         expected = "images.bin and points3D.bin, or the same as .txt, as in sparse/0 of a project"
@@ -106,7 +106,7 @@ def read_posed_images(folder: Path) -> tuple[list[ModelImage], dict[int, Camera]
 
 
 def files_of(folder: Path, *names: str) -> list[Path] | None:
-    """Return the files of a model with these names, all as .bin or else all as .txt; None if any is missing."""
+    """Return the files of a model with these names, either all .bin or all .txt; None if any is missing."""
     found = ([folder / f"{name}{suffix}" for name in names] for suffix in (".bin", ".txt"))
     return next((files for files in found if all(map(is_file, files))), None)
 
@@ -120,7 +120,7 @@ def depth_map_of(model: Path, name: str) -> Path | None:
 
 
 def read_colmap_depth(path: Path) -> DepthImage:
-    """Read a depth map, in units of the model. Raises ``InputError`` for a truncated file or one of another kind."""
+    """Read a depth map, in units of the model. Raises ``InputError`` for a truncated file and for any other format."""
     content = read_file(path, "a COLMAP depth map")
     *sizes, numbers = content.split(b"&", 3)
     if len(sizes) != 3 or not all(size.isdigit() and len(size) < 10 for size in sizes):
@@ -152,7 +152,7 @@ def _images(file: Path) -> list[ModelImage]:
 
 @dataclass(frozen=True)
 class _Columns:
-    """What each entry of a file consists of: numbers, the name of an image, and a list, of which the last column is used."""
+    """The layout of a file's entries: numbers, an image name, and a list, of which only the last column is used."""
 
     numbers: str  # as ``struct`` names them
     item: np.dtype  # of the list
@@ -163,7 +163,7 @@ class _Columns:
 
 
 def _parameters(path: Path, numbers: Sequence[Any]) -> int:
-    """Return how many parameters a camera has. Raises ``InputError`` for an unknown model."""
+    """Return the number of parameters of a camera. Raises ``InputError`` for an unknown model."""
     number, model, *_ = numbers
     for known, _, places in MODELS.values():
         if known == model:
@@ -240,9 +240,9 @@ def _text(path: Path, columns: _Columns) -> Iterator[_Entry]:
 
 
 def stored_keypoints(path: Path) -> Iterator[tuple[str, Keypoints]]:
-    """Yield the name and the keypoints of each image in a database or a file of features, by its ending.
+    """Yield the name and keypoints of each image in a database or feature file, distinguished by file extension.
 
-    Raises ``InputError`` for a file that cannot be read, and if h5py, which features of hloc need, is not installed.
+    Raises ``InputError`` for a file that cannot be read, and if h5py, required for hloc features, is not installed.
     """
     read = _of_features if path.suffix == ".h5" else _of_database
     for name, pixels, scales, descriptors in read(path):
@@ -298,7 +298,7 @@ def _of_features(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.n
         raise InputError("features of hloc need h5py (pip install h5py)", where=path) from error
 
     def images(group: Any, parents: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
-        """Yield the groups that hold keypoints; the folders of an image's name are nested groups."""
+        """Yield the groups that contain keypoints; folders in an image name are nested groups."""
         if "keypoints" in group:
             yield str(PurePosixPath(*parents)), group
             return

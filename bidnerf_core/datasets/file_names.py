@@ -1,4 +1,4 @@
-"""Finding files from names that were written on another system.
+"""Finding files by names that were written on another system.
 
 Metadata files may use Windows separators, different case from the files, no image extension, or an absolute
 path from another machine. The file is found anyway if the name is unambiguous.
@@ -16,12 +16,12 @@ IMAGE_ENDINGS = ("", *IMAGE_SUFFIXES, *HEIF_SUFFIXES)
 
 
 def posix_name(name: str) -> PurePosixPath:
-    """Return a name with POSIX separators; backslashes are taken for those of Windows."""
+    """Return a name with POSIX separators; backslashes are treated as Windows separators."""
     return PurePosixPath(PureWindowsPath(name).as_posix() if "\\" in name else name)
 
 
 class FileNames:
-    """The files below a folder, or else below others, found by the names in a metadata file.
+    """Finds the files named in a metadata file below a folder or, failing that, below the ``others``.
 
     Each folder is listed at most once.
     """
@@ -35,8 +35,8 @@ class FileNames:
     ) -> Path | None:
         """Return the file named ``name`` plus one of the ``endings``, or None.
 
-        The exact name is tried first, then names that differ in case, then the last parts of an absolute path, and of a
-        relative one if it may be relative to a folder elsewhere because files were ``moved``.
+        The exact name is tried first, then names that differ in case, then the trailing parts of an absolute path.
+        With ``moved``, a relative path may refer to a folder elsewhere, so its trailing parts are tried as well.
         """
         name = posix_name(str(name))
         # Of a relative name, all parts are looked for; of an absolute or moved one, the last ones too, most first.
@@ -56,11 +56,11 @@ class FileNames:
         return None
 
     def path(self, name: str | PurePosixPath, endings: tuple[str, ...] = ("",), moved: bool = False) -> Path:
-        """Return the file that ``find`` returns, or where it should be."""
+        """Return the file that ``find`` returns or, if there is none, the path where it is expected."""
         return self.find(name, endings, moved) or self._folders[0] / posix_name(str(name))
 
     def _ignoring_case(self, place: Path, parts: tuple[str, ...]) -> Path:
-        """Return the path of ``parts`` below a folder, each spelled as in its folder unless that is ambiguous."""
+        """Return the path of ``parts`` below a folder, each with the upper and lower case used on disk unless that is ambiguous."""
         for part in parts:
             if place not in self._listed:
                 try:

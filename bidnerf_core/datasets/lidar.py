@@ -35,16 +35,16 @@ UP = (0.0, 1.0, 0.0)
 
 
 class LidarDepth:
-    """Reads lidar depth where its confidence is high, and remarks once that an image loses all of its depth.
+    """Reads lidar depth of high confidence only, and remarks once if an image loses all of its depth.
 
-    ``high`` maps the largest confidence in an image to the value of a high one, for apps that do not keep ARKit's.
+    ``scales`` are the values that may denote high confidence, for apps that do not keep ARKit's values.
     """
 
     def __init__(self, scales: Sequence[int] = (HIGH_CONFIDENCE,)) -> None:
         self._scales, self._remarked = scales, False
 
     def __call__(self, depth: Path, confidence: Path | None) -> DepthImage:
-        """Read depth in millimetres, and its confidence. Raises ``InputError`` as ``sure`` does."""
+        """Read a depth image stored in millimetres and its confidence image. Raises ``InputError`` as ``sure`` does."""
         measured = read_depth_image(depth, MILLIMETRE)
         if confidence is None:
             return self.sure(measured, None, "")
@@ -60,8 +60,8 @@ class LidarDepth:
 
         Depth beyond 5 m, the range of the lidar according to Apple, is 0 as well.
 
-        Raises ``InputError``, whose message begins with ``where``, for a confidence of another size or with
-        values above the high one.
+        Raises ``InputError``, whose message begins with ``where``, if the confidence image differs in size or has
+        values above that of high confidence.
         """
         metres = torch.where(measured.metres <= 5.0, measured.metres, 0)
         if confidence is None:

@@ -1,4 +1,4 @@
-"""The options with which images are read. Importing them imports neither torch nor a reader, for the sake of help pages."""
+"""Options for reading images. This module imports neither torch nor the readers, so that help pages load fast."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ DepthRegistration: TypeAlias = Union[bool, "DepthCamera", str, Path]
 
 @dataclass(frozen=True)
 class DatasetOptions:
-    """How images are read: by commands, by Python and by the service; readers of a format receive the same options.
+    """Options for reading images, shared by the commands, the Python API, the service and the format readers.
 
     ``camera``, ``register_depth`` and ``depth_unit`` are passed only to readers that accept them. The command line has an option
-    for each field, called as its annotation says and described by the text below it.
+    for each field, named by the field's annotation and described by the text below the field.
     """
 
     camera: Annotated[Camera | CameraSource | str | Path | None, "CAMERA.json"] = None
@@ -75,7 +75,7 @@ class DatasetOptions:
 
         Metadata are read and checked immediately, images when views are requested. Files that are listed but
         missing, and images without a pose, are left out with an ``InputWarning`` that counts them. Raises
-        ``InputError`` if there is no such folder, if no reader recognizes it, if nothing is left, and if a
+        ``InputError`` if the folder does not exist, if no reader recognizes it, if no image is left, and if a
         metadata file is invalid.
         """
         from bidnerf_core.datasets.reader import read_dataset
@@ -95,27 +95,27 @@ class DatasetOptions:
 
     @property
     def camera_source(self) -> CameraSource:
-        """The camera as a source of cameras for single images."""
+        """The camera options as a ``CameraSource`` for single images."""
         from bidnerf_core.camera import CameraSource
 
         return self.camera if isinstance(self.camera, CameraSource) else CameraSource(self.camera)
 
     @property
     def given_camera(self) -> Camera | Path | None:
-        """The camera for a format that stores none: intrinsics, or a file of them."""
+        """The camera for formats that do not store one: intrinsics or a file with intrinsics."""
         camera = self.camera_source.camera
         return Path(camera) if isinstance(camera, str) else camera
 
     @property
     def colour(self) -> tuple[float, float, float]:
-        """The background, by default black. Raises ``InputError`` for an unknown one."""
+        """The background colour, by default black. Raises ``InputError`` for an unknown colour."""
         from bidnerf_core.io import background_colour
 
         return background_colour("black" if self.background is None else self.background)
 
     @property
     def mask_folder(self) -> MaskFolder | None:
-        """The folder of masks. Raises ``InputError`` if there is no such folder, or no image in it."""
+        """The mask folder. Raises ``InputError`` if the folder does not exist or contains no image."""
         from bidnerf_core.frames import MaskFolder
 
         if self.masks is None or isinstance(self.masks, MaskFolder):
@@ -124,14 +124,14 @@ class DatasetOptions:
 
     @property
     def registration(self) -> DepthRegistration | None:
-        """``register_depth``, which is False if depth is used as it is."""
+        """The value of ``register_depth``; False if depth is used without registration."""
         return False if self.register_depth == "no" else self.register_depth
 
     def sensor(self, where: Path | str, own: DepthCamera | None = None) -> DepthCamera | None:
-        """Return the sensor from which depth is registered, or None if depth is used as it is; ``own`` is the format's.
+        """Return the sensor from which depth is registered, or None for no registration; ``own`` is the format's sensor.
 
-        Raises ``InputError``, whose message begins with ``where``, for True if the format has no sensor, and
-        as ``DepthCamera.read`` does.
+        Raises ``InputError``, whose message begins with ``where``, if the option is True but the format has no sensor,
+        and as ``DepthCamera.read`` does.
         """
         from bidnerf_core.depth import DepthCamera
 

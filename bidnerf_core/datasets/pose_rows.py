@@ -24,11 +24,11 @@ def camera_of(
     lens: Sequence[float] = (),
     first_centre: float = 0.5,
 ) -> Intrinsics:
-    """Return the camera with fx, fy, cx, cy (pixels) of images of ``size`` (width, height), with OpenCV's distortion, if any.
+    """Return a camera from fx, fy, cx, cy (pixels), the image ``size`` (width, height) and OpenCV's distortion, if any.
 
     ``first_centre`` is added to the principal point: half a pixel if the centre of the upper left pixel is (0, 0) in the
-    source, 0 if it is (0.5, 0.5). Raises ``InputError``, whose message begins with ``where``, for numbers that no
-    camera has.
+    source, 0 if it is (0.5, 0.5). Raises ``InputError``, whose message begins with ``where``, for values that
+    are invalid for a camera.
     """
     fx, fy, cx, cy = numbers
     try:
@@ -43,8 +43,8 @@ def pose_and_scale(record: Record, key: str = "transform_matrix") -> tuple[SE3, 
     """Return ``T_world_camera`` (OpenCV axes, float64) from a matrix (3x4 or 4x4, OpenGL axes), and the scale removed from it.
 
     A rotation that is orthonormal up to rounding is orthonormalized. A homogeneous matrix whose last entry is
-    not 1 is divided by it, and a rotation of uniform scale is normalized; the position of the camera is that
-    of the matrix. The scale is 1 if neither applies. Raises ``InputError`` for any other matrix.
+    not 1 is divided by that entry, and a uniformly scaled rotation is normalized without changing the camera
+    position. The scale is 1 if neither applies. Raises ``InputError`` for any other matrix.
     """
     rows, scale = record.homogeneous(key, record.items(key))
     matrix = torch.tensor(rows, dtype=torch.float64)

@@ -31,7 +31,7 @@ EXPECTED_POINTS = "n rows of x, y, z in metres"
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """An image, or several with known relative poses; the pose of the last one is to be found."""
+    """One image, or several with known relative poses, of which the last one is to be localized."""
 
     name: str
     views: tuple[View, ...]
@@ -41,25 +41,25 @@ class Query:
 
     @property
     def frame(self) -> Frame:
-        """The image whose pose is to be found."""
+        """The image to be localized."""
         return self.views[-1].frame
 
 
 @runtime_checkable
 class QuerySource(Protocol):
-    """Queries by name, read one at a time."""
+    """A source of named queries that are read one at a time."""
 
     @property
     def names(self) -> Sequence[str]: ...
 
     def read(self, place: int) -> Query:
-        """Read the query at index ``place``. Raises ``InputError`` if one of its files is missing or unusable."""
+        """Read the query with index ``place``. Raises ``InputError`` if any of its files is missing or unusable."""
         ...
 
 
 @dataclass(frozen=True)
 class DepthPoints:
-    """Measured points: a file of points, or a COLMAP model with the points that frames observe."""
+    """Measured points from a point file, or from a COLMAP model with the points that each frame observes."""
 
     path: Path
     sparse: SparsePoints | None
@@ -120,9 +120,9 @@ def read_depth_points(path: Path) -> Observations:
 
 
 class Photos:
-    """Image files, each of them a query. ``depth`` holds the depth files of photos that have one.
+    """Image files, each of which is a query. ``depth`` contains the depth files of the photos that have depth.
 
-    Without a background among the ``options``, the map in which a photo is localized gives it.
+    If the ``options`` set no background, the background of the map in which a photo is localized is used.
     """
 
     def __init__(
@@ -154,9 +154,9 @@ class Photos:
         return self.capture.names
 
     def read(self, place: int) -> Query:
-        """Read the query at index ``place``. Raises ``InputError`` if one of its files is missing or unusable.
+        """Read the query with index ``place``. Raises ``InputError`` if any of its files is missing or unusable.
 
-        The source of its camera, and what is assumed, is logged unless the same was logged for an earlier photo.
+        The source of the photo's camera and any assumptions are logged, unless already logged for an earlier photo.
         """
         shot = self.capture.shots[place]
         if self._depth and shot.file not in self._depth:
@@ -175,9 +175,9 @@ class Photos:
 
 
 class DatasetFrames:
-    """Frames of a dataset as queries: one rig of ``names``, or each frame of a split with the ``window - 1`` before it.
+    """Dataset frames as queries: one rig of ``names``, or each frame of a split with the ``window - 1`` frames before it.
 
-    The pose of the last frame of each rig is to be found.
+    The last frame of each rig is the one to be localized.
     """
 
     def __init__(
@@ -207,7 +207,7 @@ class DatasetFrames:
         return [rig[-1] for rig in self._rigs]
 
     def read(self, place: int) -> Query:
-        """Read the query at index ``place``. Raises ``InputError`` if one of its files is missing or unusable."""
+        """Read the query with index ``place``. Raises ``InputError`` if any of its files is missing or unusable."""
         rig = self._rigs[place]
         views, (shot,) = (
             tuple(self.capture.views(self._split, rig)),
@@ -218,7 +218,7 @@ class DatasetFrames:
 
 
 def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]:
-    """Return the image files among ``paths`` and in folders among them; other files there are logged.
+    """Return the image files among ``paths``, and those in the folders among ``paths``, whose other files are logged.
 
     Files of ``depth`` may lie among the photos. Raises ``InputError`` for a folder without photos.
     """
@@ -242,9 +242,9 @@ def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]
 
 
 def depth_files(photos: Sequence[Path], depth: Sequence[Path]) -> dict[Path, Path]:
-    """Return the depth file of each photo: by name if the names agree (``NAME.png``, ``NAME.depth.png``), else in order.
+    """Return each photo's depth file, matched by name if names agree (``NAME.png``, ``NAME.depth.png``), else by order.
 
-    Raises ``UsageError`` if depth files can be assigned in neither way.
+    Raises ``UsageError`` if the depth files cannot be matched in either way.
     """
     if not depth:
         return {}

@@ -1,4 +1,4 @@
-"""Readers of capture formats, and how datasets, folders of images and videos are opened."""
+"""Readers of capture formats, and functions that open datasets, folders of images and videos."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def read_sequence(
 
 
 def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
-    """Return what a reader reads, in splits, with masks.
+    """Return the capture that a reader reads, with splits assigned and masks added.
 
     Raises ``InputError`` for options that the format does not accept, and if a third-party reader fails.
     """
@@ -157,7 +157,7 @@ def open_sequence(
 
 @runtime_checkable
 class Reader(Protocol):
-    """A reader for one dataset format. Subclasses inherit the attributes and methods that have a default here."""
+    """A reader for one dataset format. Subclasses inherit the attributes and methods that have defaults here."""
 
     accepts: Collection[OpenQuestion] = ()
     """The options that the format accepts: "camera" if its files have none, "focal" if a focal length suffices for it,
@@ -178,16 +178,16 @@ class Reader(Protocol):
         ...
 
     def read(self, path: Path, options: DatasetOptions) -> Capture:
-        """Return the images in a folder. Raises ``InputError`` if it cannot be used.
+        """Return the images in a folder. Raises ``InputError`` if the folder cannot be used.
 
-        Images without a pose belong to it as well. Without any splits, every eighth image with a pose is held out.
+        The capture includes images without a pose. If it has no splits, every eighth image with a pose is held out.
         """
         ...
 
 
 @dataclass(eq=False)
 class Format(Generic[Found]):
-    """A bundled reader: how a folder is recognized, and how what was found in it is read."""
+    """A bundled reader, defined by a function that recognizes a folder and one that reads what was found in it."""
 
     expected: str
     find: Callable[[Path], Found | None]
@@ -206,7 +206,7 @@ class Format(Generic[Found]):
 
 
 def first_file(path: Path, *names: str) -> Path | None:
-    """Return the first of the files in a folder that exists, such as the metadata by which its format is recognized."""
+    """Return the first of the files that exists in a folder, such as the metadata file that identifies its format."""
     return next((file for name in names if is_file(file := path / name)), None)
 
 
@@ -226,7 +226,7 @@ READERS: Plugins[Reader] = Plugins("readers", _defects, first=ORDER)
 
 
 def find_reader(folder: Path) -> Reader | None:
-    """Return the reader that recognizes a folder, or None: the first bundled one, or else the only other one.
+    """Return the reader that recognizes a folder: the first bundled reader, else the only third-party one, else None.
 
     A reader that cannot be loaded or fails is reported by an ``InputWarning``. Raises ``InputError`` if
     several third-party readers recognize the folder.
@@ -260,23 +260,23 @@ def may_hold(reader: Reader, path: Path) -> bool:
 
 
 def _reader_of(folder: Path, readers: Sequence[Reader] | None) -> Reader | None:
-    """Return the first of ``readers``, by default of all, that recognizes a folder, or None."""
+    """Return the first of ``readers`` (by default, all readers) that recognizes a folder, or None."""
     if readers is None:
         return find_reader(folder)
     return next((each for each in readers if may_hold(each, folder) and each.recognises(folder)), None)
 
 
 def file_of_dataset(path: Path) -> str | None:
-    """Return a clause that names the folder to give instead of a file in it that describes a dataset, or None."""
+    """If ``path`` is a file of a dataset, return an error clause asking for its folder instead; otherwise return None."""
     if path.suffix.lower() in IMAGE_SUFFIXES or not path.is_file() or find_reader(path.parent) is None:
         return None
     return f"is a file of a dataset; give its folder, {path.parent}"
 
 
 def no_dataset(path: Path, readers: Sequence[Reader] | None = None, or_else: str = "") -> InputError:
-    """Return the error for a folder that is no dataset, or a file in place of one, and what to do.
+    """Return the error, with a remedy, for a folder that is not a dataset or a file given instead of a folder.
 
-    ``or_else`` names what else than the folder of a dataset could be given.
+    ``or_else`` names the alternatives to a dataset folder that are accepted.
     """
     if not path.is_dir():
         if (instead := file_of_dataset(path)) is not None:

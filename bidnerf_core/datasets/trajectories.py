@@ -1,4 +1,4 @@
-"""Rows with time stamps, as in the TUM RGB-D benchmark, tables, and trajectories with poses interpolated in time.
+"""Readers of timestamped rows (as in the TUM RGB-D benchmark), tables, and trajectories with poses interpolated in time.
 
 A row is ``timestamp value value ...``, separated by spaces or commas; ``#`` begins a comment, empty lines are
 skipped, and Windows line endings are allowed. Rows may be in any order. A truncated last row, as left by an
@@ -44,7 +44,7 @@ LEAST_NANOSECONDS = 10**14
 
 @dataclass(frozen=True)
 class TimedRow:
-    """A row that begins with a time stamp."""
+    """A row that begins with a timestamp."""
 
     row: Row
     time: float  # seconds
@@ -52,20 +52,20 @@ class TimedRow:
 
     @property
     def rest(self) -> str:
-        """What follows the time stamp as one string, such as a file name with spaces."""
+        """The text after the timestamp as one string, such as a file name with spaces."""
         return self.row.text[len(_words(self.row)[0]) :].lstrip(", \t")
 
 
 def column_names(line: str) -> list[str]:
-    """Return the names in the head of a table, in lower case."""
+    """Return the column names in the header of a table, in lower case."""
     return [name.strip().lstrip("#").strip().lower() for name in line.split(",")]
 
 
 def read_table(path: Path, expected: str, columns: str, needed: set[str]) -> list[tuple[Row, dict[str, str]]]:
-    """Read the rows of comma-separated values below a head, each with its cells by the names of their columns.
+    """Read rows of comma-separated values below a header, each with a dictionary of its cells by column name.
 
-    ``expected`` briefly describes the file, ``columns`` its head. Raises ``InputError`` unless the ``needed`` columns are
-    there, and for rows that are too short; a truncated last one is left out with a remark.
+    ``expected`` briefly describes the file, ``columns`` its header. Raises ``InputError`` if ``needed`` columns are
+    missing, and for rows that are too short; a truncated last row is left out with a remark.
     """
     first, *lines = read_lines(path, expected, columns)
     names = column_names(first.text)
@@ -84,7 +84,7 @@ def read_table(path: Path, expected: str, columns: str, needed: set[str]) -> lis
 def _complete(
     path: Path, rows: Sequence[tuple[Row, list[str]]], count: int, columns: str
 ) -> Sequence[tuple[Row, list[str]]]:
-    """Return rows of at least ``count`` words with their words; a truncated last one is left out with a remark."""
+    """Return rows of at least ``count`` words, with their words; a truncated last row is left out with a remark."""
     if not rows:
         raise InputError("has no rows", where=path, expected=f"lines of {columns}")
     last, words = rows[-1]
@@ -105,7 +105,7 @@ def _timed_rows(rows: Sequence[Row], path: Path, columns: str, nanoseconds: bool
     """Return rows that begin with a time stamp, followed by ``columns``, in chronological order.
 
     Integer times are nanoseconds if ``nanoseconds`` is set, or if they are too large for seconds. Raises ``InputError``
-    for a row with too few entries or without a finite time, and if there is no row.
+    for a row with too few entries or without a finite time, and if there are no rows.
     """
     timed = list[TimedRow]()
     columns = f"timestamp {columns}"
@@ -124,9 +124,9 @@ def _timed_rows(rows: Sequence[Row], path: Path, columns: str, nanoseconds: bool
 
 
 def read_timed_files(path: Path) -> list[TimedRow]:
-    """Read a list of files with their time stamps, in chronological order.
+    """Read a list of files with timestamps, in chronological order.
 
-    Raises ``InputError`` if it is missing, not text, too large or empty, and for a row without a file name, without a
+    Raises ``InputError`` if the list is missing, not text, too large or empty, and for a row without a file name, without a
     finite time, or with the time of another row.
     """
     rows = _timed_rows(read_rows(path, "a list of time stamps", "timestamp filename"), path, "filename")
@@ -143,7 +143,7 @@ def read_timed_files(path: Path) -> list[TimedRow]:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses ``T_world_camera`` (OpenCV axes, metres) in chronological order (seconds), with distinct times."""
+    """Poses ``T_world_camera`` (OpenCV axes, metres) in chronological order, with distinct times (seconds)."""
 
     times: Float[Tensor, "n"]
     rotations: Float[Tensor, "n 3 3"]
@@ -153,7 +153,7 @@ class Trajectory:
         return len(self.times)
 
     def at(self, time: float, largest_gap: float = LARGEST_GAP) -> SE3 | None:
-        """Return the pose at a time: a sample, or the interpolation of its two neighbours (slerp and linear).
+        """Return the pose at a time: a sample, or the interpolation (slerp and linear) of the two neighbouring samples.
 
         Returns None before the first sample, after the last, and between two samples more than
         ``largest_gap`` seconds apart.
@@ -226,9 +226,9 @@ def _quaternion_order(comments: Sequence[str], first: Row) -> str:
 
 
 def pose_numbers(where: str, numbers: Sequence[float], order: str = "xyzw") -> list[float] | None:
-    """Return a position and the quaternion (x, y, z, w) after it, given in another order, or None if they hold no pose.
+    """Return a position and its quaternion reordered to (x, y, z, w), or None if the numbers represent no pose.
 
-    Raises ``InputError``, which begins with ``where``, unless the length of the quaternion is 1 up to rounding.
+    Raises ``InputError``, whose message begins with ``where``, unless the quaternion has length 1 up to rounding.
     """
     quaternion, length = dict(zip(order, numbers[3:], strict=True)), math.hypot(*numbers[3:])
     if length == 0 or not all(map(math.isfinite, numbers)):
@@ -240,7 +240,7 @@ def pose_numbers(where: str, numbers: Sequence[float], order: str = "xyzw") -> l
 
 
 def pose_of_numbers(where: str, numbers: Sequence[float], opengl: bool) -> SE3 | None:
-    """Return ``T_world_camera`` (OpenCV axes) from a position and a quaternion x y z w, or None if they hold no pose.
+    """Return ``T_world_camera`` (OpenCV axes) from a position and quaternion (x y z w), or None if they represent no pose.
 
     The camera axes are OpenGL's or OpenCV's. Raises ``InputError`` for a quaternion whose length is not 1.
     """
@@ -254,7 +254,7 @@ def pose_of_numbers(where: str, numbers: Sequence[float], opengl: bool) -> SE3 |
 
 
 def numbers_in(where: object, text: str, count: int) -> list[float]:
-    """Return the numbers of a text, separated by spaces or commas. Raises ``InputError`` unless there are ``count``."""
+    """Return the numbers in a text, separated by spaces or commas. Raises ``InputError`` unless there are ``count`` of them."""
     try:
         numbers = [float(word) for word in text.replace(",", " ").split()]
     except ValueError as error:
@@ -265,9 +265,9 @@ def numbers_in(where: object, text: str, count: int) -> list[float]:
 
 
 def pose_of_matrix(where: object, numbers: Sequence[float], what: str = "the rotation") -> SE3:
-    """Return the pose in the first three rows of a matrix of four columns, given row by row.
+    """Return the pose in the first three rows of a four-column matrix stored row by row.
 
-    Raises ``InputError``, whose message begins with ``where``, if its rotation, called ``what``, is none.
+    Raises ``InputError``, whose message begins with ``where``, if the rotation, called ``what`` there, is invalid.
     """
     return rigid_pose(torch.tensor(numbers, dtype=torch.float64).reshape(-1, 4)[:3], where, what)
 
@@ -275,7 +275,7 @@ def pose_of_matrix(where: object, numbers: Sequence[float], what: str = "the rot
 def read_matrices(path: Path) -> list[SE3]:
     """Read KITTI's rows of twelve numbers as poses ``T_world_camera``.
 
-    Raises ``InputError``, with file and line, for others.
+    Raises ``InputError``, with file and line, for rows of any other kind.
     """
     columns = f"{KITTI_ROW} numbers, a 3x4 matrix"
     rows = [(row, _words(row)) for row in read_rows(path, "a file of KITTI poses", columns)]
@@ -286,7 +286,7 @@ def read_matrices(path: Path) -> list[SE3]:
 def read_pose_matrix(path: Path) -> SE3 | None:
     """Read ``T_world_camera`` (metres, OpenCV axes, float64) from a text file with one 4x4 matrix.
 
-    Returns None if there is no file, or if it holds numbers that are not finite, since tracking failed.
+    Returns None if the file does not exist, or contains non-finite numbers, which mean that tracking failed.
 
     Raises ``InputError``, which names the offending line.
     """

@@ -1,6 +1,6 @@
 """Frames of video files; needs the extra ``video`` (PyAV, whose wheels include FFmpeg's libraries).
 
-Each frame has its time stamp from the file, in seconds from the start: phones record at a varying rate.
+Frame timestamps are read from the file, in seconds from the start, because phones record at a varying rate.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Video:
         return ((time, self.pixels(number, is_upright=True)) for number, time in enumerate(self.times))
 
     def pixels(self, number: int, is_upright: bool = False) -> UInt8[np.ndarray, "h w 3"]:
-        """Return the pixels of a frame as stored, or turned by the rotation in the metadata.
+        """Return the pixels of a frame, as stored or rotated upright according to the metadata.
 
         HDR colours are kept as coded, without tone mapping. Raises ``InputError`` if the file ends before the frame.
         """
@@ -108,20 +108,20 @@ class Video:
         self._decoded = container.decode(stream)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the open file, which another process cannot use."""
+        """Exclude the open file, which another process cannot use, from the pickled state."""
         return {**self.__dict__, "_open": None, "_decoded": iter(()), "_next": 0}
 
 
 @dataclass(frozen=True)
 class VideoPicture:
-    """A frame of a video, which is the image of a shot: as stored, or turned by the rotation in the metadata."""
+    """A video frame used as the image of a shot, as stored or rotated upright according to the metadata."""
 
     video: Video
     number: int
     is_upright: bool = False
 
     def pixels(self) -> UInt8[Tensor, "h w 3"]:
-        """Decode it. Raises ``InputError`` if the file ends before it."""
+        """Decode this frame. Raises ``InputError`` if the file ends before the frame."""
         return torch.from_numpy(self.video.pixels(self.number, self.is_upright))
 
     def __str__(self) -> str:
@@ -129,7 +129,7 @@ class VideoPicture:
 
 
 def is_video(path: Path) -> bool:
-    """Return whether a file is a video, judging by its name or first bytes; it is not decoded."""
+    """Return whether a file is a video, judging by its name or first bytes, without decoding it."""
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return not path.is_dir()
     try:

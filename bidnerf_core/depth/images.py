@@ -27,7 +27,7 @@ MILLIMETRE = 0.001
 
 @dataclass(frozen=True, eq=False)
 class DepthImage:
-    """A depth image, and the values that were found in place of measurements."""
+    """A depth image, and counts of the values that stood for missing measurements."""
 
     metres: Float[Tensor, "h w"]  # planar z, 0 where nothing was measured
     unit: float  # metres per step
@@ -51,7 +51,7 @@ class DepthImage:
 
     @property
     def dropped(self) -> str | None:
-        """A clause that lists the values dropped, or None if there were none."""
+        """A phrase that lists the dropped values, or None if there were none."""
         found = ", ".join(f"{count} x {what}" for what, count in self.replaced.items())
         return f"treated as not measured: {found}" if found else None
 

@@ -96,7 +96,7 @@ DEPTH_SENSORS: dict[str, DepthSensorModel] = {
 
 
 def find_depth_sensor(name: str) -> DepthSensorModel:
-    """Return the model of a sensor. Raises ``InputError``, which lists the known names, for an unknown one."""
+    """Return the model of a sensor. Raises ``InputError``, which lists the known names, for an unknown name."""
     if name not in DEPTH_SENSORS:
         raise unknown_name("depth sensor", name, DEPTH_SENSORS)
     return DEPTH_SENSORS[name]
@@ -161,11 +161,11 @@ def _windows(image: Float[Tensor, "h w *c"]) -> Float[Tensor, "n *c p"]:
 
 
 def _lines_of_sensor(depth: Float[Tensor, "h w"]) -> tuple[Int[Tensor, "r"], Int[Tensor, "c"]]:
-    """Return the indices of the rows and columns that do not repeat the one before.
+    """Return the indices of the rows and columns that do not repeat the preceding row or column.
 
     If the sensor's resolution is lower than the image's, depth was resampled by nearest neighbour: repeated
     pixels are not separate measurements. All lines are returned if few of them repeat another, such as empty
-    ones along a border, and if hardly any would be left, as in an exact image of a wall.
+    lines along a border, and if hardly any would be left, as in an exact image of a wall.
     """
     first = torch.ones(1, dtype=torch.bool)
     rows, columns = (torch.cat([first, (x[1:] != x[:-1]).any(-1)]) for x in (depth, depth.T))

@@ -221,9 +221,10 @@ def compare(
 def measured(
     trial: Trial, scene: Opened | None = None, registered: Sequence[tuple[str, str]] = ()
 ) -> tuple[TrialResult, float]:
-    """Run a trial as ``run_trial`` does, and count the samples on a ray in its last frame at the true pose.
+    """Run a trial as ``run_trial`` does, and also return the samples per ray in its last frame at the true pose.
 
-    They are the mean number of valid ones, on uniformly drawn rays, of the level that the method uses, else the finest.
+    These are the mean number of valid samples on uniformly drawn rays, at the level of detail that the method
+    uses, else the finest.
     """
     result = run_trial(trial, scene, registered)
     stored, dataset = scene or opened(trial.map, trial.data, trial)
@@ -239,7 +240,7 @@ def measured(
 
 
 def map_bytes(stored: Scene) -> int:
-    """Return the size of a map's description and weights in a folder, or of the field's tensors in memory; 0 in closed form."""
+    """Return the size of a map: its description and weights in a folder, or its field's tensors; 0 in closed form."""
     if isinstance(stored, Map):
         state = stored.field.state_dict() if isinstance(stored.field, nn.Module) else {}
         return sum(tensor.numel() * tensor.element_size() for tensor in state.values())

@@ -1,4 +1,4 @@
-"""What is tried: protocols, which choose frames, seeds and starts; the options that trials share; trials, and plans of many."""
+"""Protocols, which choose frames, seeds and starts; the options shared by trials; trials, and plans of many trials."""
 
 from __future__ import annotations
 
@@ -55,10 +55,10 @@ def perturb(T_true: SE3, translation: float, rotation_deg: float, seed: int) -> 
 
 
 def inerf_start(T_true: SE3, seed: int) -> SE3:
-    """Return a perturbed start as in iNeRF (Yen-Chen et al. 2021, IV-A): off by up to 40 degrees, and 0.2 along each axis.
+    """Return a start perturbed as in iNeRF (Yen-Chen et al. 2021, IV-A), by up to 40 degrees and 0.2 along each axis.
 
-    The camera is rotated about a random axis through its own centre by an angle that is uniform in -40 to 40 degrees; the
-    offsets are uniform in -0.2 to 0.2.
+    The camera is rotated about a random axis through its own centre by an angle drawn uniformly from -40 to 40
+    degrees; the offsets are uniform in -0.2 to 0.2.
     """
     generator = torch.Generator().manual_seed(seed)
     axis = random_units(1, generator)[0]
@@ -81,7 +81,7 @@ PARALLEL_SEED, PARALLEL_TRIALS = 1234, 25
 def draw_starts(
     frames: int,
 ) -> tuple[Int[np.ndarray, "5"], Float[np.ndarray, "5 5 3"], Float[np.ndarray, "5 5 3"]]:
-    """Return the published indices of frames, angles (degrees) and translations (units of the data), bit for bit."""
+    """Return the published frame indices, angles (degrees) and translations (units of the data), bit for bit."""
     generator = np.random.RandomState(PARALLEL_SEED)
     chosen, shape = generator.choice(frames, 5), (5, 5, 3)
     angles = generator.uniform(-15.0, 15.0, size=shape)
@@ -89,7 +89,7 @@ def draw_starts(
 
 
 def parallel_cases(frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
-    """Return the frame index and the seed of each trial; 1234 is the first of the 25."""
+    """Return the frame index and the seed of each trial; the 25 seeds begin at 1234."""
     if seed != PARALLEL_SEED or trials > PARALLEL_TRIALS:
         raise InputError(
             f"{trials} trials from seed {seed}",
@@ -101,7 +101,7 @@ def parallel_cases(frames: int, trials: int, seed: int) -> list[tuple[int, int]]
 
 
 def parallel_start(T_true: SE3, seed: int, frames: int) -> SE3:
-    """Return T_world_camera of the trial with ``seed`` (1234 to 1258) in a split of ``frames`` frames."""
+    """Return the start (T_world_camera) of the trial with ``seed`` (1234 to 1258) in a split of ``frames`` frames."""
     from scipy.spatial.transform import Rotation  # imported here: other protocols do without
 
     if not PARALLEL_SEED <= seed < PARALLEL_SEED + PARALLEL_TRIALS:
@@ -121,13 +121,16 @@ MOST_TRIALS = 100_000
 
 
 def each_in_turn(frames: int, trials: int, seed: int, times: int = 1) -> list[tuple[int, int]]:
-    """Return all frames in random order, each ``times`` in a row, repeatedly; every trial has its own seed."""
+    """Return the frame index and seed of each trial; all seeds are distinct.
+
+    Frames are taken cyclically in random order, each ``times`` in a row.
+    """
     order = torch.randperm(frames, generator=torch.Generator().manual_seed(seed)).tolist()
     return [(order[i // times % frames], seed + i) for i in range(trials)]
 
 
 def once_each(frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
-    """Return as many distinct frames as trials were requested, in random order; every trial has its own seed."""
+    """Return frame index and seed of each trial: at most ``trials`` distinct frames, in random order; seeds are distinct."""
     return each_in_turn(frames, min(trials, frames), seed)
 
 
@@ -149,13 +152,13 @@ class Protocol:
     fixed: bool = False  # whether it always chooses from all frames of a split
 
     def cases(self, frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
-        """Return the cases for one size. More trials append cases, and leave the first ones as they are."""
+        """Return the frame index and seed of each trial of one size; more trials only append cases to the first ones."""
         if frames < 1:
             raise InputError("nothing to try:", expected="at least one frame")
         return self.cases_of(frames, trials, seed)
 
     def check_size(self, size: Size) -> None:
-        """Raise ``InputError`` for a size with the wrong number of values, or with one that is out of range."""
+        """Raise ``InputError`` for a size with the wrong number of values, or with a value out of range."""
         most = [180.0 if "deg" in unit else 1e6 for unit in self.units]  # degrees, metres
         if len(size) != len(self.units) or not all(0 <= x <= m for x, m in zip(size, most, strict=True)):
             expected = (
@@ -224,7 +227,7 @@ FOLDERS = ("map", "data", "depth_points", "masks", "camera", "register_depth")
 
 @dataclass(frozen=True, kw_only=True)
 class Setup:
-    """What all trials of a plan share."""
+    """The options shared by all trials of a plan."""
 
     protocol: str = "none"  # how starts are chosen
     method: str = "auto"
@@ -249,7 +252,7 @@ class Setup:
 
     @property
     def reading(self) -> DatasetOptions:
-        """How the dataset is read."""
+        """The options with which the dataset is read."""
         return DatasetOptions(
             self.camera, self.split, self.register_depth, self.depth_unit, self.masks, self.mask_hides
         )
@@ -381,12 +384,12 @@ def planned(plan: Plan, map: str, data: str, dataset: Capture) -> list[Trial]:
 
 
 def listed(frames: Sequence[str]) -> str:
-    """Return the first few names of frames, for a message."""
+    """Return the first few of these frame names as text for a message."""
     return ", ".join(frames[:4]) + (", ..." if len(frames) > 4 else "")
 
 
 def _rigs(plan: Plan, dataset: Capture, names: list[str], data: str) -> list[tuple[str, ...]]:
-    """Return the names of the views for each frame that may be tried: those of which masks leave something visible."""
+    """Return the names of the views for each frame to try, without frames that masks hide entirely."""
     for name in plan.frames or ():
         if name not in names:
             others = {split: dataset.frame_names(split) for split in dataset.splits}
@@ -420,12 +423,12 @@ def _rigs(plan: Plan, dataset: Capture, names: list[str], data: str) -> list[tup
 
 
 def arc(poses: Sequence[SE3], last: int, count: int, angle_deg: float) -> tuple[int, ...] | None:
-    """Return the indices of ``count`` frames, ``angle_deg`` apart about their common centre, ending with ``last``
-    (BID-NeRF, Table 2).
+    """Return the indices of ``count`` frames ending with ``last``, ``angle_deg`` apart about a common centre (BID-NeRF, Table 2).
 
-    The centre is the point that the surrounding cameras look at, the least-squares intersection of their optical axes. At
-    each step about the vertical axis, the frame nearest in direction from the centre is chosen. Both senses of rotation
-    are tried, and the better fit is returned; None if at some step no unused frame lies within half a step.
+    The centre is the point that the surrounding cameras look at, the least-squares intersection of their
+    optical axes. At each step about the vertical axis, the frame nearest in direction from the centre is
+    chosen. Both senses of rotation are tried, and the better fit is returned; None if at some step no unused
+    frame lies within half a step.
     """
     rotations, positions = (
         torch.stack([T.rotation for T in poses]),

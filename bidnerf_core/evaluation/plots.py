@@ -1,6 +1,7 @@
 """The figures of an evaluation: success, errors, confidence, convergence and faults; maps side by side.
 
-A figure is a grid of panels of one size, so that all of a page have the same type. A condition has the same colour in all.
+A figure is a grid of equally large panels, so that all figures of a page have the same font size. A condition
+has the same colour in all figures.
 """
 
 from __future__ import annotations
@@ -68,8 +69,10 @@ SHARES: dict[str, tuple[Callable[[TrialResult], bool], str]] = {
 
 
 class Quantity(NamedTuple):
-    """What panels show of trials: its name, the axis of their share, the bound of right answers, and its value for a result
-    and a criterion, infinite for trials that never count.
+    """A quantity of trials that panels show.
+
+    It has a label, the axis label for the share of trials, the bound for right answers, and a function that
+    returns the value for a result and a criterion, infinite for trials that never count.
     """
 
     label: str
@@ -99,7 +102,7 @@ Panel = tuple[str, Callable[[Any], None]]
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure with its caption; the file is an SVG, next to which the same is a PNG."""
+    """A figure with its caption; ``file`` is an SVG, next to which the same figure lies as PNG."""
 
     file: Path
     caption: str
@@ -122,13 +125,13 @@ class Figures:
         self.clean = [g for g in self.groups if g.situation.fault == NO_FAULT] or self.groups
 
     def all(self) -> list[Figure]:
-        """Draw every figure that the results have something to show in."""
+        """Draw every figure for which the results have data."""
         drawn = (self.rates(), self.faults(), self.errors(), self.calibration(), self.convergence())
         return [figure for figure in drawn if figure is not None]
 
     @property
     def omitted(self) -> str:
-        """A sentence about what is not drawn; empty if everything is."""
+        """A sentence about what is not drawn; empty if everything is drawn."""
         places = situations(self.groups)
         if len(self.groups) <= MOST_LINES and len(places) <= MOST_SITUATIONS:
             return ""
@@ -176,7 +179,7 @@ class Figures:
         )  # fmt: skip
 
     def errors(self) -> Figure | None:
-        """Draw, for each situation, the shares of trials within an error, and those answered rightly within a time."""
+        """Draw, for each situation, the share of trials within each error, and the share answered rightly within each time."""
         return self._by_situation(
             "errors", self.clean, self.cumulative(),
             "Cumulative errors: the share of all trials whose final error is at most that on the axis; answers that the"
@@ -185,11 +188,11 @@ class Figures:
         )  # fmt: skip
 
     def cumulative(self) -> list[Callable[..., None]]:
-        """Return functions that draw the shares of trials by each kind of error, and by time."""
+        """Return functions that draw the cumulative share of trials over each kind of error, and over time."""
         return [partial(self._shares, of=of) for of in (*ERRORS, "seconds")]
 
     def convergence(self) -> Figure | None:
-        """Draw errors and success after each step of the methods that have steps; None if none has."""
+        """Draw errors and success after each step, for methods that work in steps; None if there are none."""
         draw = [*(partial(self._quartiles, kind=kind) for kind in ERRORS), partial(self._shares, of="steps")]
         return self._by_situation(
             "convergence", [group for group in self.clean if are_stepwise(group.results)], draw,
@@ -199,7 +202,7 @@ class Figures:
         )  # fmt: skip
 
     def calibration(self) -> Figure | None:
-        """Draw how often answers of a confidence are right, and errors against their standard deviations."""
+        """Draw the rate of right answers by stated confidence, and errors against stated standard deviations."""
         # The results of a group that pools all sizes are among those of the others.
         results = {
             label: [
@@ -226,7 +229,7 @@ class Figures:
     # What a panel shows of the groups of a situation.
 
     def _shares(self, axes: Any, groups: Sequence[Group], of: str) -> None:
-        """Draw the share of trials whose quantity is at most that on the axis."""
+        """Draw the cumulative share of trials over the quantity ``of``."""
         label, share, bound, value = QUANTITIES[of]
         for group in groups:
             values = sorted(value(result, self.criterion) for result in group.results)
@@ -296,7 +299,7 @@ class Figures:
     def _by_situation(
         self, name: str, groups: Sequence[Group], draw: Sequence[Callable[..., None]], caption: str
     ) -> Figure | None:
-        """Draw a row of panels for each situation, one with each function of axes and groups."""
+        """Draw a row of panels for each situation, one panel for each function in ``draw``."""
         panels: list[Panel] = []
         for situation in situations(groups)[:MOST_SITUATIONS]:
             own = [group for group in groups if group.situation == situation]
@@ -335,7 +338,7 @@ class Figures:
 def _intervals(
     axes: Any, places: Sequence[float] | Float[np.ndarray, "n"], rates: Sequence[Rate], across: bool = False, **look: Any
 ) -> None:  # fmt: skip
-    """Draw rates (%) with their intervals at ``places`` of the other axis, which is the vertical one if ``across``."""
+    """Draw rates (%) with their intervals at ``places`` on the horizontal axis, or on the vertical axis if ``across``."""
     middle = 100 * np.array([rate.rate for rate in rates])
     spread = np.abs(100 * np.array([[rate.low for rate in rates], [rate.high for rate in rates]]) - middle)
     look = {"marker": "o", "markersize": 4, "elinewidth": 1, "linewidth": 1.4} | look

@@ -49,13 +49,13 @@ def write_report(
     view: str | None = None,
     data: Sequence[str | Path] = (),
 ) -> Path:
-    """Write ``index.html``, and its figures as PNG and SVG, to ``folder``, and return the path of the page.
+    """Write a report to ``folder``: ``index.html``, and its figures as PNG and SVG; return the path of the page.
 
-    ``criterion`` is the one of ``CRITERIA`` used where only one is shown. ``runs`` has the name of each
-    results file and the runs that made it. ``view`` is the address of a page of ``bidnerf view --results``,
-    to whose frames the report links. ``data`` has folders of datasets, from which the images of the listed trials are
-    shown. An earlier report in the folder is replaced. Raises ``InputError`` without results or matplotlib, for a folder
-    that holds anything but a report, and for a dataset that cannot be read.
+    ``criterion`` is the one of ``CRITERIA`` used where the report shows a single criterion. ``runs`` pairs the
+    name of each results file with the runs that made it. ``view`` is the address of a page of ``bidnerf view
+    --results``, to whose frames the report links. ``data`` lists dataset folders, from which the images of the
+    listed trials are shown. An earlier report in the folder is replaced. Raises ``InputError`` without results
+    or matplotlib, for a folder that holds anything but a report, and for a dataset that cannot be read.
     """
     if not table.rows:
         raise InputError("no finished trial, nothing to report")
@@ -81,7 +81,10 @@ def write_report(
 
 
 def chosen_criterion(given: str | None, groups: Sequence[Group]) -> str:
-    """Return the criterion to use where only one is shown. Raises ``InputError`` for one that applies to no trial."""
+    """Return the criterion to use where a report shows a single one.
+
+    Raises ``InputError`` for an unknown criterion, and for one that applies to no trial.
+    """
     if given is None:
         return RELATIVE if all(applies(RELATIVE, group.results) for group in groups) else ABSOLUTE
     if given not in CRITERIA:
@@ -103,7 +106,7 @@ def page(
     view: str | None = None,
     pictures: Sequence[str | None] = (),
 ) -> str:
-    """Return a report as HTML; ``pictures`` has the JPEG (base64) of each of the worst trials, or None."""
+    """Return a report as HTML; ``pictures`` holds a JPEG (base64) or None for each of the worst trials."""
     environment = Environment(
         autoescape=True, finalize=_printed, undefined=StrictUndefined, keep_trailing_newline=True
     )
@@ -146,7 +149,10 @@ def page(
 
 
 def worst(rows: Sequence[TrialResult]) -> list[TrialResult]:
-    """Return the trials accepted although wrong (beyond 5 degrees or 0.05 units), then the refused, then the others, by error."""
+    """Return the trials in order of concern, and by decreasing error.
+
+    Wrongly accepted trials (beyond 5 degrees or 0.05 units) come first, then the refused ones, then the others.
+    """
 
     def rank(row: TrialResult) -> tuple[bool, bool, float]:
         error = float("inf") if row.error is None else row.error.translation
@@ -156,7 +162,7 @@ def worst(rows: Sequence[TrialResult]) -> list[TrialResult]:
 
 
 def thumbnails(rows: Sequence[TrialResult], data: Sequence[str | Path]) -> list[str | None]:
-    """Return the image of each trial, with its faults, as a JPEG in base64; None for one whose dataset is not in ``data``."""
+    """Return the image of each trial, with its faults, as a JPEG in base64; None if the trial's dataset is not in ``data``."""
     folders = {Path(os.path.realpath(folder)).name: str(folder) for folder in data}
     opened: dict[tuple[str, str], Capture] = {}
     pictures: list[str | None] = []
@@ -189,7 +195,7 @@ def _number(value: float | None, digits: int | None = None, unit: str = "") -> s
 
 
 def _facts(name: str, runs: Sequence[Provenance]) -> dict[str, str]:
-    """Return how a results file was made, by the name of each fact; empty if that is not recorded."""
+    """Return the facts about how a results file was made, by name; empty if no runs are recorded."""
     if not runs:
         return {}
     first, last = runs[0], runs[-1]

@@ -1,5 +1,6 @@
-"""Trial results: a table in memory, a file of one JSON line per trial, each on disk before its trial counts as done, and
-the runs that made such a file.
+"""Trial results: a table in memory, a file with one JSON line per trial, and the runs that made such a file.
+
+Each line is on disk before its trial counts as done.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ BEGINNING = b'{"T_world_camera": '
 
 
 class SummaryRow(NamedTuple):
-    """The statistics of the trials of one condition in one situation, with the words used for these in reports."""
+    """The statistics of the trials of one condition in one situation, with the titles of both in reports."""
 
     start: str  # title of the situation
     label: str  # of the condition
@@ -134,7 +135,7 @@ def aligned(lines: Sequence[Sequence[str]]) -> str:
 
 
 def key_of(trial: Trial) -> str:
-    """Return a key that is equal for two trials if and only if they are the same trial, wherever their folders are."""
+    """Return a key that is equal for two trials if and only if they are the same trial, wherever their folders lie."""
     return json.dumps(to_plain(trial.portable), sort_keys=True)
 
 
@@ -213,7 +214,7 @@ class ResultsFile:
         return self.values[key_of(trial)]
 
     def add(self, result: TrialResult) -> None:
-        """Append a result, which is on disk when this returns. Raises ``InputError`` if the file was removed."""
+        """Append a result and write it to disk before returning. Raises ``InputError`` if the file was removed."""
         if self.path is not None:
             file = self._unmoved(self.path)
             file.write(as_line(to_plain(result)))
@@ -234,7 +235,7 @@ class ResultsFile:
         self.values = {key: self.values[key] for key in order}
 
     def _unmoved(self, path: Path) -> BinaryIO:
-        """Return the open file. Raises ``InputError`` if the path no longer names it: lines would be lost unnoticed."""
+        """Return the open file. Raises ``InputError`` if it is no longer at ``path``: lines would be lost unnoticed."""
         assert self._file is not None
         if not (path.exists() and os.path.samestat(os.fstat(self._file.fileno()), path.stat())):
             raise InputError(
@@ -245,7 +246,7 @@ class ResultsFile:
         return self._file
 
     def _open(self, path: Path) -> BinaryIO:
-        """Open, create if needed, and lock the file."""
+        """Open the file, creating it if needed, and lock it."""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             if path.exists():
@@ -313,13 +314,13 @@ def provenance(command: str, workers: str) -> Provenance:
 
 
 def note_run(results: Path, run: Provenance) -> None:
-    """Add a run to the list next to a results file, which may take several runs to complete."""
+    """Append a run to the list next to a results file, which may take several runs to complete."""
     runs = [*read_runs(results), run]
     write_file(results.with_suffix(RUNS), (json.dumps({"runs": to_plain(runs)}, indent=1) + "\n").encode())
 
 
 def read_runs(results: Path) -> list[Provenance]:
-    """Return the runs behind a results file, in order; empty if there is no list next to it."""
+    """Return the runs that made a results file, in order; empty if there is no list of them next to the file."""
     path = results.with_suffix(RUNS)
     if not path.is_file():
         return []
@@ -354,7 +355,7 @@ def _cpu_model() -> str:
 
 
 def script_command() -> str:
-    """Return the command of the running script; paths are relative to the checkout, or only names outside it."""
+    """Return the command of the running script, with paths relative to the checkout; outside it, only file names."""
     root = Path(bidnerf_core.__file__).resolve().parents[1]
 
     def shortened(part: str) -> str:

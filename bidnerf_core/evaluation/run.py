@@ -1,4 +1,4 @@
-"""Evaluation: many localizations in one map as a table, run in this process, in others, or on a cluster."""
+"""Evaluation: many localizations in one map as a table, run in this process, in worker processes, or on a cluster."""
 
 from __future__ import annotations
 
@@ -76,18 +76,19 @@ def evaluate(
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> ResultTable:
-    """Localize many frames of ``data`` in a map, from the starts of a protocol or from none, and return all results.
+    """Localize many frames of ``data`` in a map, with the starts of a protocol or without starts, and return all results.
 
-    ``out`` is a results file: trials already in it are not run again, and each result is on disk before the next trial
-    begins, so that the same call resumes an evaluation that was interrupted or cancelled. The command of the running
-    program is recorded next to it as the origin of the results. ``workers`` is the number of processes (None: one per
-    core, and one on a GPU), or the address of a dask scheduler; more than one requires a map and data in folders and an
-    importable main module, and finds registered names only if importing that module registers them. With one,
-    everything runs in the calling thread.
+    ``out`` is a results file: trials already in it are not run again, and each result is on disk before the
+    next trial begins, so that the same call resumes an evaluation that was interrupted or cancelled. The
+    command of the running program is recorded next to it as the origin of the results. ``workers`` is the
+    number of processes (None: one per core, or a single one on a GPU), or the address of a dask scheduler. More
+    than one process requires a map and data in folders and an importable main module, and names registered at
+    run time are found only if importing that module registers them. With one process, everything runs in the
+    calling thread.
 
-    Raises ``InputError`` for an evaluation that cannot be carried out, also if the method does not use the plan's depth
-    points or the views of some trial observe none, and ``Cancelled`` once ``cancel`` returns True and the running trials
-    have ended.
+    Raises ``InputError`` for an evaluation that cannot be carried out, including a method that does not use the
+    plan's depth points and a trial whose views observe none. Raises ``Cancelled`` once ``cancel`` returns True
+    and the running trials have ended.
     """
     in_memory = isinstance(scene, Map) or not isinstance(data, str | Path)
     if in_memory and workers not in (1, None):
@@ -121,12 +122,13 @@ def run_trials(
     scene: Opened | None = None,
     workers: Workers = 1,
 ) -> None:
-    """Run the trials without results in ``file``, and store each result as soon as it is available.
+    """Run the trials that have no result in ``file``, and store each result as soon as it is available.
 
-    At most as many trials as there are workers run concurrently, so that a kill loses little. None begins once the job is
-    cancelled. A trial that fails ends the run with its error, after the results of the running trials have been stored.
-    ``scene`` is the map and data of all trials, by default those that they name; other processes read them from folders.
-    Raises ``InputError`` as ``left_to_do`` does, and ``Cancelled``.
+    At most as many trials as there are workers run concurrently, so that a kill loses little. No trial begins
+    once the job is cancelled. A trial that fails ends the run with its error, after the results of the other
+    running trials have been stored. ``scene`` is the map and data of all trials, by default those that the
+    trials name; other processes read them from folders. Raises ``InputError`` as ``left_to_do`` does, and
+    ``Cancelled``.
     """
     todo = left_to_do(trials, file, scene)
     if len(todo) < len(trials):
@@ -190,10 +192,11 @@ def _run(
 
 
 def left_to_do(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None = None) -> list[Trial]:
-    """Return the trials without results in the file. ``scene`` is their map and data, by default those they name.
+    """Return the trials that have no result in the file.
 
-    Raises ``InputError`` if the file holds a result from another training run or surface of the map, other images or
-    other settings. Settings unknown to the version that made a result had their defaults.
+    ``scene`` is the map and data of the trials, by default those that the trials name. Raises ``InputError`` if
+    the file holds a result from another training run or surface of the map, other images or other settings.
+    Settings unknown to the version that made a result are assumed to have had their defaults.
     """
     digests: dict[Any, dict[str, Any]] = {}
     advice = "name another --out, or remove the file to start again"
@@ -235,7 +238,8 @@ def left_to_do(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None 
 class InThisProcess(Executor):
     """An executor that runs every call immediately, in this process.
 
-    What runs neither reports to the job at hand nor is stopped with it: cancelling ends an evaluation between trials.
+    Calls neither report progress to the current job nor are stopped with it: cancelling ends an evaluation
+    between trials.
     """
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -251,18 +255,18 @@ class InThisProcess(Executor):
 def local_processes(count: int) -> Executor:
     """Return an executor of ``count`` single-threaded processes, which end when this process ends, for whatever reason.
 
-    With one, everything runs in this process.
+    With a count of 1, everything runs in this process.
     """
     return InThisProcess() if count == 1 else own_processes(count)
 
 
 def own_processes(count: int) -> ProcessPoolExecutor:
-    """Return an executor of processes other than this one, as ``local_processes`` does."""
+    """Return an executor like that of ``local_processes``, but with separate processes even for a count of 1."""
     return ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_prepare_worker)
 
 
 def _prepare_worker() -> None:
-    """Set up a worker: it leaves Ctrl-C to its parent and exits when the parent is gone."""
+    """Set up a worker process to ignore Ctrl-C, use one thread, and exit when its parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
     parent = parent_process()
@@ -277,11 +281,11 @@ def _prepare_worker() -> None:
 
 @contextmanager
 def executor_of(workers: Workers, trials: int, on_cpu: bool) -> Iterator[tuple[Executor, int, str]]:
-    """Yield an executor for a number of trials, how many of them to run on it at once, and its description.
+    """Yield an executor for ``trials`` trials, the number of trials to run on it at once, and its description.
 
-    If the work fails, its processes are ended with their trials. Workers of a cluster need this package, the same
-    backends, and the maps and data under the same paths. Peak memory is measured per process: it is that of a single
-    trial only if the worker has one thread (``dask worker --nthreads 1``).
+    If the work fails, the local processes are ended along with their trials. Workers of a cluster need this
+    package, the same backends, and the maps and data under the same paths. Peak memory is measured per process:
+    it is that of a single trial only if the worker has one thread (``dask worker --nthreads 1``).
 
     Raises ``InputError`` for a number below 1, if dask is missing, and if no scheduler or worker responds.
     """
@@ -311,7 +315,7 @@ def executor_of(workers: Workers, trials: int, on_cpu: bool) -> Iterator[tuple[E
 
 @contextmanager
 def ended_on_failure(executor: Executor) -> Iterator[Executor]:
-    """Yield an executor that is shut down afterwards; if the block fails, its processes are ended with their work."""
+    """Yield an executor, which is shut down afterwards; if the block fails, the executor's processes are terminated."""
     try:
         yield executor
     except BaseException:
@@ -334,7 +338,7 @@ def open_both(scene: Scene, data: Data, plan: Plan) -> Opened:
 
 
 def device_name(scene: Scene, given: str) -> str:
-    """Return the device on which a map computes: that of a map in memory, else the given one."""
+    """Return the device of a map in memory, or ``given`` for any other map."""
     return str(device_of(scene.field)) if isinstance(scene, Map) else given
 
 

@@ -1,4 +1,4 @@
-"""Results side by side: grouped by what was localized and by what localized it, with statistics and significance tests."""
+"""Results grouped by situation (what was localized) and condition (what localized it), with statistics and tests."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RELATIVE, ABSOLUTE = "10%", "5deg 0.05"
 
 @dataclass(frozen=True)
 class Situation:
-    """The map, the images and the starts of some trials. ``size`` is None if trials of all sizes are pooled."""
+    """The map, images and starts that trials have in common. ``size`` is None if trials of all sizes are pooled."""
 
     map: str
     weights: str  # identifies the training run, see ``Map.training``
@@ -107,7 +107,7 @@ def situation_titles(every: Sequence[Situation]) -> dict[Situation, str]:
 
 
 def _condition(result: TrialResult) -> dict[str, Any]:
-    """Return all that distinguishes what localized one trial from what localized another, by name."""
+    """Return the properties that define the condition of a trial, by name: method, input, hardware and settings."""
     trial = result.trial
     own = {
         name: getattr(trial, name)
@@ -132,7 +132,7 @@ WORDS: dict[str, Callable[[Any], str]] = {
 
 
 def _labels(conditions: Sequence[dict[str, Any]]) -> dict[str, str]:
-    """Return a label for each condition, by its JSON: its method, and the properties in which that method's conditions differ."""
+    """Return a label for each condition, by its JSON: the method, and the properties in which its conditions differ."""
     every = {json.dumps(condition, sort_keys=True): condition for condition in conditions}
     labels = {}
     for key, own in every.items():
@@ -203,7 +203,7 @@ def frame_of(result: TrialResult) -> tuple[str, str, tuple[str, ...]]:
 
 
 def unit_of(results: Sequence[TrialResult]) -> LengthUnit:
-    """Return the unit of the errors of some trials: metres if all of them have it."""
+    """Return the unit of the errors of trials: metres if all errors are in metres."""
     return "metres" if results and all(result.unit == "metres" for result in results) else "units"
 
 
@@ -214,7 +214,7 @@ def applies(criterion: str, results: Sequence[TrialResult]) -> bool:
 
 
 def are_stepwise(results: Sequence[TrialResult]) -> bool:
-    """Return whether a method moved the pose in steps, which have a speed; others answer at once."""
+    """Return whether a method refined the pose in steps rather than answering at once."""
     return statistics.median(result.steps for result in results) > 1
 
 
@@ -251,9 +251,9 @@ def success_of(results: Sequence[TrialResult], criterion: str) -> Success | None
 
 
 def median(values: Iterable[float | None]) -> float | None:
-    """Return the median (of an even number, the mean of the two middle values); an unknown value counts as infinite.
+    """Return the median, or for an even number of values the mean of the middle two; an unknown value counts as infinite.
 
-    Returns None if there is no value, or if a middle value is unknown.
+    Returns None if there are no values, or if a middle value is unknown.
     """
     known = [math.inf if value is None else float(value) for value in values]
     middle = statistics.median(known) if known else math.inf

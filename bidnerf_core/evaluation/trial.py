@@ -177,7 +177,7 @@ def registered_for(trial: Trial) -> list[tuple[str, str]]:
 def trial_views(trial: Trial, dataset: Capture) -> list[View]:
     """Return the views that the method receives, with T_world_camera.
 
-    They include the trial's faults, and have no depth if the trial withholds it.
+    The trial's faults are applied to the views, and their depth is removed if the trial withholds depth.
     """
     views = [faulty(view, trial.fault, trial.seed) for view in dataset.views(trial.split, trial.frames)]
     if trial.depth:
@@ -200,7 +200,7 @@ def open_map(name: str, device: str = "cpu") -> Map:
 def open_data(data: Data, options: DatasetOptions, stored: Map | None = None) -> Capture:
     """Return a dataset, read from its folder unless it is in memory; ``stored`` gives the background colour.
 
-    Raises ``InputError`` for anything else, and for options of files if there are none.
+    Raises ``InputError`` for ``data`` of another type, and for file options with data that has no files.
     """
     if isinstance(data, str | Path) and not is_closed_form(str(data)):
         return replace(options, background=None if stored is None else stored.bounds.background).open(data)
@@ -295,7 +295,7 @@ def folder_digest(folder: str) -> str:
 def forget_peak_memory() -> None:
     """Reset the peaks that ``peak_memory_bytes`` reports.
 
-    Where the operating system cannot do that, the peak resident memory remains that since the process began.
+    If the operating system cannot reset the peak resident memory, it remains the peak since the process began.
     """
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         torch.cuda.reset_peak_memory_stats()

@@ -29,26 +29,26 @@ def contract_points(points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
 class RaySpacing:
     """A coordinate along rays in which equal steps match the resolution of a contracted field (eq. 11).
 
-    It is the distance (metres) up to ``exit``, where the ray leaves the uncontracted box, and ``exit + radius
-    * x / (1 + x)`` beyond, with ``x`` the distance from there in units of ``radius``.
+    The coordinate is the distance (metres) up to ``exit``, where the ray leaves the uncontracted box, and ``exit + radius
+    * x / (1 + x)`` beyond, with ``x`` the distance from ``exit`` in units of ``radius``.
     """
 
     exit: Float[Tensor, "*r"]  # metres along the ray
     radius: float  # metres: half the side of the uncontracted cube; infinite without contraction
 
     def rows(self, numbers: Int[Tensor, "m"]) -> RaySpacing:
-        """Return the spacing of the rays with these indices. ``exit`` must have a single dimension, (r,)."""
+        """Return the ``RaySpacing`` of the rays with these indices. ``exit`` must have shape (r,)."""
         return RaySpacing(self.exit.index_select(0, numbers), self.radius)
 
     def place(self, distance: Float[Tensor, "*r s"]) -> Float[Tensor, "*r s"]:
-        """Return the coordinate at a distance along the ray (metres)."""
+        """Convert distances along the rays (metres) to the coordinate."""
         if self.radius == float("inf"):
             return distance
         beyond = (distance - self.exit[..., None]).clamp(min=0)
         return torch.minimum(distance, self.exit[..., None]) + beyond / (1 + beyond / self.radius)
 
     def distance(self, place: Float[Tensor, "*r s"]) -> Float[Tensor, "*r s"]:
-        """Return the distance (metres) at a coordinate, the inverse of ``place``."""
+        """Convert the coordinate to distances along the rays (metres), the inverse of ``place``."""
         if self.radius == float("inf"):
             return place
         beyond = (place - self.exit[..., None]).clamp(min=0)
@@ -58,7 +58,7 @@ class RaySpacing:
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Half-lines and the part of each that may hold matter. ``far <= near`` marks a ray that misses the scene."""
+    """Half-lines, each with the interval [near, far] that may contain matter. ``far <= near`` marks a ray that misses the scene."""
 
     origins: Float[Tensor, "*r 3"]
     directions: Float[Tensor, "*r 3"]  # unit
@@ -76,7 +76,7 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class RaySamples:
-    """Disjoint intervals of each ray, nearest first, each queried at its middle. Invalid intervals have no effect."""
+    """Disjoint intervals along each ray, nearest first; the field is queried at their midpoints. Invalid intervals have no effect."""
 
     starts: Float[Tensor, "*r s"]
     ends: Float[Tensor, "*r s"]
@@ -88,7 +88,7 @@ class RaySamples:
 
     @property
     def parts(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The starts, the ends, and whether they are valid."""
+        """The start, the end and the validity of each interval."""
         return self.starts, self.ends, self.valid
 
     def unflattened(self, shape: torch.Size) -> RaySamples:
@@ -98,7 +98,7 @@ class RaySamples:
 
 @dataclass(frozen=True, eq=False)
 class FieldValues:
-    """Density and colour at points, seen along given directions."""
+    """Density at points, and colour seen along a viewing direction at each."""
 
     density: Float[Tensor, "*p"]  # >= 0, per metre
     rgb: Float[Tensor, "*p 3"]  # in [0, 1]
@@ -106,7 +106,7 @@ class FieldValues:
 
 @dataclass(frozen=True, eq=False)
 class FieldDerivatives:
-    """A field's values at points, with the derivatives of density and of the three colours, in this order."""
+    """A field's values at points, with the derivatives of the density and the three colour channels, in this order."""
 
     values: FieldValues
     by_position: Float[Tensor, "*p 4 3"]  # per metre
@@ -124,7 +124,7 @@ class RaySampler(Protocol):
 
 @runtime_checkable
 class RadianceField(Protocol):
-    """A differentiable scene. Only reverse-mode derivatives are required of it."""
+    """A differentiable scene. Only reverse-mode derivatives are required."""
 
     @property
     def sampler(self) -> RaySampler: ...
@@ -136,9 +136,9 @@ class RadianceField(Protocol):
 
 @runtime_checkable
 class DifferentiatedField(RadianceField, Protocol):
-    """Optional part of a field that computes its derivatives with its values, faster than a backward pass would.
+    """Optional interface of a field that computes derivatives along with its values, faster than a backward pass would.
 
-    Ask for the derivatives of any field by ``derivatives_of``.
+    To get the derivatives of any field, call ``derivatives_of``.
     """
 
     def jacobian(
@@ -146,16 +146,16 @@ class DifferentiatedField(RadianceField, Protocol):
     ) -> FieldDerivatives:  # fmt: skip
         """Return the values of ``query`` and their derivatives, without recording gradients.
 
-        Points that are not ``wanted`` may be left out: all that is returned for them must be finite, and is not used.
+        Points that are not ``wanted`` may be skipped: the numbers returned for them are not used, but must be finite.
         """
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class RayHits:
-    """Where rays hit something, and what is seen there, in compositing order.
+    """Hits along rays: their distances, colours and opacities, in compositing order.
 
-    This is the order of distance, except for fields that composite otherwise, such as splats trained in the
+    Compositing order is the order of distance, except for fields that composite otherwise, such as splats trained in the
     order of their means. Invalid hits have no effect.
     """
 
@@ -172,10 +172,10 @@ class RayHits:
 
 @runtime_checkable
 class HitField(RadianceField, Protocol):
-    """Optional part of a field that computes the hits of whole rays, as splats and meshes do.
+    """Optional interface of a field that computes all hits of a ray at once, as splats and meshes do.
 
-    ``render`` then uses ``hits`` instead of ``sampler`` and ``query``. These remain available for points and
-    for other ways of sampling rays, and are consistent with it: the integral of ``query``'s density along a
+    ``render`` then uses ``hits`` instead of ``sampler`` and ``query``. The latter remain available for
+    points and for other ways of sampling rays, and are consistent with ``hits``: the integral of ``query``'s density along a
     ray gives the opacity of the ray's hits.
     """
 
@@ -186,7 +186,7 @@ class HitField(RadianceField, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """The pieces of a field (splats, triangles, discs) as points, for drawing without ray casting."""
+    """The primitives of a field (splats, triangles, discs) as points, for drawing without ray casting."""
 
     positions: Float[Tensor, "n 3"]  # metres, world
     rgb: Float[Tensor, "n 3"]  # in [0, 1], independent of direction
@@ -196,15 +196,15 @@ class Splats:
 
 @runtime_checkable
 class SplatField(Protocol):
-    """Optional part of the interface, for fields made of discrete primitives (splats, triangles, discs) that viewers can draw."""
+    """Optional interface of fields made of discrete primitives (splats, triangles, discs), which viewers can draw."""
 
     def splats(self) -> Splats:
-        """Return all pieces, in any order."""
+        """Return all primitives, in any order."""
         ...
 
 
 def levels(field: RadianceField) -> tuple[RadianceField, ...]:
-    """Return the field's levels of detail, coarsest first; a field without any is its own only level."""
+    """Return the field's levels of detail, coarsest first; a field without levels is returned as the only one."""
     return tuple(getattr(field, "levels", None) or (field,))
 
 
@@ -212,7 +212,7 @@ def derivatives_of(
     field: RadianceField, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"],
     wanted: Bool[Tensor, "p"] | None = None,
 ) -> FieldDerivatives:  # fmt: skip
-    """Return a field's values at the ``wanted`` points and their derivatives, by its ``jacobian`` if it has one."""
+    """Return a field's values and their derivatives at the ``wanted`` points, using the field's ``jacobian`` if it has one."""
     if isinstance(field, DifferentiatedField):
         return field.jacobian(positions, directions, wanted)
     return backward_derivatives(field.query, positions, directions)
@@ -221,10 +221,10 @@ def derivatives_of(
 def backward_derivatives(
     query: Callable[[Tensor, Tensor], FieldValues], positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
 ) -> FieldDerivatives:  # fmt: skip
-    """Return the values of ``query`` at points and their derivatives, by a backward pass for each channel.
+    """Return the values of ``query`` at points and their derivatives, by one backward pass per channel.
 
-    Points are independent, so the gradient of a channel's sum has the gradients of all points. On an accelerator, where launches
-    take most of the time, one pass over four copies of up to 65536 points replaces the four.
+    Points are independent, so the gradient of a channel's sum contains the gradients of all points. On an accelerator, where
+    launches take most of the time, a single pass over four copies of up to 65536 points replaces the four passes.
     """
     n = len(positions)
     copies = 4 if positions.device.type != "cpu" and n <= 2**16 else 1
@@ -275,7 +275,7 @@ LARGEST_LENGTH = 1e15
 
 @dataclass(frozen=True)
 class SceneBounds:
-    """Extent, depth range and background of a scene, known before training; plain numbers, stored as JSON."""
+    """Extent, depth range and background of a scene, known before training; stored as plain numbers in JSON."""
 
     lower: tuple[float, float, float]  # metres, world: corners of the box that holds all matter
     upper: tuple[float, float, float]
@@ -336,8 +336,8 @@ class SceneBounds:
     def normalized(self, positions: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
         """Return positions (metres, world) scaled so that the modelled space is the cube [-1, 1].
 
-        This is the cube around the box or, if the scene is contracted, all of space: the cube around the box
-        then fills the inner half of each axis.
+        The modelled space is the cube around the box or, if the scene is contracted, all of space: the cube around
+        the box then fills the inner half of each axis.
         """
         scaled = (positions - constant(self.centre, positions)) * (2 / self.side)
         return contract_points(scaled) / 2 if self.contracted else scaled
@@ -360,7 +360,7 @@ class SceneBounds:
 
     @torch.no_grad()
     def spacing(self, rays: Rays) -> RaySpacing:
-        """Return the coordinate along the rays in which a field with these bounds should be sampled evenly."""
+        """Return the coordinate along the rays in which a field with these bounds should be sampled at equal steps."""
         origins, directions = rays.origins.detach(), rays.directions.detach()
         if not self.contracted:
             return RaySpacing(torch.zeros_like(rays.near), float("inf"))

@@ -1,4 +1,4 @@
-"""Inputs and outputs of networks that are radiance fields: frequency encoding, and density from a raw number."""
+"""Input encodings of radiance-field networks, and the conversion of their raw output to density."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Network: TypeAlias = Callable[
 
 
 def encoded_width(frequencies: int, include_input: bool = True) -> int:
-    """Return the length of a point's encoding."""
+    """Return the number of values in a point's encoding."""
     return 3 * (2 * frequencies + include_input)
 
 
@@ -48,7 +48,7 @@ def frequency_encoding(
 def query_network(
     network: Network, bounds: SceneBounds, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]
 ) -> FieldValues:
-    """Return a network's values; positions are scaled to the cube [-1, 1], so that the length unit has no effect."""
+    """Query a network at positions scaled to the cube [-1, 1], so that the unit of length has no effect."""
     shape = positions.shape[:-1]
     raw, rgb = network(bounds.normalized(positions.reshape(-1, 3)), directions.reshape(-1, 3))
     # The shift makes an untrained field nearly transparent (Barron et al. 2021, mip-NeRF). The density is 30 per side of the scene

@@ -1,6 +1,6 @@
-"""Fields that consist of pieces (Gaussians, triangles, discs): what rays hit, the density that has the same opacity, and a sampler.
+"""Fields that consist of pieces (Gaussians, triangles, discs): ray hits, a density of the same opacity, and a sampler.
 
-Pieces are found with a tree of boxes. They are sorted along a Morton curve, eight neighbours share a box, eight of these boxes share the
+Pieces are found with a tree of boxes. Pieces are sorted along a Morton curve, eight neighbours share a box, eight of these boxes share the
 next, and so on (Lauterbach et al. 2009, with eight children). The tree has no pointers: child ``c`` of node ``n`` is ``8 n + c`` on
 the level below. The boxes of a node's children are stored side by side, as (6 nodes 8): lower corner, upper corner.
 """
@@ -48,7 +48,7 @@ class Meeting:
 
 
 class PieceField(nn.Module, ABC):
-    """A field of pieces, such as Gaussians or triangles, each of which a ray meets at one point.
+    """A field of pieces, such as Gaussians or triangles, each of which a ray intersects in a single point.
 
     ``hits`` returns these points with the opacity alpha of each piece. The density that ``query`` returns distributes the optical
     thickness ``-log(1 - alpha)`` along the line of sight, so that its integral along a ray gives the same opacity. A field
@@ -75,11 +75,11 @@ class PieceField(nn.Module, ABC):
 
     @abstractmethod
     def profile(self, meeting: Meeting) -> Float[Tensor, "p"]:
-        """Return the share per metre of a piece's optical thickness at the lines' origins; its integral along a line is 1."""
+        """Return the fraction per metre of a piece's optical thickness at the lines' origins; this profile integrates to 1 along a line."""
 
     @abstractmethod
     def half_length(self, meeting: Meeting) -> Float[Tensor, "p"]:
-        """Return half the length (metres) of the interval that a piece has in ``sampler``."""
+        """Return half the length (metres) of the interval that ``sampler`` places around a piece."""
 
     def register_tree(self, count: int) -> None:
         """Register the buffers of the tree of ``count`` pieces."""
@@ -92,13 +92,13 @@ class PieceField(nn.Module, ABC):
 
     @property
     def boxes(self) -> list[Float[Tensor, "6 _ 8"]]:
-        """The boxes of the children of each node, the lowest level (whose children are pieces) first."""
+        """The boxes of each node's children, starting with the lowest level (whose children are pieces)."""
         return [part for name, part in self.named_buffers(recurse=False) if name.startswith("boxes_")]
 
     def rebuild(
         self, centres: Float[Tensor, "n 3"], halves: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]
     ) -> None:
-        """Set the tree for boxes with these centres and half sizes; pieces that are not ``seen`` are in an empty box."""
+        """Fill the tree from boxes with these centres and half sizes; pieces that are not ``seen`` get an empty box."""
         self.order.copy_(torch.argsort(_morton(centres, seen), stable=True))
         centres, halves, seen = centres[self.order], halves[self.order], seen[self.order, None]
         lower = torch.where(seen, centres - halves, torch.inf)
@@ -118,7 +118,7 @@ class PieceField(nn.Module, ABC):
         return PieceSampler(self)
 
     def hits(self, rays: Rays) -> RayHits:
-        """Return where rays meet pieces, with colour and alpha; differentiable in the rays and the parameters."""
+        """Return the hits of rays on pieces, with colour and alpha; differentiable in the rays and the parameters."""
         shape, flat = rays.near.shape, rays.flattened()
         piece, valid = self.met(flat)
         width = piece.shape[1]
@@ -140,8 +140,8 @@ class PieceField(nn.Module, ABC):
 
     @torch.no_grad()
     def met(self, rays: Rays, by_distance: bool = False) -> tuple[Int[Tensor, "r s"], Bool[Tensor, "r s"]]:
-        """Return the indices of the pieces that rays (r) meet, in the order of compositing until the transmittance is
-        negligible, and which slots are in use.
+        """Return the indices of the pieces that rays (r) meet, in compositing order until the transmittance is negligible,
+        and the mask of slots in use.
 
         The order is that of ``Meeting.key``, or of the distances with ``by_distance``.
         """
@@ -216,10 +216,10 @@ class PieceField(nn.Module, ABC):
     def _nearby(
         self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"], near: Float[Tensor, "r"], far: Float[Tensor, "r"]
     ) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"], Bool[Tensor, "p"]]:  # fmt: skip
-        """Return pairs of a line and a piece whose box it meets between ``near`` and ``far``, sorted by line, and which of them count.
+        """Return pairs of a line and a piece whose box it crosses between ``near`` and ``far``, sorted by line, and which are valid.
 
-        If the host must not wait, each line has equally many pairs, of the boxes that it enters first. Otherwise all pairs are
-        returned and count, and ``TooMany`` is raised if several lines meet so many boxes that memory might not suffice.
+        If the host must not wait, each line gets the same number of pairs, for the boxes that it enters first. Otherwise all pairs
+        are returned and valid, and ``TooMany`` is raised if several lines meet so many boxes that memory might not suffice.
         """
         # Smaller components of a direction are replaced by this one, so that slopes stay finite.
         least = torch.full_like(directions, 1e-9)
@@ -257,11 +257,11 @@ class PieceField(nn.Module, ABC):
 
 
 class TooMany(Exception):
-    """Lines meet more boxes than may be tested at once; fewer lines may work."""
+    """The lines cross more boxes than can be tested at once; try again with fewer lines."""
 
 
 def _in_parts(function: Callable[..., T], parts: Sequence[Tensor], count: int) -> list[T]:
-    """Return the results of ``function`` for ``count`` rows of ``parts`` at a time, or for fewer where these are ``TooMany``."""
+    """Apply ``function`` to ``count`` rows of ``parts`` at a time, or to fewer where it raises ``TooMany``."""
     found: list[T] = []
     for few in zip(*(part.split(count) for part in parts), strict=True):
         try:
@@ -272,7 +272,7 @@ def _in_parts(function: Callable[..., T], parts: Sequence[Tensor], count: int) -
 
 
 def _morton(centres: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]) -> Int[Tensor, "n"]:
-    """Return the positions along a Morton curve; unseen pieces come last."""
+    """Return the position of each piece along a Morton curve; unseen pieces come last."""
     # Between quantiles, so that a few distant pieces do not put all others into one cell.
     some = centres[:: max(1, len(centres) // 10_000)].double()
     low, high = (some.quantile(q, dim=0) for q in (0.02, 0.98))
@@ -288,9 +288,9 @@ def _morton(centres: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]) -> Int[Tenso
 
 @dataclass(frozen=True, eq=False)
 class PieceSampler:
-    """An interval around each piece that a ray meets, as long as its density there divided by its peak.
+    """A sampler that places an interval of length ``2 half_length`` around each piece that a ray meets.
 
-    For an isolated piece, density times length is its optical thickness; if several overlap, their intervals
+    For an isolated piece, density times length is its optical thickness; if pieces overlap, their intervals
     end half-way between them. ``hits`` is exact, and is what the core renders.
     """
 

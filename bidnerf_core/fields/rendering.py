@@ -1,4 +1,4 @@
-"""Rays that were measured, and their volume rendering (Mildenhall et al. 2020, eq. 3; BID-NeRF, eq. 3)."""
+"""Rays with measurements, and volume rendering (Mildenhall et al. 2020, eq. 3; BID-NeRF, eq. 3)."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ class Observations:
     def from_points(points: Float[Tensor, "n 3"], T_ref_sensor: SE3) -> Observations:
         """Return rays to ``points`` (metres), as measured by a sensor at the origin of their frame; float64.
 
-        Points that are not finite or lie at the origin are a lidar's missing returns and are left out. Raises
-        ``InputError`` if none is left.
+        Points that are not finite or lie at the origin (missing returns of a lidar) are left out. Raises
+        ``InputError`` if no point remains.
         """
         points = points.to(torch.float64)
         distance = torch.linalg.vector_norm(points, dim=-1)
@@ -61,7 +61,7 @@ class Observations:
     def of_depth(
         origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], distance: Float[Tensor, "n"]
     ) -> Observations:
-        """Return rays along which only a distance (metres, > 0) was measured. Raises ``InputError`` if there are none."""
+        """Return rays with a measured distance (metres, > 0) but no colour. Raises ``InputError`` if there are no rays."""
         if len(distance) == 0:
             raise InputError(
                 "nothing was measured", where="depth rays", expected="at least one finite point in front"
@@ -83,7 +83,7 @@ class Observations:
         return len(self.distance)
 
     def __getitem__(self, index: Tensor | slice | None) -> Observations:
-        """Return some of the rays, by index along the first axis or by a mask; None adds an axis of length 1."""
+        """Select rays by an index along the first axis or by a mask; None adds an axis of length 1."""
         return self._changed(lambda part: part[index])
 
     @property
@@ -97,7 +97,7 @@ class Observations:
         return self.origins + self.distance[..., None] * self.directions
 
     def gathered(self, index: Int[Tensor, "k m"]) -> Observations:
-        """Return m rays from each row of rays of shape (k p), at ``index`` along the second axis."""
+        """Select m rays from each row of rays of shape (k p), by ``index`` along the second axis."""
         return self._changed(
             lambda part: part.take_along_dim(index.reshape(*index.shape, *(1,) * (part.ndim - 2)), 1)
         )
@@ -113,7 +113,7 @@ class Observations:
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> Observations:
-        """Draw ``count`` of the rays uniformly with replacement; return all of them if there are no more than that."""
+        """Draw ``count`` rays uniformly with replacement, or return all rays if there are at most ``count``."""
         if count >= len(self):
             return self.to(device, dtype)
         index = torch.randint(len(self), (count,), generator=generator, device=generator.device)
@@ -168,8 +168,8 @@ def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> Fiel
     """Return the field's values at the samples (*r s), with density 0 at invalid samples.
 
     Invalid samples are skipped. If the host must not wait for the device to count them (see ``may_wait``), the
-    field is queried at the origin instead, and the result is discarded; but rays that are differentiated in a field
-    whose parameters are not get the field's own derivatives, if it offers them.
+    field is queried at the origin instead, and the result is discarded; but if gradients are
+    needed for the rays and not for the field's parameters, the field's own derivatives are used where it offers them.
     """
     valid = samples.valid
     waiting = may_wait(valid.device)
@@ -209,7 +209,7 @@ def query_packed(
 ) -> tuple[FieldValues, RaySamples]:
     """Return the field's values at the first ``room`` valid samples (r s), and the samples with only these left valid.
 
-    The field is queried at ``room`` points whatever the number of valid samples is, so that the host need not wait for it.
+    The field is always queried at ``room`` points, so that the host need not wait for the number of valid samples.
     """
     valid = samples.valid.reshape(-1)
     total, room = valid.numel(), min(room, valid.numel())
@@ -229,7 +229,7 @@ def query_packed(
 
 
 class _Queried(torch.autograd.Function):
-    """Density and colour (p 4) at points, 0 at those that are not wanted, with the derivatives that the field offers."""
+    """Density and colour (p 4) at points, 0 at unwanted points, differentiated by the field's own derivatives."""
 
     @staticmethod
     def forward(
@@ -304,8 +304,8 @@ def render_values(
 class _Composite(torch.autograd.Function):
     """Colour (without background), distance, opacity and weights of rays, from density and colour at their samples.
 
-    With ``q_i`` the derivative by weight i, that by the density of sample i, of length l_i, is
-    ``l_i (T_i+1 q_i - sum_j>i w_j q_j)``, where T_i+1 is the share of the light that passes it.
+    With ``q_i`` the derivative of the loss by weight i, its derivative by the density of sample i, of length l_i,
+    is ``l_i (T_i+1 q_i - sum_j>i w_j q_j)``, where T_i+1 is the transmittance behind the sample.
     """
 
     @staticmethod
@@ -367,9 +367,9 @@ def render_image(
 def render_picture(
     field: RadianceField, intrinsics: Intrinsics, T_world_camera: SE3, bounds: SceneBounds, chunk: int = 8192
 ) -> RenderedImage:  # fmt: skip
-    """Render an image to look at: every second pixel of every second row, and of the others those whose neighbours differ.
+    """Render an image for display: every second pixel of every second row, and those in between whose neighbours differ.
 
-    The others are interpolated, which misses only what is smaller than two pixels, and saves up to half of the time.
+    All other pixels are interpolated. This misses only details smaller than two pixels, and saves up to half of the time.
     """
     pixels = intrinsics.pixel_centres().reshape(-1, 2)
     height, width = intrinsics.height, intrinsics.width

@@ -1,6 +1,6 @@
 """Residuals between renderings and measurements, which the first-order methods minimize.
 
-A ``Residual`` compares what is rendered along rays with what was measured there; a ``Term`` adds a robust loss, a weight and
+A ``Residual`` compares the rendering of rays with the measurements along them; a ``Term`` adds a robust loss, a weight and
 the rays that it applies to; an ``Objective`` is a sum of terms (eq. 5).
 """
 
@@ -31,8 +31,8 @@ def depth_residual(rendering: Rendering, observed: Observations) -> Float[Tensor
 def truncated_depth_residual(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p"]:
     """Return ``sum_i w_i clip(t_i - d) + (1 - sum_i w_i) 0.3``, metres, where clip limits to +-0.3.
 
-    At a silhouette, part of the weight lies on a surface far behind. Here its contribution is limited, however far away the
-    surface is; in the paper's residual it counts with its full distance.
+    At a silhouette, part of the weight lies on a surface far behind. Here the contribution of this weight is limited, however far
+    away the surface is; in the paper's residual it counts with its full distance.
     """
     limit = 0.3
     off = (rendering.samples.middles - observed.distance[..., None]).clamp(-limit, limit)
@@ -40,7 +40,7 @@ def truncated_depth_residual(rendering: Rendering, observed: Observations) -> Fl
 
 
 def first_surface_residual(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p"]:
-    """Return how far the first surface lies behind the measured distance, metres; 0 for a ray that is not stopped.
+    """Return rendered minus measured distance of the first surface, metres; 0 for a ray that no surface stops.
 
     The first surface is where the cumulative weight reaches half of the ray's total; its distance is the weighted mean within
     0.1 m.
@@ -68,15 +68,15 @@ DEPTH_RESIDUALS: dict[str, DepthResidual] = {
 def free_space(rendering: Rendering, distance: Float[Tensor, "*p"], margin: float) -> Float[Tensor, "*p"]:
     """Return how far (metres) matter on a ray lies in front of ``distance - margin``, summed with the rendering weights.
 
-    A sensor that measured a distance saw nothing in front of it. The error of the mean distance can be 0 with
-    matter on both sides of the measured point; this residual cannot.
+    A sensor that measured a distance saw nothing in front of it. The error of the mean distance can be 0 even
+    with matter on both sides of the measured point; this residual cannot.
     """
     before = (distance[..., None] - margin - rendering.samples.middles).clamp(min=0)
     return (rendering.weights * before).sum(-1)
 
 
 def masked_mean(values: Float[Tensor, "*k p"], mask: Bool[Tensor, "*k p"]) -> Float[Tensor, "*k"]:
-    """Return the mean over the last axis where ``mask`` holds; 0 where it holds nowhere."""
+    """Return the mean of the values selected by ``mask`` along the last axis; 0 where none is selected."""
     return torch.where(mask, values, 0).sum(-1) / mask.sum(-1).clamp(min=1)
 
 

@@ -1,4 +1,4 @@
-"""Samplers: where on each ray a field is queried; and fields that wrap others, or stand for none."""
+"""Samplers, which choose where on each ray a field is queried; fields that wrap others; and a stand-in for a missing field."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ density for a cell that is only partly dense; what lies behind the empty part mu
 class Stratified:
     """``count`` intervals of [near, far]; with jitter, their borders are shifted randomly by up to half an interval.
 
-    They have equal length in the coordinate of ``SceneBounds.spacing`` or, without bounds, in distance.
+    The intervals have equal length in the coordinate of ``SceneBounds.spacing`` or, without bounds, in distance.
     """
 
     count: int
@@ -63,7 +63,7 @@ class Stratified:
 
 @dataclass(frozen=True)
 class OccupiedOnly:
-    """The samples of another sampler, valid only in cells that may hold matter."""
+    """The samples of another sampler; only those in cells that may hold matter are valid."""
 
     occupancy: OccupancyMask
     sampler: RaySampler
@@ -87,7 +87,7 @@ def rows_of(of: OfRays, index: Int[Tensor, "n"]) -> OfRays:
 
 @dataclass(frozen=True)
 class Importance:
-    """Hierarchical sampling (Mildenhall et al. 2020, section 5.2): more intervals where ``field`` has its weight.
+    """Hierarchical sampling (Mildenhall et al. 2020, section 5.2): more intervals where the weights of ``field`` are large.
 
     The field's own valid intervals are split at ``count`` further distances; space that its sampler skips,
     such as one with an occupancy grid, remains skipped. No gradient flows through the choice of distances.
@@ -113,8 +113,8 @@ def inverse_transform(
     """Return ``count`` distances along each ray, by inverse transform sampling of the piecewise-constant PDF
     ``weights`` over the intervals.
 
-    They are in ascending order, each with the index of its interval. On a ray without weight, all are in its
-    first interval.
+    The distances are in ascending order, each with the index of its interval. On a ray without weight, all lie
+    in the first interval.
     """
     cdf = torch.cumsum(weights, dim=-1)
     cdf = cdf / cdf[..., -1:].clamp(min=torch.finfo(cdf.dtype).tiny)
@@ -148,8 +148,8 @@ def gathered(samples: RaySamples) -> RaySamples:
 def _cut(rough: RaySamples, places: Float[Tensor, "*r n"], owner: Int[Tensor, "*r n"]) -> RaySamples:
     """Return the gathered intervals ``rough``, split at ``places``, which lie in the intervals ``owner``.
 
-    A piece begins at the start of an interval or at a place in it, and ends at the next place or at the
-    interval's end.
+    A part begins at the start of an interval or at a place inside the interval, and ends at the next place or at
+    the interval's end.
     """
     first = torch.arange(rough.starts.shape[-1], device=owner.device).expand(rough.starts.shape)
     owner = torch.cat([owner, first], dim=-1)
@@ -186,7 +186,7 @@ class HierarchicalField(nn.Module):
 
 @dataclass(frozen=True)
 class Concentrated:
-    """At most ``count`` intervals per ray, short where the field ``guide`` has its weight and long elsewhere.
+    """At most ``count`` intervals per ray, short where the weights of the field ``guide`` are large, and long elsewhere.
 
     Three quarters of the borders divide the guide's weight over its own valid intervals into equal parts; the
     others divide their length. Each interval is as long as what it replaces. A ray with ``count`` intervals
@@ -271,7 +271,7 @@ def _interpolated(
 class ScaledField(nn.Module):
     """A field whose world is ``scale`` times as large as that of the wrapped field.
 
-    Colours stay, and densities are per new length.
+    Colours stay the same; densities are per unit of the new length.
     """
 
     def __init__(self, field: RadianceField, scale: float) -> None:
@@ -315,17 +315,17 @@ class ScaledHitField(ScaledField):
 
 
 class ScaledSplatField(ScaledHitField):
-    """A scaled field that consists of pieces."""
+    """A scaled field that consists of discrete primitives."""
 
     def splats(self) -> Splats:
-        """Return the pieces in the scaled world."""
+        """Return the primitives in the scaled world."""
         trained: SplatField = self.trained
         found = trained.splats()
         return replace(found, positions=found.positions * self.scale, radius=found.radius * self.scale)
 
 
 def scaled_field(field: RadianceField, scale: float) -> ScaledField:
-    """Return a field in a world that is ``scale`` times as large; it has the same optional parts as ``field``."""
+    """Return a field in a world that is ``scale`` times as large; it has the same optional interfaces as ``field``."""
     if isinstance(field, HitField) and isinstance(field, SplatField):
         return ScaledSplatField(field, scale)
     return (ScaledHitField if isinstance(field, HitField) else ScaledField)(field, scale)
@@ -350,7 +350,7 @@ class ScaledSampler:
 
 
 def trained_field(field: RadianceField) -> RadianceField:
-    """Return the field as its backend built it, in the unit of its training; its weights are the ones stored."""
+    """Return the field as its backend built it, in the length unit of training; its weights are those that are stored."""
     return field.trained if isinstance(field, ScaledField) else field
 
 
@@ -366,5 +366,5 @@ class NoField(nn.Module):
 
 
 def has_field(field: RadianceField) -> bool:
-    """Return whether there is a field behind the name, see ``NoField``."""
+    """Return whether there is a real field, rather than ``NoField``."""
     return not isinstance(trained_field(field), NoField)

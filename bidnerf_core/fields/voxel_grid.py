@@ -1,4 +1,4 @@
-"""Voxel grids: cubic cells that cover a box, and look-up of the value of the cell that contains a point.
+"""Voxel grids: cubic cells that cover a box, and look-up of cell values at points.
 
 A grid is only geometry; the values of its cells are tensors of its shape, stored by the classes that use it.
 All look-ups go through ``VoxelGrid.at``.
@@ -96,7 +96,7 @@ class VoxelGrid:
         return x & y & z
 
     def _own(self, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
-        """Convert points (metres, world) to the coordinates of the grid."""
+        """Convert points (metres, world) to the grid's own coordinates."""
         return points if self.contracted is None else self.contracted.normalized(points)
 
     def rays(self, origins: Float[Tensor, "*r 3"], directions: Float[Tensor, "*r 3"]) -> Rays:

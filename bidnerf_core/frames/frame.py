@@ -56,7 +56,7 @@ def as_floats(colours: Shaped[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 class _Colours:
-    """The attribute ``rgb`` of a frame: it is given as bytes or as floats, stored as bytes and read as floats."""
+    """Descriptor of a frame's ``rgb``, which is set as bytes or floats, stored as bytes and read as floats."""
 
     def __get__(self, frame: Frame | None, owner: type) -> Float[Tensor, "h w 3"]:
         if frame is None:
@@ -240,10 +240,10 @@ class Frame:
         hidden: Bool[Tensor, "h w"] | None = None,
         **about: Any,
     ) -> Frame:
-        """Return the frame of upright images taken by ``camera``.
+        """Build a frame from upright images taken by ``camera``.
 
-        Those of a ``Lens`` are resampled to its pinhole camera: colours are interpolated between pixels, depth
-        is that of the nearest one, and pixels that the lens did not see are hidden. ``about`` holds further
+        Images of a ``Lens`` are resampled to its pinhole camera: colours are interpolated between pixels, depth
+        is taken from the nearest pixel, and pixels that the lens did not see are hidden. ``about`` holds further
         attributes of the frame, as for its constructor.
         """
         intrinsics = camera
@@ -261,7 +261,7 @@ class Frame:
         return Frame(name, rgb, intrinsics, depth, alpha, hidden=hidden, **about)  # type: ignore[arg-type]
 
     def over(self, background: tuple[float, float, float]) -> Frame:
-        """Return the frame with ``background`` (rgb in [0, 1]) behind transparent pixels, if it awaits one; else the frame itself."""
+        """Composite the frame over ``background`` (rgb in [0, 1]) if it awaits one; otherwise, return the frame itself."""
         if not self.awaits_background or self.alpha is None:
             return self
         uncovered = (1 - self.alpha)[..., None]
@@ -271,7 +271,7 @@ class Frame:
     def with_hidden(self, hidden: Bool[Tensor, "h w"] | None) -> Frame:
         """Return the frame with more pixels hidden; the frame itself if ``hidden`` is None or false everywhere.
 
-        Raises ``WhollyHidden`` if nothing would be left.
+        Raises ``WhollyHidden`` if no pixel would remain visible.
         """
         if hidden is None or not bool(hidden.any()):
             return self
@@ -356,8 +356,8 @@ class Frame:
     def at_most(self, largest: int) -> Frame:
         """Return the frame downscaled to ``largest`` pixels along its longer side; the frame itself if it is not larger.
 
-        Colours are averaged over areas and rounded to bytes. Depth is that of the nearest pixel, and a pixel
-        is hidden if any pixel it covers is.
+        Colours are averaged over areas and rounded to bytes. Depth is taken from the nearest pixel, and a
+        pixel is hidden if any of the pixels it covers is hidden.
         """
         camera = self.intrinsics
         if max(camera.width, camera.height) <= largest:

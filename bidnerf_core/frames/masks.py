@@ -35,9 +35,9 @@ def read_mask(
 ) -> Bool[Tensor, "h w"]:
     """Return which pixels of an image of ``size`` (width, height) the mask in file ``path`` hides.
 
-    ``raster`` is that of the image file, with which a mask is turned upright if its size fits the stored image. A mask of another
+    ``raster`` is the raster of the image file; a mask that fits the stored image is turned upright with it. A mask of another
     resolution is resampled to the nearest of its pixels. Masks whose values are all small, such as 0 and 1,
-    hide what is 0; otherwise the bright half of the values is white. If the colours are uniform, the alpha
+    hide the pixels that are 0; otherwise the bright half of the values is white. If the colours are uniform, the alpha
     channel is the mask. Raises ``InputError`` if the file is not an image, or has another aspect ratio, and
     ``WhollyHidden`` if it hides everything.
     """

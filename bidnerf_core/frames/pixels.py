@@ -54,7 +54,8 @@ def observe(
 ) -> Observations:
     """Return the measurements of ``view`` at ``pixels``, as half-lines in its reference frame.
 
-    They are on ``device``, by default that of the image. Nothing is copied if the image, the pose and ``pixels`` are there.
+    The measurements are on ``device``, by default the image's device. Nothing is copied if the image, the pose and
+    ``pixels`` are already there.
     """
     frame = view.frame
     columns, rows = pixels.unbind(-1)
@@ -133,7 +134,7 @@ def interest_regions(frame: Frame) -> Int[Tensor, "n 2"]:
 
 
 def visible_at(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:
-    """Return which of ``pixels`` (u, v) inside the image are not hidden."""
+    """Return a mask of those ``pixels`` (u, v, inside the image) that are not hidden."""
     if frame.hidden is None:
         return torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
     columns, rows = pixels.to(frame.hidden.device).long().unbind(-1)
@@ -153,7 +154,7 @@ def continued(frame: Frame) -> Float[Tensor, "h w 3"]:
 def among(choose: Callable[[Frame], Int[Tensor, "n 2"]]) -> PixelDrawer:
     """Return a drawer that draws uniformly among the visible pixels that ``choose`` finds in a frame, with replacement.
 
-    They are found once for each frame, with which they are kept. If there are none, as in the image of a blank wall,
+    These pixels are found once per frame and cached with it. If there are none, as in the image of a blank wall,
     pixels are drawn uniformly: they still carry depth, and evidence of where there are no edges.
     """
 

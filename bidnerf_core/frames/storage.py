@@ -1,4 +1,4 @@
-"""The images of many frames, which are read at pixels of many images at once.
+"""Storage for the images of many frames, from which pixels of many images are read at once.
 
 They are stored in a few large blocks of memory or, if there are many, in a mapped file.
 """
@@ -30,7 +30,7 @@ MOST_BLOCKS = 64
 class PixelStore:
     """Holds the images of frames one after another.
 
-    ``expected`` is the number of bytes that will be stored. If it exceeds ``BLOCK``, they go to nameless
+    ``expected`` is the number of bytes that will be stored. If it exceeds ``BLOCK``, the images go to unnamed
     files in ``folder`` (by default, the system's folder for temporary files) that vanish with the process.
     """
 
@@ -100,7 +100,7 @@ class ImagePixels:
         default: float = 0.0,
         device: torch.device | str = "cpu",
     ) -> ImagePixels:
-        """Build this on ``device`` from ``images``; None has the value ``default`` everywhere.
+        """Store ``images`` on ``device``; for an image that is None, every pixel has the value ``default``.
 
         On the CPU, images that share few blocks of memory are not copied.
         """

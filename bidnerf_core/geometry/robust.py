@@ -50,7 +50,8 @@ def inlier_weight(squared: Values, half: Values | float) -> Values:
     """Return ``1 / (1 + s / half^2)`` of squared residuals s: 1 at 0, a half where the residual is ``half``.
 
     This is the weight of ``cauchy_loss``. It is also the degree to which a residual is an inlier (Geman and
-    McClure 1985): their loss is one minus this value, and its least-squares weight is the square.
+    McClure 1985): the loss of Geman and McClure is one minus this value, and its least-squares weight is the
+    square of this value.
     """
     return 1 / (1 + squared / half**2)
 
@@ -109,7 +110,5 @@ CORNERS_PER_INDEPENDENT = 4.0
 
 
 def independent(drawn: float, most: float) -> float:
-    """Return the effective number of independent measurements among ``drawn`` ones of a kind limited to
-    ``most``.
-    """
+    """Return how many independent measurements ``drawn`` correlated ones amount to, which is never more than ``most``."""
     return drawn * most / (drawn + most - 1)

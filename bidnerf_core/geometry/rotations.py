@@ -1,4 +1,4 @@
-"""Rotations and updates of single poses in NumPy, which take microseconds.
+"""Rotations and updates of single poses in NumPy, in microseconds per call.
 
 ``SE3`` and SciPy are built for batches and take a millisecond.
 """

@@ -135,7 +135,7 @@ class SE3:
         return _matvec(self.rotation, vectors)
 
     def translated(self, offset: Float[Tensor, "3"]) -> SE3:
-        """Return the transform to a parallel left-hand frame in which points have ``offset`` added."""
+        """Return the transform with ``offset`` added to its translation; the left-hand frame stays parallel."""
         return SE3(self.rotation, self.translation + offset.to(self.translation))
 
     def retract_linearly(self, tangent: Float[Tensor, "*c 6"]) -> SE3:
@@ -158,7 +158,7 @@ class SE3:
         return torch.cat([top, bottom], dim=-2)
 
     def normalized(self) -> SE3:
-        """Return the nearest rigid transform: rounding makes long products drift off the group."""
+        """Return the nearest rigid transform, since rounding makes long products of transforms drift off the group."""
         u, _, vh = torch.linalg.svd(self.rotation)
         sign = torch.ones_like(self.translation)
         sign = torch.cat([sign[..., :2], torch.linalg.det(u @ vh)[..., None]], dim=-1)
@@ -219,7 +219,7 @@ def skew(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def _guarded_angle(phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the squared angle, whether it is small, and the angle (1 if small).
+    """Return the squared angle, whether the angle is small, and the angle (1 if small).
 
     Neither branch of a ``where`` may divide by 0. For small angles, below 0.01 rad, series are used, since sin and cos cancel.
     """
@@ -242,7 +242,7 @@ def _matvec(matrix: Tensor, vector: Tensor) -> Tensor:
 def pose_from_matrix(matrix: Float[Tensor, "..."], what: str, where: object = None) -> SE3:
     """Convert a row-major homogeneous 4x4 matrix to T_world_camera.
 
-    Raises ``InputError``, whose message begins with ``where``, if it is given, and ``what``, unless it is 4x4,
+    Raises ``InputError``, whose message begins with ``where`` (if given) and ``what``, unless the matrix is 4x4,
     ends in 0 0 0 1 and has an orthonormal rotation.
     """
     if matrix.shape != (4, 4):

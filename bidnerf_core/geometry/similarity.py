@@ -47,7 +47,8 @@ def multiplied(point: tuple[float, float, float], factor: float) -> tuple[float,
 def rigid_pose(matrix: Float[Tensor, "3 4"], where: object, what: str = "the rotation") -> SE3:
     """Return the rigid transform that ``matrix`` represents up to rounding.
 
-    Raises ``InputError``, whose message begins with ``where``, if its rotation, called ``what``, is none.
+    Raises ``InputError``, whose message begins with ``where``, if the rotation block, called ``what``, is not a
+    rotation.
     """
     given = SE3(matrix[:3, :3], matrix[:3, 3])
     if not given.is_rigid(RIGID_TO):
@@ -92,7 +93,7 @@ def turned_about(
 def covariance_in(
     covariance: Float[Tensor, "6 6"], T_world_camera: SE3, convention: CovarianceConvention
 ) -> Float[Tensor, "6 6"]:
-    """Convert one of our covariances at ``T_world_camera`` to another convention (float64).
+    """Convert a pose covariance in our convention, at ``T_world_camera``, to another convention (float64).
 
     A right update by (rho, phi) moves the position by ``R rho`` in the world and premultiplies the rotation
     by ``exp(R phi)``, to first order, so both blocks are rotated for ROS. Case does not matter. Raises ``InputError``
@@ -121,7 +122,7 @@ class Similarity:
 
     @property
     def is_identity(self) -> bool:
-        """Whether it maps every point to itself."""
+        """Whether the similarity maps every point to itself."""
         matrix = self.T_target_source.matrix()
         return self.scale == 1 and bool((matrix == torch.eye(4).to(matrix)).all())
 

@@ -42,14 +42,14 @@ class Archive:
 
     @property
     def unpacked_size(self) -> int:
-        """The bytes of all members together, once they are unpacked."""
+        """The total size of all members after unpacking (bytes)."""
         return sum(member.file_size for member in self._zip.infolist())
 
     def __contains__(self, name: str) -> bool:
         return name in self._members
 
     def file(self, name: str) -> PackedFile:
-        """Return a member as a file; it is read when opened."""
+        """Return a member as a file, whose content is read only when it is opened."""
         return PackedFile(f"{self.path}/{name}", partial(self.read, name))
 
     def read(self, name: str) -> bytes:

@@ -1,4 +1,4 @@
-"""Files and folders that a user names: opened, written atomically and locked; and the memory and the cores of this process."""
+"""Files and folders named by the user: opening, atomic writing and locking; also the memory and cores available to this process."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class PackedFile:
 def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
     """Open a regular file for reading. ``expected`` briefly describes what it should be ("an image file").
 
-    Raises ``InputError`` if there is no such file, if reading is not permitted, for a pointer of Git LFS, and for
+    Raises ``InputError`` if there is no such file, if reading is not permitted, for a Git LFS pointer, and for
     folders, pipes and devices: reading from a pipe could block forever.
     """
     if isinstance(path, PackedFile):
@@ -73,13 +73,13 @@ def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
 
 
 def read_file(path: Path, expected: str, most: int = LARGEST_TEXT) -> bytes:
-    """Return the content of a regular file. Raises ``InputError`` as ``open_binary`` does, and if it exceeds ``most`` bytes."""
+    """Return the content of a regular file. Raises ``InputError`` as ``open_binary`` does, and if the file exceeds ``most`` bytes."""
     with open_binary(path, expected) as file:
         return read_open_file(file, path, expected, most)
 
 
 def read_open_file(file: BinaryIO, path: Path, expected: str, most: int = LARGEST_TEXT) -> bytes:
-    """Return the rest of the open file ``path``. Raises ``InputError`` if it is unreadable or larger than ``most`` bytes."""
+    """Read the rest of the open file ``path``. Raises ``InputError`` if the rest is unreadable or exceeds ``most`` bytes."""
     size = os.fstat(file.fileno()).st_size
     if size > most:
         found, limit = (f"{count / 2**20:,.0f} MiB" for count in (size, most))
@@ -106,7 +106,7 @@ def is_temporary(name: str) -> bool:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write a file atomically: it appears under its name only once all of it is on disk.
+    """Write a file atomically: it appears under its name only once its whole content is on disk.
 
     Raises ``OSError``, which names the file; an existing file of that name is then left untouched.
     """
@@ -173,7 +173,7 @@ def take_lock(number: int) -> bool:
 
 
 def available_memory() -> int:
-    """Return the available memory of the machine in bytes, or what is left of a container's limit if that is less."""
+    """Return the available memory in bytes: the machine's, or the rest of the container's limit if that is less."""
     import psutil  # imported here, since few commands ask for it
 
     available: int = psutil.virtual_memory().available
@@ -201,7 +201,7 @@ def output_folder(
     """Create a folder, and check before hours of work that it is writable and that no other process writes to it.
 
     A folder that is not empty is rejected unless ``overwrite`` is set; temporary files, and those that
-    ``is_leftover`` recognizes, do not count. ``described`` returns what a folder holds, for the message. If
+    ``is_leftover`` recognizes, do not count. ``described`` returns a description of a folder's content, for the message. If
     the work fails before anything is in the folder, the folder is removed again, with the parents that were
     created for it. Raises ``InputError``.
     """

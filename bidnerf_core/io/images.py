@@ -71,8 +71,8 @@ def read_image(
     """Read colour in [0, 1] composited over ``background``, and alpha if there is an alpha channel.
 
     Grey becomes three channels, CMYK becomes RGB, and 16-bit values are scaled by the sensor's range: 10, 12
-    or 14 bits if no value needs more. The raster is the stored one, whatever the EXIF orientation, downscaled
-    to ``size`` (width, height) as by ``reduced``: the image is converted in strips, so that only its bytes and
+    or 14 bits if no value needs more. The image is returned as stored, ignoring the EXIF orientation, and downscaled
+    to ``size`` (width, height) as by ``reduced``. It is converted in strips, so that only its bytes and
     the result are in memory. Raises ``InputError`` if the file is not a complete image with 1 to 4 channels of
     8 or 16 bits, or is too large.
     """
@@ -92,8 +92,8 @@ def read_compact_image(
 ) -> tuple[Shaped[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
     """Read an image like ``read_image``, but keep colours as bytes (uint8) if the file has 8 bits and no alpha.
 
-    Images downscaled to ``size`` (width, height) have bytes as well; a JPEG file is decoded no larger than
-    needed.
+    Images downscaled to ``size`` (width, height) are bytes as well; a JPEG file is decoded at no higher
+    resolution than needed.
     """
     with open_image(path) as image:
         if image.mode in ("L", "RGB", *CONVERTED) and not _is_deep(image):
@@ -115,7 +115,7 @@ def channels(
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
     """Scale an array (h, w) or (h, w, 1 to 4) of unsigned integers to colour in [0, 1] and alpha.
 
-    ``full`` is the value of white, by default the largest of the array's type. Other arrays raise
+    ``full`` is the value of white, by default the maximum of the array's type. Other arrays raise
     ``InputError``, whose message begins with ``finding``.
     """
     count = raw.shape[2] if raw.ndim == 3 else 1
@@ -159,7 +159,7 @@ def pixel_array(pixels: np.ndarray | Tensor, what: str) -> Float[Tensor, "h w c"
 
 
 def to_numpy(array: np.ndarray | Tensor) -> np.ndarray:
-    """Convert an array or tensor (any device and dtype) to NumPy. Raises ``InputError`` for what NumPy cannot convert."""
+    """Convert an array or tensor (any device and dtype) to NumPy. Raises ``InputError`` if NumPy cannot convert it."""
     if not isinstance(array, Tensor):
         try:
             return np.asarray(array)
@@ -197,7 +197,7 @@ def background_colour(background: Background) -> tuple[float, float, float]:
 def reduced(image: Shaped[Tensor, "h w *c"], width: int, height: int) -> Shaped[Tensor, "nh nw *c"]:
     """Downscale an image of floats or bytes; each new pixel is the mean over the area that it covers.
 
-    An image that has the size already is returned as it is.
+    An image that already has this size is returned unchanged.
     """
     import cv2  # imported here, since most images keep their size
 
@@ -224,7 +224,7 @@ def decode(path: ImageSource) -> np.ndarray:
 
 
 def _strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[np.ndarray, int | None]]:
-    """Yield the pixels of strips of an open image, from top to bottom, and the value of white if it is not that of the type."""
+    """Yield strips of an open image from top to bottom, each with the value of white, or None for the maximum of the type."""
     rows = max(1, STRIP // image.width)
     if not _is_deep(image):
         for top in range(0, image.height, rows):
@@ -239,7 +239,7 @@ def _strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[np.ndarray,
 
 
 def _is_deep(image: Image.Image) -> bool:
-    """Return whether an open image has 16 bits per channel. With several channels, Pillow keeps only 8 of them."""
+    """Return whether an open image has 16 bits per channel; Pillow reduces images with several such channels to 8 bits."""
     return (
         image.mode.startswith("I;16")
         or (image.format == "PNG" and image.mode == "I")
@@ -320,7 +320,7 @@ def open_image(path: ImageSource) -> Iterator[Image.Image]:
 
 
 def _check_segments(path: ImageSource, file: BinaryIO) -> None:
-    """Raise ``InputError`` for a JPEG file whose decoding takes far longer than its size suggests; rewind others."""
+    """Raise ``InputError`` for a JPEG file that would take far longer to decode than its size suggests; rewind any other file."""
     content = file.read() if file.read(2) == b"\xff\xd8" else b""
     file.seek(0)
     # Each scan goes through the whole image, and libjpeg's usual script has ten of them. The depth map that a phone stores with a
@@ -362,13 +362,13 @@ def looks_like_image(path: Path) -> bool:
 
 
 def reason(error: Exception) -> str:
-    """Return the first line of a decoder's message, which may have many."""
+    """Return the first line of a decoder's message."""
     text = str(error).strip()
     return text.splitlines()[0][:120] if text else type(error).__name__
 
 
 def png_bytes(pixels: Shaped[np.ndarray, "h w *channels"]) -> bytes:
-    """Return an image of 8 bits, or a grey one of 16, as the content of a PNG file."""
+    """Encode an 8-bit image, or a 16-bit grey one, as the content of a PNG file."""
     import imageio.v3 as iio  # imported here, since reading does without it
 
     return bytes(iio.imwrite("<bytes>", pixels, extension=".png"))

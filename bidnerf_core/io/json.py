@@ -1,7 +1,7 @@
 """JSON: one parser, objects with typed access to values, and conversion of frozen dataclasses to and from
 plain values; and the YAML of calibrations.
 
-Everything that reads JSON uses ``parse_json``, so damaged text of any origin gives the same one-line error.
+All code that reads JSON uses ``parse_json``, so that damaged text of any origin gives the same one-line error.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def read_json(path: Path, expected: str) -> Any:
 
 
 def parse_json(content: bytes | str, where: str, expected: str) -> Any:
-    """Parse JSON text (UTF-8). Raises ``InputError`` for text that is not JSON or could not be written again.
+    """Parse JSON text (UTF-8). Raises ``InputError`` for text that is not JSON, or whose value could not be written as JSON again.
 
     ``where`` begins the message (the file, or nothing), and ``expected`` briefly describes what should be
     there.
@@ -92,8 +92,8 @@ class Record:
         return None if found is None else self.checked_number(found, key)
 
     def size(self, key: str) -> int | None:
-        """Return a positive integer number of pixels, which some programs write as 800.0, or None if the key
-        is missing.
+        """Return a positive integer number of pixels (800.0, as some programs write it, is accepted), or None if
+        the key is missing.
         """
         found = self.number(key)
         if found is not None and (found < 1 or found != int(found)):
@@ -121,8 +121,8 @@ class Record:
         return float(found)
 
     def homogeneous(self, key: str, rows: list[Any] | None) -> tuple[list[list[float]], float]:
-        """Return the first three of a matrix's 3 or 4 ``rows``, divided by the last entry w of a fourth row 0 0 0 w, and w (1
-        up to rounding). ``key`` is their key, for messages.
+        """Return the first three of a matrix's 3 or 4 ``rows``, divided by w, and w itself (1 up to rounding), where w is the last
+        entry of a fourth row 0 0 0 w. ``key`` is their key, for messages.
         """
         if rows is None:
             raise self.error(f"no {key}", expected="a 4x4 matrix of a pose")
@@ -165,7 +165,7 @@ def _shown(value: Any, as_json: bool = False) -> str:
 
 
 def _is_tensor(value: Any) -> TypeGuard[Tensor]:
-    """Return whether a value is a tensor, without importing torch, which commands that compute nothing do without."""
+    """Return whether a value is a tensor, without importing torch: commands that compute nothing need not load it."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(value, torch.Tensor)
 
@@ -198,7 +198,7 @@ def to_plain(value: Any, where: str = "", tensors: dict[str, Tensor] | None = No
 
 
 def with_tensors(plain: Any, tensors: Mapping[str, Tensor], where: str) -> Any:
-    """Return what ``to_plain`` returned with the tensors that it moved; ``from_plain`` checks their shapes.
+    """Put the tensors that ``to_plain`` moved back into its result; ``from_plain`` checks their shapes.
 
     Raises ``InputError`` for a missing tensor.
     """
@@ -232,7 +232,7 @@ def from_plain(kind: type[_T], value: Any, where: str) -> _T:
 
 @functools.cache
 def _validator(kind: Any) -> SchemaValidator:
-    """Return what validates a list of values of type ``kind``: pydantic takes a configuration for dataclasses within others only."""
+    """Return a validator of lists of ``kind``: pydantic accepts a configuration only for dataclasses nested in other types."""
     from pydantic import ConfigDict, TypeAdapter
     from pydantic_core import SchemaValidator
 
@@ -241,7 +241,7 @@ def _validator(kind: Any) -> SchemaValidator:
 
 
 def _strict(node: Any) -> Any:
-    """Return a schema of pydantic with the additions of ``STRICT``."""
+    """Return a pydantic schema with the additions of ``STRICT``."""
     if isinstance(node, list):
         return [_strict(part) for part in node]
     if not isinstance(node, dict):
@@ -272,9 +272,9 @@ def _first_error(errors: Sequence[Any], where: str, of: Any) -> InputError:
 
 
 def parse_yaml(content: bytes, where: str, expected: str) -> Any:
-    """Return the first document of a YAML text, with all its values, numbers too, as text; tags, which may stand for code, are ignored.
+    """Return the first document of a YAML text, with all values, including numbers, as text. Tags, which may run code, are ignored.
 
-    Raises ``InputError``, whose message begins with ``where``, if it is malformed, too large or too deep, or has aliases.
+    Raises ``InputError``, whose message begins with ``where``, if the text is malformed, too large or too deep, or has aliases.
     """
     import yaml  # imported here, since few commands read any
 

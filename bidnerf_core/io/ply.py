@@ -29,13 +29,13 @@ class PlyElement:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the properties that are numbers."""
+        """The names of the numeric properties."""
         return tuple(self.properties)
 
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """The header of a PLY file: the elements that it declares, and how their numbers are written."""
+    """The header of a PLY file: the elements that it declares, and the format of their numbers."""
 
     is_text: bool
     elements: dict[str, PlyElement]
@@ -47,7 +47,7 @@ class PlyHeader:
 
 
 def read_ply_header(path: Path, expected: str = "a PLY file") -> PlyHeader:
-    """Read the header of a PLY file. Raises ``InputError`` if it is missing or malformed."""
+    """Read the header of a PLY file. Raises ``InputError`` if the header is missing or malformed."""
     with open_binary(path, expected) as file:
         start = file.read(64 * 1024)
     end = start.find(b"end_header")

@@ -16,7 +16,7 @@ LARGEST_ROWS = 256 * 2**20
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a file, without leading and trailing white space."""
+    """A line of a text file, stripped of leading and trailing white space."""
 
     path: Path
     line: int  # counted from 1
@@ -25,7 +25,7 @@ class Row:
 
     @property
     def where(self) -> str:
-        """The file and the line number, with which error messages begin."""
+        """The file and the line number, used as the beginning of error messages."""
         return f"{self.path}: line {self.line}"
 
     @property

@@ -45,7 +45,7 @@ def read_array(path: Path, expected: str) -> np.ndarray:
 
 
 def read_archive(path: Path, names: Sequence[str], expected: str) -> dict[str, np.ndarray]:
-    """Read those of the arrays ``names`` that a ``.npz`` file holds. Raises ``InputError`` as ``read_array`` does."""
+    """Read the arrays ``names`` from a ``.npz`` file, skipping those that it lacks. Raises ``InputError`` as ``read_array`` does."""
     archive = Archive(path, expected, LARGEST_ARRAY)
     found = {name: archive.read(f"{name}.npy") for name in names if f"{name}.npy" in archive}
     try:
@@ -55,7 +55,7 @@ def read_archive(path: Path, names: Sequence[str], expected: str) -> dict[str, n
 
 
 def _array(file: BinaryIO | io.BytesIO, size: int) -> np.ndarray:
-    """Read an array from a file of ``size`` bytes. Raises ``ValueError``, and NumPy's ``OSError``."""
+    """Read an array from a file of ``size`` bytes. Raises ``ValueError``, or ``OSError`` from NumPy."""
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"version {version} of the format")
@@ -85,7 +85,7 @@ def read_tensors_and_metadata(
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read the tensors of a safetensors file, and the metadata in its header.
 
-    Raises ``InputError`` if it is not such a file, or if its length contradicts its header.
+    Raises ``InputError`` if the file is not a safetensors file, or if its length contradicts its header.
     """
     with open_binary(path, expected) as file:
         try:
@@ -123,7 +123,7 @@ def _checked_header(path: Path, file: BinaryIO, expected: str) -> dict[str, Any]
 def load_part(
     path: Path, make: Callable[[dict[str, Tensor]], _Part], what: str, expected: str = TENSOR_FILE
 ) -> _Part:
-    """Return the result of ``make`` for the tensors of a file. Raises ``InputError`` if ``make`` rejects them."""
+    """Return the result of ``make`` for the tensors of a file. Raises ``InputError`` if ``make`` rejects the tensors."""
     tensors = read_tensors(path, expected)
     try:
         return make(tensors)
@@ -151,9 +151,9 @@ def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
     """Read a file written by ``torch.save``: tensors and numbers in dicts and lists. NumPy numbers come back as placeholders.
 
     ``expected`` briefly describes what the file should be. With ``mapped``, tensors stay in the file until they are used, so that
-    one of any size is recognised quickly; files in the format of torch before version 1.6, which are not zip archives,
+    a file of any size is recognised quickly; files in the format of torch before version 1.6, which are not zip archives,
     cannot be mapped and are read. Raises a one-line ``InputError`` if the file is missing or damaged, or would run code or unpack to
-    more than its own size. Unless ``mapped``, it is refused, too, if a tensor's storage is smaller than its shape (stride 0).
+    more than its own size. Unless ``mapped``, a tensor whose storage is smaller than its shape (stride 0) is rejected as well.
     """
     open_binary(
         path, expected

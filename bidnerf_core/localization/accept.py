@@ -1,4 +1,4 @@
-"""Acceptance: one record of evidence, one table of bounds, one logistic model."""
+"""Acceptance of landmark-based poses: the evidence, a table of bounds and a logistic model."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ answers that the model was fitted to show falsified cameras, which may be why; n
 
 @dataclass(frozen=True)
 class Evidence:
-    """All that the decision about a pose by landmarks depends on; no number depends on the unit of length or the image's size."""
+    """The evidence for accepting a landmark-based pose; no value depends on the unit of length or the image size."""
 
     # false alarms of the matches by descriptors alone; 0 if the pose was found by other means
     log10_nfa: float
@@ -43,12 +43,12 @@ class Evidence:
 
     @property
     def above_chance(self) -> float:
-        """Ratio of the matches to those expected at a wrong pose."""
+        """Ratio of the number of inliers to the number expected at a wrong pose, with one added to both."""
         return (1 + self.inliers) / (1 + self.by_chance)
 
 
 class Bound(NamedTuple):
-    """A bound of a measure, and what it means if it is not kept."""
+    """A limit on one measure, with the outcome and the reason to report if the measure violates it."""
 
     measure: str
     limit: float
@@ -57,7 +57,7 @@ class Bound(NamedTuple):
     reason: str  # with the value as ``{0}``, and the limit as ``{1}``
 
     def keeps(self, value: float, limit: float) -> bool:
-        """Return whether a value keeps a ``limit``; what is not a number does not."""
+        """Return whether a value satisfies the ``limit``; NaN never does."""
         return value >= limit if self.is_least else value <= limit
 
 
@@ -75,9 +75,9 @@ LANDMARK_BOUNDS = (
 
 
 def judge(evidence: Evidence, log_odds: float = 0.0) -> Verdict:
-    """Return the first bound that is not kept, or else whether the pose is likely to be right.
+    """Return the verdict of the first violated bound or, if all bounds hold, of the logistic model.
 
-    ``log_odds`` are those of the pose before its image was seen, relative to an image that may have been taken anywhere.
+    ``log_odds`` are the prior log odds of the pose before its image was seen, relative to an image that may have been taken anywhere.
     """
     confidence = model().probability(features(evidence), log_odds)
     for bound in LANDMARK_BOUNDS if evidence.searched else LANDMARK_BOUNDS[1:]:
@@ -93,7 +93,7 @@ def judge(evidence: Evidence, log_odds: float = 0.0) -> Verdict:
 
 
 def features(found: Evidence) -> dict[str, float]:
-    """Return the features of the logistic model."""
+    """Return the input features of the logistic model by name."""
     return {
         "inliers": math.log10(1 + found.inliers),
         "above_chance": math.log10(found.above_chance),
@@ -118,21 +118,21 @@ class LogisticModel:
     bias: float
 
     def probability(self, values: dict[str, float], prior: float = 0.0) -> float:
-        """Return the probability for features by name; ``prior`` is added to the log odds."""
+        """Return the probability for the named feature values; ``prior`` is added to the log odds."""
         log_odds = prior + self.bias + sum(weight * values[name] for name, weight in self.weights.items())
         return 1 / (1 + math.exp(-min(max(log_odds, -500), 500)))
 
 
 @lru_cache(maxsize=1)
 def stored() -> dict[str, dict[str, object]]:
-    """Return the model and the calibrated risks, which ``benchmarks/confidence.py`` and ``benchmarks/risk.py`` have fitted."""
+    """Return the model and the calibrated risks, fitted by ``benchmarks/confidence.py`` and ``benchmarks/risk.py``."""
     found: dict[str, dict[str, object]] = json.loads((files(__package__) / "acceptance.json").read_text())
     return found
 
 
 @lru_cache(maxsize=1)
 def model() -> LogisticModel:
-    """Return the logistic model of poses by landmarks."""
+    """Return the logistic model for landmark-based poses."""
     return LogisticModel(**stored()["landmarks"])  # type: ignore[arg-type]
 
 

@@ -25,10 +25,10 @@ BETAS = (0.9, 0.999)
 
 
 class AdamSteps:
-    """Adam's steps for one pose, on its device: no step copies anything between host and device.
+    """Adam optimization of one pose on its device; no step copies data between host and device.
 
-    Each step parametrizes the pose by an update delta of the current one about ``pivot``, takes the gradient with respect to
-    delta at 0, and applies Adam's update. A non-finite step leaves the pose unchanged. All state is in tensors that are written
+    Each step parametrizes the pose by an update delta of the current pose about ``pivot``, takes the gradient with respect to
+    delta at 0, and applies Adam's update. A non-finite step leaves the pose unchanged. All state is kept in tensors that are updated
     in place, so each replay of a captured CUDA graph takes the next step.
     """
 
@@ -50,7 +50,7 @@ class AdamSteps:
         return SE3(self._T.rotation.clone(), self._T.translation.clone())
 
     def __call__(self) -> None:
-        """Take a step."""
+        """Take one optimization step."""
         delta = torch.zeros_like(self._rate).requires_grad_()
         value = self._loss(self._pivot.moved_linearly(self._T, delta))
         update = torch.zeros_like(delta)
@@ -68,9 +68,9 @@ class AdamSteps:
             self._steps += 1
 
     def block(self) -> tuple[SE3, Float[Tensor, "s"], Bool[Tensor, "s"]]:
-        """Return the poses after the last ``WINDOW`` steps on the CPU, the loss before each, and whether each was finite.
+        """Return, on the CPU, the poses after the last ``WINDOW`` steps, the loss before each step, and whether each step was finite.
 
-        Call it after every ``WINDOW`` steps; rows of steps not yet taken contain earlier ones.
+        Call this method after every ``WINDOW`` steps; rows for steps not yet taken still hold earlier steps.
         """
         log = self._log.to("cpu", copy=True)  # later steps overwrite it
         return SE3(log[:, :9].unflatten(1, (3, 3)), log[:, 9:12]), log[:, 12], log[:, 13] > 0
@@ -93,11 +93,11 @@ def follow_gradient(
     loss: Loss, pivot: Pivot, config: AdamSettings, start: SE3, device: torch.device,
     generator: Generator | None = None,
 ) -> tuple[list[SE3], list[float], bool, str]:  # fmt: skip
-    """Return the poses from ``start`` on, the losses before each step, whether all were finite, and the reason why steps ended.
+    """Descend from ``start``; return all poses, the loss before each step, whether all steps were finite, and why the descent ended.
 
-    Steps are taken on ``device``, ``WINDOW`` at a time; the host reads them after each block. If a stopping criterion was met
-    within a block, the steps after it are discarded. Pass the ``generator`` from which the loss draws if all calls do the same
-    computation apart from random numbers: on a GPU, a step is then captured once and replayed.
+    Steps are taken on ``device``, ``WINDOW`` at a time; the host reads the results after each block. If a stopping criterion was met
+    within a block, the steps after it are discarded. Pass the ``generator`` that the loss draws from if every call does the same
+    computation except for the random numbers: on a GPU, a step is then captured once and replayed.
     """
     steps = AdamSteps(loss, pivot, config, start.to(device))
     take: Callable[[], None] = steps

@@ -1,4 +1,4 @@
-"""What each outcome means and what to try first, in the words of the documentation's page on troubleshooting."""
+"""What each outcome means and what to try first, worded as on the documentation's troubleshooting page."""
 
 from __future__ import annotations
 

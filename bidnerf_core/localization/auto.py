@@ -1,9 +1,9 @@
 """Method ``auto``: find the pose with or without a start, from all available measurements, and decide whether to trust it.
 
-If the map has landmarks, they are matched first, and their pose is fused with measured depth and rendered rays. If that pose is
-not accepted in a map with few landmarks, or there are none, the surface is searched: measured points are aligned with it if there is
-enough depth; otherwise, the images are compared with its renderings. In a map without a surface and landmarks, ``auto`` needs a start,
-from which it descends as ``bid`` does.
+If the map has landmarks, they are matched first, and the resulting pose is fused with measured depth and rendered rays. If the map has
+no landmarks, or has few and that pose is not accepted, the surface is searched: measured points are aligned with the surface if there
+is enough depth; otherwise, the images are compared with renderings of the surface. In a map with neither surface nor landmarks, ``auto``
+needs a start, from which it descends as ``bid`` does.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from bidnerf_core.mapping import true_intrinsics
 
 
 def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
-    """Find the pose by landmarks, or else on the surface, or else by descent from a start.
+    """Find the pose from landmarks, else by a search on the surface, else by descent from a start.
 
     Raises ``InputError`` if the map has neither landmarks nor a baked surface, and there is no start.
     """
@@ -53,7 +53,7 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
 
 
 def localize_by_landmarks(problem: Problem, rays: int, seed: int) -> Localization:
-    """Return the answer by landmarks, fused with measured depth and up to ``rays`` rendered rays."""
+    """Localize from landmarks, fused with measured depth and up to ``rays`` rendered rays."""
     assert problem.matcher is not None
     began = time.perf_counter()
     answer = Loop(problem.views, problem.matcher, problem, rays, seed)()
@@ -63,7 +63,7 @@ def localize_by_landmarks(problem: Problem, rays: int, seed: int) -> Localizatio
 def _on_surface(
     problem: Problem, config: AutoConfig, seed: int, loop: Loop | None, best: Localization | None, began: float
 ) -> Localization:  # fmt: skip
-    """Return the answer by measured depth or images on the surface, or else the ``best`` so far, which is by landmarks."""
+    """Localize on the surface by measured depth or images; failing that, return ``best``, the landmark-based answer so far."""
     surface = problem.surface
     if loop is None and surface is None:
         why = "the map has no surface ('bidnerf bake' makes one)"
@@ -104,7 +104,7 @@ def _on_surface(
 
 
 def _uncertain_camera(found: Localization, problem: Problem) -> Localization:
-    """Reject a pose on the surface by a camera whose focal length is approximate, as only landmarks separate that from distance."""
+    """Reject a surface-based pose if the focal length is approximate: only landmarks can separate focal length from distance."""
     by_rays = problem.depth_rays is not None and not any(view.frame.has_depth for view in problem.views)
     if not found.converged or not problem.focal_is_approximate or by_rays:
         return found
@@ -113,7 +113,7 @@ def _uncertain_camera(found: Localization, problem: Problem) -> Localization:
 
 
 def localization_of(problem: Problem, answer: Answer, began: float) -> Localization:
-    """Convert an answer of the loop."""
+    """Convert an answer of the landmark loop to a ``Localization``."""
     T, noise = answer.T_world_rig, float(answer.posterior.states.noise[answer.posterior.best])
     stated, camera = problem.views[-1].frame.intrinsics, answer.camera
     corrected = None if camera is None else true_intrinsics(stated, camera[:6])
@@ -138,7 +138,7 @@ def localization_of(problem: Problem, answer: Answer, began: float) -> Localizat
 
 
 def unrecognized(problem: Problem) -> Localization:
-    """Return the answer to images in which no landmarks were recognised."""
+    """Return the rejected answer for images in which no landmarks were recognised."""
     causes = "the image may show another place, or be too dark, too blurred or taken from too far away"
     why = Verdict(Outcome.TOO_FEW_MATCHES, f"too few landmarks were recognised: {causes}")
     path, none = (problem.start or SE3.identity())[None], torch.zeros(0, dtype=torch.float64)
@@ -146,7 +146,7 @@ def unrecognized(problem: Problem) -> Localization:
 
 
 def within_risk(found: Localization, risk: float | None) -> Localization:
-    """Return the answer, rejected as ``uncertain`` if landmarks did not find it, or its confidence is lower than the risk requires."""
+    """Return the answer, rejected as ``uncertain`` if its confidence is not from landmarks or is lower than ``risk`` requires."""
     if risk is None or not found.converged:
         return found
     least = least_confidence(risk)

@@ -1,4 +1,4 @@
-"""Refinement on rendered rays, from many poses on few rays at the coarsest level to one pose on many rays, and its verdict."""
+"""Pose refinement on rendered rays, from many poses with few rays at the coarsest level to one pose with many rays; and its verdict."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ COLOUR_SIGMA = SHAPE_SIGMA / 5
 
 @dataclass(frozen=True)
 class RayTerms:
-    """What is compared along rendered rays."""
+    """The settings for comparing colours and, optionally, depths along rendered rays."""
 
     colour: ColourSettings
     depth: DepthLossSettings | None  # None: colour alone
@@ -44,10 +44,10 @@ class RayTerms:
         self, problem: Problem, count: int, seed: int, level: int | None = None, blur: int = 1,
         wide: float = 1.0, sigma: float = 0.0,
     ) -> Rays:  # fmt: skip
-        """Draw ``count`` rays and return the term of a level of the field (0 is the coarsest, None the field itself).
+        """Draw ``count`` rays and return their residual term at a level of the field (0 is the coarsest, None the field itself).
 
-        Observed colours are averaged over squares of ``blur`` pixels. ``wide`` is a factor of the scales of the losses, and ``sigma``
-        the uncertainty of the map's surfaces, relative to the scene's mean side.
+        Observed colours are averaged over squares of ``blur`` pixels. ``wide`` multiplies the scales of the losses, and ``sigma``
+        is the uncertainty of the map's surfaces, relative to the scene's mean side.
         """
         depth, bounds = self.depth, problem.bounds
         if depth is not None and (depth.depth_weight == 0 or not problem.has_depth):
@@ -65,7 +65,7 @@ class RayTerms:
 
 
 def colour_stages(problem: Problem, terms: RayTerms, steps: RefinementSettings, seed: int) -> Iterator[Stage]:
-    """Yield a stage of few rays at the coarsest level from each pose, and one in full detail from the better of the last two."""
+    """Yield two stages: few rays at the coarsest level from each pose, then full detail from the two best, keeping the better."""
     coarse = terms.term(problem, steps.fine_rays // 4, seed, level=0, blur=2, sigma=COLOUR_SIGMA)
     yield Stage([coarse], min(4, steps.fine_steps), 2)
     yield Stage([terms.term(problem, steps.fine_rays, seed + 1, sigma=COLOUR_SIGMA / 2)], steps.fine_steps, 1)
@@ -73,10 +73,11 @@ def colour_stages(problem: Problem, terms: RayTerms, steps: RefinementSettings, 
 
 @torch.no_grad()
 def centred(problem: Problem, T: SE3, middle: Float[Tensor, "3"]) -> SE3:
-    """Return the poses T (h) after shifting each camera to align the median of the rendered points with the measured ``middle``.
+    """Return the poses T (h), each camera shifted so that the median rendered point coincides with the measured ``middle``.
 
-    Where a scene is seen from outside, the main error is often that it appears in another part of the image. This removes it with
-    one rendering of a few rays, even where the loss has no useful gradient. A pose is unchanged if nothing is rendered.
+    When a scene is seen from outside, the main error is often that the scene appears in the wrong part of the image. The shift
+    removes this error with one rendering of a few rays, even where the loss has no useful gradient. A pose is
+    unchanged if nothing is rendered.
     """
     shift = rendered_middle(problem.level(0), problem.bounds, problem.views, T).cpu().double() - middle
     shift = torch.where(shift.isfinite(), shift, 0)
@@ -87,10 +88,11 @@ def localization_by_rays(
     problem: Problem, found: Proposals, fresh: Rays, middle: Float[Tensor, "3"], least_inliers: float,
     method: str, began: float,
 ) -> Localization:  # fmt: skip
-    """Accept or reject the best pose of a search by rays to which it was not fitted.
+    """Accept or reject the best pose of a search, using rays to which the pose was not fitted.
 
-    It is the better of the last two stages' poses on these rays. It must agree with them, be where they have a minimum, and leave
-    differences of colour as small as in the map's own images; and they must distinguish it from its rivals and from a plain image.
+    The best poses of the last two stages are compared on these rays, and the better pose is judged. It must agree with the rays, lie at
+    a minimum of their cost, and leave colour differences as small as in the map's own images; and the rays must distinguish the pose
+    from its rivals and from a plain image.
     """
     some = States.cat([found.before, found.states[:1]])
     best = some[fresh.costs(some).sum(-1).argmin()[None]]

@@ -1,4 +1,4 @@
-"""Localization on the baked surface of a map without landmarks: by measured depth, or by comparing images with its renderings."""
+"""Localization on a map's baked surface, without landmarks: by measured depth, or by comparing images with renderings of the surface."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ DETAILED_STAGES = ((32, 0, 64), (32, 6, 16), (48, 8, 6), (96, 6, 2), (192, 4, 1)
 def localize_by_depth(
     problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int
 ) -> Localization | None:
-    """Align measured points with the surface, in rounds until a pose is acceptable, then refine it on rendered rays as well.
+    """Align measured points with the surface, in rounds until a pose is acceptable, then refine the pose on rendered rays as well.
 
-    None if too few points were measured.
+    Returns None if too few points were measured.
     """
     began = time.perf_counter()
     points = Surface.of(problem.views, problem.depth_rays, surface, seed, config.points)
@@ -110,9 +110,9 @@ def localize_by_depth(
 
 
 def localize_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:
-    """Compare the images with renderings of the surface, in rounds until an answer is accepted, and refine each answer.
+    """Compare the images with renderings of the surface, in rounds until an answer is accepted; each answer is refined.
 
-    The first round is fast. The others assume that part of the scene is hidden. If no answer is accepted, the one with the
+    The first round is fast. Later rounds assume that part of the scene is occluded. If no answer is accepted, the answer with the
     smallest loss is returned.
     """
     began, steps, answers = time.perf_counter(), config.by_colour, list[Localization]()
@@ -139,9 +139,9 @@ def localize_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig
 
 
 def by_depth(problem: Problem, points: Surface, count: int, seed: int) -> Proposals:
-    """Align measured points with the surface from ``count`` hypotheses all over the scene, best first.
+    """Align measured points with the surface from ``count`` hypotheses throughout the scene; return the poses, best first.
 
-    Scores are mean costs of points, from 0 to 2.
+    Scores are mean costs per point, from 0 to 2.
     """
     surface, middle, stages = points.surface, points.points.median(0).values, list[Stage]()
     for n, steps, keep, distance, colour in POINT_STAGES:
@@ -158,11 +158,12 @@ def by_depth(problem: Problem, points: Surface, count: int, seed: int) -> Propos
 def by_images(
     problem: Problem, surface: SurfaceMap, count: int, seed: int, detailed: bool = False, later: Iterable[Stage] = ()
 ) -> tuple[Proposals, Float[Tensor, "3"]]:  # fmt: skip
-    """Compare the images with renderings of the surface from ``count`` hypotheses all over the scene, then run ``later`` stages.
+    """Compare the images with renderings of the surface from ``count`` hypotheses throughout the scene, then run ``later`` stages.
 
-    Returns the best poses and the middle of the visible scene (metres, last camera's frame): rays cast from the keyframes give its
-    typical distance, and whether it has a background. ``detailed``: for images that something partly hides. Scales are narrow
-    then, as wider ones favour poses that partly explain the occluders' colours, and the exposure is about that of the map.
+    Returns the best poses and the middle of the visible scene (metres, last camera's frame). Rays cast from the keyframes
+    tell the typical distance of the scene, and whether the scene has a background. ``detailed`` is for partly occluded images: its
+    colour scales are narrow, as wider ones favour poses that partly explain the occluders' colours, and the exposure stays close to
+    that of the map.
     """
     small = moved(Thumbnail.of(problem.views[-1], 16), surface.device)
     keyframes = SE3.from_matrix(surface.keyframes[:: max(1, len(surface.keyframes) // 16)]).to(small.flat)
@@ -185,12 +186,12 @@ def by_images(
 def hypotheses(
     surface: SurfaceMap, start: SE3 | None, middle: Float[Tensor, "3"], count: int, by_points: bool, seed: int
 ) -> SE3:
-    """Return ``count`` poses from which a query may have been taken; on the CPU, so that a seed gives the same on any device.
+    """Return ``count`` poses from which a query may have been taken, on the CPU so that a seed gives the same poses on any device.
 
-    Half are poses of keyframes, slightly displaced where they repeat. For points, the others place their ``middle`` at that of the
-    scene, which suits cameras around an object, with orientations near those of keyframes or, for a quarter, random. For
-    images, they are keyframes displaced about the middle of their view, every fourth of them rolled. If there is a start, a
-    quarter of all poses are the start and poses near it.
+    Half are keyframe poses, slightly displaced for points or where keyframes repeat. For points, the other half align the points'
+    ``middle`` with the middle of the scene, which suits cameras around an object; their orientations are near those of keyframes or,
+    for a quarter of them, random. For images, the other half are keyframe poses displaced about the middle of their view, every fourth
+    one rolled. If there is a start, a quarter of all poses are the start and poses near it.
     """
     generator, extent = Generator().manual_seed(seed), surface.extent
     keyframes = SE3.from_matrix(surface.keyframes).to("cpu", torch.float64)
@@ -238,18 +239,18 @@ def hypotheses(
 
 
 def _score(points: Surface) -> Callable[[States], Float[Tensor, "h"]]:
-    """Return the mean cost of points at the fixed scale at which poses are compared."""
+    """Return the function that scores poses: the mean cost of the points at a fixed scale."""
     compared = compared_at(points)
     return lambda states: compared.costs(states).mean(-1)
 
 
 def compared_at(points: Surface) -> Surface:
-    """Return the term at the fixed scale at which poses are compared."""
+    """Return the term at the fixed scale used to compare poses."""
     return replace(points, noise=ON_SURFACE / 2 * points.surface.extent, colour_weight=1.0)
 
 
 def _exposed(points: Surface, best: States, middle: Float[Tensor, "3"]) -> tuple[States, Surface]:
-    """Align a pose again with the points' colours converted to the map's exposure; return it and the points."""
+    """Convert the points' colours to the map's exposure and align the pose again; return the pose and the points."""
     rgb = compared_at(points).exposed(best).rgb
     if rgb is points.rgb:
         return best, points
@@ -259,9 +260,9 @@ def _exposed(points: Surface, best: States, middle: Float[Tensor, "3"]) -> tuple
 
 
 def _evidence(points: Surface, best: States, margin: float) -> Support:
-    """Measure how well the points, seen from one pose, fit the surface; each counts by its inlier weight.
+    """Measure how well the points, seen from one pose, fit the surface; each point counts with its inlier weight.
 
-    Points without a colour do not count for the colour inliers, unless no point has a colour.
+    Points without a colour are left out of the colour inliers, unless no point has a colour.
     """
     near, alike = compared_at(points).inliers(best)
     coloured = (points.coloured > 0).to(near.device)
@@ -283,11 +284,11 @@ def _evidence(points: Surface, best: States, margin: float) -> Support:
 def _covariance(
     problem: Problem, points: Surface, best: States, middle: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, "6 6"], float]:
-    """Return the covariance of a pose that aligns measured points with the surface, positive definite, and its precision.
+    """Return the positive definite covariance of a pose that aligns measured points with the surface, and the pose's precision.
 
-    Along directions that the points do not determine, such as that of a bare wall, the standard deviation is the size of the scene
+    In directions that the points do not constrain, such as along a bare wall, the standard deviation is the size of the scene
     or half a turn. The uncertainties of the sensor's scale and offset, which all points share, are added. The precision is the standard
-    deviation of the position without these, relative to the distance of the points.
+    deviation of the position without these shared errors, relative to the distance of the points.
     """
     prior = torch.tensor([points.surface.extent] * 3 + [math.pi] * 3, dtype=torch.float64)
     about = torch.eye(6, dtype=torch.float64)
@@ -323,7 +324,7 @@ class Occluder:
 
     @torch.no_grad()
     def share_in_front(self, surface: SurfaceMap, T_world_camera: SE3) -> float:
-        """Return the fraction of its points clearly in front of the surface, or of empty space, as seen from a pose."""
+        """Return the fraction of the occluder's points that, seen from a pose, are clearly in front of the surface or of empty space."""
         T = T_world_camera.to(surface.device)
         lines = (T.apply(self.points.to(T.translation)) - T.translation).float()
         length = torch.linalg.vector_norm(lines, dim=-1)
@@ -335,7 +336,7 @@ class Occluder:
 def nearest_piece(problem: Problem) -> Occluder | None:
     """Return the segment of a single depth image that may be an occluder: the nearest large one.
 
-    None if there is no such segment, if nothing else was measured, or if there are several images or other sensors.
+    Returns None if there is no such segment, if nothing else was measured, or if there are several images or another depth sensor.
     """
     view = problem.views[-1]
     if len(problem.views) != 1 or problem.depth_rays is not None or view.frame.depth is None:

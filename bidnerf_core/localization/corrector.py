@@ -19,9 +19,9 @@ class Corrector:
 
     A loop passes frames to ``give``, which never blocks: a localization takes longer than a frame, so a frame is dropped if
     another is already waiting. Each accepted pose gives a new correction, computed with the odometry of the localized frame, so
-    it may arrive late. From then on, localizations start from the corrected odometry. An error of the localizer is raised once,
-    by the next ``give`` or ``close``; the thread continues with later frames. All methods may be called from any thread. Use it
-    as a context manager, or call ``close``.
+    the correction remains valid even if it arrives late. From then on, localizations start from the corrected odometry. An error of
+    the localizer is raised once, by the next ``give`` or ``close``; the thread continues with later frames. All methods may be called
+    from any thread. Use the corrector as a context manager, or call ``close``.
     """
 
     def __init__(self, localizer: Localizer) -> None:
@@ -40,7 +40,7 @@ class Corrector:
         return None if T_world_odom is None else T_world_odom @ T_odom_camera
 
     def give(self, frame: Frame, T_odom_camera: SE3) -> bool:
-        """Submit a frame and its pose by odometry; return False if it was dropped because another is already waiting.
+        """Submit a frame and its pose by odometry; return False if the frame was dropped because another one is already waiting.
 
         Raises the error of an earlier frame's localization, and ``InputError`` after ``close``.
         """
@@ -56,7 +56,7 @@ class Corrector:
     def close(self) -> None:
         """End the thread after the current localization, whose answer still counts; a waiting frame is dropped.
 
-        Raises the error of a localization that has not been raised yet.
+        Raises any localization error that has not been raised yet.
         """
         with self._lock:
             self._closed = True

@@ -1,7 +1,7 @@
-"""What may be true of a query's camera and of its motion, each with a prior probability.
+"""Hypotheses about a query's camera and the camera's motion, each with a prior probability.
 
-An explanation is a Gaussian prior on the nuisances of ``states``; a seed is a pose from which all explanations are refined. Other places
-and other images, such as the mirror image, are modes of the ``loop``, each with all explanations.
+An explanation is a Gaussian prior on the nuisances of ``states``; a seed is a pose from which all explanations are refined. Other places,
+and other images such as the mirror image, are modes of the ``loop``, each with all explanations.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ MOVE, TURN = 0.005, 0.01
 
 @dataclass(frozen=True, eq=False)
 class Seed:
-    """A pose from which to refine, found with some camera."""
+    """A pose from which refinement starts, and the camera with which the pose was found."""
 
     name: str
     T: SE3  # T_world_rig
@@ -97,18 +97,18 @@ class Explanations:
 
     @property
     def usual(self) -> Bool[Tensor, "k"]:
-        """Mask of those by which the stated camera or one of the map's is at least approximately right."""
+        """Mask of the explanations under which the stated camera, or one of the map's, is at least approximately right."""
         return torch.tensor([name.removesuffix(MOVING) in USUAL for name in self.names])
 
     @property
     def widest(self) -> int:
-        """The number of the explanation at rest that leaves the camera most freedom."""
+        """The index of the static explanation that leaves the camera the most freedom."""
         return int((self.deviation[:, :6].sum(-1) - self.deviation[:, 6:12].sum(-1)).argmax())
 
     def first(self, seed: Seed, mode: int, noise: float) -> States:
-        """Return the states with which the search begins: one of each kind of camera, and the stated one in motion.
+        """Return the initial states of the search: one for each kind of camera, and one with the stated camera in motion.
 
-        With another focal length or principal point, the camera is moved along its axis and turned so that it sees about the same.
+        If the focal length or the principal point changes, the camera is moved along its axis and turned to see about the same view.
         """
         # These three are not tried by themselves at first, since they are similar to others.
         kinds = [
@@ -134,7 +134,7 @@ class Explanations:
         )
 
     def about(self, free: States) -> States:
-        """Return a state for each explanation of each mode: the poses of ``free`` (g), with the nuisances at their means."""
+        """Return one state for each explanation of each mode, with the poses of ``free`` (g) and the nuisances at their prior means."""
         k, g = len(self), len(free)
         index = torch.arange(g, device=free.z.device).repeat_interleave(k)
         row = torch.arange(k, device=free.z.device).repeat(g)
@@ -146,10 +146,10 @@ class Explanations:
 def explanations(
     query: Query, landmarks: LandmarkMap, distance: float, depth_scale: float, moving: bool = True
 ) -> Explanations:
-    """Return all explanations of the images; ``distance`` (metres) is that of the scene, for the prior of a motion, and
-    ``depth_scale`` the relative deviation of measured depth.
+    """Return all explanations of the images.
 
-    Images of different cameras are only compared with their stated intrinsics.
+    ``distance`` (metres) is the distance of the scene, for the prior on motion; ``depth_scale`` is the relative deviation of measured
+    depth. Images from different cameras are explained only by their stated intrinsics.
     """
     # Of each: its name, the mean corrections of the camera and their deviations, its probability, and whether it is credible.
     rows = list[tuple[str, list[float], list[float], float, bool]]()
@@ -193,10 +193,10 @@ def explanations(
 
 
 def cameras_of_map(query: Query, landmarks: LandmarkMap) -> list[Float[Tensor, "6"]]:
-    """Return the corrections of the stated camera that make it one of those of the map's images; empty for images of several cameras.
+    """Return the corrections that turn the stated camera into cameras of the map's images; empty for images from several cameras.
 
-    Among the map's cameras with images of one shape, one that agrees with the stated intrinsics is chosen or, if there is none, the one
-    with the median focal length. A camera with only landscape images is turned to either side for a portrait image. An image of a
+    Among the map's cameras with images of one shape, a camera that agrees with the stated intrinsics is chosen or, if none does, the
+    camera with the median focal length. A camera with only landscape images is turned to either side for a portrait image. An image of a
     shape that the map does not have is compared with the map's images resized to it and, if its focal length is approximate,
     with their centre crops.
     """
@@ -222,9 +222,9 @@ def cameras_of_map(query: Query, landmarks: LandmarkMap) -> list[Float[Tensor, "
 
 @lru_cache(maxsize=256)
 def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "6"] | None:
-    """Return the correction of ``given`` intrinsics, in the order of ``NUISANCES``, that best matches ``true`` ones.
+    """Return the correction of ``given`` intrinsics, in the order of ``NUISANCES``, that best reproduces the ``true`` ones.
 
-    It minimizes the squared differences in pixels. None if these remain large.
+    The correction minimizes the squared differences in pixels. Returns None if the differences remain large.
     """
     true = true.resized(given.width, given.height)
     # The cameras are compared at seven rows and columns of pixels.

@@ -50,8 +50,8 @@ Start = SE3 | Float[Tensor, "4 4"] | np.ndarray | Sequence[Sequence[float]]
 class Localizer:
     """Localizes frames in one map by one method.
 
-    The map, the method and its settings are checked once, on construction. It keeps no state between calls, so threads may share
-    it; the same seed gives the same answer on the same machine.
+    The map, the method and its settings are checked once, on construction. A localizer keeps no state between calls, so threads may
+    share one; the same seed gives the same answer on the same machine.
     """
 
     def __init__(
@@ -63,11 +63,11 @@ class Localizer:
         warm_up: bool = True,
         preset: str | None = None,
     ) -> None:
-        """Prepare the map ``scene``, or the one in that folder, for ``method``.
+        """Prepare the map ``scene``, or the map in that folder, for ``method``.
 
         ``config`` holds the method's settings: an instance of their type (``METHODS[method].config_type``), or a dictionary of
-        those that differ from the defaults, or from ``preset``, the name of other settings (``METHODS[method].presets``).
-        ``device`` is that of the field, the surface and the landmarks, by default where they are; parts of the map on another
+        the settings that differ from the defaults or from ``preset``, the name of a set of settings (``METHODS[method].presets``).
+        The field, the surface and the landmarks are used on ``device``, by default where they are; parts of the map on another
         device are copied.
         ``warm_up``: initialize now, so that the first call is not delayed. Raises ``InputError`` for unsuitable arguments.
         """
@@ -123,11 +123,11 @@ class Localizer:
         seed: int = 0,
         workers: int | None = None,
     ) -> Iterator[Localization | InputError]:
-        """Localize independent queries, each as by a call, and yield the answers in their order.
+        """Localize independent queries, each as ``__call__`` does, and yield the answers in the order of the queries.
 
-        A query that cannot be localized at all gives its ``InputError`` in place of an answer. ``workers`` threads, each with a
-        stream of its own on a GPU, localize at the same time; by default as many as torch uses or, on a GPU, 8.
-        ``queries`` may be an iterator, from which they draw a few queries in advance, or a folder of photos. Raises ``InputError`` unless
+        A query that cannot be localized at all yields its ``InputError`` in place of an answer. ``workers`` threads, each with its
+        own stream on a GPU, localize at the same time; by default as many as torch uses or, on a GPU, 8.
+        ``queries`` may be an iterator, from which a few queries are taken in advance, or a folder of photos. Raises ``InputError`` unless
         ``workers`` is positive, and for a folder without photos, and ``Cancelled`` as usual.
         """
         if isinstance(queries, str | Path):
@@ -187,7 +187,7 @@ class Localizer:
     ) -> Problem:
         """Return the problem that ``__call__`` solves; solving it several times detects the images' keypoints only once.
 
-        Unlike there, ``start`` is in the map's own coordinates, see ``Map.origin``, as is the answer of ``solved``.
+        Unlike in ``__call__``, ``start`` is in the map's own coordinates (see ``Map.origin``), and so is the answer of ``solved``.
         """
         T_world_camera = None if start is None else start_pose(start)
         if isinstance(query, str | Path):
@@ -214,7 +214,7 @@ class Localizer:
 
     @property
     def depth_sensor(self) -> DepthSensorModel:
-        """The noise model of the depth sensor; the generic one if the method has no such setting."""
+        """The noise model of the depth sensor; the generic model if the method has no such setting."""
         return find_depth_sensor(self.shared.depth_sensor)
 
     @property

@@ -1,7 +1,8 @@
-"""The loop: propose a pose, refine it under all explanations, fuse all measurements, accept it or go on.
+"""The loop: propose a pose, refine it under all explanations, fuse all measurements, and accept the pose or try the next one.
 
-``docs/methods.md#code`` says which module does which step. A further measurement is a term of ``Loop._fused``; between places it decides
-only by the log odds of ``Loop._posterior``. What the image may be other than a photo of the scene is a rival of ``Loop._rivals``.
+``docs/methods.md#code`` says which module does which step. A further measurement becomes a term in ``Loop._fused``; it decides between
+places only through the log odds in ``Loop._posterior``. Anything else that the image may be, such as a mirror image of the scene,
+becomes a rival in ``Loop._rivals``.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ HEAVY_TAILS = 1.7
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """A place, or a mirror image, that may explain the images, with the matches that agree with it."""
+    """A place or a mirror image that may explain the query, with the matches that agree with this hypothesis."""
 
     name: str
     query: Query
@@ -83,7 +84,7 @@ class Mode:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """A pose by landmarks and all that was fused with them, under the explanations of the images, and whether to accept it."""
+    """A landmark-based pose with everything that was fused into it, the explanations of the images, and the verdict."""
 
     modes: Sequence[Mode]
     posterior: Posterior
@@ -113,23 +114,23 @@ class Answer:
 
     @property
     def camera(self) -> Float[Tensor, "6"] | None:
-        """The correction of the stated camera, or None if that is at least approximately right."""
+        """The correction of the stated camera, or None if the stated camera is at least approximately right."""
         if self.explanation.removesuffix(MOVING) in USUAL[:3]:
             return None
         return self.posterior.states.nuisances[self.posterior.best, :6]
 
 
 class Loop:
-    """Localizes the images of one problem in a map by landmarks, measured depth and rendered colours."""
+    """Localizes the images of one problem in a map from landmarks, measured depth and rendered colours."""
 
     def __init__(
         self, views: Sequence[View], matcher: LandmarkMatcher, problem: Problem | None = None, rays: int = 0, seed: int = 0,
         features: Features | None = None, moving: bool = True,
     ) -> None:  # fmt: skip
-        """Detect keypoints of ``views``, whose poses are relative to the last one.
+        """Detect keypoints of ``views``, whose poses are relative to the last view.
 
-        Without a ``problem``, only landmarks are used. ``rays`` is the number that may be rendered if the map has a field, 0
-        for none. ``features`` detects the keypoints, by default the map's detector. ``moving`` is whether the camera may have
+        Without a ``problem``, only landmarks are used. ``rays`` is the maximum number of rays to render if the map has a field,
+        0 for none. ``features`` is the keypoint detector, by default the map's. ``moving`` tells whether the camera may have
         moved during the readout.
         """
         self.matcher, self.problem, self.seed, self.moving = matcher, problem, seed, moving
@@ -181,7 +182,7 @@ class Loop:
         return self._nearest[count]
 
     def _proposals(self) -> Iterator[tuple[Seed, Nearest, float]]:
-        """Yield poses, the cheapest first: by sample consensus on the strongest keypoints, and on all; and the start."""
+        """Yield poses to refine, cheapest first: by sample consensus on the strongest keypoints, then on all keypoints; then the start."""
         most = max(len(image.keypoints) for image in self.query.images)
         nearest, record = self.nearest(STRONGEST), current_record()
         for count in dict.fromkeys((min(STRONGEST, most), most)):
@@ -198,13 +199,13 @@ class Loop:
             yield Seed("start", T, torch.zeros(6, dtype=torch.float64), self._distance(T)), nearest, 0.0
 
     def _distance(self, T_world_rig: SE3) -> float:
-        """Return the median distance of the landmarks in front of the camera, or of all."""
+        """Return the median distance of the landmarks in front of the camera, or of all landmarks if none is in front."""
         local = T_world_rig.inverse().apply(self.landmarks.positions.double())
         front = local[local[:, 2] > 0]
         return float((front if len(front) else local).norm(dim=-1).median())
 
     def _term(self, modes: Sequence[Mode], best: States) -> Landmarks:
-        """Return the reprojection errors of the modes' matches, padded; ``best`` (g) are the modes' states.
+        """Return the reprojection errors of the modes' matches, padded to equal length; ``best`` (g) are the modes' states.
 
         On an accelerator, sizes are multiples of 256, so that few CUDA graphs are captured.
         """
@@ -232,7 +233,7 @@ class Loop:
     def _modes(
         self, nearest: Nearest, seed: Seed, given: Explanations, nfa: float, searched: bool
     ) -> tuple[list[Mode], States]:
-        """Return the modes, and the most probable state of each, refined on matches by projection."""
+        """Return the modes and the most probable state of each mode, refined on matches by projection."""
         first = self._mode(seed.name, self.query, nearest.best, seed, given, searched)
         if first is None:
             return [], States.known(seed.T, seed.camera)
@@ -262,9 +263,10 @@ class Loop:
     def _mode(
         self, name: str, query: Query, found: Matches, seed: Seed, given: Explanations, searched: bool
     ) -> tuple[Mode, States] | None:
-        """Return the mode at a seed, and its most probable state; None if too few matches agree.
+        """Return the mode at a seed and its most probable state; None if too few matches agree.
 
-        Unless the seed was ``searched`` for among them, the matches are those by projection.
+        If the seed was ``searched`` for among the matches ``found``, those that agree with it are kept; otherwise, landmarks are
+        matched by projection.
         """
         known, within = States.known(seed.T, seed.camera), RADII[0] * query.threshold
         if searched:
@@ -277,7 +279,7 @@ class Loop:
         return mode, self._compared(mode, seed, given, query.threshold / 2)
 
     def _compared(self, mode: Mode, seed: Seed, given: Explanations, noise: float) -> States:
-        """Return the most probable state of a mode, comparing kinds of cameras, each with its own noise, on some of the matches."""
+        """Return the most probable state of a mode among the kinds of cameras, each with its own noise, using a subset of the matches."""
         count = len(mode.matches)
         # At most a hundred matches are compared, evenly spread.
         some = torch.linspace(0, count - 1, min(count, 100)).long()
@@ -287,10 +289,10 @@ class Loop:
         return run_on(self.device, most_probable, states, term)
 
     def _warped(self, mode: Mode, seed: Seed, given: Explanations, best: States) -> States:
-        """Return the fit of a camera that explains any warp of the image, if many more matches agree with it, or else ``best``.
+        """Return the fit of a camera that explains any warp of the image if many more matches agree with that fit, else ``best``.
 
-        Consensus finds those matches of a sheared image, or of a photo of a picture, that happen to agree with a usual camera. From
-        there, the fit to all matches is graduated: residuals as large as the warp count at first (Blake and Zisserman 1987).
+        In a sheared image, or a photo of a picture, consensus finds only the matches that happen to agree with a usual camera. From
+        that pose, the fit to all matches is graduated: at first, residuals as large as the warp still count (Blake and Zisserman 1987).
         """
         query, found = mode.query, mode.by_descriptors
         agreeing = int(inliers(query, self.landmarks, found, best).sum())
@@ -306,10 +308,10 @@ class Loop:
     def _rivals(
         self, nearest: Nearest, nfa: float, best: States
     ) -> Iterator[tuple[str, Query, Matches, Seed]]:
-        """Yield what competes with the place of the state ``best``.
+        """Yield the hypotheses that compete with the place of the state ``best``.
 
         A scene may be repetitive, such as two rooms with the same furniture: keypoints that agree with the state may agree as well
-        with similar landmarks elsewhere. And the image may be mirrored.
+        with similar landmarks elsewhere. The image may also be mirrored.
         """
         query = self.query
         rivals: list[tuple[str, Query, Matches]] = []
@@ -409,7 +411,7 @@ class Loop:
         self, found: Posterior, mass: float, modes: list[Mode], term: Landmarks, given: Explanations, searched: bool,
         others: dict[str, float | None],
     ) -> Answer:  # fmt: skip
-        """Collect the evidence for the most probable pose; ``others`` is that of measurements other than landmarks."""
+        """Judge the most probable pose; ``others`` is the evidence from measurements other than landmarks."""
         mode, state = modes[found.mode], found.chosen
         query = mode.query
         inlier = (term.residuals(state)[0][0] <= 9) & (term.valid[found.mode] > 0)

@@ -43,13 +43,13 @@ OCTAVES, OBLIQUE = 1.0, math.radians(40)
 
 
 class LandmarkMatcher:
-    """Finds the landmarks whose descriptors are nearest to those of keypoints.
+    """Finds the landmarks whose descriptors are nearest to given keypoint descriptors.
 
     Above some thousand landmarks, it uses an inverted file: k-means divides the landmarks into sqrt(n) cells (more in large
     maps), and only the cells nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). Threads may share
-    a matcher. It also prepares ``LandmarkMap.cells`` for guided matching.
+    a matcher. The matcher also prepares ``LandmarkMap.cells`` for guided matching.
 
-    Descriptors are compared on the device of those of ``landmarks``; all other computations with landmarks run on the CPU. On an
+    Descriptors are compared on the device of the descriptors of ``landmarks``; all other computations with landmarks run on the CPU. On an
     accelerator the search is always exhaustive.
     """
 
@@ -81,7 +81,7 @@ class LandmarkMatcher:
         )
 
     def for_query(self) -> LandmarkMatcher:
-        """Return a matcher for one query, whose ``features`` cache the keypoints of each image; all else is shared."""
+        """Return a matcher for one query, whose ``features`` cache the keypoints of each image; everything else is shared."""
         found = copy.copy(self)
         found._found_once = FoundOnce(lambda rgb: detected(self.features, rgb))
         return found
@@ -123,7 +123,7 @@ class _Products:
     def nearest(
         self, descriptors: UInt8[Tensor, "q d"], count: int
     ) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
-        """Return squared distances, which are exact, and indices of the nearest; on the CPU."""
+        """Return the exact squared distances and the indices of the nearest landmarks, on the CPU."""
         found, n = [], len(self._half)
         # At most 2^26 products are computed at a time, which bounds the memory.
         for part in descriptors.split(max(1, 2**26 // max(1, n))):
@@ -233,14 +233,14 @@ class Nearest:
 
     @property
     def best(self) -> Matches:
-        """The unambiguous matches, filled up with others if they are few."""
+        """The unambiguous matches, supplemented by ambiguous ones if there are few."""
         order = self.ambiguity.argsort(stable=True)
         # Ambiguous matches are added up to 60.
         count = max(60, int((self.ambiguity <= AMBIGUITY).sum()))  # host
         return Matches(self.keypoint[order[:count]], self.landmark[order[:count], 0])
 
     def others(self, near: Bool[Tensor, "k n"]) -> Matches:
-        """Return matches with landmarks as similar as the nearest one, but not among those that a pose projects ``near``."""
+        """Return matches with landmarks about as similar as the nearest one, except those that a pose projects close by (``near``)."""
         ratio = self.distance / self.distance[:, :1].clamp(min=1)
         row, column = (
             ((ratio <= AMBIGUITY**-2) & ~near & self.distance.isfinite()).nonzero().unbind(-1)
@@ -250,7 +250,7 @@ class Nearest:
 
 
 class Projected:
-    """The landmarks that one state should see, with their projections, view by view."""
+    """The landmarks that should be visible from one state, with their projections, view by view."""
 
     def __init__(
         self,
@@ -260,7 +260,7 @@ class Projected:
         margin: float,
         among: Projected | None = None,
     ) -> None:
-        """Project landmarks up to ``margin`` pixels beyond the images' edges, ``among`` those visible from a pose nearby."""
+        """Project landmarks up to ``margin`` pixels beyond the image edges, optionally only ``among`` those visible from a nearby pose."""
         self.query, self.landmarks, self.visible = query, landmarks, 0
         # Of each view: its keypoints, the landmarks, its focal length, their expected sizes in pixels, and a tree of their projections.
         self._parts: list[tuple[Tensor, Tensor, float, Tensor, cKDTree | None]] = []
@@ -295,7 +295,7 @@ class Projected:
             self._parts.append((own, index, image.focal, expected, tree))
 
     def matches(self, radius: float, shift: float = 0.0) -> Matches:
-        """Return the matches within ``radius`` pixels; with keypoints displaced by ``shift``, all are due to chance."""
+        """Return the matches within ``radius`` pixels; with keypoints displaced by ``shift``, all matches are due to chance."""
         query, landmarks = self.query, self.landmarks
         pairs = []
         for own, index, focal, expected, tree in self._parts:
@@ -335,7 +335,7 @@ class Projected:
 def log10_nfa(matches: int, agreeing: int, probability: float, sample: int = 3) -> float:
     """Return log10 of the number of false alarms (Moisan and Stival 2004, eq. 10).
 
-    It is the expected number of poses with ``agreeing`` inliers among ``matches`` if all are wrong, each an inlier with
+    This is the expected number of poses with ``agreeing`` inliers if all ``matches`` are wrong and each is an inlier with
     ``probability``; ``sample`` matches determine a pose.
     """
     if agreeing <= sample:

@@ -1,4 +1,4 @@
-"""``Method``, by which plugins register their own localization methods, the methods by name, and those that need a start.
+"""``Method``, with which plugins register their own localization methods; the methods by name; and those that need a start.
 
 The first-order methods are Adam on the loss of sampled rays: ``bid`` uses colour and depth of one or several images at the coarse level
 (BID-NeRF, Alg. 1), and ``inerf`` the colours of one image in full detail (Yen-Chen et al. 2021, iNeRF), that is, of the field itself,
@@ -6,7 +6,8 @@ which a NeRF renders hierarchically with its coarse and fine networks. iNeRF opt
 from the start; here, each step is a separate update in the same frame, the world's. The two differ to second order, and updates have
 no axis that is undefined at magnitude 0.
 
-The second-order methods halve poses around the start from coarse to fine: ``bid-lm`` on colour and depth, ``inerf-lm`` on colour.
+The second-order methods run successive halving on poses around the start, from coarse to fine: ``bid-lm`` on colour and depth,
+``inerf-lm`` on colour.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ RAYS = 1024
 
 @dataclass(frozen=True)
 class SharedSettings:
-    """Settings of a method that trackers, collections of maps and the command line take into account as well."""
+    """The method settings that trackers, collections of maps and the command line also use."""
 
     matches_landmarks: bool = True  # whether images are matched with the map's landmarks
     depth_sensor: str = UNKNOWN_SENSOR  # name of the sensor that measured the depth
@@ -73,7 +74,7 @@ class SharedSettings:
 
 @dataclass(frozen=True)
 class Method:
-    """A localization method: how it finds poses, its settings, what it needs and what it offers."""
+    """A localization method: its solver, its settings, its inputs and its presets."""
 
     solve: Callable[[Problem, Any, int], Localization]
     """Solves a problem with settings of ``config_type``; all random choices are drawn from the seed."""
@@ -144,7 +145,7 @@ def matches_landmarks(method: str, config: Any) -> bool:
 
 
 def settings_of(method: str, values: dict[str, Any], where: str = "config", preset: str | None = None) -> Any:
-    """Return a method's settings; ``values`` are those that differ from its defaults or a preset, by their flat names.
+    """Return a method's settings; ``values`` are the settings, by flat name, that differ from its defaults or a preset.
 
     Raises ``InputError``, prefixed with ``where``, for an unknown method or name, or a value that is not allowed.
     """
@@ -193,7 +194,7 @@ def descended(
 ) -> Localization:  # fmt: skip
     """Descend with Adam from ``problem.start`` (Alg. 1), then accept or reject the pose.
 
-    Low-contrast images have a small loss even at a wrong pose, so it must also be supported by other rays.
+    Low-contrast images have a small loss even at a wrong pose, so other rays must also support the pose.
     """
     began, start, device = time.perf_counter(), problem.start_for(method), problem.device
     if depth is not None and depth.depth_scale is None:
@@ -284,7 +285,7 @@ def bid_lm(problem: Problem, config: BidLmConfig, seed: int = 0) -> Localization
 def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localization:
     """Refine poses around ``problem.start``; poses and pixels are drawn from ``seed``.
 
-    It needs only the field, and uses neither measured depth nor a baked surface.
+    The method needs only the field; it uses neither measured depth nor a baked surface.
     """
     return _halved(problem.without_depth(), config, None, 0.04, seed, "inerf-lm")
 
@@ -292,7 +293,7 @@ def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localiza
 def _halved(
     problem: Problem, config: BidLmConfig | InerfLmConfig, depth: DepthLossSettings | None, share: float, seed: int, method: str
 ) -> Localization:  # fmt: skip
-    """Refine poses around the start; ``share`` is their usual displacement relative to the distance of the scene.
+    """Refine poses around the start; ``share`` is the default spread of the poses relative to the distance of the scene.
 
     Colours alone have a narrow basin of convergence, so images without depth are first compared with small renderings.
     """

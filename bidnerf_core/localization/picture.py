@@ -1,4 +1,4 @@
-"""The picture of an answer in a notebook: the photo, the map at the pose found, and both blended."""
+"""The picture of an answer in a notebook: the photo, the map rendered at the estimated pose, and a blend of both."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from bidnerf_core.localization.result import Localization
 
 
 def shown_in(scene: SceneMap, frame: Frame) -> Callable[[Localization], str]:
-    """Return a function that shows an answer to a frame as an element of a page, and keeps only a small file of the photo.
+    """Return a function that renders an answer to a frame as an HTML element, and holds only a small copy of the photo.
 
-    Answers may outlive the map, whose memory they do not hold: then, for a map without weak references, and where it cannot be
-    rendered from the pose, it returns "".
+    The function does not keep the map in memory. It returns "" once the map is gone, if the map does not support weak references, or
+    if the map cannot be rendered from the pose.
     """
     # At most 240 pixels along the longer side, since each rendered pixel takes time.
     small = frame.replace(depth=None).at_most(240)
@@ -57,7 +57,7 @@ def shown_in(scene: SceneMap, frame: Frame) -> Callable[[Localization], str]:
 
 
 def picture_at(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
-    """Return what a camera sees of a map (colours in [0, 1], on the CPU): the field or, without one, the landmarks as dots.
+    """Return the image of a map from a camera (colours in [0, 1], on the CPU): the field or, without a field, the landmarks as dots.
 
     The pose is in the map's own coordinates.
     """

@@ -1,4 +1,4 @@
-"""Pivots: the points about which updates of poses rotate, and the middle of the visible scene."""
+"""Pivots: the points about which pose updates rotate, and the middle of the visible scene."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Pivot:
     def lever_arm(self) -> float:
         """Distance (metres) by which a rotation of one radian moves the camera.
 
-        In the world's frame it is 1, since iNeRF does not balance steps of translation and rotation; so it is at the camera, which
-        no rotation moves.
+        It is 1 in the world's frame, since iNeRF does not balance steps of translation and rotation, and also for a pivot at the
+        camera, which no rotation moves.
         """
         reach = 0.0 if self.T_camera_pivot is None else float(self.T_camera_pivot.translation.norm())
         return reach if reach > 0 else 1.0
@@ -45,7 +45,7 @@ class Pivot:
         return (T @ self.T_camera_pivot).retract(delta) @ self.T_camera_pivot.inverse()
 
     def moved_linearly(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
-        """Return ``moved`` to first order in ``delta``, which is cheaper and has the same value and derivative at 0."""
+        """Return ``moved`` to first order in ``delta``: cheaper, with the same value and derivative at 0."""
         if self.T_camera_pivot is None:
             return SE3.identity(device=delta.device).retract_linearly(delta) @ T
         return (T @ self.T_camera_pivot).retract_linearly(delta) @ self.T_camera_pivot.inverse()
@@ -67,9 +67,9 @@ def pivot(name: PivotName, problem: Problem) -> Pivot:
 
 @torch.no_grad()
 def middle_of_view(problem: Problem, T: SE3 | None) -> Float[Tensor, "3"]:
-    """Return the median of the measured points or, without any, of those rendered from the pose ``T``; on the CPU.
+    """Return the median of the measured points or, if there are none, of the points rendered from the pose ``T``; on the CPU.
 
-    It is in the last camera's frame, metres: the middle of the scene's box if nothing is rendered, and 0 without a pose.
+    The result is in the last camera's frame (metres). It is the middle of the scene's box if nothing is rendered, and 0 without a pose.
     """
     point = measured_middle(problem.views)
     if point is not None:

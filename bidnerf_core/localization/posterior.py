@@ -1,4 +1,4 @@
-"""The posterior of the explanations of one query: probabilities by Laplace's approximation, and the pose as their mixture."""
+"""The posterior over the explanations of one query: probabilities by Laplace's approximation, and the pose as a mixture."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TOLERANCE = 0.03
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """The explanations (h) with their probabilities; poses are right updates of that of the most probable one."""
+    """The explanations (h) with their probabilities; poses are right updates of the most probable explanation's pose."""
 
     states: States
     normal: Normal
@@ -41,8 +41,8 @@ class Posterior:
     ) -> Posterior:
         """Compare explanations within a mode by their cost, and modes by the evidence of landmarks and their prior ``log_odds``.
 
-        ``terms`` are the models of all terms, whose minima are ``states`` and ``normal``, and ``systematic`` is the scatter of their
-        gradient (in its units) in addition to that of independent errors. Most is computed on ``device``.
+        ``terms`` are the quadratic models of all terms, with minima ``states`` and ``normal``. ``systematic`` is the scatter of their
+        gradient (in its units) beyond the scatter due to independent errors. Most of the computation runs on ``device``.
         """
         by_mode, information = run_on(device, _information, states, normal, terms, landmarks, systematic)
         log = log_evidence(states, normal)
@@ -101,9 +101,9 @@ class Posterior:
         return torch.where(own[:, None, None] > 1e-12, own[:, None, None] * spread, 0).sum(0)
 
     def mass(self, distance: float, shared: Float[Tensor, "6 6"], credible: Bool[Tensor, "h"]) -> float:
-        """Return the probability that the pose is right, and under an explanation that is ``credible``.
+        """Return the probability that the pose is right and its explanation is ``credible``.
 
-        ``distance`` (metres) is that of the scene, and ``shared`` a covariance that is added to those of all explanations.
+        ``distance`` (metres) is the distance of the scene; ``shared`` is a covariance added to the covariances of all explanations.
         """
         weight = self.probability * credible
         return mass_within(weight, self.update - self.mean, self.covariance + shared, distance)
@@ -112,7 +112,7 @@ class Posterior:
 def mass_within(
     weight: Float[Tensor, "h"], off: Float[Tensor, "h 6"], covariance: Float[Tensor, "h 6 6"], distance: float
 ) -> float:
-    """Return the mass of a mixture of Gaussians of updates within ``TOLERANCE`` of the ``distance`` (metres) and 0.05 rad."""
+    """Return the probability mass of a Gaussian mixture of updates within ``TOLERANCE`` of the ``distance`` (metres) and 0.05 rad."""
     sane = covariance.isfinite().all(-1).all(-1)
     factor, info = torch.linalg.cholesky_ex(
         torch.where(sane[:, None, None], covariance, torch.eye(6, dtype=covariance.dtype))
@@ -126,7 +126,7 @@ def mass_within(
 def normal_draws() -> Float[Tensor, "d 6"]:
     """Return 256 draws of a standard normal distribution that cover it evenly (Sobol).
 
-    With as many draws of the pose from each explanation's Gaussian, the probability mass within a tolerance is integrated.
+    Scaled to each explanation's Gaussian, these draws integrate the probability mass of the pose within a tolerance.
     """
     even = torch.quasirandom.SobolEngine(6, scramble=True, seed=0).draw(256).double()
     return torch.distributions.Normal(0.0, 1.0).icdf(even.clamp(1e-6, 1 - 1e-6))
@@ -135,7 +135,7 @@ def normal_draws() -> Float[Tensor, "d 6"]:
 def _information(
     states: States, normal: Normal, terms: Quadratic, landmarks: Landmarks, systematic: Tensor | float
 ) -> tuple[Float[Tensor, "g"], tuple[Tensor, ...]]:
-    """Return the evidence of landmarks for each mode, and the arguments of ``_robust_covariance``."""
+    """Return the landmark evidence for each mode, and the arguments of ``_robust_covariance``."""
     unit, scale, g = terms.here.unit, 1 / states.unit, states.mode
     parts = [unit[:, :, None] * part * unit[:, None] for part in landmarks.sandwich(terms.here)]
     parts = [parts[0], parts[1], parts[2] + systematic]
@@ -160,10 +160,10 @@ def _robust_covariance(
     unit: Float[Tensor, "h P"],
     sound: Bool[Tensor, "h"],
 ) -> Float[Tensor, "h P P"]:
-    """Return the covariance of the unknowns: that of an M-estimator for landmarks, and of a Gaussian likelihood for all else.
+    """Return the covariance of the unknowns, treating landmarks as an M-estimator and all other terms as a Gaussian likelihood.
 
-    With the Cholesky ``factor`` of the Hessian in ``unit``, its curvature is ``factor curvature factor^T``; it is infinite where there
-    is no ``sound`` factor.
+    With the Cholesky ``factor`` of the Hessian in ``unit``, its curvature is ``factor curvature factor^T``; the covariance is infinite
+    where the factor is not ``sound``.
     """
     values, vectors = torch.linalg.eigh(curvature)
     # With few matches the curvature may be indefinite; well-behaved residuals keep it near the Hessian. It counts as at least a
@@ -179,8 +179,8 @@ def _true_cameras(
 ) -> tuple[States, Float[Tensor, "h 6 6"]]:
     """Return the states with the most probable true cameras, and the covariance of their poses.
 
-    The apparent camera is the true one plus a spurious part of standard deviation ``scatter``, by errors of the landmarks. The pose
-    follows the true one: it is linear in the camera with the rest eliminated.
+    The apparent camera is the true camera plus a spurious part, due to landmark errors, of standard deviation ``scatter``. The pose
+    follows the true camera, in which it is linear once the other unknowns are eliminated.
     """
     H = normal.hessian
     apparent = states.deviation[:, :4].square()  # = prior + scatter^2

@@ -27,7 +27,7 @@ _Map = TypeVar("_Map", bound="SceneMap")
 
 @runtime_checkable
 class SceneMap(Protocol):
-    """The parts of a map that localization uses, some of which may be absent; ``bidnerf_core.Map`` is one."""
+    """The parts of a map that localization uses, some of which may be absent; ``bidnerf_core.Map`` implements this protocol."""
 
     @property
     def field(self) -> RadianceField: ...
@@ -37,12 +37,12 @@ class SceneMap(Protocol):
 
     @property
     def surface(self) -> SurfaceMap | None:
-        """The baked surface; None if there is none."""
+        """The baked surface; None if the map has no surface."""
         ...
 
     @property
     def landmarks(self) -> LandmarkMap | None:
-        """The landmarks; None if there are none."""
+        """The landmarks; None if the map has no landmarks."""
         ...
 
     @property
@@ -57,12 +57,12 @@ class SceneMap(Protocol):
 
 
 def unit_of(scene: SceneMap) -> LengthUnit:
-    """Return the unit of a map's lengths; "units" for maps that do not state it, such as other projects' fields."""
+    """Return the unit of a map's lengths; "units" for maps that do not state a unit, such as other projects' fields."""
     return getattr(scene, "unit", "units")
 
 
 def origin_of(scene: SceneMap) -> Float[Tensor, "3"]:
-    """Return the origin of a map's own coordinates in its world (float64), see ``Map.origin``; 0 for maps that state none."""
+    """Return the origin of a map's own coordinates in its world frame (float64), see ``Map.origin``; 0 for maps that state no origin."""
     return torch.tensor(getattr(scene, "origin", (0.0, 0.0, 0.0)), dtype=torch.float64)
 
 
@@ -91,7 +91,7 @@ def on_device(scene: _Map, device: torch.device | str) -> _Map:
 class Problem:
     """K images with known relative poses in a map; the unknown is the pose of the last image's camera.
 
-    ``views[i].T_ref_camera`` is T_K_i, the pose of camera i in the frame of the last camera K, so the last is the identity.
+    ``views[i].T_ref_camera`` is T_K_i, the pose of camera i in the frame of the last camera K, so the last pose is the identity.
     """
 
     field: RadianceField
@@ -107,7 +107,7 @@ class Problem:
     sensor: DepthSensorModel  # model of the sensor that measured the depth
 
     def start_for(self, method: str) -> SE3:
-        """Return the start. Raises ``InputError``, naming ``method``, if there is none."""
+        """Return the start. Raises ``InputError``, naming ``method``, if there is no start."""
         if self.start is None:
             raise InputError(f"method {method!r} needs a start; give one, or use a method that needs none")
         return self.start

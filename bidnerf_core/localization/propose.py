@@ -24,7 +24,7 @@ LEAST_AGREEING = 6
 
 
 def best_consensus(query: Query, landmarks: LandmarkMap, matches: Matches) -> tuple[Seed, float] | None:
-    """Return the seed with the fewest false alarms, over the stated camera, the map's and a ladder of focal lengths."""
+    """Return the seed with the fewest false alarms, over the stated camera, the map's cameras and a ladder of focal lengths."""
     best = None
     for camera in cameras(query, landmarks):
         found = consensus(query, landmarks, matches, camera)
@@ -55,10 +55,10 @@ def consensus(
     camera: Float[Tensor, "6"],
     name: str = "landmarks",
 ) -> tuple[Seed, float] | None:
-    """Return the pose with the most inliers by a given camera, with log10 of its false alarms; None if too few agree.
+    """Return the pose with the most inliers under a given camera, and log10 of its false alarms; None if too few matches agree.
 
     The solvers are poselib's in LO-RANSAC with progressive sampling: P3P for each image (Persson and Nordberg 2018) and, for a rig,
-    the generalized P3P (Kukelova et al. 2016) besides, as that is unstable if the camera centres almost coincide.
+    also the generalized P3P (Kukelova et al. 2016), which alone is unstable if the camera centres almost coincide.
     """
     still = States.known(SE3.identity(), camera)
     flat = query.sights.image[matches.keypoint]
@@ -117,13 +117,13 @@ def pinhole(focal: float) -> dict[str, object]:
 
 
 def to_poselib(T: SE3) -> poselib.CameraPose:
-    """Convert a pose T_camera_world on the CPU."""
+    """Convert a pose T_camera_world, on the CPU, to poselib's type."""
     pose = poselib.CameraPose()
     pose.R, pose.t = T.rotation.numpy(), T.translation.numpy()
     return pose
 
 
 def from_poselib(pose: poselib.CameraPose) -> SE3:
-    """Return T_camera_world."""
+    """Convert poselib's pose to T_camera_world."""
     rotation = torch.from_numpy(np.array(pose.R, dtype=np.float64))
     return SE3(rotation, torch.from_numpy(np.array(pose.t, dtype=np.float64).reshape(3)))

@@ -33,7 +33,7 @@ class Query:
 
     @staticmethod
     def of(views: Sequence[View], features: Features) -> Query:
-        """Detect the keypoints of ``views``, whose ``T_ref_camera`` are relative to the last one."""
+        """Detect the keypoints of ``views``, whose ``T_ref_camera`` are relative to the last view."""
         images = tuple(image_keypoints(view, features) for view in views)  # host
         return Query.seen(images, any(view.frame.focal_is_approximate for view in views))
 
@@ -86,7 +86,7 @@ class Query:
 
     @property
     def area(self) -> float:
-        """Square pixels of an image."""
+        """The area of an image, in square pixels."""
         return float(self.camera.width * self.camera.height)
 
     @property

@@ -1,4 +1,4 @@
-"""Records of the search for a pose, for visualization. Nothing is kept or computed unless a record is requested."""
+"""Records of the pose search, for visualization. Nothing is stored or computed unless a record is requested."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class RecordedStep:
 
 @dataclass(eq=False)
 class SearchRecord:
-    """The steps of a search and the answers by landmarks, in order."""
+    """The steps of a search and the landmark-based answers, in order."""
 
     steps: list[RecordedStep] = field(default_factory=list)
     answers: list[Answer] = field(default_factory=list)
 
     def add(self, caption: str, T: SE3, scores: Float[Tensor, "h"] | None = None, kept: int = 1) -> None:
-        """Record poses T (h) or a single one; without scores, they must be in order, best first."""
+        """Record poses T (h) or a single pose; without scores, the poses must be sorted, best first."""
         T = T if T.translation.ndim == 2 else T[None]
         compared = scores is not None
         if scores is None:
@@ -62,5 +62,5 @@ def recorded() -> Iterator[SearchRecord]:
 
 
 def current_record() -> SearchRecord | None:
-    """Return the record to add to; None if none was requested."""
+    """Return the active record; None if no record was requested."""
     return _RECORD.get()

@@ -1,4 +1,4 @@
-"""Steps of the loop that are functions of tensors alone, each of which a GPU replays as one graph."""
+"""The steps of the loop that depend on tensors alone; a GPU replays each step as one graph."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from bidnerf_core.mapping import (
 
 
 def most_probable(states: States, term: Landmarks) -> States:
-    """Return the most probable state, comparing them with the noise of each."""
+    """Refine the states, each with its own noise, and return the most probable one."""
     states, _ = descend(states, [term], 4)
     states, normal = descend(term.with_noise(states), [term], 3)
     return states[log_evidence(states, normal).argmax()[None]]
@@ -54,7 +54,7 @@ Minima = tuple[Quadratic, States, Normal]
 
 
 def fit(best: States, terms: Sequence[Term], given: Explanations, steps: int) -> tuple[States, Minima]:
-    """Return the refined state of each mode (g), and the minima about it."""
+    """Return the refined state of each mode (g), and the minima about these states."""
     best, _ = descend(best, terms, steps)
     quadratic = linearize(best, terms, given)
     return best, (quadratic, *quadratic.minimum(given.about(quadratic.here)))
@@ -67,7 +67,7 @@ def linearize(best: States, terms: Sequence[Term], given: Explanations) -> Quadr
 
 
 def settle(best: States, term: Landmarks, given: Explanations) -> tuple[States, Minima, States]:
-    """Return what ``fit`` does, and the state of each mode that is then the most probable."""
+    """Return the results of ``fit``, and then the most probable state of each mode."""
     best, (quadratic, states, normal) = fit(term.with_noise(best), [term], given, 4)
     member = states.mode[None] == best.mode[:, None]
     log = torch.where(member, log_evidence(states, normal)[None], -torch.inf)
@@ -77,7 +77,7 @@ def settle(best: States, term: Landmarks, given: Explanations) -> tuple[States, 
 def fit_with_rays(
     best: States, terms: Sequence[Term], rays: Rays, given: Explanations
 ) -> tuple[Minima, Quadratic]:
-    """Refine the first state with rays, and return the minima, and the model of rays about this state alone.
+    """Refine the first state with rays; return the minima, and the quadratic model of the rays about this state alone.
 
     Rays are too expensive to be rendered for all hypotheses.
     """
@@ -90,12 +90,12 @@ def fit_with_rays(
 
 
 def agreement(points: Surface, state: States) -> tuple[Tensor, Tensor]:
-    """Return the fractions of the points on the surface, and on it with its colour."""
+    """Return the fractions of the points that lie on the surface, and that lie on the surface with a matching colour."""
     near, alike = points.inliers(state)
     return near.mean(), (near * alike).mean()
 
 
 def fit_noise(points: Surface, state: States) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the noise of points at a state, and their agreement with it."""
+    """Return the noise of the points at a state, and the points' agreement with that state."""
     fitted = points.fitted_noise(state)
     return torch.as_tensor(fitted.noise), *agreement(fitted, state)

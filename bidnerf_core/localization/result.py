@@ -88,12 +88,12 @@ class Localization:
     shown: Callable[[Localization], str] | None = None  # returns the picture for a notebook; not stored
 
     def _repr_html_(self) -> str:
-        """The answer in a notebook: the photo, the map at the pose found, and both blended, above a line of text."""
+        """The answer in a notebook: the photo, the map rendered at the estimated pose, and a blend of both, above a line of text."""
         picture = "" if self.shown is None else self.shown(self)
         return f"{picture}<div>{html.escape(repr(self))}</div>"
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the map, which other processes have no need of."""
+        """Return the state without the function that refers to the map, which other processes do not need."""
         return self.__dict__ | {"shown": None}
 
     def __repr__(self) -> str:
@@ -108,7 +108,7 @@ class Localization:
         verdict: Verdict, poses: SE3, losses: Float[Tensor, "s"], method: str, began: float, loss: float,
         covariance: Float[Tensor, "6 6"] | None = None, diagnostics: Any = None,
     ) -> Localization:  # fmt: skip
-        """Return the answer whose pose is the last of ``poses``; ``began`` is the time when the search did (``time.perf_counter``)."""
+        """Return the answer whose pose is the last of ``poses``; ``began`` is when the search started (``time.perf_counter``)."""
         count, seconds = len(poses.translation) - 1, time.perf_counter() - began
         return Localization(
             poses[-1], verdict.outcome, verdict.reason, count, seconds, loss, method, poses, losses, covariance,
@@ -135,7 +135,7 @@ class Localization:
         return replace(self, T_world_camera=T, poses=poses)
 
     def rejected(self, why: Verdict) -> Localization:
-        """Return the answer with another verdict, whose reason comes before that of this one."""
+        """Return the answer with another verdict, whose reason is put before the present reason."""
         reason = f"{why.reason}; {self.reason}"
         return replace(self, outcome=why.outcome, reason=reason, confidence=why.confidence)
 
@@ -170,7 +170,7 @@ class Localization:
 
     @staticmethod
     def load(path: str | Path) -> Localization:
-        """Read a file written by ``save``. It contains no diagnostics and no intermediate poses or losses.
+        """Read a file written by ``save``. The file contains no diagnostics and no intermediate poses or losses.
 
         Raises ``InputError`` for any other file, and for a pose that is not finite.
         """
@@ -218,6 +218,6 @@ def _matrix(rows: list[list[float]], size: int, what: str, where: str) -> Float[
 
 
 def _finite(value: Any) -> Any:
-    """Return a number or rows of numbers; None if any is not finite, which JSON cannot represent."""
+    """Return the number or rows of numbers, or None if any number is not finite, which JSON cannot represent."""
     rows = value if isinstance(value, list) else [[value]]
     return value if all(x is not None and math.isfinite(x) for row in rows for x in row) else None

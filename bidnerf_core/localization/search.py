@@ -1,4 +1,4 @@
-"""Search without landmarks: successive halving of many poses, with finer terms as they become fewer."""
+"""Search without landmarks: successive halving of many poses, with finer terms as fewer poses remain."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from bidnerf_core.progress import check_cancelled
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """A stage: steps from all remaining poses, the best ``keep`` of which pass to the next stage."""
+    """One stage of a search: steps from all remaining poses; the best ``keep`` poses pass to the next stage."""
 
     terms: Sequence[Term]
     steps: int
@@ -49,9 +49,9 @@ def halve(
 ) -> Proposals:
     """Run the stages on the hypotheses ``start`` (h) and return the poses that remain.
 
-    ``middle`` is that of the visible scene (metres, last camera's frame). If the best poses of a stage are all the same answer,
-    the last of them is replaced by the best different one. Steps are taken on ``device``; the host waits for it between
-    stages, but not within one.
+    ``middle`` is the middle of the visible scene (metres, last camera's frame). If the best poses of a stage are all the same
+    answer, the last of them is replaced by the best different pose. Steps are taken on ``device``; the host waits for the device
+    between stages, but not within a stage.
     """
     states, middle = moved(start, device), middle.to(device, torch.float64)
     poses, losses, margin, scores = [states.T[None]], list[Tensor](), float("inf"), states.noise
@@ -90,22 +90,22 @@ def image_stages(
     problem: Problem, renderer: Renderer, device: torch.device, scales: ColourScales,
     stages: Sequence[tuple[int, int, int]],
 ) -> Iterator[Stage]:  # fmt: skip
-    """Yield stages by small images: of each, the pixels of the longer side, the steps, and the poses to keep."""
+    """Yield the ``stages`` of a search with small images, given as pixels of the longer side, steps, and poses to keep."""
     for width, steps, keep in stages:
         thumbnails = [moved(Thumbnail.of(view, width), device) for view in problem.views]
         yield Stage([Images(renderer, thumbnails, scales)], steps, keep)
 
 
 def states_at(T: SE3) -> States:
-    """Return the states of poses (h) of known cameras at rest."""
+    """Return static states with known cameras at the poses ``T`` (h)."""
     one = States.known(SE3.identity(), torch.zeros(6, dtype=torch.float64))
     return replace(one[torch.zeros(len(T.translation), dtype=torch.long)], T=T.to("cpu", torch.float64))
 
 
 def neighbours(T: SE3, count: int, translation: float, rotation: float, seed: int) -> SE3:
-    """Return ``T`` and ``count`` - 1 right updates of it, quasi-random samples of a normal distribution.
+    """Return ``T`` and ``count`` - 1 right updates of ``T``, quasi-random samples of a normal distribution.
 
-    ``translation`` (metres) and ``rotation`` (radians) are its standard deviations along and about each axis of the camera;
+    ``translation`` (metres) and ``rotation`` (radians) are the standard deviations along and about each axis of the camera;
     the samples are a Sobol sequence, scrambled with ``seed``. Shape (count).
     """
     even = SobolEngine(6, scramble=True, seed=seed).draw(count, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Settings of the methods and the tracker, in groups that methods share, and the objectives that they define."""
+"""Settings of the methods and the tracker, in groups that methods share, and the objectives that these settings define."""
 
 from __future__ import annotations
 
@@ -142,9 +142,9 @@ def mean_side(bounds: SceneBounds) -> float:
 
 
 def rendered_depth_scale(bounds: SceneBounds) -> float:
-    """Return the depth difference (metres) at which outliers begin in rendered rays.
+    """Return the depth error (metres) beyond which a rendered ray counts as an outlier.
 
-    A field's resolution, and hence the error of its depth, is a fraction of its box, and so is this difference: 3.8 % of the
+    A field's resolution, and hence the error of its depth, is a fraction of the field's box, and so is this threshold: 3.8 % of the
     mean side. The resolution of a baked surface does not matter: it may come from measured depth, which is more accurate than
     the field's renderings.
     """

@@ -1,7 +1,7 @@
-"""Support of a pose that landmarks did not find: its agreement with the measurements, which must distinguish it from its rivals.
+"""Support of a pose found without landmarks: the measurements must agree with the pose and distinguish it from its rivals.
 
 A plain wall looks the same from everywhere, so agreement alone is weak evidence: a pose must explain the measurements better
-than its rivals. These are poses displaced from it by more than the tolerated error, the best different pose of a search, and
+than its rivals. The rivals are poses displaced by more than the tolerated error, the best different pose of a search, and
 images rendered in their mean colour. One test serves colours, depths and points on the surface: the difference of each
 measurement's cost between the rival and the pose.
 """
@@ -51,7 +51,7 @@ SUPPORT_BOUNDS = (
 
 
 def odds(log_odds: float) -> float:
-    """Return the odds of given logarithm, limited to what floating-point numbers can hold."""
+    """Return the odds for given log odds, limited to the range of floating-point numbers."""
     return math.exp(max(-500.0, min(500.0, log_odds)))
 
 
@@ -87,13 +87,13 @@ class Support:
 
     @property
     def confidence(self) -> float | None:
-        """The posterior probability of the pose, with equal prior odds against each rival; None if it was not compared with any."""
+        """The posterior probability of the pose, with equal prior odds against each rival; None if it was not compared with rivals."""
         if self.displaced is None:
             return None
         return 1 / (1 + sum(odds(-against) for against in (self.plain, self.displaced, self.other)))
 
     def verdict(self, accepted: str) -> Verdict:
-        """Return the first bound that is not kept, or else acceptance for the reason ``accepted``."""
+        """Return the verdict of the first violated bound or, if all bounds hold, acceptance with the reason ``accepted``."""
         displaced = NO_RIVAL if self.displaced is None else self.displaced
         rivals = (
             (self.plain, Outcome.UNDETERMINED, "a single-colour image"),
@@ -141,7 +141,7 @@ def support(
 
 
 def log_odds(rivals: Float[Tensor, "h n"], here: Float[Tensor, "n"]) -> Float[Tensor, "h"]:
-    """Return the log odds against each rival, from the costs of each measurement for it and the pose; 0 where not finite."""
+    """Return the log odds of the pose against each rival, from the costs of each measurement for both; 0 where not finite."""
     difference = rivals - here
     error = difference.std(-1) * difference.shape[-1] ** 0.5
     # Half a unit of log odds per standard error of the difference: independent measurements would justify more, but the errors of
@@ -155,8 +155,8 @@ def same_pose(
 ) -> Bool[Tensor, "h"]:
     """Return a mask of the ``others`` (h) that differ from ``T`` by at most ``within``.
 
-    This is a fraction of the distance to the ``middle`` of the visible scene (metres, last camera's frame), by which the middle is
-    displaced, and an angle in radians.
+    ``within`` limits both the displacement of the ``middle`` of the visible scene (metres, last camera's frame), as a fraction of the
+    distance to the middle, and the angle in radians.
     """
     middle = middle.to(T.translation)
     shift = torch.linalg.vector_norm(others.apply(middle) - T.apply(middle), dim=-1)

@@ -1,4 +1,4 @@
-"""Baking: the surface and landmarks of a map, the capture record of its photos, and whether these show its scene."""
+"""Baking the surface and landmarks of a map, and checking that photos show the scene of the map."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ def bake_surface(
 ) -> SurfaceMap:
     """Build the surface of a map from the measured depth of ``views``, or else from depth rendered by ``field``.
 
-    Depth is rendered from the map's cameras, or from those of the views if the map has none. Raises
-    ``InputError`` if there are neither, and if images do not agree on a surface. ``where`` begins log
-    messages.
+    Depth is rendered from the map's cameras or, if the map has none, from the cameras of the views. Raises
+    ``InputError`` if there are no cameras at all, and if the images do not agree on a surface. ``where``
+    prefixes log messages.
     """
     began = time.monotonic()
     cameras = cameras_of(info) or [(view.frame.intrinsics, view.T_ref_camera) for view in views]
@@ -64,11 +64,12 @@ def bake_landmarks(
     where: str,
     tracked: TrackedViews | None = None,
 ) -> tuple[MapInfo, LandmarkMap | None, TrackedViews]:
-    """Build landmarks from ``views`` or, without any, from images that ``field`` renders at the map's cameras.
+    """Build landmarks from ``views`` or, without views, from images that ``field`` renders at the map's cameras.
 
-    Returns them, None if the images show too little texture (localization then relies on the surface alone), the description of
-    the map with what was learned meanwhile, and the keypoints they were built from. ``tracked`` holds these keypoints if they
-    were tracked already. ``where`` begins log messages.
+    Returns the description of the map updated with the landmarks' source and detector, the landmarks, and the
+    keypoints from which they were built. The landmarks are None if the images show too little texture;
+    localization then relies on the surface alone. ``tracked`` holds the keypoints if already tracked. ``where``
+    prefixes log messages.
     """
     began = time.monotonic()
     source: LandmarkSource = "photos" if views else "rendered images"
@@ -107,7 +108,7 @@ def _no_cameras(where: str) -> InputError:
 
 
 def with_tracks_in(info: MapInfo, landmarks: LandmarkMap, names: Sequence[str]) -> LandmarkMap:
-    """Return landmarks that were built from images with these names, with tracks in the images of the map."""
+    """Return landmarks built from images with these ``names``, with tracks that refer to the images of the map."""
     if landmarks.tracks is None:
         return landmarks
     numbers = {camera.name: number for number, camera in enumerate(info.cameras)}
@@ -116,7 +117,7 @@ def with_tracks_in(info: MapInfo, landmarks: LandmarkMap, names: Sequence[str]) 
 
 
 def check_alike(info: MapInfo, field: RadianceField, views: Sequence[View], where: str) -> None:
-    """Raise ``InputError`` for photos that are unlike the field, regardless of whether the map was built from them."""
+    """Raise ``InputError`` if photos differ too much from the field's renderings, whether or not the map was built from them."""
     # The difference (RMS) between rendered and photographed colours indicates another scene if it is large relative to that of
     # the photos the map was built from, or in itself if that is unknown, as in a map that was never baked.
     off, usual = colour_noise(field, info.bounds, views), info.colour_noise

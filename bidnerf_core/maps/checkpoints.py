@@ -1,4 +1,4 @@
-"""``Checkpoints``: stores a map that is in training now and then."""
+"""``Checkpoints``: stores a map at intervals during training."""
 
 from __future__ import annotations
 
@@ -29,11 +29,12 @@ USUAL_SECONDS = 60.0
 
 
 class Checkpoints:
-    """The ``Report`` of a training run.
+    """The ``Report`` of a training run, which saves checkpoints.
 
-    States are saved to ``folder``, unless that is None; ``info`` describes the last one. Progress goes to the
-    current job, which may also stop the training. ``state`` is the one to resume from, ``seconds`` the time
-    between checkpoints, and ``landmarks`` are stored with the first if they are not in the folder yet.
+    States are saved to ``folder``, or not at all if that is None; ``info`` describes the last saved state.
+    Progress is reported to the current job, which may also stop the training. ``state`` is the training state
+    to resume from, ``seconds`` is the time between checkpoints, and ``landmarks`` are stored with the first
+    checkpoint if they are not in the folder yet.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Several maps at once: which of them an image shows, and its pose there."""
+"""Localization in several maps: finding the map that an image shows, and the pose of the image in that map."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ log = logging.getLogger("bidnerf")
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """The map that an image shows, its pose there, and the runner-up."""
+    """The map that an image shows, the pose of the image in that map, and the runner-up."""
 
     map: str  # the map of the best answer, even if that was rejected
     found: Localization
@@ -54,7 +54,7 @@ class Placement:
         return self.found.converged
 
     def plain(self) -> dict[str, Any]:
-        """Return the JSON values of the map, its similarity, and the runner-up."""
+        """Return the map, its similarity and the runner-up as JSON values."""
         runner_up, similarity = None, {name: round(cosine, 4) for name, cosine in self.ranking.items()}
         if self.runner_up is not None:
             name, other = self.runner_up
@@ -65,10 +65,11 @@ class Placement:
 
 
 class MapCollection:
-    """Finds the map that an image shows, and its pose there.
+    """Finds the map that an image shows, and the pose of the image in that map.
 
-    Maps are ranked by pooled descriptors, and only the first are tried. Maps without landmarks cannot be ranked
-    and are tried last. Some of the loaded maps stay in memory. Use it from one thread only.
+    Maps are ranked by the similarity of pooled descriptors, and only the most similar are tried. Maps without
+    landmarks cannot be ranked and are tried last. Recently used maps stay in memory. A collection must be used
+    from one thread only.
     """
 
     def __init__(
@@ -107,7 +108,7 @@ class MapCollection:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the maps: those of their folders, with as many of the folders around them as tell them apart."""
+        """The names of the maps: their folders' names, with as many parent folders as distinguish the maps."""
         return tuple(self._maps)
 
     def __len__(self) -> int:
@@ -115,7 +116,7 @@ class MapCollection:
 
     @property
     def cameras(self) -> tuple[Intrinsics, ...]:
-        """The cameras of the images of all maps, which serve as candidates for photos without any."""
+        """The cameras of the images of all maps, used as candidates for photos whose camera is unknown."""
         return tuple(camera.intrinsics for info in self._infos.values() for camera in info.cameras)
 
     def localizer(self, name: str) -> Localizer:
@@ -133,7 +134,7 @@ class MapCollection:
         return Localizer(stored, self.method, self.config, warm_up=False)
 
     def ranked(self, frame: Frame) -> dict[str, float]:
-        """Return the similarity of each map to an image, most similar first; it is -1 for a map without landmarks."""
+        """Return the similarity of an image to each map, most similar first; -1 for a map without landmarks."""
         vectors: dict[tuple[str, int], Float[Tensor, "p"]] = {}
         for key, vocabulary in self._vocabularies.items():
             descriptors = detected(find_features(key[0]), frame.rgb).descriptors if frame.has_colour else None
@@ -146,11 +147,12 @@ class MapCollection:
         return dict(sorted(found.items(), key=lambda item: -item[1]))
 
     def __call__(self, frame: Frame, seed: int = 0) -> Placement:
-        """Find the map that a frame shows, and its pose there.
+        """Find the map that a frame shows, and the pose of the frame in that map.
 
-        The landmarks of the most similar maps are tried one after another until one accepts the image, and
-        then the next map as runner-up. The full method then localizes in the accepting map, or in the first
-        one if none accepts. Raises ``InputError`` for a frame that cannot be localized at all.
+        The frame is localized with the landmarks of the most similar maps in turn until one map accepts it, and
+        then in the next map as runner-up. The full method then localizes the frame in the best of the maps
+        tried: an accepting one if there is any, then the one with the most inliers. Raises ``InputError`` for a
+        frame that cannot be localized at all.
         """
         ranking = self.ranked(frame)
         quick: dict[str, Localization] = {}
@@ -170,7 +172,7 @@ class MapCollection:
     def _by_landmarks(self, name: str, frame: Frame, seed: int) -> Localization:
         """Localize a frame with the landmarks of a map.
 
-        The full method is used for maps without landmarks, and for other methods.
+        The full method is used instead for maps without landmarks, and for methods that do not match landmarks.
         """
         localizer = self.localizer(name)
         try:
@@ -182,7 +184,7 @@ class MapCollection:
         return replace(found, unit=unit_of(localizer.scene)).translated(origin_of(localizer.scene))
 
     def _indexed(self) -> dict[str, tuple[str, int]]:
-        """Pool the descriptors of all maps; return the detector and the length of the descriptors of those with landmarks."""
+        """Pool the descriptors of all maps; return the detector and descriptor length of each map with landmarks."""
         count, landmarks = counter("reading", "maps"), dict[str, LandmarkMap]()
         for number, (name, scene) in enumerate(self._maps.items(), start=1):
             check_cancelled("reading maps")
@@ -212,7 +214,7 @@ def maps_in(folder: Path) -> list[Path]:
 
 
 def _named(maps: Sequence[Map | str | Path] | Mapping[str, Map]) -> Mapping[str, Map | Path]:
-    """Return maps by the last part of their paths, or by as many of the last ones as tell them apart."""
+    """Return the maps by the last part of their paths, or by as many trailing parts as distinguish them."""
     if isinstance(maps, Mapping):
         return maps
     placed, found = list[tuple[tuple[str, ...], Map | Path]](), dict[str, Map | Path]()
@@ -246,6 +248,6 @@ def _unrecognised(reason: str, method: str) -> Localization:
 
 
 def _merit(found: Localization) -> tuple[bool, float, float]:
-    """Return the sort key for answers of several maps: whether they are accepted, inliers, and confidence."""
+    """Return the key that ranks answers from several maps: acceptance, then inliers, then confidence."""
     inliers = getattr(found.diagnostics, "inliers", 0)
     return found.converged, float(inliers), -1.0 if found.confidence is None else found.confidence

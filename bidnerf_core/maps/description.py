@@ -29,9 +29,10 @@ LandmarkSource = Literal["photos", "rendered images"]
 
 @dataclass(frozen=True)
 class Anchor:
-    """Where on earth a map lies: a point, and the map's pose in the east-north-up frame there.
+    """The location of a map on earth: a geodetic point, and the map's pose in the east-north-up frame at that point.
 
-    A file ``anchor.json`` next to ``map.json``, which users may write, takes the place of key ``anchor`` until the map is saved.
+    Users may write an ``anchor.json`` next to ``map.json``; it overrides the key ``anchor`` until the map is
+    saved.
     """
 
     latitude: float  # degrees
@@ -44,7 +45,7 @@ class Anchor:
     orientation_sigma: float = 0.0  # about each axis; degrees
 
     def __post_init__(self) -> None:
-        """Raise ``InputError`` for a place off the earth, a matrix that is no pose, and a length or angle out of range."""
+        """Raise ``InputError`` for a value out of range, or a matrix that is not a rigid transform."""
         # The height is in metres above or below the ellipsoid.
         for name, most in (("latitude", 90.0), ("longitude", 180.0), ("height", 1e6)):
             if not abs(getattr(self, name)) <= most:
@@ -57,7 +58,7 @@ class Anchor:
 
     @cached_property
     def pose(self) -> SE3:
-        """T_enu_world: the map's frame, in metres, in the east-north-up frame at the anchor."""
+        """T_enu_world: the pose of the map's frame, scaled to metres, in the east-north-up frame at the anchor."""
         rows = [list(row) for row in self.T_enu_world]
         if [len(row) for row in rows] != [4] * 4:
             raise InputError(where="T_enu_world", expected="4 rows of 4 numbers")
@@ -69,10 +70,10 @@ class Anchor:
 
 
 def load_anchor(folder: Path, newer: str = "") -> Anchor | None:
-    """Return the anchor in a file of its own in the folder of a map, or None if there is none.
+    """Load the anchor from a separate file in a map's folder; None if there is no such file.
 
-    This is ``anchor.json``, or the file ``newer`` by which earlier versions replaced it. Raises ``InputError`` for a damaged
-    one.
+    The file is ``newer``, as earlier versions named it, if that exists, else ``anchor.json``. Raises
+    ``InputError`` if the file is damaged.
     """
     path = folder / newer if newer and (folder / newer).exists() else folder / ANCHOR
     if not path.exists():
@@ -83,7 +84,7 @@ def load_anchor(folder: Path, newer: str = "") -> Anchor | None:
 
 @dataclass(frozen=True)
 class FieldFrame:
-    """The length unit in which the field of a map was trained, if the map was scaled later."""
+    """The scale and bounds in which a map's field was trained, for a map that was scaled afterwards."""
 
     scale: float  # units of the map per unit of the field
     bounds: SceneBounds  # of the field, in its own unit
@@ -133,7 +134,7 @@ class MapInfo:
 
     @property
     def interruption(self) -> str | None:
-        """Where training stopped and how to resume it, as a clause; None if it is complete."""
+        """A clause that says where training stopped and how to resume it; None if training is complete."""
         if self.complete:
             return None
         if not self.step:
@@ -141,7 +142,7 @@ class MapInfo:
         return f"its training stopped at step {self.step}; 'bidnerf train' with --resume continues it"
 
     def scaled(self, factor: float, unit: LengthUnit) -> MapInfo:
-        """Return the description of the map with lengths multiplied by ``factor``; weights stay in the unit of training."""
+        """Return the description with lengths multiplied by ``factor``; the weights keep the unit of training."""
         frame = self.field_frame or FieldFrame(1.0, self.bounds)
         scale = frame.scale * factor
         return replace(
@@ -155,22 +156,22 @@ class MapInfo:
         )
 
     def in_map_unit(self, field: RadianceField) -> RadianceField:
-        """Convert a field as its backend built it to the unit of the map."""
+        """Convert a field, as built by its backend, to the length unit of the map."""
         return field if self.field_frame is None else scaled_field(field, self.field_frame.scale)
 
 
 def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
-    """Return the cameras of the training images with their ``T_world_camera`` (float64)."""
+    """Return the intrinsics and ``T_world_camera`` (float64) of each training image."""
     return [(c.intrinsics, c.pose) for c in info.cameras]
 
 
 def longest_side(info: MapInfo) -> int | None:
-    """Return the longer side of the largest training image, to which images were downscaled; None without cameras."""
+    """Return the longer side (pixels) of the largest training image after downscaling; None without cameras."""
     return max((max(c.intrinsics.width, c.intrinsics.height) for c in info.cameras), default=None)
 
 
 def load_info(folder: Path) -> MapInfo:
-    """Load and check ``map.json``. Raises ``InputError`` if it does not describe a map of this version."""
+    """Load and check ``map.json``. Raises ``InputError`` unless it describes a map of this format version."""
     path = folder / DESCRIPTION
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "no such folder"

@@ -73,18 +73,19 @@ def extend(
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Map:
-    """Return a map extended with more photos of its scene; a map in a folder is replaced there once everything is done.
+    """Extend a map with more photos of its scene and return it; a map in a folder is replaced there only at the end.
 
-    The photos are localized in the map; those that fail, and those the map was built from, are left out.
-    Training continues with the others and with ``data``, the images that the map was built from, or, without
-    these, with renderings at their cameras, so that the field does not forget them. ``steps`` is the number
-    of training steps, by default in proportion to the new photos. Landmarks of the new photos are added (with
-    ``data``, all are rebuilt), and the surface is rebaked from all cameras.
+    The photos are localized in the map; photos that cannot be localized, and photos from which the map was
+    built, are left out. Training continues with the new photos and with ``data``, the images from which the map
+    was built. Without ``data``, renderings at the cameras of those images are used instead, so that the field
+    does not forget them. ``steps`` is the number of training steps, by default in proportion to the number of
+    new photos. Landmarks of the new photos are added (with ``data``, all landmarks are rebuilt), and the
+    surface is rebaked from all cameras.
 
-    A map whose photos are all known is returned unchanged. Raises ``InputError`` if the photos show another
-    scene, if the map has no landmarks for localizing them, and if its folder changes meanwhile; raises
-    ``Cancelled`` once ``cancel`` returns True. The map in the folder is then unchanged, as it is if the
-    process is killed.
+    A map that already contains all the photos is returned unchanged. Raises ``InputError`` if the photos show
+    another scene, if the map has no landmarks for localizing them, and if the map's folder changes meanwhile;
+    raises ``Cancelled`` once ``cancel`` returns True. In these cases, and if the process is killed, the map in
+    the folder is unchanged.
     """
     if steps is not None and (isinstance(steps, bool) or steps < 1):
         raise InputError(f"steps is {steps!r}", expected="a positive whole number")
@@ -107,10 +108,10 @@ def extend(
 
 
 def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> list[View]:
-    """Localize frames in a map, and return those that the map was not built from, with names that it does not use yet.
+    """Localize frames in a map, and return those that are new to the map, under names that it does not use yet.
 
-    ``unread`` are photos that could not be read, which count as left out. Raises ``InputError`` if the map
-    has no landmarks, and if hardly any of the frames is localized.
+    ``unread`` lists photos that could not be read, which count as left out. Raises ``InputError`` if the map
+    has no landmarks, and if hardly any frame is localized.
     """
     where = scene.name
     if scene.landmarks is None:
@@ -158,7 +159,7 @@ def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> li
 
 
 def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], list[LeftOut]]:
-    """Read photos, downscaled to the size of the map's largest image; also return those that cannot be read."""
+    """Read photos, downscaled to the size of the map's largest image; also return the photos that cannot be read."""
     side, background = longest_side(scene.info), scene.bounds.background
     frames, unread = list[Frame](), list[LeftOut]()
     source: Sequence[Frame] | Sequence[View] | Capture
@@ -292,7 +293,7 @@ def _extended(
 def _trained_on(
     scene: Map, views: Sequence[View], steps: int | None, share: float
 ) -> tuple[RadianceField, int]:
-    """Continue training a copy of the field; return it, in the unit of its own training, and the number of steps."""
+    """Continue training a copy of the field; return the copy, in its own training unit, and the number of steps."""
     info = scene.info
     backend = load_backend(info.backend, str(scene.folder or ""))
     settings: Any = from_plain(backend.config_type, info.config, "config")
@@ -329,9 +330,9 @@ def _in_field_unit(view: View, factor: float) -> View:
 
 
 def _present(landmarks: LandmarkMap, more: LandmarkMap) -> Bool[Tensor, "n"]:
-    """Return which landmarks of ``more`` match one of ``landmarks``.
+    """Return a mask of the landmarks of ``more`` that match one of ``landmarks``.
 
-    They are near in space, given their accuracy, and have similar descriptors.
+    Landmarks match if they are close, given their standard deviations, and have similar descriptors.
     """
     count = min(4, len(landmarks))
     away, near = cKDTree(landmarks.positions.numpy()).query(more.positions.numpy(), k=count)
@@ -345,6 +346,6 @@ def _present(landmarks: LandmarkMap, more: LandmarkMap) -> Bool[Tensor, "n"]:
 
 
 def _names_like(name: str, taken: Container[str]) -> list[str]:
-    """Return the names taken by photos called ``name``: the name itself, and those that were derived from it."""
+    """Return the names in ``taken`` used for photos called ``name``: the name itself and names derived from it."""
     derived = itertools.chain([name], (f"{name}_{n}" for n in itertools.count(2)))
     return list(itertools.takewhile(lambda each: each in taken, derived))

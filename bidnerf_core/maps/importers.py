@@ -1,4 +1,4 @@
-"""Importers, which read a trained field, a mesh or the like from a file; found by name as backends are."""
+"""Importers: plugins, found by name like backends, that read a trained field, a mesh or the like from a file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ UNMOVED = Similarity(1.0, SE3.identity())
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """Images with poses and the points that they observe, as structure from motion finds them."""
+    """Posed images and the points that they observe, as reconstructed by structure from motion."""
 
     capture: Capture  # the images, all with poses and named; without a file, if their keypoints are known
     positions: Float[Tensor, "p 3"]  # metres, world, float64
@@ -37,7 +37,7 @@ class Structure:
 
 @dataclass(frozen=True, eq=False)
 class ImportedField:
-    """Result of an importer: how a backend builds the field, and its tensors."""
+    """The result of an importer: the field's backend, settings and tensors, and facts about the scene."""
 
     backend: str  # name of the backend that builds the field
     config: Any  # of the backend's ``config_type``
@@ -66,16 +66,16 @@ class Importer(Protocol):
 
     @property
     def summary(self) -> str:
-        """One-line description for ``bidnerf plugins importers``: which files it reads."""
+        """One-line description for ``bidnerf plugins importers``: the files that the importer reads."""
         ...
 
     @property
     def config_type(self) -> type:
-        """A frozen dataclass with a default for every field: the settings a user may need to give for a file."""
+        """The type of the importer's settings: a frozen dataclass with a default for every field."""
         ...
 
     def recognises(self, path: Path) -> bool:
-        """Return whether it can read the file or folder, judging by its name and first bytes. Never raises."""
+        """Return whether the importer can read the file or folder, judging by name and first bytes. Never raises."""
         ...
 
     def read(self, path: Path, config: Any, placement: Similarity) -> ImportedField:
@@ -97,9 +97,10 @@ IMPORTERS: Plugins[Importer] = Plugins("importers", _defects)
 
 
 def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
-    """Return an importer and its name: the one with that name or, without a name, the one that recognizes the file.
+    """Return the name and importer for a file: the importer called ``name`` or, without a name, the one that recognizes the file.
 
-    Raises ``InputError`` if there is no such file, if it is unreadable or a pointer of Git LFS, and if none or several recognize it.
+    Raises ``InputError`` if there is no such file, if the file is unreadable or a Git LFS pointer, and if no
+    importer or more than one recognizes it.
     """
     if not path.exists():
         raise InputError("no such file or folder", where=path, expected="a trained field or a COLMAP model")
@@ -129,9 +130,9 @@ def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
 def robust_box(
     points: Float[Tensor, "n 3"], outside: float = 0.005, margin: float = 0.05
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Return the corners of a box around all points except a fraction of ``outside`` at each end of each axis.
+    """Return the corners of a box around all points except the fraction ``outside`` at each end of each axis.
 
-    It is widened by ``margin`` times its longest side.
+    The box is then widened on every side by ``margin`` times its longest side.
     """
     some = points[:: max(1, len(points) // 200_000)].double()
     lower, upper = (some.quantile(q, dim=0) for q in (outside, 1 - outside))
@@ -144,10 +145,10 @@ def bounds_about(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     footprint: float = 0.0,
 ) -> SceneBounds:
-    """Return bounds for matter at ``points`` (metres, world) whose training images are unknown.
+    """Return scene bounds for geometry at ``points`` (metres, world) whose training images are unknown.
 
-    If much of the matter is far outside the box around most of it, the scene is unbounded: the box is then
-    the one around its dense part, and ``contracted`` is set.
+    If much of the geometry lies far outside the box around most of it, the scene is unbounded: the box then
+    encloses only the dense part, and ``contracted`` is set.
     """
     inner, outer = robust_box(points, 0.15, 0.25), robust_box(points)
     sides = [float((upper - lower).max()) for lower, upper in (inner, outer)]

@@ -1,4 +1,4 @@
-"""Importing: a map from a field trained elsewhere, or from a mesh or the like."""
+"""Importing maps from fields trained elsewhere, from meshes and the like, and from COLMAP models."""
 
 from __future__ import annotations
 
@@ -79,17 +79,19 @@ def import_map(
 ) -> Map:
     """Build a map from a field in a file: splats, a checkpoint, or whatever an installed importer reads.
 
-    From a COLMAP model, whose points and tracks become the landmarks, this is a map without a field, which ``train`` adds.
+    A COLMAP model yields a map without a field, whose landmarks come from the model's points and tracks;
+    ``train`` adds a field.
 
-    ``config`` holds settings of the importer: an object of its ``config_type``, or a dict of those that differ from the
-    defaults. Lengths are multiplied by ``options.scale``, and ``options.T_world_file`` then transforms the file's
-    coordinates to the world. If that is far away, as survey coordinates are, the map gets an origin there, see
-    ``Map.origin``. ``photos`` are images with poses in the world (a dataset, the path to one, or views), of which
-    ``options.images`` selects a part; landmarks are built from them. Without any, landmarks come from rendered images,
-    which match photos less well. The map is stored in folder ``out``, or only in memory if that is None.
+    ``config`` holds settings of the importer: an object of its ``config_type``, or a dict of those that differ
+    from the defaults. Lengths are multiplied by ``options.scale``, and ``options.T_world_file`` then transforms
+    the file's coordinates to the world. If that places the scene far from the world's origin, as with survey
+    coordinates, the map gets a local origin, see ``Map.origin``. ``photos`` are images with poses in the world
+    (a dataset, the path to one, or views), of which ``options.images`` selects a part; landmarks are built from
+    them. Without photos, landmarks are built from rendered images, which match photos less well. The map is
+    stored in folder ``out``, or only in memory if that is None.
 
-    Raises ``InputError`` if the file, the photos, the settings or the folder cannot be used, and if the
-    photos do not show the scene of the field; the folder must be empty unless ``options.overwrite`` is set.
+    Raises ``InputError`` if the file, the photos, the settings or the folder cannot be used, and if the photos
+    do not show the scene of the field; the folder must be empty unless ``options.overwrite`` is set.
     """
     path, scale = Path(path), options.scale
     if not (math.isfinite(scale) and scale > 0):
@@ -164,7 +166,7 @@ def import_map(
 def _of_structure(
     found: ImportedField, structure: Structure, options: ImportOptions, place: Path | None, bake: bool
 ) -> Map:
-    """Return a map of landmarks alone, from the points that posed images observe."""
+    """Build a landmark-only map from posed images and the points that they observe."""
     capture, features = structure.capture, options.features
     T_world_camera = SE3.stack([shot.T_world_camera for shot in capture.shots if shot.T_world_camera])
     origin = chosen_origin(T_world_camera.translation)
@@ -198,7 +200,7 @@ def _of_structure(
 
 
 def _described(structure: Structure, features: str, origin: Origin) -> tuple[ReadViews, TrackedViews]:
-    """Return blank views, and the keypoints that are known of them, in tracks by the points they observe.
+    """Return blank views with their known keypoints, which are grouped into tracks by the points they observe.
 
     Raises ``InputError`` if the descriptors are not those of the detector ``features``.
     """
@@ -256,7 +258,7 @@ def _described(structure: Structure, features: str, origin: Origin) -> tuple[Rea
 
 
 def _report_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
-    """Log how large the scene is, and warn if its lengths are hardly in metres."""
+    """Log the extent of the scene, and warn if its lengths are unlikely to be in metres."""
     size: Sequence[float] = found.bounds.size
     if found.points is not None and len(found.points):
         lower, upper = robust_box(found.points, margin=0.0)

@@ -1,4 +1,4 @@
-"""Finding the factor that converts the lengths of a map to metres: by a known distance, or by known positions of cameras."""
+"""Finding the factor that converts a map's lengths to metres, from a known distance or known camera positions."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ class ScaleFit:
 
 
 def factor_of_distance(scene: Map, first: Place, second: Place, metres: float) -> float:
-    """Return the factor that makes the distance between two places ``metres``.
+    """Return the scale factor that makes the distance between two points of the map equal ``metres``.
 
-    Raises ``InputError`` for places that the map does not have or that coincide, and for a length that is not
+    Raises ``InputError`` for points that the map does not have or that coincide, and for a length that is not
     positive.
     """
     if not 0 < metres < math.inf:
@@ -57,10 +57,11 @@ def factor_of_distance(scene: Map, first: Place, second: Place, metres: float) -
 
 
 def factor_of_poses(scene: Map, known: Mapping[str, SE3 | Position]) -> ScaleFit:
-    """Return the factor by which the map's cameras fit ``known`` poses (T_world_camera) or positions.
+    """Return the scale factor that best fits the map's cameras to ``known`` poses (T_world_camera) or positions.
 
-    These are in metres in any world, and matched by name. Only positions count. Raises ``InputError`` if fewer
-    than three cameras are known, all are in one place, or they do not fit with any factor.
+    The poses or positions are in metres, in any world frame, and matched by name; only positions are used.
+    Raises ``InputError`` if fewer than three cameras are known, if all are at one position, or if no factor
+    fits them.
     """
     found = {name: camera for name in known if (camera := _camera_of(scene, name)) is not None}
     if len({camera.name for camera in found.values()}) < len(found):
@@ -87,7 +88,7 @@ def factor_of_poses(scene: Map, known: Mapping[str, SE3 | Position]) -> ScaleFit
 
 
 def place_of(scene: Map, place: Place) -> Float[Tensor, "3"]:
-    """Return the world coordinates of a place of the map (float64), see ``Place``. Raises ``InputError`` if it has none."""
+    """Return the world coordinates (float64) of a point of the map, see ``Place``. Raises ``InputError`` for an unknown point."""
     if not isinstance(place, str):
         return _position(place)
     if (camera := _camera_of(scene, place)) is not None:
@@ -106,7 +107,7 @@ def place_of(scene: Map, place: Place) -> Float[Tensor, "3"]:
 
 
 def _position(place: SE3 | Position) -> Float[Tensor, "3"]:
-    """Return a position, or that of a pose (float64). Raises ``InputError`` for anything but three coordinates."""
+    """Return a position, or the position of a pose (float64). Raises ``InputError`` unless it has three coordinates."""
     given = place.translation if isinstance(place, SE3) else place
     point = torch.as_tensor(given, dtype=torch.float64).cpu()
     if point.shape != (3,) or not bool(point.isfinite().all()):
@@ -115,9 +116,9 @@ def _position(place: SE3 | Position) -> Float[Tensor, "3"]:
 
 
 def _camera_of(scene: Map, name: str) -> StoredCamera | None:
-    """Return the camera with a name, or the only one whose name ends so; None if there is none.
+    """Return the camera called ``name``, or the only camera whose name ends with it; None if there is none.
 
-    The name may end like an image file's.
+    ``name`` may include the extension of an image file.
     """
     cameras = {camera.name: camera for camera in scene.info.cameras}
     stem = name[: -len(Path(name).suffix)] if name.lower().endswith(IMAGE_SUFFIXES) else name
@@ -126,7 +127,7 @@ def _camera_of(scene: Map, name: str) -> StoredCamera | None:
 
 
 def _no_camera(scene: Map, name: str) -> str:
-    """Return the error text for a photo without a camera in the map, with other ways to name a point."""
+    """Return the error text for a name that no camera of the map has, with other ways to specify a point."""
     names = [camera.name for camera in scene.info.cameras]
     if not names:
         return "it has no cameras; expected coordinates X,Y,Z"

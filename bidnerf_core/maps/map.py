@@ -1,4 +1,4 @@
-"""A map: a field together with what localization needs."""
+"""``Map``: a radiance field together with the surface, landmarks and cameras used for localization."""
 
 from __future__ import annotations
 
@@ -79,9 +79,9 @@ USUAL_BAKE = BakeConfig()
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """A map, ready for use: its field is frozen (no parameter requires a gradient).
+    """A map ready for use, with a frozen field (no parameter requires a gradient).
 
-    A map that was loaded from or trained into a folder remembers it, and baking stores new parts there.
+    A map loaded from a folder or trained into one keeps the folder's path, and baking stores new parts there.
     """
 
     info: MapInfo
@@ -105,7 +105,7 @@ class Map:
 
     @property
     def has_field(self) -> bool:
-        """Whether the map has a radiance field; one of landmarks alone has none, and localizes images by these."""
+        """Whether the map has a radiance field; a landmark-only map has none and localizes images by its landmarks."""
         return has_field(self.field)
 
     @property
@@ -115,34 +115,35 @@ class Map:
 
     @property
     def origin(self) -> tuple[float, float, float]:
-        """The origin of the map's own coordinates in the world.
+        """The origin of the map's local coordinate frame, in world coordinates.
 
-        Poses given to the map and its localizers, and their answers, are in the world of the training data.
-        Positions of the map's parts are relative to the origin, which is 0 unless the data are far from that.
+        Poses passed to the map and its localizers, and the poses they return, are in the world frame of the
+        training data. Positions of the map's parts are relative to the origin, which is 0 unless the data lie
+        far from the world's origin.
         """
         return self.info.origin
 
     @property
     def anchor(self) -> Anchor | None:
-        """Where on earth the map lies, if known."""
+        """The map's geographic anchor, or None if its location on earth is unknown."""
         return self.info.anchor
 
     @property
     def has_distances(self) -> bool:
-        """Whether the training images determine distances."""
+        """Whether the training images determine distances; False if all were taken from one position."""
         return self.info.distances
 
     @property
     def unit(self) -> LengthUnit:
-        """The unit of all lengths: ``"metres"``, or ``"units"`` if their length is unknown."""
+        """The unit of all lengths: ``"metres"``, or ``"units"`` if the metric scale is unknown."""
         return self.info.unit
 
     @cached_property
     def up(self) -> UpDirection | None:
-        """The upward direction in the world, and its source; None for a map without cameras.
+        """The up direction in the world frame, with its source; None without measured gravity and without cameras.
 
-        It comes from gravity if the capture measured it, else from planes of the surface and from the
-        cameras.
+        The direction is that of measured gravity if the capture recorded it, and is otherwise estimated from
+        planes of the surface and from the cameras.
         """
         if self.info.gravity_up is not None:
             return given_up(self.info.gravity_up)
@@ -173,14 +174,14 @@ class Map:
 
     @property
     def name(self) -> str:
-        """The map's name in messages: its folder, else its dataset."""
+        """The map's name in messages: its folder or, in memory, its dataset."""
         return str(self.folder or self.info.data or "map in memory")
 
     def to(self, device: torch.device | str) -> Map:
-        """Return the map with its field, surface and landmarks on ``device``; only what is not there yet is copied.
+        """Return the map with its field, surface and landmarks on ``device``; parts already on the device are not copied.
 
-        Of all computations with landmarks, only the comparison of descriptors runs there, see
-        ``LandmarkMap.to``. Raises ``InputError`` for a device that does not work here.
+        Of all computations with landmarks, only the comparison of descriptors runs on ``device``, see
+        ``LandmarkMap.to``. Raises ``InputError`` for a device that is not usable on this machine.
         """
         return on_device(self, device)
 
@@ -189,12 +190,12 @@ class Map:
         return MapSummary.of(self)
 
     def scaled(self, factor: float, unit: LengthUnit = "metres") -> Map:
-        """Return the map with all lengths multiplied by ``factor``, in memory.
+        """Return a map in memory with all lengths multiplied by ``factor``.
 
-        These are the lengths of its field, bounds, surface, landmarks, record and anchor. ``unit`` is the
-        resulting length unit; ``scaled(1)`` declares that lengths are metres. ``save`` stores it, also over the
-        map itself. Raises ``InputError`` for a factor that is not positive or makes lengths too large or too
-        small, and for a map whose training is not complete.
+        The factor applies to the field, bounds, surface, landmarks, capture record and anchor. ``unit`` is the
+        length unit of the result; ``scaled(1)`` declares that lengths already are metres. ``save`` stores the
+        scaled map, and may overwrite the original. Raises ``InputError`` if ``factor`` is not positive or would
+        make lengths too large or too small, and if the map's training is incomplete.
         """
         if isinstance(factor, bool) or not (isinstance(factor, int | float) and 0 < factor < math.inf):
             raise InputError(f"factor is {factor!r}", expected="a positive number")
@@ -222,8 +223,8 @@ class Map:
     def render(self, view: View, level: int | None = None) -> RenderedImage:
         """Render colour (h, w, 3) in [0, 1] and depth (h, w), planar z in metres, with the camera and pose of ``view``.
 
-        ``level`` is the level of detail, 0 being the coarsest; None is the field itself. Raises
-        ``InputError`` for a level that the field does not have, and if ``view`` is not a view.
+        ``level`` is the level of detail, 0 being the coarsest; None selects the field itself. Raises
+        ``InputError`` for a level that the field does not have, and if ``view`` is not a ``View``.
         """
         if not isinstance(view, View):
             raise InputError(
@@ -249,15 +250,15 @@ class Map:
         progress: ProgressCallback | None = None,
         cancel: Cancel | None = None,
     ) -> Map:
-        """Return the map with a new surface and new landmarks, which are stored with it if it has a folder.
+        """Bake a new surface and new landmarks, and return the map with them; a map with a folder stores them there.
 
-        For the surface, views with measured depth replace rendered ones; landmarks are built from all views
-        of ``data`` (those of ``images.split``, for a dataset or the path to one). Without data, landmarks are
-        built from rendered images, unless the map has landmarks from photos: these are kept unless
-        ``rendered_landmarks`` is set. ``features`` names a landmark detector other than the map's. Raises
-        ``InputError`` if the data cannot be used or shows another scene, if nothing can be baked, and if
-        another program is writing to the folder; raises ``Cancelled`` once ``cancel`` returns True. Finished
-        parts are kept in that case.
+        Views with measured depth replace rendered views for the surface; landmarks are built from all views of
+        ``data`` (for a dataset or a path, those of ``images.split``). Without ``data``, landmarks built from
+        photos are kept unless ``rendered_landmarks`` is set, and otherwise new landmarks are built from
+        rendered images. ``features`` names a landmark detector other than the map's. Raises ``InputError`` if
+        the data cannot be used or shows another scene, if nothing can be baked, and if another program is
+        writing to the folder. Raises ``Cancelled`` once ``cancel`` returns True; the parts finished by then are
+        kept.
         """
         if rendered_landmarks and data is not None:
             raise InputError(
@@ -297,9 +298,10 @@ class Map:
         tracked: TrackedViews | None = None,
         surface: SurfaceMap | None = None,
     ) -> Map:
-        """Bake as ``bake`` does, with views at the map's poses, while the caller holds the lock of the folder.
+        """Bake as ``bake`` does, from views that have the map's poses; the caller must hold the folder's lock.
 
-        ``tracked`` holds the views' keypoints if they were tracked already, ``surface`` the surface if known.
+        ``tracked`` holds the keypoints of the views if already tracked, and ``surface`` the surface if already
+        built.
         """
         scene, tracked = self.with_landmarks(views, rendered_landmarks, tracked)
         return scene.with_surface(views, config, surface).with_survey(views, tracked)
@@ -307,10 +309,11 @@ class Map:
     def with_landmarks(
         self, views: Sequence[View], rendered: bool = False, tracked: TrackedViews | None = None
     ) -> tuple[Map, TrackedViews | None]:
-        """Return the map with new landmarks, and their keypoints; they need no field unless its images are ``rendered``.
+        """Return the map with new landmarks, and the tracked keypoints from which they were built.
 
-        Those from photos are kept, without keypoints, where neither views nor renderings replace them. As for ``with_parts``,
-        the caller holds the lock of the folder.
+        Landmarks are built from ``views`` or, without views, from rendered images, which require a field.
+        Without views, existing landmarks from photos are kept unless ``rendered`` is set, and no keypoints are
+        returned for them. The caller must hold the folder's lock, as for ``with_parts``.
         """
         check_cancelled("landmarks")
         if not views and not rendered and self.info.landmark_source != "rendered images":
@@ -331,14 +334,18 @@ class Map:
     def with_surface(
         self, views: Sequence[View], config: BakeConfig, surface: SurfaceMap | None = None
     ) -> Map:
-        """Return the map with a new surface: the given one, or one of the views' measured or the field's rendered depth."""
+        """Return the map with a new surface: ``surface`` if given, else a baked one.
+
+        Baking uses the measured depth of the views, or else depth rendered by the field.
+        """
         check_cancelled("surface")
         return self.with_parts(surface or bake_surface(self.info, self.field, views, config, self.name))
 
     def with_survey(self, views: Sequence[View], tracked: TrackedViews | None) -> Map:
-        """Return the map with the capture record of photos, whose keypoints were ``tracked``, and the field's error on them.
+        """Return the map with the capture record of the photos ``views`` and the field's colour error on them.
 
-        It is the map itself without photos, or without their keypoints.
+        ``tracked`` holds the keypoints of the photos. Without photos or without keypoints, the map is returned
+        unchanged.
         """
         if not views or tracked is None:
             return self
@@ -358,7 +365,7 @@ class Map:
         landmarks: LandmarkMap | None = None,
         record: CaptureReport | None = None,
     ) -> Map:
-        """Return the map with these parts in place of its own, and store them, while the caller holds the lock of the folder."""
+        """Replace parts of the map by the given ones, store them, and return the map; the caller must hold the folder's lock."""
         info = self.info
         if landmarks is not None:
             landmarks = with_images(landmarks, info)
@@ -373,17 +380,17 @@ class Map:
         )
 
     def save(self, folder: str | Path, overwrite: bool = False) -> Map:
-        """Write the whole map into a folder, and return it with that folder.
+        """Write the complete map to a folder, and return the map with that folder set.
 
-        Baked parts that were not loaded (``load_map`` with ``baked=False``) are written as well, and
-        returned. Raises ``InputError`` if the folder cannot be written, if it is not empty and ``overwrite``
-        is not set, and if the field does not come from a backend.
+        Baked parts that were not loaded (``load_map`` with ``baked=False``) are written and returned as well.
+        Raises ``InputError`` if the folder cannot be written, if it is not empty and ``overwrite`` is not set,
+        and if the field does not come from a backend.
         """
         with map_folder(Path(folder), overwrite):
             return self.stored_in(Path(folder))
 
     def stored_in(self, folder: Path) -> Map:
-        """Write the whole map into a folder as ``save`` does, while the caller holds the lock of the folder."""
+        """Write the complete map to a folder as ``save`` does; the caller must hold the folder's lock."""
         field = trained_field(self.field)
         if not isinstance(field, nn.Module):
             raise InputError(
@@ -400,7 +407,7 @@ class Map:
         return replace(whole, info=info, folder=folder, record=self.capture)
 
     def whole(self) -> Map:
-        """Return the map including the parts of its folder that were not loaded, or were added since."""
+        """Return the map with all parts of its folder, including those not loaded and an anchor added later."""
         if self.folder is None:
             return self
         surface, landmarks, info = self.surface, self.landmarks, self.info
@@ -414,10 +421,10 @@ class Map:
 
 
 def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool = True) -> Map:
-    """Load the map in ``folder`` onto ``device``, with its field built by its backend and frozen.
+    """Load the map in ``folder`` onto ``device``, with its field built by the map's backend and frozen.
 
-    ``baked`` determines whether the surface and landmarks are loaded. Raises ``InputError`` if the folder is
-    not a map, or is a damaged one.
+    ``baked`` says whether to load the surface and landmarks. Raises ``InputError`` if the folder does not hold
+    a map, or the map is damaged.
     """
     folder = Path(folder)
     info, weights, surface, landmarks = read_parts(folder, baked)
@@ -430,9 +437,10 @@ LOADERS.append(load_map)  # a Localizer opens a folder
 
 
 def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None = None) -> RadianceField:
-    """Build the field that ``info`` describes with the weights ``tensors``; no parameter requires a gradient.
+    """Build the field described by ``info`` with the weights ``tensors``; no parameter requires a gradient.
 
-    Errors name the files of ``folder``. Raises ``InputError`` if the backend or the weights do not fit.
+    ``folder`` locates the files that error messages name. Raises ``InputError`` if the backend cannot build the
+    field, or the weights do not match it.
     """
     if not info.step:
         return info.in_map_unit(NoField())

@@ -1,7 +1,8 @@
-"""The files of a map: JSON and safetensors, which cannot run code when they are read.
+"""Storage of maps as JSON and safetensors files, which cannot execute code when read.
 
-``map.json`` describes the map and names the files of its parts. Files are written under new names first and ``map.json`` is
-replaced atomically at the end: whenever writing stops, the folder holds one complete map.
+``map.json`` describes the map and names the files of its parts. Parts are first written under new names, and
+``map.json`` is replaced atomically at the end, so that an interruption always leaves one complete map in the
+folder.
 """
 
 from __future__ import annotations
@@ -62,15 +63,17 @@ def write_parts(
     capture: CaptureReport | None = None,
     keep: bool = False,
 ) -> MapInfo:
-    """Write parts of the map that ``info`` describes, and return its description with their names.
+    """Write parts of the map described by ``info``, and return the description with their file names.
 
-    With ``state``, this is a whole map, which replaces the one in the folder: parts that are not given, such as a surface that
-    was baked from earlier weights, are dropped, but with ``keep`` the landmarks that ``info`` names stay: they do not depend on
-    the weights. Without, the parts are added to the map in the folder, in place of those that it has; what ``info`` says about
-    landmarks (their source) and their images (the field's errors there) is written with these. The caller holds the lock of the folder.
+    With ``state``, the parts form a complete map that replaces the map in the folder. Parts that are not given,
+    such as a surface baked from earlier weights, are then dropped; with ``keep``, the landmarks named by
+    ``info`` stay, since landmarks do not depend on the weights. Without ``state``, the parts are added to the
+    map in the folder and replace its existing parts of the same kind; from ``info``, only the source of the
+    landmarks (with landmarks) and the colour error (with landmarks or a capture record) are stored. The caller
+    must hold the folder's lock.
 
-    Raises ``InputError`` for landmarks whose detector has no name by which a query could find it, and if the map was retrained
-    while a part was built.
+    Raises ``InputError`` for landmarks whose detector has no name by which a query could find it, and if the
+    map was retrained while a part was built.
     """
     if landmarks is not None and not landmarks.features:
         raise InputError("the landmarks' detector has no name;", where=folder, expected="a registered one")
@@ -120,9 +123,10 @@ def write_parts(
 def read_parts(
     folder: Path, baked: bool = True
 ) -> tuple[MapInfo, dict[str, Tensor], SurfaceMap | None, LandmarkMap | None]:
-    """Read the description, the weights and, if ``baked``, the surface and the landmarks of a map.
+    """Read the description and weights of a map and, if ``baked``, its surface and landmarks.
 
-    They belong together even while a training run replaces the map. Raises ``InputError`` if one of them is damaged.
+    The parts match each other even while a training run is replacing the map. Raises ``InputError`` if a part
+    is damaged.
     """
     info = load_info(folder)
     # A training run may replace the map between the reading of its description and of its parts. Checkpoints are seconds
@@ -155,21 +159,21 @@ def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingSta
 
 
 def load_surface(folder: Path, info: MapInfo) -> SurfaceMap | None:
-    """Load the baked surface of a map; None if it has none. Raises ``InputError`` if the file does not hold one."""
+    """Load the baked surface of a map, or None if the map has none. Raises ``InputError`` if the file is not a surface."""
     if info.surface is None:
         return None
     return load_part(folder / info.surface, surface_from_tensors, "a baked surface", BAKED)
 
 
 def load_landmarks(folder: Path, info: MapInfo) -> LandmarkMap | None:
-    """Load the landmarks of a map; None if it has none. Raises ``InputError`` if the file does not hold their tensors."""
+    """Load the landmarks of a map, or None if the map has none. Raises ``InputError`` if the file does not hold landmarks."""
     if info.landmarks is None:
         return None
     return with_images(load_part(folder / info.landmarks, landmarks_from_tensors, "landmarks", BAKED), info)
 
 
 def load_capture(folder: Path, info: MapInfo) -> CaptureReport | None:
-    """Load the capture record of a map; None if it has none. Raises ``InputError`` if the file does not hold one."""
+    """Load the capture record of a map, or None if the map has none. Raises ``InputError`` if the file is not a record."""
     if info.capture is None:
         return None
     path = folder / info.capture
@@ -178,15 +182,16 @@ def load_capture(folder: Path, info: MapInfo) -> CaptureReport | None:
 
 
 def with_images(landmarks: LandmarkMap, info: MapInfo) -> LandmarkMap:
-    """Return the landmarks with what a map's description records about the images they were built from."""
+    """Return the landmarks with the cameras and the detector name that the map's description records."""
     cameras = tuple(camera.intrinsics for camera in info.cameras)
     return replace(landmarks, cameras=cameras, features=info.landmark_features)
 
 
 def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
-    """Return a field's tensors from a file, checked, and upgraded if an earlier version stored them.
+    """Check the tensors of a field from a file, after upgrading those of earlier versions, and return them.
 
-    Their names, shapes and values are checked against the field here, since torch's own message would take many lines.
+    Names, shapes and values are checked against the field here, since torch's own error message would take many
+    lines.
     """
     if isinstance(field, UpgradingField):
         try:
@@ -242,10 +247,10 @@ def content_digest(field: RadianceField, surface: SurfaceMap | None, landmarks: 
 
 @contextlib.contextmanager
 def map_folder(out: Path, overwrite: bool) -> Iterator[None]:
-    """Prepare a folder for a map, and hold its lock: see ``output_folder``."""
+    """Prepare a folder for a map and hold its lock within the context, see ``output_folder``."""
 
     def is_leftover(file: Path) -> bool:
-        """Whether a process that was killed before the map was complete left the file behind."""
+        """Return whether the file was left behind by a process killed before the map was complete."""
         return OURS.fullmatch(file.name) is not None and not (file.parent / DESCRIPTION).exists()
 
     def describe(folder: Path) -> str | None:
@@ -264,9 +269,9 @@ def _json(value: Any) -> bytes:
 
 
 def _adopt_anchor(folder: Path) -> None:
-    """Move the content of ``anchor.json``, if users wrote one, into the description of their map.
+    """Move the content of a user-written ``anchor.json`` into the description of the map in the folder.
 
-    It thus never lies beside the description of another map, whenever writing stops.
+    Thus, even if writing is interrupted, the anchor never lies next to the description of another map.
     """
     if (folder / ANCHOR).exists():
         with contextlib.suppress(InputError):  # no map that the anchor could be of, or a damaged one
@@ -275,7 +280,7 @@ def _adopt_anchor(folder: Path) -> None:
 
 
 def _sweep(folder: Path) -> None:
-    """Remove the files of earlier and interrupted saves that ``map.json`` does not name; none if it is damaged."""
+    """Remove files of earlier and interrupted saves that ``map.json`` does not name; none if ``map.json`` is damaged."""
     kept = set[str]()
     if os.path.lexists(folder / DESCRIPTION):
         try:

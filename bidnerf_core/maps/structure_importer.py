@@ -104,7 +104,7 @@ class StructureImporter:
 
 
 def _numbers(observed: Tensor, ids: Tensor, sound: Tensor) -> Tensor:
-    """Return the numbers of observed points for their ids; -1 for those that are unknown or not finite."""
+    """Return the indices of observed points, given by their ids; -1 for points that are unknown or not finite."""
     if not len(ids):
         return torch.full_like(observed, -1)
     place = torch.searchsorted(ids, observed).clamp(max=len(ids) - 1)
@@ -112,7 +112,7 @@ def _numbers(observed: Tensor, ids: Tensor, sound: Tensor) -> Tensor:
 
 
 def _misfit(known: Mapping[str, Keypoints], counts: Mapping[str, int], cameras: list[object]) -> str | None:
-    """Return why keypoints do not belong to images with these ``counts`` of keypoints, or cannot be used; None if they can."""
+    """Return why keypoints do not fit images with these ``counts`` of keypoints, or cannot be used; None if they fit."""
     named = [name for name in counts if name in known]
     if not named:
         return "it has no keypoints of any image of the model"

@@ -1,4 +1,4 @@
-"""Summaries for users: the facts about a map, and how well it renders a photo."""
+"""Summaries for users: the facts about a map, and the quality of its rendering of a photo."""
 
 from __future__ import annotations
 
@@ -150,9 +150,9 @@ class RenderingScores:
 
 
 def rendering_scores(image: RenderedImage, frame: Frame, unit: LengthUnit = "units") -> RenderingScores:
-    """Compare a rendered image with the visible colours and measured depth of the frame from the same pose.
+    """Compare a rendered image with the visible colours and measured depth of a frame from the same pose.
 
-    ``unit`` is the map's, for printing the depth error.
+    ``unit`` is the length unit of the map, used to print the depth error.
     """
     errors = torch.zeros(0)
     if frame.depth is not None and frame.has_depth:

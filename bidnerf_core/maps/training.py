@@ -1,6 +1,6 @@
 """Building maps: landmarks, a trained field and a surface from posed images, and resuming interrupted work.
 
-The landmarks come first, since they localize images without a field, and stay when the rest is interrupted.
+Landmarks are built first: they can localize images without a field, and remain if later stages are interrupted.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ USUAL = TrainOptions()
 
 
 class OtherSettings(InputError):
-    """A training run cannot be resumed with settings that differ from its original ones."""
+    """Raised if a training run would be resumed with settings that differ from its original ones."""
 
 
 def train(
@@ -128,25 +128,26 @@ def train(
 ) -> Map:
     """Train a map on images: check and refine their poses, train the field, and bake a surface and landmarks.
 
-    ``data`` is a dataset, the path to one, or views whose reference frame is the world; ``options.images`` says how it
-    is read, such as which split. The path may also be a folder of photos without poses, or a video: ``find_poses`` then
-    finds the poses first, in the folder OUT-poses next to the map. ``backend`` is the name of an installed backend, and
-    ``config`` holds its settings: an object of its ``config_type``, a dict of those that differ from the defaults, or
-    "quick" for those of its short training. The map is stored in folder ``out`` during training, or only kept in memory if
-    that is None. ``bake`` may hold the settings of baking. If ``out`` holds a map of landmarks alone, such as an imported
-    one, that map gets a field and a surface, and keeps its landmarks, cameras and poses.
+    ``data`` is a dataset, the path to one, or views whose reference frame is the world; ``options.images`` says
+    how to read the images, such as which split. The path may also be a folder of photos without poses, or a
+    video: ``find_poses`` then finds the poses first, in the folder OUT-poses next to the map. ``backend`` is
+    the name of an installed backend, and ``config`` holds its settings: an object of its ``config_type``, a
+    dict of the settings that differ from the defaults, or "quick" for the settings of a short training. The map
+    is stored in folder ``out`` during training, or only kept in memory if that is None. ``bake`` may hold the
+    settings of baking. If ``out`` holds a landmark-only map, such as an imported one, that map gets a field and
+    a surface, and keeps its landmarks, cameras and poses.
 
     ``progress`` receives each step, and remarks go to the logger "bidnerf". Once ``cancel`` returns True,
-    ``Cancelled`` is raised; a map in a folder has then what was finished, landmarks first, and ``resume``
-    continues it. An exception raised by ``progress`` ends the training as well; the map in the folder is then
-    that of the last checkpoint, at most ``options.checkpoint_seconds`` old.
+    ``Cancelled`` is raised; a map in a folder then keeps the parts finished so far, landmarks first, and
+    ``resume`` continues it. An exception raised by ``progress`` ends the training as well; the map in the
+    folder is then that of the last checkpoint, at most ``options.checkpoint_seconds`` old.
 
-    Images with more than ``options.images.largest`` pixels along the longer side are downscaled to that, by default to
-    1600, or fewer if they would take more than 2 GB or a quarter of the available memory; the map's cameras are scaled
-    accordingly.
+    Images with more than ``options.images.largest`` pixels along the longer side are downscaled to that size,
+    by default to 1600, or fewer if the images would take more than 2 GB or a quarter of the available memory;
+    the map's cameras are scaled accordingly.
 
-    Raises ``InputError`` if data, settings or folder cannot be used, and if the poses contradict most pairs of images
-    unless ``options.trust_poses`` is set; the folder must be empty unless ``options.overwrite`` is set.
+    Raises ``InputError`` if data, settings or folder cannot be used, and if the poses contradict most pairs of
+    images unless ``options.trust_poses`` is set; the folder must be empty unless ``options.overwrite`` is set.
     """
     chosen, settings = load_backend(backend), config
     if config == "quick":
@@ -216,7 +217,7 @@ def train(
 def _with_field(
     scene: Map, data: Images, images: DatasetOptions, options: TrainOptions
 ) -> tuple[Map, list[View], TrackedViews | None]:
-    """Return a map of landmarks that a field is to be added to, with its images at its poses and their keypoints."""
+    """Prepare a landmark-only map for training a field; return it with its images at the stored poses, and their keypoints."""
     info, images = scene.info, replace(images, largest=longest_side(scene.info))
     read = read_views(data, images, options.depth_points, options.point_choice, scene.folder).about(
         info.origin
@@ -235,7 +236,7 @@ def _with_field(
 
 @contextlib.contextmanager
 def finished_parts(folder: Path | None) -> Iterator[None]:
-    """Add which parts of a map are in its folder to the error if the work in the context is cancelled."""
+    """If the work in the context is cancelled, list in the error the parts of the map that are finished."""
     try:
         yield
     except Cancelled as stopped:
@@ -263,10 +264,10 @@ def resume(
 ) -> Map:
     """Resume the interrupted training of the map in ``folder``, with the same result as an uninterrupted run.
 
-    A map that is trained but not baked is baked. With ``finish``, training ends with the steps done so far, and the map
-    is baked as it stands; without any steps, it is a map of landmarks alone. Backend, settings and poses are those of
-    the original run; ``data`` and those ``options`` that concern reading must give the same views. The other arguments
-    and the errors are as for ``train``. Raises ``InputError`` if nothing is left to do.
+    A map that is trained but not baked is baked. With ``finish``, training ends with the steps done so far, and
+    the map is baked as it stands; if no steps were done, the result is a landmark-only map. Backend, settings
+    and poses are those of the original run; ``data`` and the ``options`` for reading must yield the same views.
+    The other arguments and the errors are as for ``train``. Raises ``InputError`` if nothing is left to do.
     """
     out, baking, device = Path(folder), bake_settings(bake), working_device(options.device)
     interrupted(out, baking is not None)
@@ -303,9 +304,10 @@ def resume(
 
 
 def interrupted(folder: Path, baking: bool = True) -> MapInfo:
-    """Return the description of the map in ``folder``, whose training or, with ``baking``, whose surface is incomplete.
+    """Check that the map in ``folder`` has work left to resume, and return its description.
 
-    Raises ``InputError`` if nothing is left to do.
+    Work is left if training or, with ``baking``, the surface or the capture record is incomplete. Raises
+    ``InputError`` if nothing is left to do.
     """
     try:
         info = load_info(folder)
@@ -332,9 +334,9 @@ def posed_images(
 ) -> Iterator[tuple[Images, DatasetOptions]]:
     """Yield images with poses, and the options with which to read them.
 
-    For a folder of photos without poses, or a video, this is the dataset of poses found by structure from
-    motion, next to the map ``out``, or in a temporary folder for a map in memory; existing poses are reused.
-    Anything else is yielded unchanged.
+    For a folder of photos without poses, or a video, structure from motion finds the poses, and the dataset of
+    these is yielded. It lies next to the map ``out``, or in a temporary folder for a map in memory; existing
+    poses are reused. Any other ``data`` is yielded unchanged.
     """
     if not isinstance(data, str | Path) or not lacks_poses(data):
         yield data, options
@@ -397,9 +399,10 @@ def _completed(
     state: TrainingState | None = None,
     out: Path | None = None,
 ) -> Map:
-    """Go through the stages that a map lacks: landmarks, field, surface, and the capture record of its photos.
+    """Run the stages that the map has not completed: landmarks, field, surface, and the capture record of its photos.
 
-    ``tracked`` are the keypoints of ``views``, ``state`` is that of the training to resume, and the field goes to folder ``out``.
+    ``tracked`` holds the keypoints of ``views``, ``state`` the training state to resume from, and ``out`` the
+    folder for the field.
     """
     if baking is not None and scene.landmarks is None:
         scene, tracked = scene.with_landmarks(views, tracked=tracked)
@@ -419,7 +422,7 @@ def _completed(
 
 
 def _trained(views: Sequence[View], scene: Map, options: TrainOptions, state: TrainingState | None) -> Map:
-    """Train the field that a map describes to the end, from a ``state`` or from the beginning."""
+    """Train the field described by a map to completion, from ``state`` or from scratch."""
     out, device = scene.folder, working_device(options.device)
     backend, where = load_backend(scene.info.backend, str(out or "")), scene.name
     unsaved = scene.landmarks if scene.info.landmarks is None else None
@@ -446,7 +449,7 @@ def _trained(views: Sequence[View], scene: Map, options: TrainOptions, state: Tr
 
 
 def baked_if_possible(scene: Map, bake: Callable[[Map], Map]) -> Map:
-    """Return what ``bake`` returns or, if the images do not allow it, the map as it is: it is valid without a surface."""
+    """Return the result of ``bake`` or, if the images do not allow baking, the map as it is, valid without a surface."""
     try:
         return bake(scene)
     except PluginError:  # nothing that other images would fix

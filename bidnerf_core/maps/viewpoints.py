@@ -1,4 +1,4 @@
-"""Viewpoints for a field whose training images are unknown: cameras that see its matter from free space."""
+"""Viewpoints for a field whose training images are unknown: cameras in free space that see the field's geometry."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def viewpoints(
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     is_solid: bool = False,
 ) -> tuple[StoredCamera, ...]:
-    """Return cameras that see the matter of a field: from all around an object, or from free places within a room.
+    """Return cameras that see the geometry of a field, placed all around an object or in free space within a room.
 
-    ``up`` is the upward direction in the images. The inside of an ``is_solid`` object is not free, although
-    rays hit nothing there. Deterministic.
+    ``up`` is the up direction in the images. The inside of an ``is_solid`` object does not count as free space,
+    although rays hit nothing there. The result is deterministic.
     """
     generator = torch.Generator().manual_seed(0)
     lower, size = torch.tensor(bounds.lower), torch.tensor(bounds.size)
@@ -54,7 +54,7 @@ def viewpoints(
 def _distances(
     field: RadianceField, bounds: SceneBounds, places: Float[Tensor, "p 3"]
 ) -> Float[Tensor, "p d"]:
-    """Return the distances of what rays from the places hit in the directions of a sphere; 0 where they hit nothing."""
+    """Return the distance at which each ray from ``places``, in evenly spread directions, hits geometry; 0 without a hit."""
     device = device_of(field)
     origins = places[:, None].expand(-1, DIRECTIONS, 3).reshape(-1, 3).to(device)
     towards = sphere(DIRECTIONS).float().expand(len(places), -1, -1).reshape(-1, 3).to(device)
@@ -68,7 +68,7 @@ def _distances(
 def _within(
     places: Float[Tensor, "p 3"], distance: Float[Tensor, "p d"], up: tuple[float, float, float]
 ) -> list[SE3]:
-    """Return views from free places far from each other, each in the directions in which there is most to see."""
+    """Return poses at free positions far from each other, facing the directions with the most distant geometry."""
     directions, vertical = sphere(DIRECTIONS), torch.tensor(up, dtype=torch.float64)
     level = (directions @ vertical).abs() < 0.75  # neither the ceiling nor the floor
     second, first = horizontal_axes(vertical)
@@ -87,7 +87,7 @@ def _within(
 
 
 def _spread(places: Float[Tensor, "p 3"], count: int) -> list[int]:
-    """Return the indices of places far from each other (farthest-point sampling)."""
+    """Return the indices of positions far from each other (farthest-point sampling)."""
     chosen = [int((places - places.mean(0)).norm(dim=-1).argmin())]
     away = (places - places[chosen[0]]).norm(dim=-1)
     while len(chosen) < min(count, len(places)):
@@ -97,7 +97,7 @@ def _spread(places: Float[Tensor, "p 3"], count: int) -> list[int]:
 
 
 def sphere(count: int) -> Float[Tensor, "n 3"]:
-    """Return ``count`` unit directions evenly over the sphere (Fibonacci), in float64."""
+    """Return ``count`` unit directions spread evenly over the sphere (Fibonacci lattice), in float64."""
     number = torch.arange(count, dtype=torch.float64) + 0.5
     z = 1 - 2 * number / count
     azimuth, flat = number * math.pi * (3 - math.sqrt(5)), (1 - z * z).sqrt()

@@ -1,4 +1,4 @@
-"""The views that a map is built from: a dataset's, those at the path to one, or views in memory."""
+"""Reading the views from which a map is built: from a dataset, from the path to a dataset, or from memory."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ Origin: TypeAlias = tuple[float, float, float]
 
 
 def chosen_origin(points: Float[Tensor, "n 3"]) -> Origin:
-    """Return the origin for a map of ``points``, such as its cameras.
+    """Choose the origin of a map with the given ``points``, such as its camera centres.
 
-    It is 0, or a round position near their middle if they are far from 0.
+    The origin is 0, or a round position near the middle of the points if they are far from 0.
     """
     low, high = points.double().amin(0), points.double().amax(0)
     middle, size = (low + high) / 2, float((high - low).max())
@@ -68,7 +68,7 @@ def chosen_origin(points: Float[Tensor, "n 3"]) -> Origin:
 
 @dataclass(frozen=True, eq=False)
 class ReadViews:
-    """Views that were read, and their source."""
+    """Views as read, with information about their source."""
 
     views: list[View]
     source: str  # name of the dataset's folder; empty for views from memory
@@ -84,7 +84,7 @@ class ReadViews:
     files: Mapping[str, str] = field(default_factory=dict)
 
     def about(self, origin: Origin) -> ReadViews:
-        """Return the views with poses relative to ``origin``, a point of their world."""
+        """Return the views with poses relative to ``origin``, a point in their world frame."""
         if not any(origin):
             return self
         offset = -torch.tensor(origin, dtype=torch.float64)
@@ -92,10 +92,10 @@ class ReadViews:
         return replace(self, views=views)
 
     def with_files(self, cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
-        """Return the cameras of the views with the files of their images.
+        """Return the cameras of the views, with the file of each image.
 
-        Those of which an image shows only a part (a face of a panorama, the pinhole image of another lens) or the mirror image
-        are left out: the camera would not be that of the file.
+        The file is left out where an image shows only part of its file (a face of a panorama, the pinhole image
+        of another lens) or its mirror image: the camera would not be that of the file.
         """
         frames = {view.frame.name: view.frame for view in self.views}
         found = []
@@ -117,15 +117,15 @@ def read_views(
     point_choice: SparseChoice | None = None,
     folder: Path | None = None,
 ) -> ReadViews:
-    """Read the views of ``data``; ``options.split`` selects those of a dataset, and "all" stands for all splits.
+    """Read the views of ``data``; for a dataset, ``options.split`` selects the split, or "all" for all splits.
 
-    Images of a dataset with more than ``options.largest`` pixels along the longer side are downscaled to that, by
-    default to ``useful_size``. They are held as bytes, and if they are many in a nameless file in ``folder``,
-    see ``PixelStore``. The background behind images with an alpha channel is by default the dataset's; the other
-    options are for the path to a dataset.
+    Dataset images with more than ``options.largest`` pixels along the longer side are downscaled to that size,
+    by default to ``useful_size``. Images are held as bytes and, if there are many, in a nameless file in
+    ``folder``, see ``PixelStore``. The background behind images with an alpha channel is by default that of the
+    dataset; the other options apply only to the path to a dataset.
 
-    Images without depth take it from the points of the COLMAP model in folder ``depth_points``, see
-    ``SparsePoints``. Raises ``InputError`` if there are no views, and if they or the model cannot be used.
+    Images without depth get depth from the points of the COLMAP model in folder ``depth_points``, see
+    ``SparsePoints``. Raises ``InputError`` if there are no views, and if the views or the model cannot be used.
     """
     split, background, largest = options.split, options.background, checked_side(options.largest)
     if isinstance(data, str | Path):
@@ -164,7 +164,7 @@ def read_views(
 
 
 def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path | None) -> ReadViews:
-    """Read the views of a split one after another, so that only one image is in memory at full size."""
+    """Read the views of a split one after another, so that only one image at a time is in memory at full size."""
     place, shots = str(data.path), data.select(split)
     if not shots:
         raise InputError(f"split {split!r} has no frames", where=place)
@@ -227,7 +227,7 @@ is available."""
 def useful_size(frame: Frame, count: int) -> int:
     """Return the longer side (pixels) to which ``count`` images like ``frame`` are downscaled by default.
 
-    It is ``USEFUL_SIDE``, or less if the images would not fit into memory, but not less than ``LEAST_SIDE``.
+    This is ``USEFUL_SIDE``, or less if the images would not fit into memory, but at least ``LEAST_SIDE``.
     """
     most = min(MOST_BYTES, available_memory() // 4)
     longer = max(frame.intrinsics.width, frame.intrinsics.height)
@@ -236,12 +236,12 @@ def useful_size(frame: Frame, count: int) -> int:
 
 
 def _unit_of(views: Sequence[View]) -> LengthUnit:
-    """Return metres for views with dense measured depth: training rejects poses that contradict it."""
+    """Return metres if a view has dense measured depth, since training rejects poses that contradict the depth; else units."""
     return "metres" if any(view.frame.has_dense_depth for view in views) else "units"
 
 
 def _with_depth(read: ReadViews, model: Path, choice: SparseChoice, split: str) -> ReadViews:
-    """Return the views with depth from the model's points, and the number of pixels that have it."""
+    """Return the views with depth from the points of a COLMAP model, and with the number of pixels that have such depth."""
     places = [(view.frame.name, view.T_ref_camera) for view in read.views]
     sparse = SparsePoints(model, places, choice, split)
     changed = [sparse.onto(view, split) for view in read.views]

@@ -1,4 +1,4 @@
-"""The answers to a run of images, photos or frames of a sequence, in one map or in several: as JSON, pose files and summaries."""
+"""Answers for a run of images, photos or frames of a sequence, in one map or several: as JSON, pose files and summaries."""
 
 from __future__ import annotations
 
@@ -115,13 +115,13 @@ class Failure:
 
 
 class Answers:
-    """The answers to the images of a run, in order: photos in one map or in several, or the frames of a sequence.
+    """The answers for the images of a run, in order: photos in one map or several, or the frames of a sequence.
 
-    Poses of images in several maps are in the frames of these.
+    With several maps, each pose is in the frame of the map in which the image was localized.
     """
 
     def __init__(self, scene: SceneMap | MapCollection | None = None, is_sequence: bool = False) -> None:
-        """Start without answers in the given map or maps. With ``is_sequence``, losses and recoveries are logged."""
+        """Start without answers in the given map or maps. With ``is_sequence``, JSON answers include the time of each frame."""
         self.scene, self.is_sequence = scene, is_sequence
         self.given: list[Answer | Failure] = []
         self.unread = 0  # frames of a sequence whose files could not be read
@@ -138,7 +138,7 @@ class Answers:
         return len(self.given)
 
     def append(self, answer: Answer | Failure) -> None:
-        """Keep an answer."""
+        """Append an answer or a failure."""
         self.given.append(answer)
 
     def add(
@@ -171,11 +171,11 @@ class Answers:
         return answer
 
     def plain(self, answer: Answer | Failure) -> dict[str, Any]:
-        """Return an answer as the JSON object that ``bidnerf localize --json`` prints.
+        """Return an answer as the JSON object printed by ``bidnerf localize --json``.
 
-        It has the ``time`` of a frame of a sequence, and the map and the runner-up of an image in several maps.
-        Numbers and matrices that are not finite are None. For an image that could not be read, the outcome is
-        "bad input".
+        Answers for a sequence also have the ``time`` of the frame, and answers in several maps the map and the
+        runner-up. Numbers and matrices that are not finite become None. For an image that could not be read,
+        the outcome is "bad input".
         """
         backend = getattr(getattr(self.scene, "info", None), "backend", "")
         placement, values = None, dict[str, Any](frame=answer.name)
@@ -209,7 +209,7 @@ class Answers:
 
     @property
     def question(self) -> str:
-        """A question to append to a summary if none of several images shows the scene of the map, else empty."""
+        """A question to append to a summary if several images were tried and none shows the map's scene, else empty."""
         recognised = {
             Outcome.CONVERGED, Outcome.IMPRECISE, Outcome.MIRRORED, Outcome.MISCALIBRATED, Outcome.UNCERTAIN,
             Outcome.AMBIGUOUS,
@@ -221,7 +221,7 @@ class Answers:
 
     @property
     def remark(self) -> str | None:
-        """A remark on all errors together: the true poses may be those of another world; None if there is none."""
+        """A remark if one similarity explains the errors of all poses, so that the true poses are in another world; else None."""
         known = self._known
         if (
             known is None or len(known[0].translation) < 4
@@ -303,7 +303,7 @@ class Answers:
 
     @property
     def _known(self) -> tuple[SE3, SE3] | None:
-        """The accepted poses whose truth is known, and the true ones; None without any."""
+        """The accepted poses whose true poses are known, and these true poses; None if there are none."""
         known = [(answer.found.T_world_camera, answer.truth) for answer in self.accepted if answer.truth]
         if not known:
             return None
@@ -317,10 +317,10 @@ class Answers:
     def plot(
         self, file: str | Path, surface: SurfaceMap | None = None, up: UpDirection | None = None
     ) -> None:
-        """Draw the path over the surface of its map, as PNG or SVG by file extension.
+        """Plot the trajectory over the surface of its map, as PNG or SVG by file extension.
 
-        ``up`` is the upward direction of the scene (``Map.up``), by default estimated from the surface and
-        the cameras. Raises ``InputError`` without matplotlib or without any finite pose.
+        ``up`` is the up direction of the scene (``Map.up``), by default estimated from the surface and the
+        cameras. Raises ``InputError`` without matplotlib or without any finite pose.
         """
         drawn = [answer for answer in self.answers if answer.is_finite]
         if not drawn:
@@ -339,7 +339,7 @@ class Answers:
         )
 
     def summary(self, seconds: float) -> list[tuple[str, str]]:
-        """Return the rows of a table that describes a run that took ``seconds``: frames, losses, errors."""
+        """Return the rows of a summary table for a run that took ``seconds``: frames, losses, errors."""
         total, accepted, lost = len(self), len(self.accepted), self.lost
         longest = max((last - first + 1 for first, last in lost), default=0)
         losses = f"{amount(len(lost), 'time')}, at most for {amount(longest, 'frame')}" if lost else "never"
@@ -396,13 +396,13 @@ def localize_each(
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Answers:
-    """Localize each query in a map, or in the one of several maps that it shows.
+    """Localize each query in a map, or in the one of several maps that the query shows.
 
-    A query that cannot be read or localized does not stop the others; a single one raises its error. ``start`` returns
-    the start of a query, T_world_camera; method ``auto`` needs none, and several maps take none. ``answers`` collects
-    the answers, by default a new object; it holds those so far if an error ends the run. ``each`` is called with each
-    query and its answer; for a failure the query has only a name. Raises ``InputError``, and ``Cancelled`` once
-    ``cancel`` returns True.
+    A query that cannot be read or localized does not stop the others, but if it is the only query, its error is
+    raised. ``start`` returns the initial T_world_camera of a query; method ``auto`` needs none, and several
+    maps take none. ``answers`` is the object that collects the answers, by default a new one; if an error ends
+    the run, it holds the answers so far. ``each`` is called with each query and its answer; for a failure, the
+    query has only a name. Raises ``InputError``, and ``Cancelled`` once ``cancel`` returns True.
     """
     if answers is None:
         answers = Answers(localizer if isinstance(localizer, MapCollection) else localizer.scene)
@@ -448,7 +448,7 @@ def localize_each(
 
 
 def _log_depth(query: Query, sensor: str) -> None:
-    """Log that the images of a dataset have no measured depth, or that its noise is not that of the sensor."""
+    """Log if the images of a dataset have no measured depth, or if the depth noise does not match the sensor."""
     bare = [view.frame.name for view in query.views if not view.frame.has_depth]
     if bare and query.truth is not None and query.depth_rays is None:
         log.info("%s: no measured depth; colour only", ", ".join(bare))

@@ -20,10 +20,10 @@ HEAD = "# written by bidnerf"
 
 
 def check_pose_file(path: Path) -> None:
-    """Check the name of a pose file before any work is done.
+    """Check that a pose file may be written under this name, before any work is done.
 
-    Raises ``UsageError`` for a name without the ending of a format, and ``InputError`` for an images.txt beside another
-    program's cameras.txt or points3D.txt, which would be replaced.
+    Raises ``UsageError`` for a name that does not end like one of the formats, and ``InputError`` for an
+    images.txt next to another program's cameras.txt or points3D.txt, which would be overwritten.
     """
     if pose_format(path) != "images.txt":
         return
@@ -36,10 +36,10 @@ def check_pose_file(path: Path) -> None:
 
 
 def write_colmap_poses(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write ``path`` (images.txt), and the cameras.txt and points3D.txt that COLMAP requires with it.
+    """Write ``path`` (images.txt) together with the cameras.txt and points3D.txt that COLMAP requires.
 
-    Image names are file paths relative to the folder that contains all of them. Raises ``InputError`` for a
-    lens that COLMAP cannot describe, and as ``check_pose_file`` does.
+    Image names are file paths relative to the folder that contains all of the images. Raises ``InputError`` for
+    a lens that COLMAP cannot describe, and as ``check_pose_file`` does.
     """
     check_pose_file(path)
     files = [image.file for image in images if image.file is not None]
@@ -59,10 +59,10 @@ def write_colmap_model(
     points: Sequence[str] = (),
     keypoints: Sequence[Sequence[str]] = (),
 ) -> None:
-    """Write a COLMAP text model of images called as in COLMAP, whose poses and cameras are those of the stored files.
+    """Write a COLMAP text model; image names, poses and cameras must already be those of the stored files.
 
-    ``points`` are the rows of points3D.txt, and ``keypoints`` holds, for each image, those of POINTS2D[]: x, y, and the number
-    of the point. Characters of names that would break a row are escaped.
+    ``points`` holds the rows of points3D.txt, and ``keypoints`` the POINTS2D[] entries of each image: x, y, and
+    the number of the point. Characters of names that would break a row are escaped.
     """
     cameras, listed = dict[Intrinsics, int](), ""
     rows = list[str]()

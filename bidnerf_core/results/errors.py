@@ -48,9 +48,10 @@ class PoseError:
 
 
 def pose_error(found: SE3, true: SE3, unit: LengthUnit = "units") -> PoseError:
-    """Return the error of ``found`` in float64; batches broadcast. It is not finite if a pose is not.
+    """Return the error of ``found`` relative to ``true`` in float64, with broadcasting over batches.
 
-    ``unit`` is that of the poses, for printing the error.
+    The error is not finite if a pose is not finite. ``unit`` is the length unit of the poses, used to print the
+    error.
     """
     found, true = found.to(dtype=torch.float64), true.to(dtype=torch.float64)
     distance = torch.linalg.vector_norm(found.translation - true.translation, dim=-1)
@@ -89,7 +90,7 @@ def within(
 
 
 def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Return the angle in radians, 0 to pi. ``acos`` of the trace would lose half of the digits near either end."""
+    """Return a rotation's angle (radians, 0 to pi); ``acos`` of the trace would lose half of the digits near either end."""
     skewed = rotation - rotation.mT
     twice_axis = torch.stack([skewed[..., 2, 1], skewed[..., 0, 2], skewed[..., 1, 0]], dim=-1)
     trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -98,7 +99,7 @@ def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
 
 @dataclass(frozen=True)
 class Reduced:
-    """Success if the translation error is at most ``fraction`` of the start's (BID-NeRF, section IV).
+    """Success if the translation error is at most ``fraction`` of the start's translation error (BID-NeRF, section IV).
 
     A pose that is not finite never succeeds.
     """
@@ -152,7 +153,7 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Rate:
-    """A success rate with the ends of its Wilson interval, which accounts for repeated trials of a frame."""
+    """A success rate and its Wilson interval, which accounts for repeated trials of the same frame."""
 
     successes: int
     trials: int
@@ -180,13 +181,13 @@ def success_rate(successes: int, trials: int) -> Rate:
 
 
 def success_rate_by_frame(outcomes: Sequence[bool], frames: Sequence[Hashable]) -> Rate:
-    """Return the success rate of trials that repeat some frames, with a 95 % interval that accounts for it.
+    """Return the success rate of trials that repeat frames, with a 95 % interval that accounts for the repetition.
 
-    Trials of one frame share its difficulty. Wilson's interval is that of the effective number of trials: the
-    number of independent ones whose rate would vary as much as this rate does from frame to frame (Korn and
-    Graubard 1998, "Confidence intervals for proportions with small expected number of positive counts
-    estimated from survey data"; Dean and Pagano 2015). If all trials have the same outcome, nothing shows how
-    similar those of one frame are, and each frame counts once.
+    Trials of the same frame share its difficulty. The interval is Wilson's for the effective number of trials:
+    the number of independent trials whose rate would vary as much as the observed rate varies from frame to
+    frame (Korn and Graubard 1998, "Confidence intervals for proportions with small expected number of positive
+    counts estimated from survey data"; Dean and Pagano 2015). If all trials have the same outcome, nothing
+    shows how similar the trials of one frame are, and each frame counts once.
     """
     trials, successes = len(outcomes), sum(map(bool, outcomes))
     grouped: dict[Hashable, list[bool]] = {}
@@ -233,7 +234,7 @@ class ErrorSummary:
 
     @staticmethod
     def of(errors: PoseError) -> ErrorSummary:
-        """Return the summary of a batch of errors. Raises ``InputError`` for an empty one."""
+        """Return the summary of a batch of errors. Raises ``InputError`` for an empty batch."""
         if not errors.translation.numel():
             raise InputError("no errors to summarize", expected="those of at least one pose")
         t, r = (
@@ -261,9 +262,9 @@ class TrajectoryErrors:
 
     @staticmethod
     def of(found: SE3, true: SE3, unit: LengthUnit = "units") -> TrajectoryErrors:
-        """Compare poses ``T_world_camera`` (n, in ``unit``), in chronological order.
+        """Compare estimated with true poses ``T_world_camera`` (n, in ``unit``), in chronological order.
 
-        Raises ``InputError`` if there are none.
+        Raises ``InputError`` if there are no poses.
         """
         count = len(found.translation)
         # Fewer than three poses do not determine an alignment.
@@ -293,14 +294,14 @@ def alignment_errors(found: SE3, true: SE3) -> Float[Tensor, "n"] | None:
 
 
 def relative_errors(found: SE3, true: SE3) -> PoseError:
-    """Return the relative pose errors (n - 1), of the motion from each pose to the next (Sturm et al. 2012, eq. 2)."""
+    """Return the relative pose errors (n - 1) of the motion between consecutive poses (Sturm et al. 2012, eq. 2)."""
     found, true = found.to(torch.float64), true.to(torch.float64)
     moved = [T[:-1].inverse() @ T[1:] for T in (found, true)]
     return pose_error(moved[0], moved[1])
 
 
 def spans(flags: Sequence[bool]) -> list[tuple[int, int]]:
-    """Return the runs of true flags as (first, last), both included."""
+    """Return each run of true flags as its first and last index, both inclusive."""
     found: list[tuple[int, int]] = []
     for place, flag in enumerate(flags):
         if flag and found and found[-1][1] == place - 1:

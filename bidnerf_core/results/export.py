@@ -1,5 +1,6 @@
-"""Export of a map for other software: surface, landmarks and cameras as point clouds, a COLMAP model, or
-``transforms.json``.
+"""Export of a map for other software.
+
+Surface, landmarks and cameras are written as point clouds, as a COLMAP model, or as ``transforms.json``.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ EXPORTERS: Plugins[Exporter] = Plugins("exporters", _defects, first=("ply", "col
 
 
 def export_map(scene: Map | str | Path, out: str | Path, to: str, overwrite: bool = False) -> list[Path]:
-    """Write a map, or the one in a folder, into folder ``out`` in a format of other software, and return the files.
+    """Export a map, given directly or by its folder, to folder ``out`` in a format of other software; return the files.
 
     - ``"ply"``: surface.ply (points with normals and colours), landmarks.ply (points with colours and the number of photos that show
       each) and cameras.ply (a pyramid for each camera), and cameras.json (the cameras as 3D Gaussian splatting writes them, from which
@@ -53,8 +54,8 @@ def export_map(scene: Map | str | Path, out: str | Path, to: str, overwrite: boo
     - ``"transforms.json"``: the cameras in nerfstudio's format, and landmarks.ply as sparse points;
     - or an installed exporter, such as ``"splat.ply"`` of ``bidnerf-gaussians`` and ``"mesh.glb"`` of ``bidnerf-scan``.
 
-    These use the world and unit of the map, which their headers state, in double precision where it has an origin of its own;
-    installed exporters may write its own coordinates, see ``Map.origin``. Images are named by their files: relative to the
+    The first three use the world frame and unit of the map, stated in the headers, in double precision if its origin is not 0;
+    installed exporters may write coordinates relative to that origin, see ``Map.origin``. Images are named by their files: relative to the
     folder of the dataset or, for COLMAP, to the folder that contains all of them. Cameras are those of the images in the size
     that the map uses, which may be smaller. Parts that the map lacks are left out.
 
@@ -172,7 +173,7 @@ def _images(scene: Map) -> list[PosedImage]:
 
 
 def _in_world(scene: Map, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Return positions of the map's parts in its world, in double precision if the map has an origin of its own."""
+    """Return positions of the map's parts in world coordinates, in double precision if the map has a nonzero origin."""
     return positions.double() + origin_of(scene) if any(scene.origin) else positions
 
 
@@ -226,7 +227,7 @@ def ply(columns: dict[str, Tensor], comments: list[str], faces: np.ndarray | Non
 
 
 def head(scene: Map, images: Sequence[PosedImage], what: str) -> list[str]:
-    """Return the comments of a file: its content, the unit of lengths, the upward direction, and the frame of the images."""
+    """Return the header comments of a file: content, unit of lengths, up direction, and frame of the images."""
     lengths = "metres" if scene.unit == "metres" else "units of unknown length"
     lines = ["written by bidnerf", what, f"lengths in {lengths}"]
     if scene.up is not None:
@@ -235,7 +236,7 @@ def head(scene: Map, images: Sequence[PosedImage], what: str) -> list[str]:
 
 
 def _colours(scene: Map) -> Float[Tensor, "n 3"]:
-    """Return the colours of the landmarks: those of the nearest surfels."""
+    """Return the colours of the landmarks, taken from the nearest surfels; grey without a surface."""
     landmarks = scene.landmarks
     assert landmarks is not None
     if scene.surface is None:

@@ -1,4 +1,4 @@
-"""Pictures of localizations, as 8-bit images and videos: the photo next to the map rendered from the pose found."""
+"""Pictures of localizations, as 8-bit images and videos: a photo next to the map rendered at the estimated pose."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def overlay(
 
 
 class Painter:
-    """Draws overlays of one photo, of at most ``side`` pixels a side, with renderings of a map."""
+    """Draws overlays of one photo, downscaled to at most ``side`` pixels a side, with renderings of a map."""
 
     def __init__(self, map: SceneMap, frame: Frame, side: int = SIDE) -> None:
         scale = side / max(frame.intrinsics.width, frame.intrinsics.height)
@@ -74,7 +74,7 @@ class Painter:
     def row(
         self, left: Float[Tensor, "h w 3"], left_caption: str, found: SE3, caption: str
     ) -> UInt8[np.ndarray, "H W 3"]:
-        """Return an image, the rendering at the pose found, and its blend with the photo, side by side."""
+        """Return ``left``, the rendering at the pose ``found``, and the blend of photo and rendering, side by side."""
         rendered = self.rendered(found)
         blended = blend(self.observed, rendered)
         tiles = ((left, left_caption), (rendered, caption), (blended, "edges: photo green, map pink"))
@@ -95,7 +95,7 @@ def as_picture(image: ArrayLike | Tensor, what: str = "image") -> UInt8[np.ndarr
 
 
 def blend(observed: ArrayLike | Tensor, rendered: ArrayLike | Tensor) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the pale mean of two images, with the edges of each in its own colour; they coincide at the true pose."""
+    """Return the pale mean of two images, with the edges of each in a separate colour; the edges coincide at the true pose."""
     a, b = as_picture(observed, "observed"), as_picture(rendered, "rendered")
     mixed = 0.55 * (a / 2 + b / 2) + 0.45 * 255
     for image, colour in ((b, (235, 0, 140)), (a, (0, 190, 110))):
@@ -105,7 +105,7 @@ def blend(observed: ArrayLike | Tensor, rendered: ArrayLike | Tensor) -> UInt8[n
 
 
 def edges(image: ArrayLike | Tensor) -> Float[np.ndarray, "h w"]:
-    """Return the strength of edges, 0 to 1, scaled so that the strongest tenth stands out."""
+    """Return the edge strength of each pixel, 0 to 1, scaled so that the strongest tenth stands out."""
     grey = as_picture(image).astype(np.float64).mean(-1) / 255
     padded = np.pad(grey, 1, mode="edge")
     slope = np.hypot(padded[1:-1, 2:] - padded[1:-1, :-2], padded[2:, 1:-1] - padded[:-2, 1:-1])
@@ -141,7 +141,7 @@ def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float 
 
 
 def check_video(file: Path) -> None:
-    """Raise ``InputError``, before any work is done, if a video cannot be written."""
+    """Raise ``InputError`` if a video cannot be written to ``file``, before any work is done."""
     try:
         import av  # noqa: F401
     except ImportError as error:
@@ -173,14 +173,14 @@ class TrackingVideo:
         return self
 
     def __exit__(self, *about: object) -> None:
-        """Finish the file, which gets its final name only then."""
+        """Finish the file and only then give it its final name."""
         if self._stream is not None:
             self._output.mux(self._stream.encode())
             self._output.close()
             self._partial.replace(self._file)
 
     def add(self, frame: Frame, answer: Answer) -> None:
-        """Draw a frame beside the map: its colours or, if none were recorded, its depth as grey values up to 5 m."""
+        """Add a frame beside the rendered map: its colours or, if none were recorded, its depth as grey values up to 5 m."""
         import av
 
         found = answer.found

@@ -1,4 +1,4 @@
-"""Plots: their common style, a capture from above with its problems, and the path of a trajectory over the surface."""
+"""Plots: their common style, a top view of a capture with its problems, and a trajectory over the surface."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def styled() -> Any:
 
 
 def new_figure(width: float, height: float) -> Any:
-    """Return an empty figure (inches) without a window, which pyplot does not keep alive."""
+    """Return an empty figure of this size (inches), without a window and not kept alive by pyplot."""
     require_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -119,10 +119,10 @@ def draw_capture(
     report: CaptureReport, points: Float[Tensor, "n 3"] | None, seen_by: Int[Tensor, "n"] | None, out: Path,
     unit: LengthUnit = "units",
 ) -> None:  # fmt: skip
-    """Draw a capture from above to ``out``, a PNG: its cameras with their directions and problems, and its landmarks.
+    """Draw a top view of a capture to ``out``, a PNG: its cameras with their directions and problems, and its landmarks.
 
-    ``points`` (world, in ``unit``) are the landmarks, ``seen_by`` the number of photos that show each. Raises ``InputError`` if
-    matplotlib is not installed, or the file cannot be written.
+    ``points`` (world, in ``unit``) are the landmarks, and ``seen_by`` is the number of photos that show each
+    landmark. Raises ``InputError`` if matplotlib is not installed, or the file cannot be written.
     """
     up, centre = (torch.tensor(v, dtype=torch.float64) for v in (report.coverage.up, report.coverage.centre))
     axes = torch.stack(horizontal_axes(up), dim=-1)
@@ -172,11 +172,11 @@ def draw_path(
     up: UpDirection | None = None,
     unit: LengthUnit = "units",
 ) -> None:
-    """Draw the path of estimated ``poses`` (n, T_world_camera) to ``out``, a PNG or SVG, from above and from the side.
+    """Draw the trajectory of estimated ``poses`` (n, T_world_camera) to ``out``, a PNG or SVG, from above and from the side.
 
-    ``accepted`` says which poses were, ``deviations`` are the standard deviations of the positions (``unit``, NaN if unknown),
-    ``truth`` holds the true poses as far as they are known. ``up`` is the upward direction, by default estimated from the
-    surface and the cameras. Raises ``InputError`` without matplotlib.
+    ``accepted`` marks the accepted poses, ``deviations`` are the standard deviations of the positions
+    (``unit``, NaN if unknown), and ``truth`` holds the true poses where known. ``up`` is the up direction, by
+    default estimated from the surface and the cameras. Raises ``InputError`` without matplotlib.
     """
     if up is None:
         up = up_direction(poses, None if surface is None else surface.surfels.normals)

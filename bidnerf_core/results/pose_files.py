@@ -56,9 +56,10 @@ class PosedImage:
 
     @property
     def as_stored(self) -> PosedImage:
-        """The image as its file stores it, which may not be upright; the image itself without a file.
+        """This image in the orientation stored in its file, which may not be upright.
 
-        Raises ``InputError`` for a photo stored mirrored, for which no rigid pose exists.
+        Without a file and an orientation, the image is returned as it is. Raises ``InputError`` for a photo
+        stored mirrored, for which no rigid pose exists.
         """
         turned = self.orientation
         if turned is None:
@@ -84,7 +85,7 @@ def common_unit(images: Sequence[PosedImage]) -> LengthUnit:
 
 
 def frame_of(images: Sequence[PosedImage], direction: str = "camera to world") -> str:
-    """Return a file header's statement on its poses: their direction, the axes, and the unit of lengths if there are any."""
+    """Return the statement on poses for a file header: direction, axes, and the unit of lengths if there are poses."""
     if not images:
         return f"{direction}, {OPENCV_AXES}"
     lengths = "metres" if common_unit(images) == "metres" else "units of the map (not known to be metres)"
@@ -131,9 +132,9 @@ def write_pose_json(path: Path, images: Sequence[PosedImage]) -> None:
 def write_pose_transforms(path: Path, images: Sequence[PosedImage], **more: Any) -> None:
     """Write a ``transforms.json`` in nerfstudio's format: poses with OpenGL axes, and one camera per image.
 
-    ``file_path`` is relative to it; ``more`` holds further entries. It describes the image files as stored, so
-    the poses and cameras of photos with an EXIF orientation are rotated. Raises ``InputError`` for a photo stored
-    mirrored, for which no rigid pose exists.
+    Each ``file_path`` is relative to the folder of the file, and ``more`` holds further entries. The entries
+    describe the image files as stored, so the poses and cameras of photos with an EXIF orientation are rotated.
+    Raises ``InputError`` for a photo stored mirrored, for which no rigid pose exists.
     """
     frames = []
     for image in images:
@@ -164,7 +165,7 @@ POSE_WRITERS: Plugins[PoseWriter] = Plugins(
 def pose_format(path: Path) -> str:
     """Return the file-name ending that selects the format of a pose file.
 
-    Raises ``UsageError`` for a name without any of them.
+    Raises ``UsageError`` for a name without a known ending.
     """
     found = max((e for e in POSE_WRITERS if path.name.lower().endswith(e)), key=len, default=None)
     if found is None:
@@ -233,9 +234,10 @@ def read_poses(path: str | Path) -> dict[str, SE3]:
 
 
 def read_positions(path: str | Path) -> dict[str, Float[Tensor, "3"]]:
-    """Read the positions (float64) of cameras by name: one object of names with x, y and z or 4x4 rows, or poses as in ``read_poses``.
+    """Read the positions (float64) of cameras by name.
 
-    Raises ``InputError`` for anything else.
+    The file holds one object that maps names to x, y and z or to 4x4 rows, or it holds poses as for
+    ``read_poses``. Raises ``InputError`` for anything else.
     """
     path = Path(path)
     try:
@@ -275,7 +277,7 @@ def pose_of(poses: dict[str, SE3], name: str, path: str | Path) -> SE3:
 
 
 def pose_entries(path: Path, content: bytes) -> list[Any]:
-    """Return the objects of a pose file, or its matrix."""
+    """Return the list of objects in a pose file, or of its single matrix."""
     try:
         found = parse_json(content, str(path), EXPECTED_POSE)
     except InputError:

@@ -32,11 +32,12 @@ def track(
 ) -> Answers:
     """Find the poses of a sequence's frames in a map, in chronological order.
 
-    ``scene``: a map, a localizer with its own settings, or a tracker with its own settings and start. ``sequence``: the
-    result of ``open_sequence``, or the path of a dataset, a folder of images or a video, whose images use the map's
-    cameras if they have none of their own. ``every``: use only every n-th frame. ``depth``: whether measured depth is
-    used. ``answers``: collects the answers, by default a new object; it holds those so far if an error ends the
-    tracking. ``each`` is called with each frame and its answer, ``progress`` after each frame.
+    ``scene``: a map, a localizer with its own settings, or a tracker with its own settings and start.
+    ``sequence``: the result of ``open_sequence``, or the path of a dataset, a folder of images or a video;
+    images without a camera of their own use the map's cameras. ``every``: use only every n-th frame. ``depth``:
+    whether measured depth is used. ``answers``: the object that collects the answers, by default a new one; if
+    an error ends the tracking, it holds the answers so far. ``each`` is called with each frame and its answer,
+    ``progress`` after each frame.
 
     A frame whose files cannot be read is left out with an ``InputWarning`` and counted in ``unread``. Raises
     ``InputError`` if none of the first frames can be read, and ``Cancelled`` once ``cancel`` returns True.

@@ -28,10 +28,10 @@ def write_kitti_poses(path: Path, images: Sequence[PosedImage]) -> None:
 
 
 def write_euroc_poses(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write EuRoC poses: rows of nanoseconds, position and quaternion (w, x, y, z), of the camera, not of a body.
+    """Write camera (not body) poses in EuRoC format: rows of nanoseconds, position and quaternion (w, x, y, z).
 
-    The time of an image without one is its number, in seconds. The head names the unit of the positions, which is ``[m]`` only
-    for metric maps.
+    An image without a time gets its number as its time in seconds. The header names the unit of the positions,
+    which is ``[m]`` only for metric maps.
     """
     positions = ",".join(f"p_RS_R_{axis} [{symbol(common_unit(images))}]" for axis in "xyz")
     rows = [f"#timestamp [ns],{positions},q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"]

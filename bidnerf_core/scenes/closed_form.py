@@ -1,7 +1,7 @@
 """Closed-form scenes with exact depth.
 
-A scene is a list of painted solids. Its colour does not depend on the viewing direction, so any radiance field can learn
-it; its depth is exact, so any error is the field's.
+A scene is a list of painted solids. Its colour does not depend on the viewing direction, so any radiance field can learn the
+scene; its depth is exact, so any error is the field's.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class ClosedFormScene:
     ) -> tuple[Float[Tensor, "*r"], Float[Tensor, "*r 3"]]:
         """Return the first surface along unit ``directions`` (metres, world). One origin may be shared by all rays.
 
-        It is the distance (metres; inf if nothing is hit), and the lit colour (the background's if nothing is hit).
+        The result is the distance (metres) and the lit colour; inf and the background colour if nothing is hit.
         """
         rays = directions.reshape(-1, 3).T.contiguous()
         shared = origins.numel() == 3
@@ -117,7 +117,7 @@ def orbit(
     """Return poses (``T_world_camera``) spread evenly over a sphere (Fibonacci) around ``centre``, which they look at.
 
     ``radius`` is in metres. ``elevation`` is the range in degrees above the horizon; (-90, 90) is the whole sphere. ``seed``
-    rotates the spiral, so that two seeds have no position in common.
+    rotates the spiral, so that orbits with different seeds share no position.
     """
     turn, shift = torch.rand(2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).tolist()
     low, high = (math.sin(math.radians(e)) for e in elevation)

@@ -40,7 +40,7 @@ class RenderedShot(Shot):
     render: Render
 
     def frame(self, background: tuple[float, float, float] = BLACK, side: int | None = None) -> Frame:
-        """Render it, whatever the background: the scene has its own."""
+        """Render this frame; ``background`` is ignored, since the scene has its own."""
         assert self.T_world_camera is not None  # that of every frame is known
         found = self.render(self.T_world_camera, self.name)
         return found if side is None else found.at_most(side)
@@ -56,7 +56,7 @@ class ClosedFormData(Capture):
     middle: tuple[float, float, float] = (0.0, 0.0, 0.0)  # metres, world
 
     def select(self, split: str, names: Sequence[str] | None = None) -> list[Shot]:
-        """Return the frames with these names, by default all of the split."""
+        """Return the frames with these names, by default all frames of the split."""
         listed = super().select(split)
         if names is None:
             return listed

@@ -89,7 +89,7 @@ def _lorry() -> list[Primitive]:
 
 
 def _furniture() -> list[Primitive]:
-    """Return the walls, the table, the sofa, the shelf, which stands against the wall at -x, with its books, and the decoration."""
+    """Return the walls, table, sofa, the shelf (against the wall at -x) with its books, and decoration."""
     walls = Faces(
         (
             stripes(C.sky, C.cream, (0, 1, 0.25), 0.6),

@@ -16,8 +16,8 @@ from bidnerf_core.geometry import SE3
 class GaussianBlobs:
     """A sum of isotropic Gaussian clouds with smoothly changing colour; infinitely differentiable.
 
-    It computes in the precision of the positions. ``moved`` moves the whole scene, so that a test can check that a moved
-    world gives a moved answer.
+    The field computes in the precision of the positions. ``moved`` moves the whole scene, so that a test can check that
+    moving the world moves the result.
     """
 
     centres: Float[Tensor, "k 3"]  # metres, frame of the field

@@ -1,6 +1,6 @@
 """Painted solids: shapes with closed-form ray intersections, and textures rich enough to distinguish one place from another.
 
-Every shape is convex and centred on the origin of its own frame, so a line meets it in one interval. Rays are
+Every shape is convex and centred on the origin of its own frame, so a line intersects it in one interval. Rays are
 arrays of shape (3 n), with x, y and z each contiguous: for the few operations here, that layout is several
 times as fast as (n 3). Textures are smooth functions of position and practically band-limited, being plane waves with softened
 edges: an image of 100 to 200 pixels from a typical distance shows them without aliasing.
@@ -92,7 +92,7 @@ def blotches(first: Colour, second: Colour, period: float, seed: int) -> Waves:
 
 
 def dominant_axis(vectors: Float[Tensor, "n 3"]) -> Bool[Tensor, "n 3"]:
-    """Return a mask of the component of largest magnitude, the first of equal ones; ten times as fast as ``argmax``."""
+    """Return a mask of the component of largest magnitude (the first in a tie); ten times as fast as ``argmax``."""
     x, y, z = vectors.abs().unbind(-1)
     first = (x >= y) & (x >= z)
     second = ~first & (y >= z)
@@ -127,7 +127,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Box:
-    """A cuboid with its corners at plus and minus ``half`` (metres)."""
+    """A cuboid that extends from minus to plus ``half`` along each axis (metres)."""
 
     half: tuple[float, float, float]
 
@@ -201,7 +201,7 @@ class Primitive:
     ) -> Float[Tensor, " n"]:
         """Return the distance to the first crossing in front of the origin (metres; world, unit directions); inf: none.
 
-        From inside a solid, this is where the ray leaves it: a box seen from inside is a room.
+        For an origin inside a solid, this is where the ray leaves the solid: a box seen from inside is a room.
         """
         T = self.T_world_shape.to(directions)
         turned = T.rotation.mT @ directions
@@ -218,12 +218,12 @@ class Primitive:
 
 
 def _chord(middle: Tensor, squared: Tensor) -> tuple[Tensor, Tensor]:
-    """Return ``middle`` -+ sqrt(squared); where ``squared`` is negative, an empty interval whose end is before its start."""
+    """Return the interval ``middle`` -+ sqrt(squared); where ``squared`` is negative, it is empty: it ends before it starts."""
     half = squared.clamp(min=0).sqrt()
     half = torch.where(squared < 0, -torch.inf, half)
     return middle - half, middle + half
 
 
 def _tilted(directions: Tensor) -> Tensor:
-    """Return directions whose components are not so near 0 that divisions overflow; the change of the ray is negligible."""
+    """Keep the components of directions far enough from 0 that divisions do not overflow; the change of the ray is negligible."""
     return torch.where(directions.abs() < 1e-12, 1e-12, directions)

@@ -1,8 +1,8 @@
 """The HTTP service: photos in, poses out, from maps shared by several worker processes.
 
-The listening process decodes nothing and does not import torch. It hands each request to a worker, a fork of
-the one process that loaded the maps, so that a photo can only ever crash its own worker, and every map is in
-memory only once.
+The listening process decodes nothing and does not import torch. It hands each request to a worker, a fork of the one
+process that loaded the maps, so that a photo can crash only the worker that reads it, and each map is held in memory
+only once.
 """
 
 from lazy_loader import attach_stub

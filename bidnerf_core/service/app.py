@@ -1,4 +1,4 @@
-"""The service as an ASGI application: its paths and its log."""
+"""The service as an ASGI application: its routes and its request log."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ from bidnerf_core.service.web import (
 
 
 def application(order: dict[str, Any], limits: ServiceLimits, token: str | None) -> FastAPI:
-    """Build the service for the maps, method and device of an ``order``, see ``worker.main``.
+    """Build the service for the maps, method and device in ``order``, the message that ``worker.main`` receives.
 
-    It runs between ASGI startup and shutdown. Its startup raises ``InputError`` if a map cannot be served.
+    The workers run between ASGI startup and shutdown. Startup raises ``InputError`` if a map cannot be served.
     """
     pool, names = Pool(order, limits), list(order["maps"])
 
@@ -51,7 +51,7 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
             await pool.close()
 
     def report(scope: Scope, status: int, seconds: float) -> None:
-        """Count a request, and write one line of JSON about it to the log."""
+        """Count a request, and log it as one line of JSON."""
         path = getattr(scope.get("route"), "path", "unknown" if status not in (401, 403) else "refused")
         pool.requests.labels(path=path, status=status).inc()
         if scope["method"] == "POST":
@@ -73,7 +73,7 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
     app.state.pool, app.state.limits = pool, limits
 
     async def known(map: str = Path(json_schema_extra={"enum": [*names]})) -> str:
-        """Return the name of a map if it is served. Raises ``Refused`` for any other."""
+        """Return ``map`` if a map of that name is served. Raises ``Refused`` otherwise."""
         if map not in names:
             raise Refused(404, f"no map with that name, expected one of {', '.join(names)}")
         return map
@@ -162,7 +162,7 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
 
 
 async def _answer(request: Request, facts: dict[str, Any], task: dict[str, Any]) -> Any:
-    """Return the JSON of a worker's answer, and add ``facts`` about it to the log. Raises ``Refused``."""
+    """Return the JSON body of a worker's answer, and add ``facts`` to the request's log entry. Raises ``Refused`` if the request fails."""
     pool: Pool = request.app.state.pool
     upload = task.get("upload")
     facts |= {"map": task["map"], "bytes": 0 if upload is None else sum(map(len, upload.files.values()))}

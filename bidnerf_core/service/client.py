@@ -1,4 +1,4 @@
-"""A client for the service that needs only Python: copy this file to where bidnerf is not installed."""
+"""A client for the service that needs only Python (and NumPy for arrays): copy this file to use it without bidnerf."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ File: TypeAlias = str | Path | bytes
 
 
 class ServiceError(Exception):
-    """The service did not respond with a result; ``status`` is the HTTP status, 0 without a connection."""
+    """The service did not return a result. ``status`` is the HTTP status, or 0 without an HTTP response."""
 
     def __init__(self, status: int, detail: str) -> None:
         super().__init__(detail)
@@ -26,9 +26,9 @@ class ServiceError(Exception):
 
 
 class ServiceClient:
-    """Requests poses from a ``bidnerf serve`` service at ``url``.
+    """A client that requests poses from a ``bidnerf serve`` service at ``url``.
 
-    A busy service is retried for up to ``timeout`` seconds. All methods raise ``ServiceError``.
+    Requests to a busy service are retried for up to ``timeout`` seconds. All methods raise ``ServiceError``.
     """
 
     def __init__(
@@ -46,12 +46,13 @@ class ServiceClient:
         start: Any = None,
         **known: str | float | None,
     ) -> dict[str, Any]:
-        """Return the JSON of ``bidnerf localize`` for a photo: a file, its bytes, or an array of bytes (h, w) or (h, w, 3).
+        """Localize a photo and return the same JSON as ``bidnerf localize``.
 
-        ``map`` is by default the one that the photo shows. ``depth`` is a file, its bytes, or an array (h, w) of planar z,
-        ``camera`` a file with the camera, or its content, and ``start`` the 4x4 rows of T_world_camera. ``known`` takes
-        further values by keyword: ``name`` (of the frame, in the answer), ``focal`` (pixels of the stored image), ``hfov``
-        (degrees), ``depth_unit`` (metres per step of the depth image) and ``seed``.
+        ``photo`` is a file, its bytes, or a uint8 array (h, w) or (h, w, 3). ``map`` names the map to search, by
+        default whichever map the photo shows. ``depth`` is a file, its bytes, or an array (h, w) of planar z.
+        ``camera`` is a camera file or its content, and ``start`` is T_world_camera as 4x4 rows. ``known`` takes
+        further values by keyword: ``name`` (of the frame in the answer), ``focal`` (pixels of the stored image),
+        ``hfov`` (degrees), ``depth_unit`` (metres per step of the depth image) and ``seed``.
         """
         edge = uuid.uuid4().hex
         rows = getattr(start, "tolist", lambda: start)()
@@ -74,15 +75,15 @@ class ServiceClient:
         return self.ask("/localize", body, f"multipart/form-data; boundary={edge}")
 
     def maps(self) -> dict[str, Any]:
-        """Return the facts about each map by its name."""
+        """Return the facts about each map, by map name."""
         return self.ask("/maps")
 
     def health(self) -> dict[str, Any]:
-        """Return whether the service can answer, and how many requests wait."""
+        """Return the status of the service: whether it can answer, and how many requests are waiting."""
         return self.ask("/health")
 
     def ask(self, path: str, body: bytes | None = None, kind: str = "application/json") -> dict[str, Any]:
-        """Return the JSON object at a path such as /maps; with a ``body``, post it and return the response."""
+        """Get the JSON object at a path such as /maps; with a ``body``, post the body there and return the JSON response."""
         headers = {"Content-Type": kind} | ({"Authorization": f"Bearer {self.token}"} if self.token else {})
         request = urllib.request.Request(self.url + path, body, headers)
         until = time.monotonic() + self.timeout
@@ -105,7 +106,7 @@ class ServiceClient:
 
 
 def _part(edge: str, name: str, content: bytes, file: str | None = None) -> bytes:
-    """Return a form field; the stem of a photo's file name becomes its name in the answer."""
+    """Return a multipart form field. The stem of a photo's file name becomes the name of its frame in the answer."""
     quoted = (file or "").replace("\\", "\\\\").replace('"', "%22").replace("\r", "").replace("\n", "")
     head = f'--{edge}\r\nContent-Disposition: form-data; name="{name}"'
     return (head + (f'; filename="{quoted}"' if file else "") + "\r\n\r\n").encode() + content + b"\r\n"

@@ -1,4 +1,4 @@
-"""What clients send and receive: each model checks requests and describes itself in OpenAPI."""
+"""Models of requests and responses, which validate requests and provide the OpenAPI schemas."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Upload:
-    """A photo and what is known about it, as sent with a request: no value is ever used as a file name."""
+    """A photo and its metadata, as sent in a request. No value in it is ever used as a file name."""
 
     parameters: Mapping[str, Any] = field(default_factory=dict)  # the fields of ``PhotoForm`` that were given
     files: Mapping[str, bytes] = field(default_factory=dict)  # "photo" and perhaps "depth"
@@ -61,14 +61,14 @@ class Upload:
 
 
 def _decimal(value: Any) -> Any:
-    """Accept only numbers as a program writes them; Python's ``float`` takes digits of every script and underscores too."""
+    """Accept only plain ASCII decimal numbers; Python's ``float`` also accepts underscores and digits of other scripts."""
     if isinstance(value, str) and not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", value, re.ASCII):
         raise PydanticCustomError("number", "a number")
     return value
 
 
 def _without_aliases(text: str) -> str:
-    """Refuse YAML, whose aliases and merge keys expand without a limit."""
+    """Reject YAML, whose aliases and merge keys can expand without limit."""
     if text.lstrip("\ufeff \t\r\n").startswith(("%YAML", "---")):
         raise PydanticCustomError("camera", "JSON, or a row of COLMAP's cameras.txt")
     return text
@@ -129,7 +129,7 @@ EXPECTED = {
 
 
 def checked(model: type[Model], values: Any) -> Model:
-    """Return values as an instance of a model. Raises ``InputError`` that names the first that is wrong."""
+    """Validate ``values`` as an instance of ``model``. Raises an ``InputError`` that names the first invalid value."""
     try:
         return model.model_validate(values)
     except ValidationError as error:
@@ -149,7 +149,7 @@ def checked(model: type[Model], values: Any) -> Model:
 
 
 def short(value: Any) -> str:
-    """Return a value as JSON on one line, truncated if it is long."""
+    """Return a value as one line of JSON, truncated if it is long."""
     shown = json.dumps(value, default=str)
     return shown if len(shown) <= 60 else shown[:57] + "..."
 

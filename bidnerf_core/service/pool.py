@@ -1,8 +1,9 @@
 """The worker processes of the service, which may be stopped or killed at any time.
 
-A request whose worker dies is given to another. If a request takes too long, or its client disconnects, its worker is killed and
-replaced by a fork within milliseconds, so no computation continues that nobody waits for. A pool of the standard library would
-lose all its requests with one worker, cannot stop one, and would load the maps anew in each.
+A request whose worker dies is passed to another worker. If a request takes too long, or its client disconnects, the
+worker is killed and replaced by a fork within milliseconds, so that no computation continues after its client has
+left. A process pool of the standard library would lose all its requests when one worker dies, cannot stop a single
+worker, and would load the maps again in every worker.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ class Worker:
         self._process = psutil.Process(pid)
 
     async def ask(self, task: Any) -> dict[str, Any]:
-        """Return the worker's answer. Raises ``LOST`` if it exits before answering."""
+        """Send a task to the worker and return its answer. Raises one of ``LOST`` if the worker exits before answering."""
         self.reply = asyncio.get_running_loop().create_future()
         self._writer.write(pickle.dumps(task))
         return json.loads(await self.reply) | {"worker": self.pid}
@@ -67,10 +68,10 @@ class Worker:
 
 
 class Pool:
-    """The workers of a service, which share the memory of its maps, and the requests that wait for them."""
+    """The workers of a service, which share the memory of its maps, and the requests that are waiting for a worker."""
 
     def __init__(self, order: dict[str, Any], limits: ServiceLimits) -> None:
-        """``order`` is what the process that loads the maps gets, see ``worker.main``."""
+        """Create a pool that is not yet started; ``order`` is the message for the process that loads the maps, see ``worker.main``."""
         self.described: dict[str, Any] = {}
         self.places, self.taken, self.waiting = limits.processes + limits.queue, 0, 0
         self.workers = list[Worker]()
@@ -105,12 +106,12 @@ class Pool:
             memory.labels(process=kind).set_function(partial(_resident_bytes, numbers))
 
     def metric(self, name: str, **labels: str) -> float:
-        """Return the value of a metric now; 0 for one that was never counted."""
+        """Return the current value of a metric, or 0 if it was never counted."""
         return self.registry.get_sample_value(f"bidnerf_{name}", labels) or 0.0
 
     @contextlib.contextmanager
     def place(self) -> Iterator[dict[str, Any]]:
-        """Take one of the places for requests within the block, and yield the facts for its log. Raises ``Refused`` if none is left."""
+        """Reserve a slot for a request in the block, and yield the facts for its log entry. Raises ``Refused`` if no slot is free."""
         if self.taken >= self.places:
             mean = self.metric("request_seconds_sum") / max(1.0, self.metric("request_seconds_count")) or 1.0
             seconds = max(1, min(60, round(mean * self._limits.queue / self._limits.processes)))
@@ -123,9 +124,10 @@ class Pool:
             self.taken -= 1
 
     async def answer(self, task: Any, facts: dict[str, Any]) -> dict[str, Any]:
-        """Return a worker's answer to a request. Raises ``Refused`` if every worker that took it died.
+        """Return a worker's answer to a request. Raises ``Refused`` if every worker that took the request died.
 
-        Cancelling this kills the worker that is at work; the message of the cancellation says why.
+        Cancelling this call kills the worker that is processing the request; the cancellation message gives the
+        reason.
         """
         began = time.perf_counter()
         os.makedirs(tempfile.gettempdir(), exist_ok=True)  # something may have removed it
@@ -169,14 +171,14 @@ class Pool:
         self._keepers = [asyncio.create_task(self._keep(worker)) for worker in new]
 
     async def close(self) -> None:
-        """End all processes."""
+        """Stop all processes."""
         for keeper in self._keepers:
             keeper.cancel()
         await asyncio.gather(*self._keepers, return_exceptions=True)
         self._end_maps(group=True)
 
     async def _keep(self, new: tuple[Worker, asyncio.StreamReader] | None) -> None:
-        """Hand the answers of a worker to those who asked, and replace it whenever it has ended."""
+        """Keep one worker running: pass its answers to the callers, and replace the worker whenever it ends."""
         while True:
             worker, reader = new or await self._replacement()
             self.workers.append(worker)
@@ -196,7 +198,7 @@ class Pool:
             new = None
 
     async def _replacement(self) -> tuple[Worker, asyncio.StreamReader]:
-        """Fork a worker. If the process that holds the maps has ended or does not answer, they are reloaded first."""
+        """Fork a new worker, after reloading the maps if the process that holds them has ended or does not answer."""
         while True:
             async with self._loading:
                 try:
@@ -213,7 +215,7 @@ class Pool:
             await asyncio.sleep(PAUSE)
 
     async def _fork(self) -> tuple[Worker, asyncio.StreamReader]:
-        """Return a new worker. Raises as ``_greeting`` does."""
+        """Fork a worker and return it with the stream of its answers. Raises the errors of ``_greeting``."""
         assert self._maps is not None
         ours, theirs = socket.socketpair()
         with theirs:
@@ -222,7 +224,7 @@ class Pool:
         return Worker(found["pid"], writer), reader
 
     async def _load(self) -> None:
-        """Start the process that loads the maps. Raises as ``_greeting`` does."""
+        """Start the process that loads the maps. Raises the errors of ``_greeting``."""
         ours, theirs = socket.socketpair()
         with theirs:
             process = subprocess.Popen(
@@ -239,7 +241,7 @@ class Pool:
         self.described = found["maps"]
 
     def _end_maps(self, group: bool = False) -> None:
-        """Kill the process that holds the maps and, with ``group``, the workers that it forked."""
+        """Kill the process that holds the maps and, if ``group`` is set, also the workers that it forked."""
         if self._maps is None:
             return
         process, control = self._maps
@@ -255,9 +257,9 @@ class Pool:
 async def _greeting(
     connection: socket.socket, seconds: float | None
 ) -> tuple[dict[str, Any], asyncio.StreamReader, asyncio.StreamWriter]:
-    """Return the first message of a new process, and streams of at most 16 MiB a message.
+    """Return the first message of a new process, and streams that accept messages of up to 16 MiB.
 
-    Raises ``InputError`` if the process states an error, and ``LOST`` if it died or does not answer in time.
+    Raises ``InputError`` if the process reports an error, and one of ``LOST`` if it died or does not answer in time.
     """
     reader, writer = await asyncio.open_connection(sock=connection, limit=2**24)
     try:

@@ -1,7 +1,7 @@
-"""Other protocols by which clients may ask for poses, as plugins of the group ``bidnerf.services``.
+"""Further protocols for requesting poses, as plugins of the group ``bidnerf.services``.
 
-A protocol's name is its path: the service answers it at ``/NAME``, and at ``/maps/MAP/NAME`` for a map. A GET is answered with
-``{"status": "running"}``, and a POST with what the plugin makes of its JSON.
+The name of a protocol is its path: the service answers at ``/NAME``, and at ``/maps/MAP/NAME`` for a given map. A GET
+request returns ``{"status": "running"}``, and a POST request returns the plugin's answer to the JSON that was sent.
 """
 
 from __future__ import annotations
@@ -21,31 +21,32 @@ if TYPE_CHECKING:
 
 
 class ServiceProtocol(Protocol):
-    """A protocol of the service. The process that listens imports it too, so its module must not import PyTorch."""
+    """Interface of a service protocol. The listening process imports it too, so its module must not import PyTorch."""
 
     @property
     def summary(self) -> str:
-        """One line that says what is answered."""
+        """One line that describes the answers of the protocol."""
 
     @property
     def request(self) -> type[BaseModel]:
-        """The model of a request, which has been checked when ``answer`` is called."""
+        """The model of a request; the request is validated against it before ``answer`` is called."""
 
     @property
     def response(self) -> type[BaseModel]:
-        """The model of an answer, for the description."""
+        """The model of an answer, for the OpenAPI description."""
 
     @property
     def media_type(self) -> str:
-        """The type of answers to clients that accept its first part, before the semicolon; others get ``application/json``."""
+        """The media type of answers to clients that accept its part before the semicolon; other clients get ``application/json``."""
 
     def answer(
         self, body: dict[str, Any], scene: Map, localize: Callable[[Upload], tuple[Answer, dict[str, Any]]]
     ) -> dict[str, Any]:
         """Return the JSON of an answer.
 
-        ``body`` is the JSON of the request. ``localize`` finds the pose of a photo in the map ``scene``, and returns it also
-        as the JSON of ``bidnerf localize``. Raises ``InputError``, answered with 422, and ``Refused``.
+        ``body`` is the JSON of the request. ``localize`` finds the pose of a photo in the map ``scene``, and returns
+        the answer together with its JSON as printed by ``bidnerf localize``. Raises ``InputError``, which the service
+        reports with status 422, and ``Refused``.
         """
 
 

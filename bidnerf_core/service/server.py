@@ -1,4 +1,4 @@
-"""The service on a port: ``serve`` runs until it is stopped."""
+"""Run the service: ``serve`` listens on a port until it is stopped."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def service_app(
     limits: ServiceLimits | None = None,
     token: str | None = None,
 ) -> FastAPI:
-    """Return the service for the maps in some folders as an ASGI application, for your own server.
+    """Return an ASGI application that serves the maps in the given folders, to run in your own server.
 
-    ``method`` finds the poses on ``device``; ``config`` holds its settings, as an instance of their type or a dictionary of those
-    that differ from the defaults.
+    ``method`` finds the poses on ``device``. ``config`` holds the settings of the method, as an instance of its
+    settings class or as a dictionary of the settings that differ from the defaults.
 
-    Its workers are single-threaded processes, started at ASGI startup and ended at shutdown. Without a
-    ``token`` it answers only requests addressed to localhost. Raises ``InputError`` for invalid names and
-    settings, and without the extra ``serve``; a map that cannot be loaded raises it at startup.
+    The workers are single-threaded processes, started at ASGI startup and stopped at shutdown. Without a ``token``,
+    only requests addressed to localhost are answered. Raises ``InputError`` for invalid names and settings, and if
+    the extra ``serve`` is not installed; if a map cannot be loaded, ASGI startup raises it.
     """
     try:
         from bidnerf_core.service.app import application
@@ -76,11 +76,12 @@ def serve(
 ) -> None:
     """Serve maps over HTTP until the process is interrupted, or ``stop`` is set.
 
-    ``scenes``: the folder of a map, a list of them, or folders by the names under which clients ask for them. Only
-    programs on this machine are answered, unless a ``host``, such as 0.0.0.0, is given: clients then need the
-    ``token``, which is generated if none is given. ``port`` 0 picks a free one. ``options`` are ``method``, ``config``, ``device``
-    and ``limits`` of ``service_app``. ``ready`` is called with the address and the token once requests are answered. Raises
-    ``InputError`` for maps and settings that cannot be served, and for a port that is taken.
+    ``scenes`` is the folder of a map, a list of folders, or a mapping from the names that clients use to folders.
+    Only programs on this machine are answered unless a ``host``, such as 0.0.0.0, is given: clients then need the
+    ``token``, which is generated if none is given. With ``port`` 0, a free port is picked. ``options`` are
+    ``method``, ``config``, ``device`` and ``limits`` of ``service_app``. ``ready`` is called with the address and the
+    token once the service answers requests. Raises ``InputError`` for maps and settings that cannot be served, and if
+    the port is taken.
     """
     if not hasattr(os, "fork"):
         raise InputError(
@@ -92,9 +93,10 @@ def serve(
 
 
 def token_for(host: str | None, token: str | None, needs: str) -> str | None:
-    """Return the token that clients need: the given one, or one that is made up unless ``host`` is this machine only.
+    """Return the token that clients need: ``token`` if given, else a new one, or None if ``host`` is only this machine.
 
-    Raises ``InputError`` with the text ``needs`` if the web server is not installed, and for a token that is too short.
+    Raises ``InputError`` with the text ``needs`` if the web server is not installed, and ``InputError`` if the token
+    is too short.
     """
     try:
         import uvicorn  # noqa: F401 (tried before the maps are read)
@@ -114,9 +116,10 @@ def run_app(
     stop: threading.Event | None = None,
     grace: int = 10,
 ) -> None:
-    """Run an application on a port until the process is interrupted, or ``stop`` is set; ``ready`` is called with its address.
+    """Run an application on a port until the process is interrupted, or ``stop`` is set.
 
-    Requests in progress then have ``grace`` seconds to end. Raises ``InputError`` for a port that is taken.
+    ``ready`` is called with the address once the port accepts connections. When the application stops, requests in
+    progress have ``grace`` seconds to finish. Raises ``InputError`` if the port is taken.
     """
     import uvicorn
 
@@ -154,7 +157,7 @@ def run_app(
 
 
 def named(scenes: Scenes) -> dict[str, Path]:
-    """Return the folders of maps by name, by default their own names. Raises ``InputError`` for invalid names."""
+    """Return the folders of maps by name; the default name is that of the folder. Raises ``InputError`` for invalid names."""
     if isinstance(scenes, str | Path):
         scenes = [scenes]
     pairs = (

@@ -35,7 +35,7 @@ class ServiceLimits(Settings):
 
     @property
     def processes(self) -> int:
-        """The number of worker processes, by default that of the cores that this process may use."""
+        """The number of worker processes, by default the number of cores that this process may use."""
         return self.workers or usable_cores()
 
     @property
@@ -50,7 +50,7 @@ class ServiceLimits(Settings):
 
 
 def checked_token(token: str | None) -> str | None:
-    """Return a token. Raises ``InputError`` for one that is short or that a header cannot hold."""
+    """Return ``token`` if it is valid. Raises ``InputError`` if it is too short or cannot be sent in a header."""
     if token is not None and (len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable()):
         raise InputError(
             f"the token has {len(token)} characters",

@@ -1,4 +1,4 @@
-"""A photo that came with a request, read from its bytes."""
+"""Reading of photos that are uploaded with requests."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from bidnerf_core.service.models import CAMERAS, WIDEST, Upload
 def read_upload(
     upload: Upload, usual: CameraSource, folder: Path, max_pixels: float
 ) -> tuple[Photos, SE3 | None]:
-    """Write the files of a request into ``folder``, check the sizes in their headers, and return the photo and the start.
+    """Write the files of a request to ``folder``, check the image sizes in their headers, and return the photo and the start pose.
 
-    ``usual`` is the camera of photos that come without one. Raises ``InputError``, see ``public_message``.
+    ``usual`` is the camera source for photos sent without a camera. Raises ``InputError``; pass it to
+    ``public_message`` before showing it to clients.
     """
     images, widths = dict[str, Path](), dict[str, int]()
     for name, content in upload.files.items():
@@ -59,7 +60,7 @@ def read_upload(
 
 
 def public_message(error: InputError, folder: Path) -> str:
-    """Return the message of an error for clients: without the folder of the request, and with the names of its parameters."""
+    """Return the message of an error for clients: without the folder of the request, and with the names of the request's parameters."""
     text = str(error).replace(f"{folder}{os.sep}", "")
     for ways in (WAYS_OF_PHOTO, WAYS):
         text = text.replace(ways, f"{', '.join(CAMERAS[:-1])} or {CAMERAS[-1]}")

@@ -1,4 +1,4 @@
-"""What the applications of ``serve`` and ``view`` share: access, errors, the log, reading requests, and their description."""
+"""Code shared by the applications of ``serve`` and ``view``: access, errors, the log, reading requests, and the API description."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ Report = Callable[[Scope, int, float], None]
 
 
 class Application(FastAPI):
-    """An application that answers errors in the format of RFC 9457 and describes itself; on access, see ``refusal``."""
+    """A FastAPI application with access control (see ``refusal``), errors in the format of RFC 9457, and an OpenAPI description."""
 
     def __init__(
         self,
@@ -100,7 +100,7 @@ class Application(FastAPI):
             return HTMLResponse(page, headers={"Content-Security-Policy": policy})
 
     def openapi(self) -> dict[str, Any]:
-        """Return the OpenAPI description, without what FastAPI says of checks that it does not make here."""
+        """Return the OpenAPI description, without the validation errors that FastAPI declares but this application never returns."""
         if self.openapi_schema is not None:
             return self.openapi_schema
         api = super().openapi()
@@ -125,7 +125,7 @@ class Application(FastAPI):
 
 
 class Gate:
-    """What every request passes: the check of its access, the headers of every response, and the report of how it went."""
+    """ASGI middleware that checks access to each request, sets headers on each response, and reports its status and duration."""
 
     def __init__(
         self, app: ASGIApp, token: str | None, cookie: str | None = None, report: Report | None = None
@@ -174,7 +174,7 @@ def problem(status: int, detail: str, headers: Mapping[str, str] | None = None, 
 
 
 async def _failure(request: Request, error: Exception) -> Response:
-    """Return the response to a request that failed with an error of its client."""
+    """Return the error response for a ``Refused``, ``InputError`` or ``HTTPException`` that a request raised."""
     if isinstance(error, Refused):
         return problem(error.status, error.detail, error.headers, **error.more)
     if isinstance(error, HTTPException):
@@ -194,11 +194,11 @@ OPEN = "/health"
 
 
 def refusal(scope: Scope, token: str | None, cookie: str | None = None) -> tuple[int, str] | None:
-    """Return the status and the reason for which a request is refused; None if it is passed on.
+    """Return the status and the reason if a request is refused, or None if it may pass.
 
-    A web page in a browser may send requests to any address: these are detected by their ``Origin``, which is not the
-    address that they ask, or, if another site's name resolves to this machine, by their ``Host``. ``cookie`` is the name
-    of a cookie that may hold the token.
+    A web page in a browser may send requests to any address. Such requests are detected by their ``Origin`` header,
+    which differs from the address requested, or, if the name of another site resolves to this machine, by their
+    ``Host`` header. ``cookie`` is the name of a cookie that may hold the token.
     """
     request = HTTPConnection(scope)
     host, origin = request.headers.get("host", ""), request.headers.get("origin")
@@ -220,7 +220,7 @@ def refusal(scope: Scope, token: str | None, cookie: str | None = None) -> tuple
 
 
 def is_loopback(host: str | None) -> bool:
-    """Return whether a name or address is a loopback one."""
+    """Return whether a host name or address is a loopback address."""
     with contextlib.suppress(ValueError):
         return ipaddress.ip_address(host or "").is_loopback
     return host == "localhost" or str(host).endswith(".localhost")
@@ -230,7 +230,7 @@ def is_loopback(host: str | None) -> bool:
 
 
 async def body_of(request: Request, limits: ServiceLimits) -> bytes:
-    """Read the body of a request. Raises ``Refused`` for one that is too large or does not arrive in time."""
+    """Read the body of a request. Raises ``Refused`` if the body is too large or does not arrive in time."""
     close = {"Connection": "close"}  # the rest of the body is not read
     most = f"expected at most {limits.max_megabytes:g} MiB"
     text = request.headers.get("content-length", "0")
@@ -255,7 +255,7 @@ async def body_of(request: Request, limits: ServiceLimits) -> bytes:
 
 
 async def photo_of(request: Request, limits: ServiceLimits) -> Upload:
-    """Read a photo and what is known about it: a form, or the bytes of the photo with query parameters. Raises ``Refused``."""
+    """Read a photo and its metadata from a form, or from a body and query parameters. Raises ``Refused`` and ``InputError``."""
     content = await body_of(request, limits)
     kind, stem = request.headers.get("content-type", "").partition(";")[0].strip().lower(), ""
     items: list[tuple[str, Any]] = request.query_params.multi_items()
@@ -293,9 +293,9 @@ async def _parts(request: Request, content: bytes) -> list[tuple[str, str | Uplo
 
 
 async def answered(request: Request, work: asyncio.Future[Any], seconds: float | None = None) -> Any:
-    """Return the result of ``work``, which is cancelled if the client disconnects first, or it takes too long.
+    """Return the result of ``work``, or cancel it if the client disconnects or ``seconds`` pass first.
 
-    Raises ``Refused`` in these cases.
+    Raises ``Refused`` in either case.
     """
 
     async def left() -> None:
@@ -320,7 +320,7 @@ async def answered(request: Request, work: asyncio.Future[Any], seconds: float |
 
 
 def photo_body(*without: str) -> dict[str, Any]:
-    """Return what OpenAPI says of a request with a photo: its parameters and its body, leaving some out."""
+    """Return the OpenAPI parameters and body of a request with a photo, except the fields named in ``without``."""
     form = PhotoForm.model_json_schema()
     for name in without:
         del form["properties"][name]
@@ -343,13 +343,13 @@ def photo_body(*without: str) -> dict[str, Any]:
 
 
 def json_body(model: Any) -> dict[str, Any]:
-    """Return what OpenAPI says of a request with JSON."""
+    """Return the OpenAPI body of a request with JSON that matches ``model``."""
     schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
     return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}}}}
 
 
 def errors(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Return the descriptions of error responses, for the argument ``responses`` of a path."""
+    """Return the OpenAPI descriptions of error responses, for the ``responses`` argument of a route."""
     headers = {401: "WWW-Authenticate", 429: "Retry-After", 503: "Retry-After"}
     return {
         status: {

@@ -1,7 +1,7 @@
-"""The process that loads the maps once, and the workers that it forks, which share its memory and localize photos.
+"""The process that loads the maps once, and the workers forked from it, which share its memory and localize photos.
 
-The loading process has a single thread, so that forks are safe, and it never handles a request: a worker that fails or
-is killed is replaced by a fork within milliseconds, and no memory is shared for writing.
+The loading process has a single thread, so that forking is safe, and it never handles a request. A worker that fails
+or is killed is replaced by a fork within milliseconds, and workers share memory only for reading.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Worker:
     """Everything needed to answer requests, loaded before workers are forked."""
 
     def __init__(self, maps: Mapping[str, Localizer], max_pixels: float) -> None:
-        """Take the localizers by the names of their maps; several form a collection, for photos whose map is not known."""
+        """Take the localizers by map name; several maps form a collection, for photos whose map is not known."""
         self.maps, self.max_pixels, first = maps, max_pixels, next(iter(maps.values()))
         self.together: MapCollection | None = None
         if len(maps) > 1:
@@ -42,7 +42,7 @@ class Worker:
             self.together = MapCollection(scenes, first.method, first.config, localizers=dict(maps))
 
     def describe(self) -> dict[str, Any]:
-        """Return the facts about each map, by its name, that clients may see; the others name photos and folders."""
+        """Return the facts about each map that clients may see, by map name; the other facts reveal photos and folders."""
         found = {}
         for name, localizer in self.maps.items():
             scene = _scene(localizer)
@@ -51,10 +51,10 @@ class Worker:
         return found
 
     def answer(self, task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-        """Return the status and the body of the response to a request, whose files may be written to ``folder``.
+        """Return the status and the body of the response to a request; the request's files may be written to ``folder``.
 
-        ``task`` has the name of the ``map``, None for the one that the photo shows, and an ``upload``, or the JSON ``body``
-        of a request of ``protocol``.
+        ``task`` holds the name of the ``map``, or None for whichever map the photo shows, and either an ``upload`` or
+        the JSON ``body`` of a request to ``protocol``.
         """
         outcomes = list[str]()
 
@@ -80,7 +80,7 @@ class Worker:
         }
 
     def localize(self, name: str | None, upload: Upload, folder: Path) -> tuple[Answer, dict[str, Any]]:
-        """Localize a photo in a map, or in the one of several that it shows.
+        """Localize a photo in the map ``name`` or, if it is None, in whichever of the maps the photo shows.
 
         Returns the answer, and its JSON values as printed by ``bidnerf localize --json``.
         """
@@ -104,9 +104,10 @@ def _scene(localizer: Localizer) -> Map:
 
 
 def main() -> None:
-    """Load the maps that the parent names over the socket whose descriptor is the program's argument, and fork workers on demand.
+    """Load the maps named in the parent's order, then fork a worker whenever the parent asks for one.
 
-    Each byte that arrives then comes with the socket that a new worker will serve.
+    The program's argument is the descriptor of the socket on which the order arrives. Each byte that arrives
+    afterwards comes with the socket that a new worker will serve.
     """
     assert os.getpgrp() == os.getpid(), "this process ends its group"
     control = socket.socket(fileno=int(sys.argv[1]))
@@ -140,7 +141,7 @@ def main() -> None:
 
 
 def _loaded(order: Mapping[str, Any]) -> Worker:
-    """Load maps by name. Raises ``InputError`` if one cannot be served."""
+    """Load the maps named in ``order``. Raises ``InputError`` if a map cannot be served."""
     import logging
     import warnings
 
@@ -163,7 +164,7 @@ def _loaded(order: Mapping[str, Any]) -> Worker:
 def _serve(worker: Worker, device: str, stream: BufferedRWPair) -> None:
     """Answer requests until the connection ends.
 
-    On an accelerator, which does not survive a fork, the localizers are made anew.
+    On an accelerator, whose state does not survive a fork, the localizers are created again first.
     """
     try:
         if device != "cpu":
@@ -183,7 +184,7 @@ def _serve(worker: Worker, device: str, stream: BufferedRWPair) -> None:
 
 
 def _send(stream: BufferedRWPair, message: Mapping[str, Any]) -> None:
-    """Send a line of JSON, so that nothing is unpickled in the process that listens, whatever a photo does to a worker."""
+    """Send a line of JSON, so that the listening process never unpickles data from a worker that a photo may have compromised."""
     stream.write(json.dumps(message).encode() + b"\n")
     stream.flush()
 

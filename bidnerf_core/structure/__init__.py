@@ -1,4 +1,4 @@
-"""Structure from motion: cameras and poses for photos and videos without any, using COLMAP (extra ``sfm``)."""
+"""Structure from motion: cameras and poses for photos and videos that have none, using COLMAP (extra ``sfm``)."""
 
 from lazy_loader import attach_stub
 

@@ -76,7 +76,7 @@ class ListedPhoto:
 
 @dataclass(frozen=True)
 class Described:
-    """The readable photos, and why the others cannot be read."""
+    """The readable photos, and the reasons why the others cannot be read."""
 
     photos: list[ListedPhoto]
     cameras: dict[int, Intrinsics]  # of reduced photos, by number
@@ -200,7 +200,7 @@ def _keypoints(photo: ListedPhoto) -> Keypoints | InputError:
 
 
 def _without_file(error: InputError, image: SourceImage) -> str:
-    """Return a message without the leading file path, which is shown next to it anyway."""
+    """Return an error's message without the leading file path, which is shown next to the message anyway."""
     return str(error).removeprefix(f"{image.file}: ")
 
 

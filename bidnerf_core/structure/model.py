@@ -1,4 +1,4 @@
-"""The model of photos: registration by COLMAP's incremental mapper, its orientation and check, and the dataset written of it."""
+"""The model of photos: its registration by COLMAP's incremental mapper, its orientation and check, and its dataset."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def reconstructed(
 ) -> list[Any]:
     """Reconstruct the photos of a database, keeping their cameras if ``fixed``; models are written to ``folder``.
 
-    Returns the models, largest first; parts without overlap have one each. There may be no model at all.
+    Returns the models, largest first; parts of the scene without overlap become separate models. There may be no model at all.
     """
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=threads,
@@ -104,7 +104,7 @@ def agreement(model: Any, database: Any, pycolmap: Any) -> tuple[int, int]:
     """Compare the verified pairs of a database with the poses and cameras of a model.
 
     Places that look alike, such as the doors of a corridor, can be taken for one place. The model is then folded, although its points
-    project where they should. It contradicts other pairs of photos, whose many matches cannot be due to chance.
+    project where they should. A folded model contradicts other pairs of photos, whose many matches cannot be due to chance.
 
     Returns the number of pairs of registered photos with at least a hundred verified matches, since pairs of different places
     with repeated details have up to 80, and the number of those that contradict the model's poses: fewer than half of their
@@ -135,9 +135,9 @@ def agreement(model: Any, database: Any, pycolmap: Any) -> tuple[int, int]:
 def left_out(
     found: Described, models: list[Any], partners: Counter[int], keypoints: Mapping[int, int]
 ) -> dict[str, str]:
-    """Return by name why photos are in no model, or not in the largest.
+    """Return, by photo name, why the left-out photos are in no model, or not in the largest.
 
-    ``partners`` are the numbers of photos that each overlaps with, and ``keypoints`` its numbers of keypoints.
+    ``partners`` holds how many photos each photo overlaps with, and ``keypoints`` how many keypoints it has.
     """
     of_model = {number: model for model in reversed(models) for number in model.reg_image_ids()}
     reasons = dict(found.unusable)
@@ -178,7 +178,7 @@ def from_colmap(camera: Any) -> Intrinsics:
 
 
 def relative(file: Path, folder: Path) -> str:
-    """Return the path of a file relative to a folder; an absolute one if they are on different drives."""
+    """Return the path of a file relative to a folder, or its absolute path if they are on different drives."""
     try:
         return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
     except ValueError:

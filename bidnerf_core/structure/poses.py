@@ -1,4 +1,4 @@
-"""Finding poses for photos without any: from a folder of photos, or a video, to a dataset."""
+"""Pose estimation for photos without poses: from a folder of photos, or a video, to a dataset."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def find_poses(
     is kept.
 
     The dataset is a ``transforms.json`` that refers to the photos in place; ``poses.json`` lists those that
-    were left out and why, and ``sparse/0`` is the model for COLMAP. The unit of length is arbitrary, and z
+    were left out and why, and ``sparse/0`` is the model in COLMAP's format. The unit of length is arbitrary, and z
     points up. Interrupted work in the same folder is resumed; poses already found for the same photos are
     returned immediately, unless ``overwrite`` is set and ``reuse`` is not.
 

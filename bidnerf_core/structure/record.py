@@ -144,7 +144,7 @@ def is_ours(file: Path) -> bool:
 def clear(folder: Path) -> None:
     """Remove everything that this module wrote.
 
-    Other files stay, such as photos in a folder with the same name as the frames folder.
+    Other files are kept, such as photos in a folder with the same name as the frames folder.
     """
     (folder / TRANSFORMS).unlink(missing_ok=True)  # first: without it, the record counts as incomplete
     record: Any = {}

@@ -98,7 +98,8 @@ def _listed(folder: Path, out: Path | None) -> list[Path]:
 def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
     """Return the photos without smaller copies of others, as in ``images_2`` and ``images_4`` beside ``images``.
 
-    Copies have the names of the others and their aspect ratio, all of one folder; a remark names their folders.
+    A folder holds copies if all its photos have the names of those in a folder beside it, and the same aspect ratio; a
+    remark names such folders.
     """
     groups: dict[Path, list[Path]] = {}
     for photo in photos:
@@ -122,7 +123,7 @@ def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
 
 
 def refuse_panoramas(photos: Sequence[SourceImage]) -> None:
-    """Raise ``InputError`` for photos whose XMP says that they are panoramas, which no pinhole camera takes."""
+    """Raise ``InputError`` for photos that are panoramas according to their XMP, since no pinhole camera describes them."""
     for photo in photos:
         try:
             with open_binary(photo.file, "a photo") as file:
@@ -156,7 +157,7 @@ def _below(folder: Path, out: Path | None) -> Iterator[Path]:
 
 
 def measured(video: Path) -> list[Measure]:
-    """Measure each frame of a video.
+    """Measure the image motion and sharpness of each frame of a video.
 
     Up to 200 corners (Shi and Tomasi 1994) are tracked in images of at most 320 pixels a side, from an anchor frame until they have
     moved by two percent of the diagonal or half of them are lost.
@@ -196,7 +197,7 @@ def measured(video: Path) -> list[Measure]:
 
 
 def chosen(frames: Sequence[Measure]) -> list[int]:
-    """Return the indices of the frames to place: one for each step of motion, the sharpest near it."""
+    """Return the indices of the frames to find poses for: one for each step of motion, the sharpest near it."""
     motion, sharp = np.array(frames).T
     step = max(STEP, float(motion[-1]) / (MOST - 1))
     found = set[int]()

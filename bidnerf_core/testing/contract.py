@@ -21,7 +21,7 @@ from bidnerf_core.testing.scene import SCENE_BOUNDS, awkward_rays, joined, point
 
 
 class BackendContract:
-    """Tests of a backend: derive a class whose name begins with ``Test``, and set ``backend`` or ``name``.
+    """Tests of a backend; to use them, derive a class whose name begins with ``Test`` and set ``backend`` or ``name``.
 
     ``backend`` is the object that the entry point names, ``name`` the entry point's name. ``config`` should
     be small: a few dozen steps of a few milliseconds each, enough to learn something from 6 images of 24 x 24
@@ -231,7 +231,7 @@ class BackendContract:
             return self._backend().build(self._config() if config is None else config, SCENE_BOUNDS)
 
     def _trained(self) -> Any:
-        """Return a field that was trained on RGB-D views, once per test class, and frozen like that of a loaded map."""
+        """Return a field trained on RGB-D views (once per test class) and frozen like the field of a loaded map."""
         if "_kept" not in vars(type(self)):
             field = self._build()
             with calling(f"{type(self._backend()).__name__}.train"):

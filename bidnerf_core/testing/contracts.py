@@ -41,7 +41,7 @@ START_OFF = (0.02, -0.015, 0.02, 0.01, -0.008, 0.012)
 
 
 class MethodContract(Named):
-    """Tests of a localization method: derive a class whose name begins with ``Test``, and set ``name``.
+    """Tests of a localization method; to use them, derive a class whose name begins with ``Test`` and set ``name``.
 
     ``name`` is the name under which the method is registered, ``config`` a config for small images; without
     it, the default config is used. The scene is a textured ground 2.4 m wide, seen by a camera of 128 x 96
@@ -160,7 +160,7 @@ NEAR = 1.5
 
 
 class FeaturesContract(Named):
-    """Tests of a detector: derive a class whose name begins with ``Test``, and set its registered ``name``.
+    """Tests of a keypoint detector; to use them, derive a class whose name begins with ``Test`` and set its registered ``name``.
 
     ``repeated`` is the minimum repeatability: the fraction of keypoints that must be detected again, and
     matched by their descriptors, in an image shifted by a few pixels.
@@ -265,7 +265,7 @@ def _blank() -> Float[Tensor, "h w 3"]:
 
 
 class FaultContract(Named):
-    """Tests of a fault: derive a class whose name begins with ``Test``, and set its registered ``name``."""
+    """Tests of a fault; to use them, derive a class whose name begins with ``Test`` and set its registered ``name``."""
 
     kind = "fault"
 

@@ -1,11 +1,11 @@
-"""A simulated device, which proves on any machine that code neither copies between devices nor waits for one.
+"""A simulated device, which lets any machine test that code neither copies between devices nor waits for one.
 
-Tensors on the device "meta" stand in for those on a GPU. While ``Elsewhere`` is active they have values,
-which are stored and computed on the CPU, so that code runs as it would on a GPU; but operations on tensors of
-both devices, which a GPU does not allow, raise ``DeviceFault``. Within ``strict``, so does anything that
-makes the host wait for the device: copies to and from the CPU, reading numbers from a tensor (``float``,
-``bool``, ``item``, ``tolist``), and sizes that depend on values (``nonzero``, indexing by a mask). Elsewhere,
-these are counted. ``check_steps`` checks that the steps of a localization can stay on the field's device.
+Tensors on the device "meta" stand in for those on a GPU. While ``Elsewhere`` is active, their
+values are stored and computed on the CPU, so that code runs as it would on a GPU; but operations that mix tensors
+of both devices, which a GPU does not allow, raise ``DeviceFault``. Within ``strict``, so does any operation
+that makes the host wait for the device: copies to and from the CPU, reading numbers from a tensor (``float``,
+``bool``, ``item``, ``tolist``), and sizes that depend on values (``nonzero``, indexing by a mask). Outside
+``strict``, these operations are counted. ``check_steps`` checks that the steps of a localization can stay on the field's device.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class DeviceFault(AssertionError):
 
 
 class _There(torch.Tensor):
-    """A tensor that claims to be on ``DEVICE`` and keeps its values in a tensor on the CPU."""
+    """A tensor that reports ``DEVICE`` as its device and keeps its values in a tensor on the CPU."""
 
     held: Tensor
 
@@ -119,7 +119,7 @@ class _There(torch.Tensor):
 
 
 class Elsewhere(TorchDispatchMode):
-    """Makes ``DEVICE`` usable. Outside ``strict()``, tensors may be moved between devices and read, but not mixed.
+    """A context that makes ``DEVICE`` usable. Outside ``strict()``, tensors may be moved between devices and read, but not mixed.
 
     ``waits`` counts, by operation, how often the host waited for the device.
     """
@@ -199,7 +199,7 @@ def _on_cpu(parts: Iterable[Any]) -> list[Tensor]:
 
 
 def _waiting(name: str, args: Any, flat: list[Any], there: bool, wanted: str | None) -> str | None:
-    """Return why an operation makes the host wait for the device, or copies between them; None if it does neither."""
+    """Return the reason why an operation makes the host wait for the device or copies between the two; None if it does neither."""
     if there and name in READS:
         return f"{name} {READS[name]}: the host waits for the device"
     if name == "copy_":
@@ -217,7 +217,7 @@ def _waiting(name: str, args: Any, flat: list[Any], there: bool, wanted: str | N
 
 
 def _generator_of(kind: Any) -> Any:
-    """Return a subclass of the generators' class whose instances may claim to be on ``DEVICE``."""
+    """Return a subclass of ``torch.Generator`` whose instances can report ``DEVICE`` as their device."""
 
     class There(kind):
         def __new__(cls, device: Any = "cpu") -> Any:
@@ -240,9 +240,9 @@ CHECKED_RAYS = 48
 
 
 def check_steps(field: RadianceField) -> None:
-    """Check that steps at each level stay on the device and reach the same pose as on the CPU.
+    """Check that localization steps at each level stay on the device and reach the same pose as on the CPU.
 
-    They must neither copy between devices nor wait for one. The device is simulated.
+    The steps must neither copy between devices nor wait for one. The device is simulated.
     Fields without parameters and buffers have no device and pass.
     """
     for number in range(len(levels(field))):
@@ -280,7 +280,7 @@ def _problem(field: RadianceField) -> Problem:
 
 
 def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor:
-    """Return the pose (4 4) after two steps; the first fills caches, the second must not leave the device."""
+    """Return the pose (4 4) after two steps: the first fills caches, and the second must stay on the device."""
     device, start = problem.device, problem.start_for("bid")
     objective = objective_of(ColourSettings(), DepthSettings(depth_scale=0.1))
     settings = DescentSettings(CHECKED_RAYS, level=level)

@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 def require(who: str, *claims: tuple[object, str]) -> None:
-    """Raise ``AssertionError`` with the fault of the first claim (condition, fault) that does not hold of ``who``.
+    """Raise ``AssertionError`` with the fault of the first claim (condition, fault) that is false for ``who``.
 
     An ``assert`` would be skipped under ``python -O``.
     """
@@ -33,7 +33,7 @@ def is_one_line(text: object) -> bool:
 def calling(doing: str, passing: type[Exception] = AssertionError) -> Iterator[None]:
     """Turn an exception in the backend's code into a contract failure that names the call (``doing``).
 
-    A failure itself, and an exception of the type ``passing``, is raised as it is.
+    Contract failures and exceptions of the type ``passing`` propagate unchanged.
     """
     try:
         yield
@@ -44,7 +44,7 @@ def calling(doing: str, passing: type[Exception] = AssertionError) -> Iterator[N
 
 
 def equal(a: Tensor | None, b: Tensor | None) -> bool:
-    """Return whether two optional tensors are the same."""
+    """Return whether two optional tensors are equal, or both None."""
     return a is b or (a is not None and b is not None and torch.equal(a, b))
 
 
@@ -59,7 +59,7 @@ def is_depth(depth: Tensor | None) -> bool:
 
 
 class Named:
-    """The base of contracts of parts that are registered by ``name``."""
+    """Base class of the contracts of plugins that are registered under ``name``."""
 
     kind: ClassVar[str] = ""
     name: ClassVar[str] = ""

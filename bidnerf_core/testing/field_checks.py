@@ -38,7 +38,7 @@ from bidnerf_core.testing.scene import (
 
 
 def check_shapes(field: RadianceField) -> None:
-    """Check any leading axes, including empty ones, and that values do not depend on the points' arrangement."""
+    """Check that points may have any leading axes, including empty ones, and that values do not depend on this arrangement."""
     positions, directions = points(7)
     flat = stacked(query(field, positions, directions, "7 points"))
     for shape in ((), (7,), (1,), (2, 3), (2, 1, 3), (0,), (2, 0), (0, 3)):
@@ -160,7 +160,7 @@ def _check_by(
     field: RadianceField, by: str, arguments: Callable[[Tensor], tuple[Tensor, Tensor]], curve: Callable[[float], Tensor],
     speed: Float[Tensor, "n 3"],
 ) -> None:  # fmt: skip
-    """Check the derivatives of density and colour along a curve of the argument named ``by``.
+    """Check the derivatives of density and colour as the argument named ``by`` moves along a curve.
 
     ``curve(t)`` are the points at ``t`` on their curves, ``speed`` is its derivative at 0. The exact derivatives, in reverse
     mode, must agree with finite differences at the best step size.
@@ -200,7 +200,7 @@ def _check_by(
 
 
 def check_jacobian(field: RadianceField, dtype: torch.dtype) -> None:
-    """Check that the ``jacobian`` of a field that offers one has the values of ``query`` and their derivatives."""
+    """Check that a field's ``jacobian``, if it has one, returns the values of ``query`` and their derivatives."""
     if not isinstance(field, DifferentiatedField):
         return
     positions, directions = (x.to(dtype) for x in points(COUNT))
@@ -249,7 +249,7 @@ BACKGROUND = (0.1, 0.5, 0.9)
 def check_intervals(field: RadianceField) -> None:
     """Check that valid samples are sorted, disjoint and in [near, far].
 
-    Rays that miss have none, and there may be 0 rays.
+    Rays that miss the scene must have no valid samples, and batches without rays must be accepted.
     """
     for of, rays in awkward_rays().items():
         for jitter, how in ((None, ""), (_generator(), " with jitter")):
@@ -290,7 +290,7 @@ def _arrangements() -> Iterator[Rays]:
 
 
 def check_repeatable(field: RadianceField) -> None:
-    """Check that samples repeat without jitter and, with it, for the same seed of the given generator."""
+    """Check that samples are reproducible without jitter and, with jitter, for equal seeds of the given generator."""
     rays = joined(list(awkward_rays().values()))
     with torch.random.fork_rng(devices=[]):
         twice = [sample(field, rays, "rays") for _ in range(2)]
@@ -343,7 +343,7 @@ def check_background(field: RadianceField) -> None:
 
 
 def check_levels(field: RadianceField) -> None:
-    """Check that each level is a field and that the last one renders like the field itself."""
+    """Check that each level is a field, and that the last level renders like the field itself."""
     offered = tuple(getattr(field, "levels", None) or (field,))
     expected = "expected a field: an object with sampler and query"
     for number, level in enumerate(offered):
@@ -362,7 +362,7 @@ def check_levels(field: RadianceField) -> None:
 def check_hits(field: RadianceField) -> None:
     """Check the hits of a field that provides them.
 
-    Values must be in range, distances in [near, far], and the opacity that of the field's density.
+    Values must be in range, distances in [near, far], and the opacity equal to that of the field's density.
     """
     if not isinstance(field, HitField):
         return

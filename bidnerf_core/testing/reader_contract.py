@@ -31,7 +31,7 @@ MOST_VIEWS = 24
 
 
 class ReaderContract(Named):
-    """Tests of a reader: derive a class whose name begins with ``Test``, and set ``name`` and ``folder``.
+    """Tests of a reader; to use them, derive a class whose name begins with ``Test`` and set ``name`` and ``folder``.
 
     ``name`` is the name under which the reader is registered, ``folder`` a capture in its format: at least
     ten images of something textured, taken from different places, as small as possible. It is opened with

@@ -78,11 +78,11 @@ def check_learning(
 
 
 def check_exposure(backend: Backend, config: Any) -> None:
-    """Check that images brighter or darker than the others do not make the field brighter or darker there.
+    """Check that images that are brighter or darker than the others do not make the field brighter or darker.
 
     A field is trained with alternately brighter and darker images, and another one with the exposures
-    exchanged. If the two differ as the images do, exposure ended up in the field. A field that learns slowly
-    shows little of either.
+    exchanged. If the two fields differ as the images do, exposure ended up in the field. A field that
+    learns slowly shows little difference.
     """
     # Within 100 steps, the exposures of the images can be learned. The share of them that ends up in the field is above
     # 0.1 if a recipe ignores exposure, and 0.01 if it learns it.

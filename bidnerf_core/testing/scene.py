@@ -27,7 +27,7 @@ DIMMED_BOUNDS = replace(SCENE_BOUNDS, background=(DIMMED,) * 3)  # the toy's own
 
 @cache
 def rgbd_views(coverage: bool = True) -> tuple[View, ...]:
-    """Return six views of a toy with exact depth.
+    """Return six views of the toy scene with exact depth.
 
     With ``coverage`` they have an alpha channel; otherwise they show the toy in front of white, as a sensor
     would see it.
@@ -67,7 +67,7 @@ def points(count: int, seed: int = 0) -> tuple[Float[Tensor, "n 3"], Float[Tenso
 
 
 def awkward_points() -> dict[str, Float[Tensor, "n 3"]]:
-    """Return positions at which carelessly written fields index out of range or overflow."""
+    """Return positions at which a carelessly written field indexes out of range or overflows."""
     lower, upper = torch.tensor(SCENE_BOUNDS.lower), torch.tensor(SCENE_BOUNDS.upper)
     share = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
     middle, corners = (lower + upper) / 2, lower + share * (upper - lower)

@@ -1,4 +1,4 @@
-"""A textured hilly ground in closed form, whose images have keypoints, as a field, as views and as a complete map."""
+"""A textured, hilly ground in closed form, whose images have keypoints: as a field, as views and as a complete map."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class TexturedGround:
 
 @dataclass(frozen=True, eq=False)
 class MapWithLandmarks:
-    """A field as a map with all its baked parts."""
+    """A map made of a field, with all of its baked parts."""
 
     field: RadianceField
     bounds: SceneBounds
@@ -82,7 +82,7 @@ def training_views(count: int = 10) -> tuple[View, ...]:
 
 @functools.cache
 def unseen() -> View:
-    """Return an image that no landmark was built from."""
+    """Return an image of the ground that was not used to build the landmarks."""
     return view(POSES[1], "unseen")
 
 
@@ -96,7 +96,7 @@ def textured_map(surface: bool = False) -> MapWithLandmarks:
 
 @dataclass(frozen=True, eq=False)
 class MovedField:
-    """A field in another world frame."""
+    """A field expressed in another world frame."""
 
     field: TexturedGround
     T_new_old: SE3

@@ -1,4 +1,4 @@
-"""The training loop: Adam with a schedule, CUDA graphs, checkpoints and resumption; and the report that follows it."""
+"""The training loop (Adam with a schedule, CUDA graphs, checkpoints and resumption), and reports of its progress."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class TrainingStep:
 
 @dataclass(frozen=True)
 class TrainingState:
-    """All that is needed to resume a training as if it had not been interrupted."""
+    """The state needed to resume a training run as if it had not been interrupted."""
 
     step: int
     field: dict[str, Tensor]
@@ -97,7 +97,7 @@ READ_EVERY = 16
 
 @dataclass(frozen=True, eq=False)
 class StepOutcome:
-    """The result of one step of a recipe; a number that is a tensor is read when the host next waits for the device."""
+    """The result of one step of a recipe. Numbers given as tensors are read when the host next waits for the device."""
 
     loss: Float[Tensor, ""]
     mse: float | Float[Tensor, ""]  # of the colours, for display
@@ -106,10 +106,10 @@ class StepOutcome:
 
 @dataclass(frozen=True)
 class Replayable:
-    """An outcome of steps that a GPU may replay as CUDA graphs, see ``fit``.
+    """An ``outcome`` function whose steps a GPU may replay as CUDA graphs, see ``fit``.
 
-    ``prepare(step)`` is called before each step. It does what must not be part of a graph, such as reading numbers from the
-    device, and returns a key: steps with equal keys launch the same operations on tensors of the same shapes, with the same
+    ``prepare(step)`` is called before each step. It does the work that must not be part of a graph, such as reading numbers from
+    the device, and returns a key: steps with equal keys launch the same operations on tensors of the same shapes, with the same
     numbers. ``outcome(step, generator)`` draws from a generator on the field's device, must not wait for the device (see
     ``without_waiting``), and may run for another step of its key.
     """

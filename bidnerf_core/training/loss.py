@@ -1,4 +1,4 @@
-"""The supervised loss of colour, up to the exposure of each image, and of depth where a sensor or a landmark provides it."""
+"""The supervised loss: colour, up to each image's exposure, and depth where a sensor or a landmark provides it."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ def supervised_loss(
 
 
 def ray_termination(rendering: Rendering, batch: TrainingBatch) -> Float[Tensor, ""]:
-    """Return the mean distance (metres) of the rays' weight from their measured depth; 0 if no ray has a
+    """Return the mean distance (metres) between the rays' weight and their measured depth; 0 if no ray has a
     measurement.
 
     Like the ray termination loss of DS-NeRF (Deng et al. 2022) it is smallest if all weight is at the
-    measured depth; an error of the mean depth could also be 0 with equal weight on both sides. Weight that a
-    ray lacks counts as if it were at the camera. For distances from landmarks, the mean is also taken over
+    measured depth; an error of the mean depth could also be 0 with equal weight on both sides. If a
+    ray's weights sum to less than 1, the rest counts as if it were at the camera. For distances from landmarks, the mean is also taken over
     their normal distribution, so that weight within the standard deviation is hardly moved.
     """
     measured, distance, deviation = batch.observed.measured, batch.observed.distance, batch.deviation
@@ -68,7 +68,7 @@ def distortion(rendering: Rendering, side: float) -> Float[Tensor, ""]:
     """Return the mean distortion of the rays' weights (Barron et al. 2022, eq. 15), with distances in units
     of ``side``.
 
-    It is smallest if a ray's weight is in one short interval. Sums over pairs are computed from cumulative
+    The distortion is smallest if a ray's weight is in one short interval. Sums over pairs are computed from cumulative
     sums.
     """
     samples, weights = rendering.samples, rendering.weights
@@ -103,16 +103,16 @@ class ColourTransforms(nn.Module):
         return rgb * gain.index_select(0, image) + offset.index_select(0, image)
 
     def penalty(self) -> Float[Tensor, ""]:
-        """Return the mean square of the log gains and the offsets; it keeps those that the images do not
+        """Return the mean square of the log gains and offsets, a penalty that keeps those that the images do not
         constrain at 0.
         """
         return self.log_gain.square().mean() + self.offset.square().mean()
 
 
 def fitted_colours(rgb: Float[Tensor, "*p 3"], photo: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
-    """Apply to ``rgb`` the gain and offset per channel that fit it best to ``photo`` (least squares).
+    """Apply to ``rgb`` the gain and offset per channel that best fit ``rgb`` to ``photo`` (least squares).
 
-    They serve as the colour transform of an image outside the training set.
+    The gain and offset serve as the colour transform of an image outside the training set.
     """
     x, y = rgb.reshape(-1, 3).double(), photo.reshape(-1, 3).double()
     around = x - x.mean(0)

@@ -47,10 +47,10 @@ class TrainingBatch:
 class RayBank:
     """All pixels of the training views, from which batches are drawn; all tensors are on ``device``.
 
-    Images that take more than ``LARGEST_SHARE`` of the free memory of a GPU stay in the host's, and each batch is copied.
+    Images that would take more than ``LARGEST_SHARE`` of a GPU's free memory stay in host memory, and each batch is copied.
     If an image has an alpha channel, each batch replaces its background by random colours, so that a field
-    cannot explain the background by matter of one colour (as in the code of Mueller et al. 2022). The images
-    are those of the views: on the CPU, they are not copied if they lie in few blocks of memory, as in a ``PixelStore``.
+    cannot explain the background by matter of one colour (as in the code of Mueller et al. 2022). On the CPU,
+    the views' images are not copied if they lie in few blocks of memory, as in a ``PixelStore``.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class RayBank:
         """Return the rays of ``count`` pixels, drawn uniformly from all visible pixels of the views.
 
         If only few pixels have depth, a fixed fraction is drawn from these; another fraction is drawn from
-        those with landmarks. Nothing is copied between devices if the generator is on that of the images.
+        pixels with landmarks. Nothing is copied between devices if the generator is on the images' device.
         """
         index = self._visible_pixel(self._random(self._drawn, count, generator))
         if len(self._few):
@@ -127,7 +127,7 @@ class RayBank:
         return torch.randint(below, (count,), generator=generator, device=generator.device).to(self.home)
 
     def _visible_pixel(self, rank: Int[Tensor, "r"]) -> Int[Tensor, "r"]:
-        """Return the indices of the visible pixels with these ranks among all visible pixels."""
+        """Convert ranks among the visible pixels to indices among all pixels."""
         if self._visible is None:
             return rank
         block = torch.searchsorted(self._visible, rank, right=True) - 1
@@ -140,7 +140,7 @@ class RayBank:
         return block * HIDDEN_BLOCK + passed.sum(1)
 
     def _few_measured(self, frames: Sequence[Frame], offsets: Int[Tensor, "v"]) -> Int[Tensor, "m"]:
-        """Return the indices of the pixels with depth if it is sparse (structure from motion); otherwise none."""
+        """Return the indices of the pixels with depth if depth is sparse (structure from motion); otherwise no indices."""
         none = torch.zeros(0, dtype=torch.long)
         measured = sum(int((frame.depth > 0).sum()) for frame in frames if frame.depth is not None)
         if not measured or measured >= SPARSE * self.count:
@@ -158,7 +158,7 @@ MOST_RAYS = 2**24
 
 
 class _PixelRays:
-    """The rays of the pixels of many cameras, usually mostly equal ones; pixels are numbered row by row."""
+    """The pixel rays of many cameras, most of which usually have equal intrinsics; pixels are numbered row by row."""
 
     def __init__(self, cameras: Sequence[Intrinsics], device: torch.device) -> None:
         number = {kind: place for place, kind in enumerate(dict.fromkeys(cameras))}
@@ -173,14 +173,14 @@ class _PixelRays:
         )
 
     def rays(self, view: Int[Tensor, "r"], pixel: Int[Tensor, "r"]) -> Float[Tensor, "r 3"]:
-        """Return the points on the plane z = 1 shown by pixels of the views' cameras."""
+        """Return the points on the plane z = 1 (camera frame) that the views' pixels show."""
         kind = self._kind[view]
         if self._grid is not None:
             return self._grid[self._start[kind] + pixel]
         return self._batch.unproject(self._centres(kind, pixel).float(), kind)
 
     def exposure_times(self, view: Int[Tensor, "r"], pixel: Int[Tensor, "r"]) -> Float[Tensor, "r"]:
-        """Return the times at which pixels were exposed, see ``rolling_shutter``."""
+        """Return the exposure times of pixels as a fraction of the readout, -0.5 to 0.5, see ``camera.exposure_times``."""
         kind = self._kind[view]
         size, centres = self._size[kind], self._centres(kind, pixel)
         upright = size[:, 1] > size[:, 0]
@@ -193,7 +193,7 @@ class _PixelRays:
 
 
 def _visible_pixels(frames: Sequence[Frame]) -> Int[Tensor, "b"] | None:
-    """Return how many of all pixels are visible before each block of ``HIDDEN_BLOCK``, and in total; None if all are."""
+    """Return the number of visible pixels before each block of ``HIDDEN_BLOCK`` pixels, and in total; None if all pixels are visible."""
     if all(frame.hidden is None for frame in frames):
         return None
     hidden = [
@@ -222,7 +222,7 @@ def _home_of(frames: Sequence[Frame], device: torch.device) -> torch.device:
 def _landmark_pixels(
     views: Sequence[View], offsets: Int[Tensor, "v"]
 ) -> tuple[Int[Tensor, "m"], Float[Tensor, "m"], Float[Tensor, "m"]]:
-    """Return the pixels (among those of all views) that show a landmark, its distance, and the deviation of that (metres).
+    """Return the pixels (indices among those of all views) that show a landmark, its distance and its standard deviation (metres).
 
     Views with dense depth have none, since their own measurements are better.
     """

@@ -34,8 +34,8 @@ class SupervisionConfig(Settings):
 class Supervision:
     """The rays of training views and their loss, on the device of the trained field.
 
-    It learns the exposure and white balance of each image alongside the field, so that differences in
-    exposure do not spoil the field's colours, gives blurred images less weight, and takes depth from sensors
+    This class learns the exposure and white balance of each image alongside the field, so that differences in
+    exposure do not affect the field's colours, down-weights blurred images, and takes depth from sensors
     and landmarks. A simple recipe is ``fit`` with ``step`` as its outcome; others compose ``draw``,
     ``render`` and ``loss``.
     """
@@ -62,7 +62,7 @@ class Supervision:
         schedule: Callable[[int, int], float] = cosine,
         seed: int = 0,
     ) -> None:
-        """Call ``training.fit`` so that it also learns the per-image parameters, and resumes them with the field."""
+        """Call ``training.fit``, also learning the per-image parameters, which are saved and restored with the field."""
         learned: list[dict[str, Any]] = []
         if self.colours is not None:
             learned = [{"params": list(self.colours.parameters()), "lr": 2e-3}]

@@ -1,4 +1,4 @@
-"""The page that shows a map and the localizations in it: as a file that needs no server, or live."""
+"""The page that shows a map and localizations in it, either saved as a file that needs no server or served live."""
 
 from lazy_loader import attach_stub
 

@@ -1,4 +1,4 @@
-"""A localization as the page shows it: pictures, steps, matches, ellipsoid, figures and explanations."""
+"""JSON values with which the page shows a localization: pictures, steps, matches, ellipsoid, figures and explanations."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ MOST_MATCHES, MOST_STEPS = 600, 200
 
 
 def no_answer(name: str, outcome: str, reason: str) -> Json:
-    """Return the JSON values of an image that could not be localized, see ``shown_answer``."""
+    """Return the JSON values for an image that could not be localized, in the format of ``shown_answer``."""
     texts = dict.fromkeys(("meaning", "advice", "method", "method_summary", "camera"), "")
     unknown = (
         "loss",
@@ -80,13 +80,13 @@ def shown_answer(
 ) -> Json:  # fmt: skip
     """Return the JSON values of a localization, with renderings if its ``frame`` is known.
 
-    ``record`` is that of its search, ``truth`` the true T_world_camera. A ``quick`` answer has renderings of the surface.
-    Poses are shown in the map's own coordinates, see ``Map.origin``.
+    ``record`` is the record of the search, and ``truth`` the true T_world_camera. A ``quick`` answer renders the
+    surface instead of the field. Poses are shown in the map's own coordinates, see ``Map.origin``.
 
-    ``pose`` and ``truth`` in the result are the 16 numbers of T_world_camera by rows, None if they are not finite or not
-    known. ``error`` is that of the position, and of the orientation in degrees; ``path`` has the positions from the start
-    to the pose found. ``camera`` says whose intrinsics were taken, ``meaning`` and ``advice`` what a rejection means and
-    what to try.
+    In the result, ``pose`` and ``truth`` are the 16 numbers of T_world_camera in row-major order, or None if not
+    finite or not known. ``error`` holds the position error and the orientation error (degrees), and ``path`` the
+    positions from the start to the pose found. ``camera`` says which intrinsics were used, ``meaning`` what a
+    rejection means, and ``advice`` what to try.
     """
     found = found.translated(-origin_of(scene))
     truth = None if truth is None else truth.translated(-origin_of(scene))
@@ -141,10 +141,11 @@ def shown_answer(
 
 
 def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> Json | None:
-    """Return the ellipsoid of two standard deviations of a pose's position; None if its covariance is unknown or not finite.
+    """Return the two-sigma ellipsoid of a pose's position, or None if the covariance is unknown or not finite.
 
-    ``axes`` are its semi-axes in the world, 9 numbers: one axis after the other, the longest first. ``lengths`` are their
-    lengths, and ``rotation_deg`` the standard deviations of the orientation about the camera's x, y and z axes.
+    ``axes`` holds the semi-axes in the world as 9 numbers, one axis after the other, the longest first. ``lengths``
+    holds the lengths of the semi-axes, and ``rotation_deg`` the standard deviations of the orientation about the
+    camera's x, y and z axes.
     """
     if covariance is None or not bool(covariance.isfinite().all()):
         return None
@@ -158,9 +159,9 @@ def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> J
 
 
 def depth_difference(image: RenderedImage, frame: Frame) -> Json | None:
-    """Return rendered minus measured depth at the pixels that have both, as a colour image; None if there are none.
+    """Return the rendered minus the measured depth as a colour image, or None if no pixel has both.
 
-    ``range`` is the difference at the ends of the colour scale, and ``median`` the median of the absolute differences.
+    ``range`` is the difference at the ends of the colour scale, and ``median`` is the median absolute difference.
     """
     if frame.depth is None or not frame.has_depth:
         return None
@@ -193,7 +194,7 @@ def _compared(
 
 
 def _steps(found: Localization, record: SearchRecord | None) -> tuple[Json, ...]:
-    """Return the steps of the search, or else of the descent, then the pose with each of its rivals, and the pose found."""
+    """Return the steps of the search (or else of the descent), then the pose together with its rivals, then the pose found."""
     last = found.T_world_camera.to("cpu", torch.float64)
     shown = [] if record is None else [_step(s.caption, s.T, s.scores.tolist(), s.kept) for s in record.steps]
     if not shown:
@@ -214,7 +215,7 @@ def _steps(found: Localization, record: SearchRecord | None) -> tuple[Json, ...]
 
 
 def _step(caption: str, T: SE3, scores: list[float], kept: int, loss: float | None = None) -> Json:
-    """Return poses that were considered at the same time, the best first; a step of a descent has a ``loss``."""
+    """Return one step: the poses that were considered at the same time, the best first, and the ``loss`` of a descent."""
     poses = packed(T.matrix()[:, :3].detach().cpu().double().flatten(1).numpy())
     known = tuple(map(_finite, scores))
     return {"caption": caption, "poses": poses, "scores": known, "kept": kept, "loss": _finite(loss)}
@@ -225,11 +226,11 @@ def _finite(value: float | None) -> float | None:
 
 
 def _matches(scene: SceneMap, found: Localization, answer: Answer) -> Json | None:
-    """Return the matches in the last image at the last pose by landmarks: those by projection, then others by descriptors.
+    """Return the last image's matches at the last pose from landmarks: matches by projection, then further ones by descriptor.
 
-    ``keypoints`` and the ``projections`` of their landmarks (NaN behind the camera) are fractions of the image's size,
-    float32 (m, 2), and ``accepted`` is uint8 (m). ``by_appearance`` is the number of those ``refused`` that were matched by
-    descriptors alone. ``pose`` says at which pose, if not at the one found.
+    ``keypoints`` and the ``projections`` of their landmarks (NaN behind the camera) are fractions of the image size,
+    float32 (m, 2), and ``accepted`` is uint8 (m). ``by_appearance`` is the number of ``refused`` matches found by
+    descriptor alone. ``pose`` describes the pose of the projections if it is not the pose found.
     """
     if scene.landmarks is None:
         return None
@@ -265,7 +266,7 @@ def _matches(scene: SceneMap, found: Localization, answer: Answer) -> Json | Non
 def _runner_up(
     scene: SceneMap, found: Localization, record: SearchRecord, frame: Frame | None, quick: bool
 ) -> Json | None:
-    """Return the most probable other place, or else an earlier pose by landmarks, or the best different pose of the search."""
+    """Return an earlier pose from landmarks, or else the next most probable one, or else the best different pose of the search."""
     answer = last_answer(record)
     if answer is not None:
         if given_up := earlier(found, answer):
@@ -287,7 +288,7 @@ def _runner_up(
 
 
 def _rendered(scene: SceneMap, T: SE3, reason: str, frame: Frame | None, quick: bool) -> Json:
-    """Return the JSON values of another pose, with a rendering if the ``frame`` is known, and without a probability."""
+    """Return the JSON values of an alternative pose, without a probability, and with a rendering if ``frame`` is given."""
     picture = None
     if frame is not None:
         picture, _ = _compared(scene, frame.intrinsics.at_most(240), T, frame, quick)

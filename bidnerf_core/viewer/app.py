@@ -1,4 +1,4 @@
-"""The viewer as an ASGI application: the page, and the API that it calls."""
+"""The viewer as an ASGI application: the page, and the API that the page calls."""
 
 from __future__ import annotations
 
@@ -64,10 +64,10 @@ PAGE_HEADERS = {"Content-Security-Policy": "frame-ancestors 'none'", "Referrer-P
 
 @dataclass(frozen=True, eq=False)
 class LiveView:
-    """What a live viewer shows: a map, images that may be localized in it, a trajectory, and a table of results.
+    """Contents of a live viewer: a map, images that can be localized in it, a trajectory, and a table of results.
 
-    ``camera`` is that of photos without another one, by default that of EXIF or the map; the page shows its field of view,
-    which can be changed there.
+    ``camera`` is used for photos that come without a camera; by default, theirs is taken from EXIF or the map. The
+    page shows the field of view of ``camera``, and users can change it there.
     """
 
     localizer: Localizer
@@ -83,7 +83,7 @@ Read = Callable[[], tuple[Query, SE3 | None, int]]
 
 @dataclass
 class ShownJob:
-    """A localization, as the page follows it."""
+    """A localization job and its state, which the page polls."""
 
     id: str
     name: str
@@ -92,13 +92,13 @@ class ShownJob:
     answer: Json | None = None
 
     def plain(self, known: str) -> dict[str, Any]:
-        """Return the state as JSON values, with the answer unless the client has already seen it in the ``known`` state."""
+        """Return the state as JSON values, with the answer unless the client already has the answer of this state, ``known``."""
         caption = self.record.steps[-1].caption if self.record is not None and self.record.steps else ""
         said = {"id": self.id, "name": self.name, "state": self.state, "caption": caption}
         return said if self.state == known else said | {"answer": to_plain(self.answer)}
 
     def run(self, localizer: Localizer, read: Read) -> None:
-        """Localize what ``read`` returns, and set the answer, which states any error."""
+        """Localize the query that ``read`` returns, and store the answer; if localization fails, the answer states the error."""
         self.state = "searching"
         try:
             query, start, seed = read()
@@ -118,7 +118,7 @@ class ShownJob:
 
 
 class Jobs:
-    """Runs localizations in a thread, in the order in which they were requested; ``shown`` holds them by their ids."""
+    """Runs localizations in a thread, in the order of their requests; ``shown`` holds the jobs by their ids."""
 
     def __init__(self, localizer: Localizer) -> None:
         self.shown = dict[str, ShownJob]()
@@ -127,7 +127,7 @@ class Jobs:
 
     @contextlib.contextmanager
     def place(self, name: str) -> Iterator[ShownJob]:
-        """Enter a localization, which is forgotten if the block raises an error. Raises ``Refused`` if no place is left."""
+        """Register a localization, and remove it if the block raises an error. Raises ``Refused`` if too many are pending."""
         if sum(each.state != "done" for each in self.shown.values()) >= PLACES:
             headers = {"Retry-After": "5", "Connection": "close"}
             raise Refused(429, f"all {PLACES} places are taken, try again later", headers)
@@ -140,14 +140,14 @@ class Jobs:
             raise
 
     def put(self, job: ShownJob, read: Read) -> None:
-        """Queue the localization of what ``read`` returns."""
+        """Queue the localization of the query that ``read`` returns."""
         done = [each.id for each in self.shown.values() if each.state == "done"]
         for old in done[: max(0, len(self.shown) - 64)]:  # the answers of 64 localizations stay in memory
             del self.shown[old]
         self._thread.submit(self._run, job, read)
 
     def close(self) -> None:
-        """Discard the localizations that wait, and soon stop the one in progress."""
+        """Discard the waiting localizations, and ask the one in progress to stop."""
         self._closed.set()
         self._thread.shutdown(wait=False, cancel_futures=True)
 
@@ -169,19 +169,19 @@ class VirtualCamera(BaseModel):
 
     @property
     def T_world_camera(self) -> SE3:
-        """The pose with the axes of OpenCV. Raises ``InputError`` if it is none."""
+        """The pose with OpenCV axes. Raises ``InputError`` if the matrix is not a pose."""
         rows = torch.tensor(self.pose, dtype=torch.float64).reshape(4, 4)
         return pose_from_matrix(rows * torch.tensor([1.0, -1.0, -1.0, 1.0]).double(), "pose")
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """The camera without its pose."""
+        """The intrinsics, computed from the field of view and the image size."""
         focal = self.height / 2 / math.tan(math.radians(self.fov / 2))
         return Intrinsics(focal, focal, self.width / 2, self.height / 2, self.width, self.height)
 
 
 class Login:
-    """Accepts the token from a browser: ``/?token=TOKEN`` stores it as a cookie, which takes the place of the header."""
+    """Middleware that accepts the token from a browser: ``/?token=TOKEN`` stores it as a cookie, which replaces the header."""
 
     def __init__(self, app: ASGIApp, token: str) -> None:
         self.app, self.token = app, token
@@ -199,9 +199,9 @@ class Login:
 
 
 def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits | None = None) -> FastAPI:
-    """Return the viewer as an ASGI application; ``limits`` are those of uploads.
+    """Return the viewer as an ASGI application; ``limits`` apply to uploads.
 
-    Without a ``token``, only requests that are addressed to localhost are answered.
+    Without a ``token``, only requests addressed to localhost are answered.
     """
     limits = limits or ServiceLimits()
     scene, localizer, names = (
@@ -318,7 +318,7 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
 
 
 def _index(text: str, count: int, what: str) -> int:
-    """Parse an index in a URL. Raises ``Refused`` unless it is less than ``count``; a request can name no file."""
+    """Parse an index in a URL, so that no request can name a file. Raises ``Refused`` unless the index is less than ``count``."""
     if not re.fullmatch("[0-9]{1,9}", text) or int(text) >= count:
         raise Refused(404, f"no {what} has that number, expected less than {count}")
     return int(text)

@@ -1,4 +1,4 @@
-"""Why a pose was found or rejected: the competing explanations, and each measure with its threshold."""
+"""The evidence for and against a pose: the competing explanations, and each measure with its threshold."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ APART, TURNED_DEG = 0.1, 10.0
 
 
 def last_answer(record: SearchRecord | None) -> Answer | None:
-    """Return the last pose by landmarks of a search; None if there was none."""
+    """Return the last pose from landmarks in the record of a search, or None if there is none."""
     return None if record is None or not record.answers else record.answers[-1]
 
 
 def contests(found: Localization, record: SearchRecord | None) -> tuple[Json, ...]:
-    """Return all comparisons: the pose with those of other places and of the mirror image, with its rivals, and of cameras."""
+    """Return all comparisons: of the pose with other places and the mirror image, of the pose with its rivals, and of cameras."""
     shown, answer, support = list[Json](), last_answer(record), found.diagnostics
     if answer is not None and len(answer.modes) > 1:
         shown.append(_of_modes(found, answer))
@@ -50,14 +50,14 @@ def contests(found: Localization, record: SearchRecord | None) -> tuple[Json, ..
 
 
 def earlier(found: Localization, answer: Answer) -> str:
-    """Return ``EARLIER`` if a pose by landmarks is another one than the pose found, else an empty text."""
+    """Return ``EARLIER`` if the pose from landmarks differs from the pose found, else an empty string."""
     off = pose_error(answer.T_world_rig.to("cpu"), found.T_world_camera.to("cpu"))
     near = float(off.translation) <= APART * answer.distance and float(off.rotation_deg) <= TURNED_DEG
     return "" if near else EARLIER
 
 
 def probable_poses(answer: Answer) -> list[tuple[int, SE3, float]]:
-    """Return the number, the most probable pose and the probability of each mode, the most probable mode first."""
+    """Return the index, the most probable pose and the probability of each mode, in order of decreasing probability."""
     posterior, found = answer.posterior, list[tuple[int, SE3, float]]()
     for mode in range(len(answer.modes)):
         probability = float(posterior.probability[posterior.states.mode == mode].sum())
@@ -157,10 +157,10 @@ WITHOUT_LANDMARKS = {
 
 
 def bar(value: float, threshold: float, at_least: bool) -> Json | None:
-    """Return a value on a linear scale from 0 to 1, whose middle is the threshold and whose end is twice that or more.
+    """Return the position of a value on a linear scale from 0 to 1, on which the threshold is at 0.5 and values are clamped to 1.
 
-    If ``at_least`` is set, values below the threshold fail, else those above it. Returns None if the value is not finite
-    or the threshold not positive.
+    If ``at_least`` is set, values below the threshold fail; otherwise, values above the threshold fail. Returns None
+    if the value is not finite or the threshold is not positive.
     """
     if not math.isfinite(value) or threshold <= 0:
         return None
@@ -169,7 +169,7 @@ def bar(value: float, threshold: float, at_least: bool) -> Json | None:
 
 @dataclass(frozen=True)
 class Figure:
-    """A measure of a pose, and the threshold with which it is compared."""
+    """A measure of a pose, and the threshold that it is compared with."""
 
     name: str
     value: str
@@ -183,7 +183,7 @@ class Figure:
     def of(
         text: tuple[str, str, str], value: float, limit: float | None = None, is_least: bool = True
     ) -> Figure:
-        """Return a figure from its name, format and meaning, its value and its bound."""
+        """Return a figure from its texts (name, format and meaning), its value and its bound."""
         name, spec, meaning = text
         if limit is None:
             return Figure(name, format(value, spec), "", None, None, meaning)
@@ -193,7 +193,7 @@ class Figure:
 
 
 def acceptance_figures(found: Localization, record: SearchRecord | None) -> tuple[Figure, ...]:
-    """Return the measures of an answer and, if recorded, those of a pose by landmarks that was rejected on the way to it."""
+    """Return the measures of the pose found and, if recorded, those of a pose from landmarks that was rejected before."""
     measured, answer = found.diagnostics, last_answer(record)
     figures = list[Figure]()
     if found.confidence is not None and not isinstance(measured, Support):

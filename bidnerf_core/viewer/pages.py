@@ -1,4 +1,4 @@
-"""The page of a map: with localizations in it, for a notebook or the command line, and as one file that opens without a server."""
+"""The page of a map and localizations in it, for a notebook or the command line, also as one file that opens without a server."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ ESCAPED = str.maketrans({c: f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"})
 
 @dataclass(frozen=True, eq=False)
 class MapView:
-    """The page of a map and of localizations in it, which a notebook shows and ``save`` writes to a file."""
+    """A page that shows a map and localizations in it; a notebook displays the page, and ``save`` writes it to a file."""
 
     map: Json
     answers: tuple[Json, ...] = ()
@@ -51,7 +51,7 @@ class MapView:
     camera_given: bool = False
 
     def __repr__(self) -> str:
-        """Return a one-line description, without the content of the page."""
+        """Return a one-line description that leaves out the page's content."""
         return f"<MapView of {self.map['name']} with {amount(len(self.answers), 'localization')}>"
 
     def _repr_html_(self) -> str:
@@ -60,7 +60,7 @@ class MapView:
         return f'<iframe srcdoc="{page}" style="width:100%;height:620px;border:0" sandbox="allow-scripts"></iframe>'
 
     def html(self) -> str:
-        """Return the whole page. Its content security policy allows only its own scripts and, if live, its own server."""
+        """Return the whole page, whose content security policy allows only its own scripts and, if live, its own server."""
         library, scripts = _part("three.min.js"), _scripts()
         server = "'self'" if self.live else "'none'"
         policy = (
@@ -76,9 +76,9 @@ class MapView:
         return re.sub(r"<!-- (\w+) -->", lambda found: parts[found[1]], _part("index.html"))
 
     def save(self, path: str | Path) -> Path:
-        """Write the page to a file that opens without a server or a network, in one atomic step.
+        """Write the page atomically to a file that opens without a server or a network.
 
-        Raises ``InputError`` for a file extension other than .html or .htm, and for a file that cannot be written.
+        Raises ``InputError`` for a file extension other than .html or .htm, and if the file cannot be written.
         """
         path = Path(path)
         if path.suffix.lower() not in (".html", ".htm"):
@@ -94,7 +94,7 @@ def _part(name: str) -> str:
 
 @cache
 def _scripts() -> str:
-    """Return the modules of the page, joined into one script."""
+    """Return the JavaScript modules of the page, joined into one script."""
     texts = (IMPORT.sub("", _part(f"{name}.js")).replace("\nexport ", "\n") for name in MODULES)
     return "\n".join(texts)
 
@@ -113,12 +113,12 @@ def view(
     trajectory: str | Path | None = None,
     title: str = "",
 ) -> MapView:
-    """Return the page of a map with a localization in it.
+    """Return a page that shows a map and a localization in it.
 
-    With the ``frame`` that was localized, the page compares it with the map as rendered from the pose. A frame without a
-    ``localization`` is localized here, and the page then shows the search too. ``scene`` is a map, or a localizer with settings
-    of its own, and ``trajectory`` a file of poses. Raises ``InputError`` if ``scene`` is neither, and for a frame that
-    cannot be localized at all.
+    If the ``frame`` that was localized is given, the page compares it with the map as rendered from the pose. A frame
+    without a ``localization`` is localized first, and the page then shows the search too. ``scene`` is a map, or a
+    localizer with its own settings, and ``trajectory`` is a file of poses. Raises ``InputError`` if ``scene`` is
+    neither a map nor a localizer, and for a frame that cannot be localized at all.
     """
     scene_map = map_of(scene)
     answers = list[Json]()
@@ -139,7 +139,7 @@ def view(
 
 
 def map_of(scene: object) -> Map:
-    """Return a map, or that of a localizer. Raises ``InputError`` for anything else."""
+    """Return the given map, or the map of a localizer. Raises ``InputError`` for anything else."""
     found = scene.scene if isinstance(scene, Localizer) else scene
     if not isinstance(found, Map):
         raise InputError(
@@ -155,10 +155,10 @@ def localized(
     seed: int = 0,
     follow: Callable[[SearchRecord, Json | None], None] | None = None,
 ) -> Json:
-    """Localize a query, and return the answer with a record of its search. Raises ``InputError`` for an unusable query.
+    """Localize a query, and return the answer with a record of the search. Raises ``InputError`` for an unusable query.
 
-    ``follow`` is called with the record of the search before it begins, and again, before the field is rendered, with an
-    answer whose pictures are of the surface.
+    ``follow`` is called twice: before the search with its record, and before the field is rendered with the record
+    and an answer whose pictures show the surface.
     """
     with recorded() as record:
         if follow is not None:
@@ -171,7 +171,7 @@ def localized(
 
 
 def read_and_localized(localizer: Localizer, source: QuerySource, place: int) -> Json:
-    """Localize the query at index ``place`` of a source; if it cannot be used, the answer states why."""
+    """Localize the query at index ``place`` of a source; if the query cannot be used, the answer states why."""
     try:
         return localized(localizer, source.read(place))
     except InputError as error:
@@ -186,10 +186,10 @@ def page_of(
 
 
 def shown_row(row: Any) -> Json:
-    """Return the JSON values of a row of the page's table, from a result of an evaluation.
+    """Return the JSON values of a row in the page's table, from a result of an evaluation.
 
-    The pose and the covariance of ``row`` are rows of their matrices. In the result, ``error`` is that of the position, and
-    of the orientation in degrees, and ``sigma`` the standard deviation of the position.
+    In ``row``, the pose and the covariance are lists of matrix rows. In the result, ``error`` holds the position
+    error and the orientation error (degrees), and ``sigma`` is the standard deviation of the position.
     """
     variance = math.nan if row.covariance is None else sum(row.covariance[i][i] for i in range(3))
     return {

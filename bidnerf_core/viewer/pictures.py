@@ -1,4 +1,4 @@
-"""Renderings of a map from a camera, and arrays and images as JSON values: base64 of little-endian numbers, and data URLs."""
+"""Renderings of a map, and the encoding of arrays and images as JSON values: base64 of little-endian numbers, and data URLs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Json: TypeAlias = dict[str, Any]
 
 
 def packed(array: np.ndarray) -> Json:
-    """Return the ``type`` and ``shape`` of an array of bytes, 16-bit integers or floats, and its numbers in ``base64``."""
+    """Return an array of bytes, 16-bit integers or floats as its ``type``, its ``shape`` and its data in ``base64``."""
     kinds = {"i1": "int8", "u1": "uint8", "u2": "uint16", "f4": "float32", "f8": "float32"}
     kind = kinds[array.dtype.str[1:]]
     content = np.ascontiguousarray(array, dtype=np.dtype(kind).newbyteorder("<")).tobytes()
@@ -36,7 +36,7 @@ def packed(array: np.ndarray) -> Json:
 
 
 def packed_points(points: Float[Tensor, "n 3"]) -> Json:
-    """Return points as 16-bit integers, ``places``: a coordinate is ``lower + place / 65535 * size``."""
+    """Return points quantized to 16-bit integers, ``places``: a coordinate is ``lower + place / 65535 * size``."""
     values = points.detach().cpu().double().numpy()
     lower = values.min(0) if len(values) else np.zeros(3)
     size = max(float((values - lower).max(initial=0.0)), 1e-9)
@@ -45,7 +45,7 @@ def packed_points(points: Float[Tensor, "n 3"]) -> Json:
 
 
 def packed_colours(rgb: Float[Tensor, "n 3"]) -> Json:
-    """Return colours in [0, 1] as bytes."""
+    """Return colours in [0, 1], quantized to bytes."""
     return packed((rgb.detach().cpu().float().clamp(0, 1).numpy() * 255 + 0.5).astype(np.uint8))
 
 
@@ -63,7 +63,7 @@ def photograph(image: Float[Tensor, "h w 3"], quality: int = JPEG_QUALITY) -> Js
 
 
 def drawing(image: UInt8[np.ndarray, "h w channels"]) -> Json:
-    """Return an image, which may have an alpha channel, as ``photograph`` does but as a PNG."""
+    """Return an image, with or without an alpha channel, as ``photograph`` does but as a PNG."""
     file = io.BytesIO()
     Image.fromarray(image).save(file, "PNG", optimize=True)
     url = "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()
@@ -71,9 +71,9 @@ def drawing(image: UInt8[np.ndarray, "h w channels"]) -> Json:
 
 
 def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
-    """Render the colours of the field, in [0, 1], from a camera, which may be farther away or nearer than those of the images.
+    """Render the colours of the field, in [0, 1], from a camera that may be nearer or farther away than those of the images.
 
-    A map without a field shows its landmarks as dots.
+    If the map has no field, its landmarks are drawn as dots.
     """
     bounds = scene.bounds
     place = T_world_camera.translation.detach().cpu().double()
@@ -92,9 +92,9 @@ def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Flo
 
 @torch.no_grad()
 def quick_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
-    """Render the colours of the surface, in [0, 1], from a camera, twenty times as fast as the field.
+    """Render the colours of the surface, in [0, 1], from a camera, twenty times as fast as those of the field.
 
-    For a map without a surface, the field is rendered.
+    If the map has no surface, the field is rendered.
     """
     if scene.surface is None:
         return field_image(scene, camera, T_world_camera)

@@ -1,4 +1,4 @@
-"""A map as the page shows it: surface, landmarks, and the cameras of its images with thumbnails; and trajectories."""
+"""JSON values with which the page shows trajectories and a map: its surface, landmarks, and cameras with thumbnails."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ MOST_THUMBNAILS = 60
 
 
 def shown_map(scene: Map, thumbnails: int = MOST_THUMBNAILS) -> Json:
-    """Return the JSON values of a map; ``thumbnails`` is the maximum number of cameras whose view is rendered.
+    """Return the JSON values of a map; ``thumbnails`` is the maximum number of cameras with a rendered thumbnail.
 
-    ``unit`` is the symbol that follows a length, ``up_source`` says what the upward direction was found from, and
-    ``extent`` (in the unit of the map) is the size of what the initial view should show.
+    ``unit`` is the symbol of the unit of length, ``up_source`` says how the upward direction was found, and
+    ``extent`` (in the unit of the map) is the size of the region that the initial view should show.
     """
     up = scene.up
     centre, extent = _framing(scene)
@@ -79,7 +79,7 @@ def shown_map(scene: Map, thumbnails: int = MOST_THUMBNAILS) -> Json:
 
 
 def frustum(camera: Intrinsics) -> Json:
-    """Return a camera's viewing frustum without lens distortion: its sides on the plane z = 1, and its image's size (pixels)."""
+    """Return a camera's viewing frustum without lens distortion: its sides on the plane z = 1, and the image size (pixels)."""
     return {
         "left": -camera.cx / camera.fx, "right": (camera.width - camera.cx) / camera.fx,
         "top": -camera.cy / camera.fy, "bottom": (camera.height - camera.cy) / camera.fy,
@@ -122,10 +122,10 @@ def _points(
     points: Float[Tensor, "n 3"], count: int, radius: float, colours: Json | None = None, sizes: Json | None = None,
     normals: Json | None = None,
 ) -> Json:  # fmt: skip
-    """Return the JSON values of some of the ``count`` points of a map.
+    """Return the JSON values of a subset of a map's points; ``count`` is the number of all points.
 
-    The radius of a point is ``radius``, in the map's unit, times its entry in ``sizes``, float32 (n), if radii differ. The
-    ``normals``, int8 (n, 3) in 127ths, point towards the cameras, since back faces are culled.
+    The radius of each point is ``radius``, in the map's unit, times the point's entry in ``sizes``, float32 (n), if
+    given. The ``normals``, int8 (n, 3) scaled by 127, point towards the cameras, since back faces are culled.
     """
     return {
         "points": packed_points(points), "count": count, "radius": radius, "colours": colours, "sizes": sizes, "normals": normals
@@ -149,7 +149,7 @@ def _surface(scene: Map) -> Json | None:
 def towards(
     positions: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], cameras: Float[Tensor, "k 3"]
 ) -> Float[Tensor, "n 3"]:
-    """Return normals flipped to the side of the nearest camera, so that culling back faces opens a room seen from outside."""
+    """Return normals flipped towards the nearest camera, so that back-face culling lets one see into a room from outside."""
     if not len(cameras):
         return normals
     _, nearest = cKDTree(cameras.numpy()).query(positions.numpy())
@@ -165,7 +165,7 @@ def _landmarks(scene: Map) -> Json | None:
 
 
 def _splats(scene: Map) -> Json | None:
-    """Return the splats of the field that are not nearly transparent, as points with their own radii."""
+    """Return the splats of the field, except nearly transparent ones, as points with their own radii."""
     if not isinstance(scene.field, SplatField):
         return None
     splats = moved(scene.field.splats(), "cpu")
@@ -178,7 +178,7 @@ def _splats(scene: Map) -> Json | None:
 
 
 def _subset(count: int, most: int) -> Tensor:
-    """Return the indices of at most ``most`` of ``count`` elements, drawn at random, the same each time."""
+    """Return the indices of at most ``most`` of ``count`` elements, drawn at random with a fixed seed."""
     return torch.randperm(count, generator=torch.Generator().manual_seed(0))[:most]
 
 
@@ -206,13 +206,14 @@ def _framing(scene: Map) -> tuple[tuple[float, float, float], float]:
 def shown_trajectory(
     path: Path, unit: LengthUnit | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> Json:
-    """Read a trajectory: a JSON file of 'bidnerf track' or 'localize', which has uncertainties, or one of TUM, EuRoC or KITTI.
+    """Read a trajectory: a JSON file of 'bidnerf track' or 'localize', which has uncertainties, or a TUM, EuRoC or KITTI file.
 
-    Its poses are shown relative to ``origin``, that of the map. A remark is logged if the file states another unit than
-    the map's ``unit``. Raises ``InputError`` for a file without poses.
+    The poses are shown relative to ``origin``, the origin of the map. A remark is logged if the file states a unit
+    other than the map's ``unit``. Raises ``InputError`` for a file without poses.
 
     In the result, ``poses`` are T_world_camera without the last row, float32 (n, 12), ``times`` are in seconds, and
-    ``sigmas`` are standard deviations of the position. What the file does not state is None or an empty string.
+    ``sigmas`` are standard deviations of the position. Values that the file does not state are None or an empty
+    string.
     """
     content = read_file(path, "a trajectory")
     if path.suffix.lower() in (".json", ".jsonl"):

@@ -1,4 +1,4 @@
-"""The live viewer: ``serve_view``, which runs until it is stopped."""
+"""Run the live viewer: ``serve_view`` serves the page until it is stopped."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def serve_view(
     ready: Callable[[str], None] | None = None,
     stop: threading.Event | None = None,
 ) -> None:
-    """Show a map in browsers, which may localize photos in it, until the process is interrupted or ``stop`` is set.
+    """Serve a page that shows a map and localizes photos in it, until the process is interrupted or ``stop`` is set.
 
-    Only browsers on this machine are answered, unless a ``host``, such as 0.0.0.0, is named: the address that ``ready`` is
-    called with then holds a ``token``, which is made up where none is given. Raises ``InputError`` without the extra, and for
-    a port that is taken.
+    Only browsers on this machine are answered unless a ``host``, such as 0.0.0.0, is given: the address passed to
+    ``ready`` then contains a ``token``, which is generated if none is given. Raises ``InputError`` if the extra
+    ``viewer`` is not installed, and if the port is taken.
     """
     token = token_for(host, token, NEEDS)
     from bidnerf_core.viewer.app import viewer_app

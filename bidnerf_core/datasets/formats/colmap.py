@@ -1,4 +1,4 @@
-"""Folders of a COLMAP project: images and a sparse model, with no other file.
+"""Folders of a COLMAP project, consisting only of images and a sparse model.
 
 Models are looked for in ``sparse``, ``colmap/sparse`` (nerfstudio), the folder itself, ``dense`` and the
 like, as .bin or .txt (``cameras`` and ``images``; ``points3D``, ``rigs`` and ``frames`` are not read). If
@@ -47,7 +47,7 @@ IMAGES = (
 
 
 def _read(path: Path, models: list[Path], options: DatasetOptions) -> Capture:
-    """Read the model. Raises ``InputError`` if it is damaged or has no registered image."""
+    """Read the project. Raises ``InputError`` if its model is damaged or has no registered image."""
     model, folder, images, cameras, files = colmap_project(path)
     if options.masks is None and any((place / "masks").is_dir() for place in (path, folder.parent)):
         remark(
@@ -65,9 +65,9 @@ def _read(path: Path, models: list[Path], options: DatasetOptions) -> Capture:
 
 
 def colmap_project(path: Path) -> tuple[Path, Path, list[ModelImage], dict[int, Camera], dict[str, Path]]:
-    """Return the model that is used, the folder of its images, its images, cameras and image files.
+    """Return the selected model, its image folder, and its images, cameras and image files.
 
-    The images are in the natural order of their names, the cameras by id, and the files that exist by the images' names.
+    Images are in natural name order, cameras are keyed by id, and existing files are keyed by image name.
     Raises ``InputError`` if the model is damaged or has no registered image.
     """
     model, images, cameras = _largest(path, colmap_models(path))
@@ -89,14 +89,14 @@ def colmap_project(path: Path) -> tuple[Path, Path, list[ModelImage], dict[int, 
 
 
 def colmap_models(path: Path) -> list[Path]:
-    """Return the models at the first location that has any."""
+    """Return the models at the first location that contains any."""
     return next((models for place in MODELS if (models := _models_at(path / place))), [])
 
 
 def _models_at(folder: Path) -> list[Path]:
-    """Return the models at a location: the folder itself, or numbered folders in it; incomplete ones if there are no others.
+    """Return the models at a location (the folder itself or its numbered subfolders), or an incomplete one if there are no others.
 
-    Without its images, a model is no reason to find the poses of the photos anew, but damaged.
+    A model without its ``images`` file is reported as damaged, rather than taken for photos that still need poses.
     """
     inside = [child for child in folder.glob("*") if child.name.isdecimal()]
     places = [folder, *sorted(inside, key=lambda child: natural_order(child.name))]
@@ -105,7 +105,7 @@ def _models_at(folder: Path) -> list[Path]:
 
 
 def _largest(path: Path, models: Sequence[Path]) -> tuple[Path, list[ModelImage], dict[int, Camera]]:
-    """Return the model with the most images, these and their cameras; a remark names the others."""
+    """Return the model with the most images, its images and its cameras; a remark names the other models."""
     read = {model: read_posed_images(model) for model in models}
     chosen = max(models, key=lambda model: len(read[model][0]))
     if len(models) > 1:
@@ -136,7 +136,7 @@ def _image_folder(path: Path, model: Path, images: Sequence[ModelImage]) -> tupl
 
 
 def shot_of(model: Path, image: ModelImage, file: Path | None, cameras: dict[int, Camera]) -> Shot:
-    """Return an image of a model as a shot, without pixels if it has no file.
+    """Return a model image as a shot, without pixels if the image file is missing.
 
     Raises ``InputError`` if its camera is missing.
     """

@@ -47,7 +47,7 @@ def _find(path: Path) -> Path | None:
 
 
 def _sensor(file: Path, options: DatasetOptions) -> tuple[CameraSource, SE3]:
-    """Return the camera, given or calibrated, and its pose in the body frame. Raises ``InputError``."""
+    """Return the camera (given or calibrated) and its pose in the body frame. Raises ``InputError``."""
     text = read_file(file, "EuRoC's sensor.yaml").decode("utf-8", "replace")
     T_body_camera = pose_of_matrix(file, _numbers(file, text, "T_BS", 16), "the rotation of T_BS")
     if options.given_camera is not None:
@@ -67,7 +67,7 @@ def _sensor(file: Path, options: DatasetOptions) -> tuple[CameraSource, SE3]:
 def _numbers(file: Path, text: str, key: str, count: int) -> list[float]:
     """Return the ``count`` numbers of a bracketed YAML list, on one or several lines, for ``key``.
 
-    The list may stand below a matrix's ``data:``.
+    The list may also be the ``data:`` entry of a matrix.
     """
     found = re.search(rf"^\s*{key}\s*:[^\[]*\[([^\]]*)\]", text, re.MULTILINE)
     return numbers_in(f"{file}: {key}", found[1] if found else "", count)

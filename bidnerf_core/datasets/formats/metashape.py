@@ -71,7 +71,7 @@ def _find(path: Path) -> Path | None:
 
 
 def _chunk(file: Path) -> ElementTree.Element:
-    """Return the first chunk. Raises ``InputError`` for anything but XML, and for entities, which may expand without bound."""
+    """Return the first chunk. Raises ``InputError`` for invalid XML, and for XML entities, whose expansion may be unbounded."""
     content, expected = read_file(file, "cameras of Metashape"), "cameras exported by Metashape"
     if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
         raise InputError("declares a document type", where=file, expected=expected)

@@ -2,7 +2,7 @@
 
 Images are ordered by timestamp if every name is one (``12.345.png``), else in natural name order. The depth of ``NAME.png``, if
 any, is ``NAME.depth.png``, as written by ``bidnerf render``. Unlike the images of datasets, photos are turned upright
-according to their EXIF orientation, and their camera comes from EXIF where none is given, as in ``Frame.open``.
+according to their EXIF orientation, and their camera is read from EXIF unless the user gives one, as in ``Frame.open``.
 
 A video is turned by the rotation in its metadata, so its camera is that of the upright image. It does not record its focal
 length, so the camera has to be given or assumed.
@@ -24,9 +24,9 @@ from bidnerf_core.frames import BLACK, DEPTH_STEM, Frame, photos_in
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PhotoShot(Shot):
-    """A photo, and a depth image of it if one is given: in steps of ``depth_unit`` metres, registered from ``sensor``.
+    """A photo, optionally with a depth image in steps of ``depth_unit`` metres that is registered from ``sensor``.
 
-    If it ``awaits_background``, the map in which it is localized gives the colour behind transparent pixels.
+    If it ``awaits_background``, the colour behind transparent pixels is that of the map in which the photo is localized.
     """
 
     image: Path
@@ -73,7 +73,7 @@ def timestamp(stem: str) -> float | None:
 
 
 def _read_video(path: Path, found: bool, options: DatasetOptions) -> Capture:
-    """List the frames. Raises ``InputError`` if it is not a video, and if there is no camera."""
+    """List the frames of a video. Raises ``InputError`` if the file is not a video, and if there is no camera."""
     source, video = options.camera_source, Video(path)
     source.require(path, "a video does not record its focal length")
     shots = [

@@ -77,7 +77,7 @@ def _read(path: Path, cameras: Path, options: DatasetOptions) -> Capture:
 
 
 def _find(path: Path) -> Path | None:
-    """Return the folder of cameras, beside that of photos; hidden files such as a Mac's ``._NAME`` do not count."""
+    """Return the camera folder that has a photo folder beside it, ignoring hidden files such as ``._NAME`` from macOS."""
     for prefix in ("corrected_", ""):
         for base in (path / "keyframes", path):
             cameras = base / f"{prefix}cameras"

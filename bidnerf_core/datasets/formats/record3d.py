@@ -34,7 +34,7 @@ EXPECTED = "a Record3D recording (.r3d)"
 
 
 class Recording:
-    """The files of a recording by their names in the archive, which may have been unpacked to a folder."""
+    """The files of a recording, accessed by their names in the archive; the archive may be unpacked to a folder."""
 
     def __init__(self, path: Path) -> None:
         self.path, self._lidar = path, lidar.LidarDepth()
@@ -47,12 +47,12 @@ class Recording:
         return read_file(self.path / name, EXPECTED) if self._archive is None else self._archive.read(name)
 
     def file(self, name: str) -> ImageSource:
-        """Return a file that is read when opened, or where it should be."""
+        """Return a file of the recording: an archive member, read when opened, or the path where it is expected in the folder."""
         is_packed = self._archive is not None and name in self._archive
         return self._archive.file(name) if self._archive is not None and is_packed else self.path / name
 
     def depth(self, number: int, size: tuple[int, int]) -> DepthImage:
-        """Read the depth of a frame, whose size is width and height. Raises ``InputError`` for any other number of bytes."""
+        """Read the depth of a frame of ``size`` (width, height). Raises ``InputError`` if the number of bytes does not match."""
         depth, confidence = (f"rgbd/{number}.{kind}" for kind in ("depth", "conf"))
         values = self._unpacked(depth, "<f4", size)
         metres = np.where(np.isfinite(values) & (values > 0), values, 0)
@@ -81,7 +81,7 @@ class Recording:
 
 
 def _read(path: Path, metadata_file: Path, options: DatasetOptions) -> Capture:
-    """Read the metadata. Raises ``InputError`` if it or the archive is damaged, and if ``lzfse`` is missing."""
+    """Read the metadata. Raises ``InputError`` if the metadata or the archive is damaged, and if ``lzfse`` is missing."""
     files = Recording(path)
     metadata = parse_record(str(metadata_file), files.read("metadata"), "the metadata of Record3D")
     poses = metadata.items("poses") or []
@@ -120,7 +120,7 @@ def _read(path: Path, metadata_file: Path, options: DatasetOptions) -> Capture:
 
 
 def _find(path: Path) -> Path | None:
-    """Return where the metadata is, in the archive or the folder."""
+    """Return the location of the metadata in the archive or folder."""
     unpacked = is_file(path / "metadata") and (path / "rgbd").is_dir()
     return path / "metadata" if unpacked or (path.suffix.lower() == ".r3d" and not path.is_dir()) else None
 
@@ -137,7 +137,7 @@ def _lzfse(path: Path) -> Callable[[bytes], bytes]:
 
 
 def _times(metadata: Record, count: int) -> list[float | None]:
-    """Return the frame times, from their stamps or from the rate."""
+    """Return the frame times, from the timestamps or from the frame rate."""
     stamps = metadata.items("frameTimestamps")
     if stamps is not None and len(stamps) >= count:
         return [metadata.checked_number(stamp, "an entry of frameTimestamps") for stamp in stamps[:count]]
@@ -146,7 +146,7 @@ def _times(metadata: Record, count: int) -> list[float | None]:
 
 
 def _cameras(metadata: Record, count: int) -> list[list[float]]:
-    """Return fx, fy, cx and cy of the frames: their own, or the first frame's for all."""
+    """Return fx, fy, cx and cy of each frame: per-frame values if recorded, else the same values for all."""
     rows, shared = metadata.items("perFrameIntrinsicCoeffs") or [], metadata.items("K") or []
     if len(rows) < count:
         rows = [[shared[i] for i in (0, 4, 6, 7)]] * count if len(shared) == 9 else []  # column by column

@@ -48,7 +48,7 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
 
 
 def _find(path: Path) -> list[Path]:
-    """Return the images of a sequence with poses, in their order."""
+    """Return the images of a posed sequence, in order."""
     found = (path / "results").glob("frame*") if is_file(path / "traj.txt") else ()
     return sorted(found, key=lambda file: natural_order(file.name))
 

@@ -4,7 +4,7 @@
 camera), ``pose/0.txt`` its pose (4x4, camera to world, OpenCV axes, metres; -inf if tracking failed).
 ``intrinsic/intrinsic_color.txt`` and ``intrinsic_depth.txt`` are the 4x4 matrices of the two cameras, whose
 principal points are relative to the centre of the upper left pixel, so half a pixel is added. Depth is
-registered to the colour camera by them, as in 12-Scenes.
+registered to the colour camera using these intrinsics, as in 12-Scenes.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def _intrinsics(path: Path, kind: str) -> Path | None:
 
 
 def _camera(file: Path, image: Path) -> Intrinsics:
-    """Return the camera of the images that are like ``image``."""
+    """Return the camera of the images, with the size of ``image``."""
     expected = "a matrix of intrinsics, 3x3 or 4x4"
     rows = [row.numbers() for row in read_rows(file, "ScanNet's intrinsics", expected)]
     if len(rows) < 3 or any(len(row) < 3 for row in rows):

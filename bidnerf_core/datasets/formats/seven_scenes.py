@@ -60,7 +60,7 @@ SEQUENCE = re.compile(r"seq(?:uence)?-?0*(\d+)", re.IGNORECASE)
 
 
 def _read(path: Path, folders: dict[int, Path], options: DatasetOptions) -> Capture:
-    """Read the poses and splits. Raises ``InputError`` for invalid ones.
+    """Read the poses and splits. Raises ``InputError`` if any of them is invalid.
 
     Poses and depth are transferred from the depth sensor to the colour camera, by default with a Kinect's calibration.
     """
@@ -91,7 +91,7 @@ def _read(path: Path, folders: dict[int, Path], options: DatasetOptions) -> Capt
 
 
 def _find(path: Path) -> dict[int, Path]:
-    """Return the folders of the sequences by number; that of a folder that is one is -1."""
+    """Return the sequence folders by number; if ``path`` is itself a sequence, its number is -1."""
     found = {child: SEQUENCE.fullmatch(child.name) for child in path.glob("seq*") if child.is_dir()}
     folders = {int(match[1]): child for child, match in found.items() if match}
     if any(map(images_of, folders.values())):
@@ -109,7 +109,7 @@ def images_of(folder: Path) -> list[Path]:
 def frames_of(
     folder: Path, camera: CameraSource, read_depth: Callable[[Path], DepthImage], sensor: DepthCamera | None
 ) -> list[Shot]:
-    """Return the frames of a folder with their poses as stored. Raises ``InputError`` if there is none."""
+    """Return the frames of a folder with their poses as stored. Raises ``InputError`` if there are no frames."""
     images, shots = images_of(folder), list[Shot]()
     if not images:
         raise InputError("has no frames", where=folder, expected="frame-000000.color.png ...")

@@ -28,7 +28,7 @@ LENS = ("fx", "fy", "cx", "cy")
 def _read(path: Path, odometry: Path, options: DatasetOptions) -> Capture:
     """Read the odometry. Raises ``InputError`` if a file is invalid, and if the extra ``video`` is missing.
 
-    The app leaves cells empty: those of an unknown pose or lens, and those of the distortion, which are not read.
+    The app leaves cells empty where a pose or the intrinsics are unknown; distortion cells, also left empty, are not read.
     """
     video, read, shots = Video(path / "rgb.mp4"), lidar.LidarDepth(), list[Shot]()
     columns = "timestamp, frame, x, y, z, qx, qy, qz, qw"

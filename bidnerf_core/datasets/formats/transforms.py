@@ -10,10 +10,12 @@ These keys are read from a frame or, where it lacks them, from the file: ``camer
 a frame: ``file_path`` (its extension may be missing, its separators may be those of Windows, its upper and lower case may differ
 from the file's), ``transform_matrix``, ``depth_file_path`` or instant-ngp's ``depth_path`` (planar z of the image's aspect ratio
 and of any size; each pixel has the depth of the nearest measurement; see ``depth_image`` for values that count as not measured),
-``mask_path`` (an image whose black pixels are not used). Where ``dynamic_mask_NAME.png`` of instant-ngp lies beside ``NAME.png``,
+``mask_path`` (an image whose black pixels are not used). If instant-ngp's ``dynamic_mask_NAME.png`` lies beside ``NAME.png``,
 its white pixels are not used.
 The images of fisheye and division lenses (``camera_model`` as in COLMAP, or ``is_fisheye``, with ``k1`` to ``k4``) are undistorted
-on reading; a panorama (EQUIRECTANGULAR) becomes six frames, see ``PANORAMA_FACES``. Frames whose image is missing are left out, and missing depth images too, with a remark that counts them. ``applied_transform`` and ``applied_scale`` record transformations that were already applied to the poses. They are
+on reading; a panorama (EQUIRECTANGULAR) becomes six frames, see ``PANORAMA_FACES``. Frames whose image is missing are left out,
+and so are missing depth images, with a remark that counts them. ``applied_transform`` and ``applied_scale`` record
+transformations that were already applied to the poses. They are
 not undone, so the world is that of the file. A sequence is ordered by ``time`` or ``timestamp`` of the frames (seconds), or
 by the number that names the file in ``source``; where a frame lacks all of them, by name. Other keys are ignored.
 
@@ -37,7 +39,7 @@ from bidnerf_core.io import background_colour, is_file, read_header
 
 
 def _read(path: Path, found: list[Path], options: DatasetOptions) -> Capture:
-    """Read the frames, and find their files. Raises ``InputError`` if no image is found."""
+    """Read the frames and find their files. Raises ``InputError`` if no image is found."""
     listed, names = read_splits(path), FileNames(path)
     images = [names.path(frame.file_path, IMAGE_ENDINGS, moved=True) for frame, _ in listed]
     _check_images(path, [frame for frame, _ in listed], images)
@@ -100,7 +102,7 @@ def _check_images(folder: Path, frames: Sequence[FrameRecord], images: Sequence[
 
 
 def _camera(frame: FrameRecord, size: tuple[int, int] | None) -> Camera | CameraSource:
-    """Return the camera of a frame; one without a size describes the first image, since all have the same lens."""
+    """Return the camera of a frame; a camera without a size is that of the first image, since all images share the lens."""
     width, height = frame.camera.width or (size and size[0]), frame.camera.height or (size and size[1])
     if width is None or height is None:  # no image is readable, which is an error when one is read
         return CameraSource()
@@ -122,7 +124,7 @@ def _first_size(frames: Sequence[FrameRecord], images: Sequence[Path]) -> tuple[
 
 
 def _header(image: Path) -> tuple[tuple[int, int] | None, bool]:
-    """Return the size of an image, and whether it has an alpha channel; None if it is not readable, an error when it is read."""
+    """Return an image's size and whether it has an alpha channel; None if it is unreadable, which is an error on reading it."""
     try:
         header = read_header(image)
     except InputError:

@@ -1,4 +1,4 @@
-"""Frames and splits as ``transforms*.json`` describes them: read without their images, and written with them."""
+"""Reading frames and splits from ``transforms*.json`` (without images) and writing them (with images)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LARGEST_DEPTH = 65534  # readers interpret the largest 16-bit number as "not mea
 
 @dataclass(frozen=True, eq=False)
 class FrameRecord:
-    """One entry of ``frames`` with the defaults of its file applied."""
+    """An entry of ``frames`` with the file-level defaults applied."""
 
     record: Record
     file_path: PurePosixPath  # as in the file, without a leading "./"
@@ -45,7 +45,7 @@ class FrameRecord:
 
     @property
     def unit(self) -> LengthUnit | None:
-        """The unit of its position if the file states ``"unit": "metres"`` or ``"units"``, as bidnerf's files do."""
+        """The unit of the camera position, if the file states it (``"unit": "metres"`` or ``"units"``), as bidnerf's files do."""
         stated = self.record.value("unit")
         return stated if stated in get_args(LengthUnit) else None
 
@@ -56,12 +56,12 @@ class FrameRecord:
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """The folders of the image, then its stem."""
+        """The folders of the image path, followed by its stem."""
         return (*self.file_path.parts[:-1], self.stem)
 
 
 def read_splits(path: Path) -> list[tuple[FrameRecord, tuple[str, ...]]]:
-    """Read the frames of the folder ``path`` with their splits, none of them if a single file lists no splits.
+    """Read the frames in the folder ``path`` with their splits; frames have no split if a single file lists none.
 
     Raises ``InputError`` for an invalid ``transforms*.json``.
     """
@@ -94,7 +94,7 @@ def read_splits(path: Path) -> list[tuple[FrameRecord, tuple[str, ...]]]:
 def read_frames(file: Record) -> list[FrameRecord]:
     """Read every entry of ``frames`` that has a pose; a remark counts the others.
 
-    Raises ``InputError`` if two have the same image, and if none has a pose.
+    Raises ``InputError`` if two frames have the same image, and if no frame has a pose.
     """
     entries = file.items("frames")
     if not entries:
@@ -125,7 +125,7 @@ def read_frames(file: Record) -> list[FrameRecord]:
 
 
 def _lacks_pose(entry: Any) -> bool:
-    """Return whether a frame has no matrix, a zero matrix, or one with numbers that are not finite."""
+    """Return whether a frame's matrix is missing, zero, or has non-finite entries."""
     if not isinstance(entry, dict):
         return False
     try:
@@ -160,7 +160,7 @@ def _frame(file: Record, number: int, entry: object) -> FrameRecord:
 
 
 def _depth(record: Record, own: Record) -> tuple[PurePosixPath | None, float]:
-    """Return the depth image of a frame, or None, and the metres per step of its values.
+    """Return the depth image of a frame, or None, and its depth unit (metres per step).
 
     nerfstudio and instant-ngp use different keys for both; ``enable_depth_loading`` disables instant-ngp's.
     """
@@ -197,7 +197,7 @@ def write_transforms(
 ) -> None:  # fmt: skip
     """Write ``transforms_SPLIT.json``, ``images/SPLIT/NAME.png`` (8 bits) and ``depth/SPLIT/NAME.png`` (16 bits).
 
-    ``background`` is the colour behind frames that have an alpha channel; it is removed from their colours.
+    ``background`` is the colour over which frames with an alpha channel were composited; it is removed from their colours.
     Depth is stored in millimetres, or in larger steps if 16 bits would not suffice. A split without views is
     left out. Raises ``InputError`` for an unknown split, a duplicate name, and a lens with more than five
     distortion coefficients.
@@ -221,7 +221,7 @@ def write_transforms(
 
 
 def _written(folder: Path, split: str, view: View, background: tuple[float, float, float]) -> dict[str, Any]:
-    """Write the images of a frame and return its entry."""
+    """Write the images of a frame and return the frame's entry."""
     frame = view.frame
     file = f"images/{split}/{frame.name}.png"
     entry = frame_entry(file, frame.name, frame.intrinsics, view.T_ref_camera)

@@ -106,14 +106,14 @@ def _find(path: Path) -> Path | None:
 
 
 def _published(name: str, whole: bool = False) -> Intrinsics | None:
-    """Return the benchmark's calibration of the sensor that is, or is in, a name such as ``freiburg1``, or None."""
+    """Return the benchmark's calibration of the sensor that a name is or contains, such as ``freiburg1``, or None."""
     sensor = re.compile(r"(?:freiburg|fr)_?([123])(?!\d)", re.IGNORECASE)
     found = sensor.fullmatch(name) if whole else sensor.search(name)
     return CAMERAS[found[1]] if found else None
 
 
 def _file(row: TimedRow, names: FileNames) -> Path:
-    """Return the file that a row lists, whose name may contain spaces; it may be missing."""
+    """Return the path of the file listed in a row. Its name may contain spaces, and the file may not exist."""
     return names.find(row.rest.strip("\"'")) or names.path(row.words[0])
 
 

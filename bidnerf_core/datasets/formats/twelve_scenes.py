@@ -4,7 +4,7 @@ A scene has ``info.txt`` (``m_calibrationColorIntrinsic`` and ``m_calibrationDep
 of ``m_colorWidth`` x ``m_colorHeight`` and ``m_depthWidth`` x ``m_depthHeight``), ``split.txt`` (``sequence0
 [frames=357] [start=0 ; end=356]``) and ``data`` with ``frame-000000.color.jpg``, ``frame-000000.depth.png``
 (16-bit planar z in millimetres) and ``frame-000000.pose.txt`` (4x4, camera to world, OpenCV axes, metres;
--INF if tracking failed). Depth is registered to the colour camera by the two calibrations. As in the
+-INF if tracking failed). Depth is registered to the colour camera using the two calibrations. As in the
 relocalization literature (the successors of SCoRe Forests, DSAC, ACE) the first sequence is "test" and the
 others are "train"; without ``split.txt`` every eighth frame is held out.
 """
@@ -49,14 +49,14 @@ def _read(path: Path, found: tuple[Path, Path], options: DatasetOptions) -> Capt
 
 
 def _find(path: Path) -> tuple[Path, Path] | None:
-    """Return the folder of the frames, and the file of their cameras."""
+    """Return the folder of the frames and the file with their cameras."""
     folder = next((place for place in (path / "data", path) if images_of(place)), None)
     info = first_file(path, "info.txt", "_info.txt", "../info.txt", "../_info.txt")
     return None if folder is None or info is None else (folder, info)
 
 
 def own_sensor(colour: Intrinsics, depth: Intrinsics | None) -> DepthCamera | None:
-    """Return the depth sensor if it is a different camera: the focal lengths of equal ones agree up to rounding."""
+    """Return the depth sensor, or None if it is the colour camera, that is, if their focal lengths agree up to rounding."""
     if depth is None or abs(depth.resized(colour.width, colour.height).fx / colour.fx - 1) < 1e-3:
         return None
     return DepthCamera(depth, SE3.identity())
@@ -73,7 +73,7 @@ def _camera(info: Path, values: dict[str, list[float]], kind: str) -> Intrinsics
 
 
 def _in_splits(path: Path, shots: list[Shot]) -> list[Shot]:
-    """Return the frames with those of the first sequence as "test" and the others as "train"."""
+    """Assign the frames of the first sequence to "test" and all other frames to "train"."""
     file = first_file(path, "split.txt", "../split.txt")
     if file is None:
         return shots

@@ -36,8 +36,8 @@ def nominal(frame: Frame, on: float, generator: Generator) -> Frame:
 def cropped(frame: Frame, share: float, generator: Generator) -> Frame:
     """Crop away a ``share`` of the width and height at a random corner; the stated principal point ignores the crop.
 
-    Its stated offset from the centre of the cropped image is its true offset from the centre of the whole
-    one.
+    Its stated offset from the centre of the cropped image equals its true offset from the centre of the whole
+    image.
     """
     camera = frame.intrinsics
     parts = []
@@ -91,9 +91,9 @@ def rolling_shutter(frame: Frame, degrees: float, generator: Generator) -> Frame
 
 
 def turned(*, columns: bool = False, rows: bool = False) -> Change:
-    """Return the fault that reverses columns, rows or both, as of a camera that is held upside down.
+    """Return the fault that reverses columns, rows or both, as with a camera held upside down.
 
-    If only one of them is reversed, the result is not a view of the scene from anywhere.
+    If only columns or only rows are reversed, no camera pose gives such an image of the scene.
     """
     orientation = Orientation(mirrors_columns=columns, mirrors_rows=rows)
 
@@ -104,7 +104,7 @@ def turned(*, columns: bool = False, rows: bool = False) -> Change:
 
 
 def covered_lens(frame: Frame, on: float, generator: Generator) -> Frame:
-    """Show one random colour everywhere, without any measured depth."""
+    """Replace the image by one random colour, and remove any measured depth."""
     colour = torch.rand(3, generator=generator).to(frame.rgb)
     depth = None if frame.depth is None else torch.zeros_like(frame.depth)
     alpha = None if frame.alpha is None else torch.ones_like(frame.alpha)
@@ -116,7 +116,7 @@ def _rays(camera: Intrinsics) -> Float[Tensor, "h w 3"]:
 
 
 def _of_images(frame: Frame, change: Callable[[Tensor], Tensor], **more: Any) -> Frame:
-    """Return the frame with its colours, depth, alpha and hidden pixels changed alike; ``more`` replaces other attributes."""
+    """Return the frame with ``change`` applied to colours, depth, alpha and hidden pixels; ``more`` sets other attributes."""
     for name in ("rgb", "depth", "alpha", "hidden"):
         image = getattr(frame, name)
         more[name] = None if image is None else change(image)
@@ -180,7 +180,7 @@ def warped(frame: Frame, pixels: Float[Tensor, "h w 2"]) -> Frame:
 
 
 def reflected(pixels: Float[Tensor, "*p 2"], width: int, height: int) -> Float[Tensor, "*p 2"]:
-    """Return pixels (u, v) inside an image: those beyond a border are reflected at it."""
+    """Return pixels (u, v) mapped into an image: those beyond a border are reflected at it."""
     size = pixels.new_tensor([width, height])
     folded = pixels.remainder(2 * size)
     return torch.minimum(folded, 2 * size - folded)

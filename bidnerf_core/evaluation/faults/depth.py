@@ -75,7 +75,7 @@ def one_wall(frame: Frame, on: float, generator: Generator) -> Frame:
 
 
 def _largest_plane(points: Float[Tensor, "n 3"], generator: Generator) -> Float[Tensor, "4"]:
-    """Return the plane (unit normal, offset) that contains the most points, as found by trial.
+    """Return the plane (unit normal, offset) that contains the most points, found by random sampling.
 
     256 planes through three random points each are compared on a sample of the points.
     """

@@ -69,7 +69,7 @@ def random_units(count: int, generator: Generator) -> Float[Tensor, "n 3"]:
 
 
 def random_direction(generator: Generator) -> tuple[float, float]:
-    """Return a unit vector of the image plane, uniformly distributed."""
+    """Return a uniformly distributed unit vector in the image plane."""
     angle = 2 * math.pi * uniform_number(generator)
     return math.cos(angle), math.sin(angle)
 
@@ -123,7 +123,7 @@ def expand_faults(words: Iterable[str]) -> tuple[str, ...]:
 def parse_faults(text: str) -> tuple[AppliedFault, ...]:
     """Parse a text such as ``depth-scale:1.02+exposure:0.7``; the result is empty for ``NO_FAULT``.
 
-    Raises ``InputError`` for an unknown name, a missing size or one out of range, and a fault that is there twice.
+    Raises ``InputError`` for an unknown name, a missing or out-of-range size, and a fault that occurs twice.
     """
     faults: list[AppliedFault] = []
     for part in [] if text == NO_FAULT else text.split("+"):
@@ -149,8 +149,8 @@ def faulty(view: View, faults: str, seed: int) -> View:
     """Return the view with all faults, applied in order.
 
     ``T_ref_camera`` is the true pose of the faulty image. The random choices of a fault depend only on the
-    seed, the frame and the fault, regardless of other faults. Raises ``InputError`` for a fault of depth if none was
-    measured.
+    seed, the frame and the fault, regardless of other faults. Raises ``InputError`` for a depth fault on a
+    frame without measured depth.
     """
     for applied in parse_faults(faults):
         fault, T_ref_camera = FAULTS.load(applied.name), view.T_ref_camera
@@ -170,7 +170,7 @@ def faulty(view: View, faults: str, seed: int) -> View:
 
 
 def check_depth(faults: Iterable[str], depth: bool) -> None:
-    """Raise ``InputError`` for an unknown fault and, unless ``depth`` is used, for a fault of depth."""
+    """Raise ``InputError`` for an unknown fault and, without ``depth``, for a fault that changes depth."""
     for part in (part for text in faults for part in parse_faults(text)):
         if FAULTS.load(part.name).needs_depth and not depth:
             raise InputError(f"fault {part} changes the measured depth, which the method does not receive")

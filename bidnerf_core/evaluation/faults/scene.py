@@ -42,7 +42,7 @@ def unmeasured_occluder(frame: Frame, share: float, generator: Generator) -> Fra
 
 
 def moved_thing(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Show a piece of the scene, slightly nearer, at a second place that covers ``share`` of the image.
+    """Copy a piece of the scene, slightly nearer, to another position, where it covers ``share`` of the image.
 
     The features of the copy match those of the map, and consistently support a wrong pose.
     """
@@ -130,7 +130,7 @@ def _pasted(
 
 
 def blob(height: int, width: int, share: float, generator: Generator) -> Bool[Tensor, "h w"]:
-    """Return a mask of one irregular piece around a random place that covers exactly ``share`` of the image.
+    """Return a mask of one irregular piece around a random position that covers exactly ``share`` of the image.
 
     With the same generator state, a larger share covers everything that a smaller one does.
     """

@@ -1,1 +1,1 @@
-"""Terms of the sums that are minimized: measured points, rendered rays and whole images."""
+"""Terms of the cost functions: measured points, rendered rays and whole images."""

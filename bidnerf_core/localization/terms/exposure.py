@@ -13,7 +13,7 @@ NEARLY_CLIPPED = 0.01
 
 
 def clipped(seen: Float[Tensor, "*s"], measured: Float[Tensor, "#*s"]) -> Bool[Tensor, "*s"]:
-    """Return the mask of the colours clipped in the image where the exposed rendering ``seen`` is out of range too.
+    """Return the mask of colours that are clipped in the image and out of range in the exposed rendering ``seen``.
 
     Such colours agree with the exposure whatever the difference, but do not constrain it.
     """
@@ -30,9 +30,9 @@ def fit_exposure(
 ) -> tuple[Float[Tensor, "h 1 3"], Float[Tensor, "h 1 3"]]:
     """Return the gain and the offset of the model ``measured = gain * seen + offset``, by reweighted least squares.
 
-    ``weigh`` returns the weights of differences, at most 1; ``known`` (0 to 1) multiplies them. ``precision`` is that of
-    Gaussian priors of the gain about 1 and the offset about 0, in the unit of the weights: it matters where the colours do
-    not suffice, as in a channel that is constant over the image. The first of the ``rounds`` is unweighted.
+    ``weigh`` returns the weights of differences, at most 1; ``known`` (0 to 1) multiplies the weights. ``precision`` holds
+    the precisions of Gaussian priors of the gain about 1 and the offset about 0, in the unit of the weights: they matter where the
+    colours do not suffice, as in a channel that is constant over the image. The first of the ``rounds`` is unweighted.
     """
     weight = known.expand_as(seen)
     gain, offset = torch.ones_like(seen[:, :1]), torch.zeros_like(seen[:, :1])

@@ -1,4 +1,4 @@
-"""Whole small images: photos compared with renderings of a map from many poses.
+"""Comparison of whole small photos with renderings of a map from many poses.
 
 Thumbnails are small, smoothed photos. Renderers quickly render the same views, without derivatives, from the baked surface or a
 field. The derivative of a rendered image with respect to the pose follows from the image's gradient and its depth, for any renderer.
@@ -50,7 +50,7 @@ class Thumbnail:
 
 
 def smooth(image: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
-    """Convolve with a 5x5 binomial kernel, approximately a Gaussian of one pixel; the border is replicated."""
+    """Convolve an image with a 5x5 binomial kernel, approximately a Gaussian of one pixel; the border is replicated."""
     kernel = constant((1.0, 4.0, 6.0, 4.0, 1.0), image) / 16
     flat = image.reshape(-1, 1, *image.shape[-2:])
     flat = conv2d(pad(flat, (2, 2, 0, 0), mode="replicate"), kernel.view(1, 1, 1, 5))
@@ -59,7 +59,7 @@ def smooth(image: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
 
 
 def slopes(image: Float[Tensor, "*b h w"], camera: Intrinsics) -> Float[Tensor, "*b n 2"]:
-    """Return central differences to the right and down, per unit on the plane z = 1."""
+    """Return the image's central differences to the right and down, per unit on the plane z = 1."""
     flat = image.reshape(-1, 1, *image.shape[-2:])
     wide = pad(flat, (1, 1, 1, 1), mode="replicate")
     across = (wide[..., 1:-1, 2:] - wide[..., 1:-1, :-2]) * (camera.fx / 2)
@@ -122,9 +122,9 @@ class ColourScales:
 class Images:
     """Mean over pixels of ``1 - 1 / (1 + c^2 / s^2)``, with the difference c between rendered and measured colour.
 
-    It is multiplied by 60, the number of independent measurements in a small image.
+    The mean is multiplied by 60, the number of independent measurements in a small image.
 
-    By the mean of both images' gradients, colours are linearized with second-order accuracy (Benhimane and Malis 2004, "Real-time
+    Colours are linearized with second-order accuracy, using the mean of both images' gradients (Benhimane and Malis 2004, "Real-time
     image-based tracking of planes using efficient second-order minimization"). Only the pose has derivatives. The cost is infinite for
     poses that are not finite. Everything is computed on the device of the thumbnails, which is also that of the renderer.
     """

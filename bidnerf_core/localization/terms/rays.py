@@ -28,10 +28,10 @@ OUTLIER = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Colours of rendered rays and, with a ``depth_loss``, their distances.
+    """Residuals of the colours of rendered rays and, with a ``depth_loss``, of their distances.
 
-    A gain and an offset of the exposure are eliminated per channel (variable projection). All tensors are on the field's device when it
-    is evaluated.
+    A gain and an offset of the exposure are eliminated per channel (variable projection). All tensors are on the field's device when
+    the term is evaluated.
     """
 
     field: RadianceField
@@ -63,9 +63,9 @@ class Rays:
         depth_rays: Observations | None = None,
         device: torch.device | str | None = None,
     ) -> Rays:
-        """Draw ``count`` visible pixels of ``views``, whose poses are relative to the last, and at most as many of
-        ``depth_rays``, which another sensor measured in the last camera's frame.
+        """Draw ``count`` visible pixels of ``views``, and at most as many of ``depth_rays``.
 
+        The poses of ``views`` are relative to the last view; another sensor measured ``depth_rays`` in the last camera's frame.
         Colours are averaged over squares of ``blur`` pixels. The tensors are put on ``device``, by default the field's.
         """
         generator, parts = torch.Generator().manual_seed(seed), []
@@ -104,7 +104,7 @@ class Rays:
         return moved(self.at(moved(states, self.rgb.device)).normal(), states.z.device)
 
     def at(self, states: States, derivatives: bool = True) -> ComparedRays:
-        """Render the rays at ``states``, which are on the field's device, and compare them with what was measured."""
+        """Render the rays at ``states``, which are on the field's device, and compare them with the measurements."""
         if derivatives:
             return ComparedRays(self, *self._residuals(states))
         *_, origins, directions = self._sent(states)
@@ -123,9 +123,9 @@ class Rays:
         return self.at(moved(states, self.rgb.device), derivatives=False).agreement().to(states.z.device)
 
     def plain_costs(self) -> Float[Tensor, "n"] | None:
-        """Return each ray's robust loss, in units of the noise, if all had the colour that fits best.
+        """Return each ray's robust loss, in units of the noise, if all rays had the single best-fitting colour.
 
-        None with depth, or without colours.
+        Returns None with depth, or without colours.
         """
         with_depth = self.depth_loss is not None and bool((self.distance > 0).any())
         if with_depth or not bool(self.coloured.any()):
@@ -155,7 +155,7 @@ class Rays:
         return cost, weight
 
     def _sent(self, states: States) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return the sights on the plane z = 1, their lengths and directions in the rig's frame; and the rays (h n), world."""
+        """Return the sights on the plane z = 1, their lengths and rig-frame directions, and the rays (h n) in the world."""
         rays, sights = rays_through(states, self.sights.image), self.sights
         length = rays.norm(dim=-1, keepdim=True)
         sight, times = rays / length, sights.times[:, None]
@@ -168,7 +168,7 @@ class Rays:
         return rays, length, unit, origins.float().flatten(0, 1), directions.float().flatten(0, 1)
 
     def _distances(self, count: int) -> tuple[Float[Tensor, "r"] | None, float]:
-        """Return the measured distances of all rays from ``count`` states, and by how much a ray that hits nothing is off."""
+        """Return the measured distances of all rays from ``count`` states, and the residual of a ray that hits nothing."""
         if self.depth_loss is None:
             return None, 0.0
         # The residual of a ray that hits nothing is that of an outlier, but less than the whole distance.
@@ -177,7 +177,7 @@ class Rays:
     def _differences(
         self, seen: Float[Tensor, "h n c"]
     ) -> tuple[Float[Tensor, "h n c"], Float[Tensor, "h 1 3"]]:
-        """Return rendered minus measured, and the gain of the exposure."""
+        """Return the rendered minus the measured values, and the gain of the exposure."""
         gain, offset = self._exposure(seen[..., :3])
         value = (gain * seen[..., :3] + offset - self.rgb) * self.coloured[:, None]
         if self.depth_loss is None:
@@ -200,7 +200,7 @@ class Rays:
     def _residuals(
         self, states: States
     ) -> tuple[Float[Tensor, "h n c"], Float[Tensor, "h n c P"], Float[Tensor, "h n c"]]:
-        """Return the residuals, their derivatives, and the norms of their gradients by the rays' origins."""
+        """Return the residuals, their derivatives, and the norms of the residuals' gradients with respect to the ray origins."""
         rays, length, unit, origins, directions = self._sent(states)
         found = differentiate(
             self.field,
@@ -249,7 +249,7 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class ComparedRays:
-    """Rendered minus measured, of n rays from each of h poses."""
+    """Rendered minus measured values of n rays from each of h poses."""
 
     term: Rays
     value: Float[Tensor, "h n c"]

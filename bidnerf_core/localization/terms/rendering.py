@@ -1,7 +1,7 @@
 """Rendered rays and their derivatives, from the derivatives of the field at the rays' samples.
 
 With features f_i of the samples (colours, distances), weights w_i and a background b, a channel of a ray is
-``C = sum_i w_i f_i + (1 - sum_i w_i) b``. Its derivative by the density of a sample of length l_i needs no backward pass:
+``C = sum_i w_i f_i + (1 - sum_i w_i) b``. Its derivative with respect to the density of a sample of length l_i needs no backward pass:
 ``dC / dsigma_i = l_i (T_i+1 f_i - sum_j>i w_j f_j - T_end b)``, where T_i+1 is the share of the light that passes sample i.
 """
 
@@ -47,7 +47,7 @@ def differentiate(
     field: RadianceField, rays: Rays, background: tuple[float, float, float],
     measured: Float[Tensor, "r"] | None = None, miss: float = 0.0,
 ) -> Derivatives:  # fmt: skip
-    """Render rays (r), and differentiate their ``channels`` by their origins and directions."""
+    """Render rays (r), and differentiate their ``channels`` with respect to the ray origins and directions."""
     if isinstance(field, HitField):
         return _differentiate_hits(field, rays, background, measured, miss)
     samples = field.sampler(rays)
@@ -104,7 +104,7 @@ def differentiate(
 def _differentiate_hits(
     field: HitField, rays: Rays, background: tuple[float, float, float], measured: Float[Tensor, "r"] | None, miss: float
 ) -> Derivatives:  # fmt: skip
-    """Differentiate by a backward pass for each channel: the gradient of its sum over rays has the gradients of all rays."""
+    """Differentiate with one backward pass per channel: the gradient of the channel's sum over rays holds the gradients of all rays."""
     leaves = [part.detach().requires_grad_() for part in (rays.origins, rays.directions)]
     with torch.enable_grad():
         rendering = render(field, replace(rays, origins=leaves[0], directions=leaves[1]), background)

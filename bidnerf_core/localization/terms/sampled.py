@@ -21,7 +21,7 @@ DIFFERENT = 0.02
 
 @dataclass(eq=False)
 class SampledLoss:
-    """The loss of a pose on pixels that are drawn at each call."""
+    """The loss of a pose on pixels that are newly drawn at each call."""
 
     problem: Problem
     objective: Objective
@@ -44,7 +44,7 @@ class SampledLoss:
                 self._candidates = self.reach.candidates
 
     def __call__(self, T_world_last: SE3) -> Float[Tensor, ""]:
-        """Return the loss; differentiable in the pose of the last view's camera."""
+        """Return the loss, differentiable in the pose of the last view's camera."""
         problem, generator, here = self.problem, self.generator, T_world_last.detach()
         many, device = self.rays.rays * self._candidates, problem.device
         pixels = draw(problem.views, many, DRAWERS[self.rays.pixels], generator, device=device)
@@ -63,7 +63,7 @@ class SampledLoss:
         return found
 
     def _loss(self, observed: Observations, T_world_last: SE3) -> Float[Tensor, ""]:
-        """Return the objective's loss and the mean robust distance (metres) between measured points and the box of the scene."""
+        """Return the objective's loss plus the weighted mean robust distance (metres) between measured points and the box of the scene."""
         bounds, weight, rays = self._bounds, self.reach.box_weight, self._rays(observed, T_world_last)
         loss = self.objective.loss(render(self._field, rays, bounds.background), observed)
         if weight == 0 or not self.objective.uses_depth or bounds.contracted:

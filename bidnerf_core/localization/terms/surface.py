@@ -1,4 +1,4 @@
-"""Distances of measured points from the baked surface, and differences of their colours, as a log likelihood."""
+"""Distances of measured points from the baked surface, and colour differences, as a log likelihood."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ COLOUR = 0.15
 def sights_of(
     view: View, row: Tensor, column: Tensor, may_move: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the parts of ``Sights`` of some pixels of a view, in which rotation and translation are T_rig_camera.
+    """Return the fields of ``Sights`` for some pixels of a view; rotation and translation are T_rig_camera.
 
-    ``may_move`` is whether the camera may have moved during the readout: views of a rig may be from different times.
+    ``may_move`` tells whether the camera may have moved during the readout: views of a rig may be from different times.
     """
     pixels, camera = torch.stack([column, row], -1).double() + 0.5, view.frame.intrinsics
     times = exposure_times(pixels, camera) if may_move else torch.zeros_like(pixels[:, 0])
@@ -46,9 +46,9 @@ def sights_of(
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Distances of measured points from the planes of the nearest surfels, metres, and differences from their colours.
+    """Distances of measured points from the planes of the nearest surfels (metres), and differences from the surfels' colours.
 
-    All tensors are on the surface's device when it is evaluated.
+    All tensors are on the surface's device when the term is evaluated.
     """
 
     surface: SurfaceMap
@@ -66,9 +66,9 @@ class Surface:
         views: Sequence[View], rays: Observations | None, surface: SurfaceMap, seed: int, count: int = 500,
         device: torch.device | str | None = None,
     ) -> Surface | None:  # fmt: skip
-        """Draw measured points of ``views``, whose poses are relative to the last, in random order; None if there are too few.
+        """Draw measured points of ``views``, whose poses are relative to the last view, in random order; None if there are too few.
 
-        They are put on ``device``, by default the surface's.
+        The points are put on ``device``, by default the surface's.
         """
         generator, parts = torch.Generator().manual_seed(seed), []
         for view in views:
@@ -158,20 +158,20 @@ class Surface:
         return moved(found, states.z.device)
 
     def costs(self, states: States) -> Float[Tensor, "h n"]:
-        """Return each point's cost, 0 to 1 plus the weight of colours."""
+        """Return each point's cost, from 0 to 1 plus the colour weight."""
         near, alike = self.inliers(states)
         return 1 - near + self.colour_weight * (1 - near * alike)
 
     def fitted_noise(self, states: States) -> Surface:
-        """Return the term with the noise of the points at the first state."""
+        """Return the term with the noise estimated from the points at the first state."""
         r = self._offsets(moved(states[:1], self.surface.device))[0].abs()
         found = (MAD_TO_SIGMA * r.median()).clamp(min=0.25 * self.surface.cell)
         return replace(self, noise=found.clamp(max=3 * self.noise))
 
     def exposed(self, states: States) -> Surface:
-        """Return the term with colours converted to the map's exposure, by the points on the surface at the first state.
+        """Return the term with colours converted to the map's exposure, using the points on the surface at the first state.
 
-        The colours stay as they are if hardly any more points have the surface's colour then.
+        The colours are left unchanged if the conversion makes hardly any more points match the surface's colour.
         """
         here = moved(states[:1], self.surface.device)
         _, squared, _, index, along, *_ = self._offsets(here)
@@ -199,7 +199,7 @@ class Surface:
     def _colours(
         self, index: Tensor, along: Tensor
     ) -> tuple[Float[Tensor, "h n 3"], Float[Tensor, "h n 3 3"]]:
-        """Return the surface's colour at each point minus the measured one, and its derivative by the point's position (world)."""
+        """Return the surface's colour at each point minus the measured one, and the derivative with respect to the point (world)."""
         surfels = self.surface.surfels
         slope = surfels.rgb_gradient[index]
         change = (slope @ along.to(slope)[..., None])[..., 0]

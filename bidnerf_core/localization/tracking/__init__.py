@@ -1,1 +1,1 @@
-"""Tracking: poses of the frames of a sequence, each predicted from those before it."""
+"""Tracking: poses of the frames of a sequence, each predicted from the preceding frames."""

@@ -1,4 +1,4 @@
-"""What a frame says about its predicted pose: by landmarks, measured depth or rendered colours; and the verdict on the result."""
+"""Correction of a frame's predicted pose by landmarks, measured depth or rendered colours; and the verdict on the corrected pose."""
 
 from __future__ import annotations
 
@@ -75,10 +75,10 @@ class Measurement:
 
 @dataclass(frozen=True, eq=False)
 class Determined:
-    """A term of measured points without the directions of the pose that they determine far worse than others.
+    """A term of measured points, without the pose directions that the points constrain far more weakly than others.
 
-    Points slide along flat walls at no cost, and in a corridor, the few others, on door frames and edges, fit wrong places about as
-    well as the right one (solution remapping, Zhang et al. 2016, "On degeneracy of optimization-based state estimation problems").
+    Points slide along flat walls at no cost; in a corridor, the few points on door frames and edges fit wrong places about as well
+    as the right place (solution remapping, Zhang et al. 2016, "On degeneracy of optimization-based state estimation problems").
     """
 
     term: Surface
@@ -103,7 +103,7 @@ class Determined:
 
 @dataclass(frozen=True, eq=False)
 class Measurer:
-    """Corrects predicted poses by what frames show of one map, and judges them."""
+    """Corrects predicted poses by what frames show of one map, and judges the corrected poses."""
 
     scene: SceneMap
     landmarks: LandmarkMap | None
@@ -115,10 +115,10 @@ class Measurer:
     def __call__(
         self, frame: Frame, image: Grey | None, state: TrackerState, predicted: Motion
     ) -> Measurement | None:
-        """Correct a prediction by all that a frame shows; None if it shows nothing of the map.
+        """Correct a prediction by everything that a frame shows; None if the frame shows nothing of the map.
 
-        The landmarks that were tracked to this frame are used as long as they are enough; otherwise, landmarks are recognised
-        around their pose or the prediction.
+        Landmarks tracked to this frame are used as long as there are enough; otherwise, landmarks are recognised anew around the pose
+        of the tracked landmarks or around the prediction.
         """
         landmarks = self.landmarks
         if landmarks is None or image is None:
@@ -144,7 +144,7 @@ class Measurer:
     def _recognised(
         self, known: LandmarkMap, frame: Frame, predicted: Motion, tracked: Fit | None
     ) -> Fit | None:
-        """Fit a pose to landmarks recognised around the pose of the tracked ones, or else around the prediction."""
+        """Fit a pose to landmarks recognised around the pose of the tracked landmarks, or else around the prediction."""
         assert self.features is not None
         camera, T = frame.intrinsics, predicted.T_world_camera
         radius = search_radius(frame, predicted)
@@ -203,8 +203,8 @@ class Measurer:
     ) -> Measurement:
         """Fuse landmarks with measured depth, and both with the prediction; then judge the pose.
 
-        Whether the camera moved during the readout, and the effect of its intrinsics and of correlated errors, are determined in
-        frames in which landmarks are recognised, and change little until the next one.
+        Whether the camera moved during the readout, and the effects of its intrinsics and of correlated errors, are estimated only in
+        frames in which landmarks are recognised; they change little until the next such frame.
         """
         points = fit.points
         distance = float((points.positions - fit.states.T.translation).norm(dim=-1).median())
@@ -261,7 +261,7 @@ class Measurer:
     def _depth(
         self, frame: Frame, state: TrackerState, points: Points, states: States
     ) -> tuple[Surface | None, float]:
-        """Return the measured points as a term, or how many times larger than those of the landmarks their depths are."""
+        """Return the term of the measured points, or else the ratio of their depths to the landmarks' depths."""
         surface, sensor = self.scene.surface, self.sensor
         if surface is None or not shows_shape(frame):
             return None, 1.0
@@ -279,7 +279,7 @@ class Measurer:
     def _judged(
         self, landmarks: LandmarkMap, state: TrackerState, fit: Fit, motion: Motion, distance: float
     ) -> Measurement:
-        """Judge a pose by landmarks, after its fusion with the prediction."""
+        """Judge a landmark-based pose after its fusion with the prediction."""
         covariance, inliers, noise = motion.covariance, fit.points[fit.is_inlier], float(fit.states.noise)
         count, one = len(inliers), torch.ones(1, dtype=torch.float64)
         if fit.by_chance is None:
@@ -312,7 +312,7 @@ class Measurer:
     ) -> Measurement | None:
         """Correct a prediction by measured points on the surface, or else by rendered colours; then judge the pose.
 
-        Along directions that these do not determine, such as that of a corridor, the prediction remains.
+        In directions that these measurements do not constrain, such as along a corridor, the prediction is kept.
         """
         surface, view = self.scene.surface, View(frame, SE3.identity())
         reach, covariance = predicted.reach, predicted.covariance
@@ -387,7 +387,7 @@ class Measurer:
     def odometry(
         self, frame: Frame, corners: Points, motion: Motion, predicted: Motion, seconds: float
     ) -> tuple[Motion, Points] | None:
-        """Return the prediction by corners with measured depth, and those that agree; None if these are too few."""
+        """Return the motion predicted from corners with measured depth, and the corners that agree; None if too few agree."""
         if len(corners) < LEAST_CORNERS:
             return None
         fit = Fit.of(corners, frame.intrinsics, predicted.T_world_camera, CORNERS_PER_INDEPENDENT)
@@ -400,7 +400,7 @@ class Measurer:
 
 
 def search_radius(frame: Frame, predicted: Motion) -> float | None:
-    """Return the radius (pixels) within which landmarks very likely project; None if that is most of the image."""
+    """Return the radius (pixels) within which landmarks very likely project; None if this would cover most of the image."""
     camera = frame.intrinsics
     radius = INLIER * pixel_radius(predicted.covariance, camera.fx, predicted.reach)
     # A search within more than 0.4 of the diagonal would be one of most of the image.
@@ -408,12 +408,12 @@ def search_radius(frame: Frame, predicted: Motion) -> float | None:
 
 
 def shows_shape(frame: Frame) -> bool:
-    """Return whether the frame has enough measured depth for the shape of the scene to be recognised."""
+    """Return whether the frame has enough measured depth to recognise the shape of the scene."""
     return frame.depth is not None and int((frame.depth > 0).sum()) >= LEAST_POINTS
 
 
 def _position_deviation(covariance: Float[Tensor, "6 6"]) -> float:
-    """Return the standard deviation (metres) of the position along its least certain direction, infinite if unknown."""
+    """Return the standard deviation (metres) of the position along its least certain direction; infinite if unknown."""
     if not bool(covariance.isfinite().all()):
         return math.inf
     return float(torch.linalg.eigvalsh(covariance[:3, :3])[-1].clamp(min=0).sqrt())

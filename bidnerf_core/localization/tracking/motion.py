@@ -23,14 +23,14 @@ from bidnerf_core.io import LARGEST_NUMBER
 
 @dataclass(frozen=True)
 class Clock:
-    """The time of the last frame. Frames without a time stamp come at the interval of the last two that had one."""
+    """The time of the last frame. Frames without a time stamp are assumed at the interval of the last two frames that had one."""
 
     now: float | None  # seconds, from any origin
     interval: float  # seconds
     stamped: bool = True  # whether the last frame had a time stamp
 
     def step(self, time: Any) -> tuple[Clock, float]:
-        """Return the clock at the next frame and the seconds since the last one, negative if it is out of order.
+        """Return the clock at the next frame and the seconds since the last frame, negative if the next frame is out of order.
 
         ``time`` is in seconds, or None. Raises ``InputError`` for anything else, and for a time that is not finite.
         """
@@ -88,7 +88,7 @@ class Motion:
 
     @staticmethod
     def at(pose: PoseEstimate, reach: float) -> Motion:
-        """Return a camera at a known pose with an unknown velocity."""
+        """Return the motion of a camera at a known pose with an unknown velocity."""
         noise = torch.zeros((12, 12), dtype=torch.float64)
         noise[:6, :6] = pose.noise
         noise[6:, 6:] = _scaled(reach * SPEED, SPEED)
@@ -96,14 +96,14 @@ class Motion:
 
     @property
     def covariance(self) -> Float[Tensor, "6 6"]:
-        """Covariance of the pose, right update."""
+        """Covariance of the pose as a right update."""
         return self.noise[:6, :6] + self.bias
 
     def predicted(self, seconds: float, stamped: bool = True) -> Motion:
         """Return the state ``seconds`` later, or earlier if negative.
 
-        After a gap, the pose is unchanged, and its uncertainty grows with a camera's possible speed. Without a time stamp, the
-        interval is an assumption, and the distance covered in it is uncertain in proportion.
+        After a gap, the pose is unchanged, and its uncertainty grows with the camera's possible speed. Without a time stamp, the
+        interval is an assumption, so the distance covered during the interval is uncertain in proportion.
         """
         motion = self
         if abs(seconds) > LONGEST_GAP:  # the velocity is unknown
@@ -124,7 +124,7 @@ class Motion:
         return replace(motion, T_world_camera=T, noise=_symmetric(noise), bias=back @ self.bias @ back.T)
 
     def corrected(self, measured: PoseEstimate) -> Motion:
-        """Return the state after fusing it with a measured pose.
+        """Return the state after fusion with a measured pose.
 
         The biases of the measurement and the state are assumed to be fully correlated, so fusion does not reduce them.
         """
@@ -160,9 +160,9 @@ class Motion:
         )
 
     def updated(self, measured: PoseEstimate) -> Motion:
-        """Return the state after fusing it with a measured pose, or reset to that pose if the prediction is incompatible.
+        """Return the state after fusion with a measured pose, or reset to that pose if the prediction is incompatible with it.
 
-        A pose whose covariance is not finite carries no information: the state is returned as it is.
+        A pose whose covariance is not finite carries no information: the state is returned unchanged.
         """
         if not bool(measured.noise.isfinite().all() and measured.bias.isfinite().all()):
             return self
@@ -188,9 +188,9 @@ class Motion:
         return min(1.0, max(0.1, self.agility * math.sqrt(1 - 0.4 + 0.4 * ratio)))
 
     def moved(self, T_world_camera: SE3, relative: Float[Tensor, "6 6"], seconds: float) -> Motion:
-        """Return the state ``seconds`` later, after a motion measured between the images themselves.
+        """Return the state ``seconds`` later, at a pose whose motion was measured between the images themselves.
 
-        ``relative`` is the covariance of that motion, a right update of the new pose.
+        ``relative`` is the covariance of that motion, as a right update of the new pose.
         """
         step = update_between(self.T_world_camera, T_world_camera)
         back = _adjoint_of_inverse(step)

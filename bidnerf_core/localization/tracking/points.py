@@ -1,7 +1,7 @@
 """The points that are tracked from image to image: recognised landmarks, and corners with measured depth.
 
 Landmarks give the camera's pose in the map; corners give the motion between frames with depth (odometry).
-They are followed by optical flow (Lucas and Kanade 1981; pyramids by Bouguet 2000), by OpenCV.
+Both are tracked with OpenCV's optical flow (Lucas and Kanade 1981; pyramids by Bouguet 2000).
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class Points:
         return self[self.landmark == FRESH]
 
     def followed(self, before: Grey, now: Grey, frame: Frame, predicted: SE3) -> Points:
-        """Return the points that are found in the next image, by optical flow from where a predicted pose projects them."""
+        """Return the points found in the next image by optical flow, starting from their projections at a predicted pose."""
         guess = frame.intrinsics.project(predicted.inverse().apply(self.positions)).float()
         guess = torch.where(guess.isfinite().all(-1, keepdim=True), guess, self.pixels)
         pixels, found = flow(before, now, self.pixels, guess)
@@ -108,7 +108,7 @@ class Points:
         return replace(self, pixels=pixels)[found]
 
     def well_spread(self, camera: Intrinsics, most: int) -> Points:
-        """Return up to ``most`` points, taken in turn from the cells of the image, of points that are sorted best first."""
+        """Return up to ``most`` of the points, which are sorted best first, taken in turn from the cells of the image."""
         if len(self) <= most:
             return self
         cell = cells(self.pixels, camera)
@@ -119,7 +119,7 @@ class Points:
 
 
 def cells(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Int[Tensor, "m"]:
-    """Return the numbers of the cells of the image in which pixels (u, v) lie."""
+    """Return the index of the image cell that contains each pixel (u, v)."""
     size = torch.tensor([camera.width, camera.height])
     column, row = (pixels / size * CELLS).long().clamp(0, CELLS - 1).unbind(-1)
     return row * CELLS + column
@@ -138,7 +138,7 @@ class Fit:
 
     @staticmethod
     def of(points: Points, camera: Intrinsics, start: SE3, correlation: float) -> Fit:
-        """Fit a pose near ``start`` to points of which ``correlation`` count as one."""
+        """Fit a pose near ``start`` to points, of which every ``correlation`` points count as one independent point."""
         focal, count = (camera.fx * camera.fy) ** 0.5, len(points)
         threshold = max(2.0, THRESHOLD * math.hypot(camera.width, camera.height))
         image = camera.unproject(points.pixels.double())[:, :2]
@@ -183,15 +183,15 @@ class Fit:
 
     @property
     def log10_nfa(self) -> float:
-        """The number of false alarms if each point is a match that would be anywhere in the image if it were wrong."""
+        """Log10 of the number of false alarms, if a wrong match may lie anywhere in the image."""
         by_chance = min(0.5, math.pi * self.term.most_noise**2 / self.term.area)
         return log10_nfa(len(self.points), self.agreeing, by_chance)
 
     @property
     def is_accurate(self) -> bool:
-        """Whether the points fit better than if spread evenly over a disc with the radius of inliers, as after failed flow.
+        """Whether the points fit better than points spread evenly over the inlier disc, as after failed flow.
 
-        These have a standard deviation of half that radius along each axis.
+        Evenly spread points have a standard deviation of half the disc's radius along each axis.
         """
         return float(self.states.noise) <= self.term.most_noise / 2
 
@@ -204,7 +204,7 @@ def flow(
 ) -> tuple[Float[Tensor, "m 2"], Bool[Tensor, "m"]]:
     """Track ``pixels`` (u, v) of one image to the next; return their new positions and a mask of those found.
 
-    The search starts at ``guess``. A point counts as found if the backward flow returns to its old position.
+    The search starts at ``guess``. A point counts as found if the backward flow returns to its original position.
     """
     if not len(pixels):
         return pixels, torch.zeros(0, dtype=torch.bool)
@@ -225,7 +225,7 @@ def alike(
 ) -> Bool[Tensor, "m"]:
     """Return a mask of the patches around ``pixels`` of one image that resemble those around ``there`` in the next.
 
-    The flow leaves patches of pure noise where its search started; these do not correlate.
+    In pure noise, the flow stays where its search started, and the patches do not correlate.
     """
     one, two = (_patches(image, at) for image, at in ((before, pixels), (now, there)))
     spread = np.sqrt((one**2).sum(-1) * (two**2).sum(-1)).clip(min=1e-6)

@@ -1,4 +1,4 @@
-"""The state that a tracker keeps between frames, and its file."""
+"""The state that a tracker keeps between frames, and the file format of this state."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class TrackerState:
     doubt: Float[Tensor, "6 6"] = _zeros(6, 6)  # covariance of the pose due to errors of the intrinsics
 
     def corrected(self, frame: Frame) -> Frame:
-        """Return a frame with the corrections of its camera; frames of the other kind are from another source."""
+        """Return a frame with its camera corrected, or unchanged if its focal length is of the other kind (exact or approximate)."""
         if frame.focal_is_approximate != self.is_approximate or not bool(self.camera.any()):
             return frame
         return frame.replace(intrinsics=true_intrinsics(frame.intrinsics, self.camera))

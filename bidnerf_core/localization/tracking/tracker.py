@@ -40,9 +40,9 @@ MISREAD = 5
 class Tracker:
     """Estimates the pose of each frame of a sequence from the frames before it.
 
-    It predicts the pose with a constant-velocity model and corrects it by landmarks tracked with optical flow, by measured
-    depth, or by colour. Each pose passes through the localizer's acceptance. After a rejected pose, which is marked as such, the
-    tracker relocalizes in the following frames, and meanwhile continues by odometry. Its memory does not grow. Trackers may share
+    The tracker predicts each pose with a constant-velocity model and corrects the prediction by landmarks tracked with optical flow,
+    by measured depth, or by colour. Each pose passes through the localizer's acceptance. After a rejected pose, which is marked as such,
+    the tracker relocalizes in the following frames, and meanwhile continues by odometry. Its memory does not grow. Trackers may share
     a localizer, even across threads, but a tracker itself belongs to one thread.
     """
 
@@ -86,7 +86,7 @@ class Tracker:
         """Estimate T_world_camera of the next frame.
 
         ``time`` (seconds, from any origin) is its time stamp; without one, the last interval is assumed. If the pose is
-        rejected, the answer has an ``outcome`` other than ``CONVERGED``, and its pose is the best guess with a corresponding
+        rejected, the answer has an ``outcome`` other than ``CONVERGED``, and its pose is the best estimate with a corresponding
         covariance. Raises ``InputError`` for a non-finite time, and if the map does not allow the first frame to be found
         without a start. Warns with ``InputWarning`` if the depth of several frames disagrees with the map by a factor.
         """
@@ -122,7 +122,7 @@ class Tracker:
     def _step(
         self, stated: Frame, image: Grey | None, state: TrackerState, seconds: float
     ) -> tuple[Localization, TrackerState]:
-        """Predict the pose, correct it by what the frame shows, and search the map for it if that is rejected."""
+        """Predict the pose and correct it by what the frame shows; if the result is rejected, search the map for the pose."""
         frame, motion, measured = state.corrected(stated), state.motion, None
         if motion is None and self._start is not None:
             motion = self._at(frame, self._start, None)
@@ -175,7 +175,7 @@ class Tracker:
         return self._answer(bridged, predicted), state
 
     def _at(self, frame: Frame, T: SE3, covariance: torch.Tensor | None) -> Motion:
-        """Return a camera of unknown velocity at a pose, by default with the uncertainty of a start."""
+        """Return the motion of a camera of unknown velocity at a pose, by default with the uncertainty of a start."""
         # A start of unknown uncertainty is off by 3 % of the scene's extent, and by 0.1 radians.
         deviation = torch.tensor([0.03 * self._extent] * 3 + [0.1] * 3, dtype=torch.float64)
         noise, bias = (deviation.square().diag(), 0.0 * deviation.diag())
@@ -227,7 +227,7 @@ class Tracker:
         )
 
     def _corners(self, frame: Frame, image: Grey | None, points: Points, T_world_camera: SE3) -> Points:
-        """Return the corners among ``points``, or new ones at the pose of this frame if they have become few."""
+        """Return the corners among ``points``, or new corners at the pose of this frame if few are left."""
         points, count = points.fresh, self.config.points
         # New corners are detected once fewer than half of them are left.
         if image is None or not frame.has_depth or len(points) >= 0.5 * count:
@@ -237,10 +237,10 @@ class Tracker:
     def _relocalized(
         self, frame: Frame, image: Grey | None, state: TrackerState, predicted: Motion | None
     ) -> Localization | None:
-        """Search the map for the pose of a frame; None if that is not due, or the frame cannot be searched for.
+        """Search the map for the pose of a frame; None if no search is due or the frame is unsuitable.
 
-        By landmarks, each image is searched for. The search of the whole surface, which takes longer, runs at increasing intervals.
-        A shape without an image fits many places.
+        The search by landmarks runs for every image; the slower search of the whole surface runs at increasing intervals. Frames
+        without an image are not searched for, since a shape alone fits many places.
         """
         has_begun = state.motion is not None
         lost = max(state.searchable, min(state.lost, 1)) if has_begun else state.searchable
@@ -264,7 +264,7 @@ class Tracker:
             raise
 
     def _reach(self, frame: Frame) -> float:
-        """Return the distance (metres) to what the camera sees."""
+        """Return the typical distance (metres) of the visible scene."""
         depth = frame.depth
         if depth is None or not shows_shape(frame):
             return 0.3 * self._extent

@@ -31,7 +31,7 @@ constrains a pose that is plainly wrong.
 
 @dataclass(frozen=True, eq=False)
 class PosePrior:
-    """The given poses and their errors, which are independent and isotropic."""
+    """The prior of the poses: their given values, and errors that are independent and isotropic."""
 
     T_world_camera: SE3  # (v), float64
     translation: float  # metres: standard deviation along each axis
@@ -85,7 +85,7 @@ def adjusted(
 
 @dataclass(frozen=True, eq=False)
 class AdjustmentSystem:
-    """Normal equations of images and points, in blocks.
+    """Normal equations for the poses of images and for points, stored as blocks.
 
     An image has six unknowns, the right update of its pose (translation first), or twelve if its motion is estimated too.
     """
@@ -116,7 +116,7 @@ class AdjustmentSystem:
         return torch.from_numpy(of_images).reshape_as(self.image_gradient), of_points
 
     def _sparse(self, blocks: Float[Tensor, "m k 3"]) -> bsr_array:
-        """Return the sparse matrix (k v, 3 n) with the observations' blocks."""
+        """Assemble the observations' blocks into a sparse matrix (k v, 3 n)."""
         order = torch.argsort(self.image, stable=True)
         rows, columns = len(self.image_gradient), len(self.point_gradient)
         ends = np.concatenate([[0], torch.bincount(self.image, minlength=rows).cumsum(0).numpy()])
@@ -127,7 +127,7 @@ class AdjustmentSystem:
 def linearized(
     sightings: Sightings, state: Adjustment, prior: PosePrior, noise: float, correlation: float = 1.0
 ) -> AdjustmentSystem:
-    """Return the normal equations about a state, with the weights of iteratively reweighted least squares."""
+    """Linearize the cost at a state: return its normal equations, weighted as in iteratively reweighted least squares."""
     view, point, times = sightings.view, sightings.point, sightings.exposure_times
     T = state.T_world_camera[view]
     if bool(state.motion.any()):
@@ -182,7 +182,7 @@ def _prior_term(
 
 
 def _damped(blocks: Float[Tensor, "b k k"], damping: float) -> Float[Tensor, "b k k"]:
-    """Return damped blocks; those of points without parallax become invertible."""
+    """Return the blocks with damping added, which makes even the blocks of points without parallax invertible."""
     diagonal = blocks.diagonal(dim1=-2, dim2=-1)
     least = 1e-9 * diagonal.mean(-1, keepdim=True).clamp(min=1e-30)
     return blocks + torch.diag_embed(damping * diagonal + least)

@@ -14,7 +14,7 @@ from bidnerf_core.mapping.resection.states import by_camera_point, pinhole
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Observations of points by images with known poses, both by number. Float64."""
+    """Observations of points in images with known poses; points and images are identified by number. Float64."""
 
     point: Int[Tensor, "m"]
     view: Int[Tensor, "m"]  # number of the image
@@ -37,7 +37,7 @@ class Sightings:
         return world / torch.linalg.vector_norm(world, dim=-1, keepdim=True)
 
     def in_camera(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
-        """Return the observed point of each observation in the frame of its camera."""
+        """Transform each observation's point to the frame of the camera that observes it."""
         return (self.rotation @ (points[self.point] - self.centre)[..., None])[..., 0]
 
     def residuals(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 2"]:
@@ -47,12 +47,12 @@ class Sightings:
 
 
 def summed(values: Tensor, index: Tensor, count: int) -> Tensor:
-    """Return the sums of those ``values`` that belong to each of ``count`` points or views, by number."""
+    """Sum the ``values`` of each of ``count`` points or views; ``index`` holds the number of each value's point or view."""
     return torch.zeros((count, *values.shape[1:]), dtype=values.dtype).index_add_(0, index, values)
 
 
 def intersected(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
-    """Return the point nearest to all rays of each of ``count`` points (metres, world), by linear least squares."""
+    """Triangulate ``count`` points: return the position (metres, world) nearest to all rays of each, by linear least squares."""
     d = sightings.directions()
     across = torch.eye(3, dtype=d.dtype) - d[:, :, None] * d[:, None]
     matrix = summed(across, sightings.point, count)
@@ -65,7 +65,7 @@ def refined_points(
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Minimize the reprojection errors under a Cauchy loss of ``scale`` pixels by ``steps`` Gauss-Newton iterations.
 
-    From the linear solution, four or five suffice. Returns the points and their covariances for a noise of one pixel (the
+    Four or five iterations suffice from the linear solution. Returns the points and their covariances for a noise of one pixel (the
     inverses of their normal matrices).
     """
     for _ in range(steps):
@@ -104,7 +104,7 @@ def fitting(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float
 
 
 def noise(sightings: Sightings, points: Float[Tensor, "n 3"]) -> float:
-    """Return a robust standard deviation of the observations along each axis (pixels), corrected for the fitted points."""
+    """Return a robust standard deviation (pixels, per axis) of the observations, corrected for the points' degrees of freedom."""
     if not len(sightings):
         return 1.0
     seen = torch.bincount(sightings.point, minlength=len(points))
@@ -114,6 +114,6 @@ def noise(sightings: Sightings, points: Float[Tensor, "n 3"]) -> float:
 
 
 def _damped(matrix: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
-    """Return matrices that are solvable for rays without parallax, too."""
+    """Return the matrices with damping added, so that they are invertible even for rays without parallax."""
     size = matrix.diagonal(dim1=-2, dim2=-1).mean(-1).clamp(min=1e-30)
     return matrix + 1e-6 * size[:, None, None] * torch.eye(3, dtype=matrix.dtype)

@@ -59,7 +59,7 @@ Result = TypeVar("Result")
 
 
 def update_scatter(updates: Sequence[Float[Tensor, "6"] | None]) -> Float[Tensor, "6 6"]:
-    """Return a robust covariance of pose updates; zero if there are too few, or fewer than half of the images have one."""
+    """Return a robust covariance of pose updates; zero if there are too few, or if fewer than half of the images have an update."""
     known = [update for update in updates if update is not None]
     if len(known) < max(ENOUGH_IMAGES, len(updates) / 2):
         return torch.zeros((6, 6), dtype=torch.float64)
@@ -69,9 +69,9 @@ def update_scatter(updates: Sequence[Float[Tensor, "6"] | None]) -> Float[Tensor
 def pose_updates(
     tracked: TrackedKeypoints, positions: Float[Tensor, "n 3"], most: int | None = None
 ) -> dict[int, Float[Tensor, "6"]]:
-    """Return the right updates from given to resected poses, by image number, for images with enough points.
+    """Return the right updates from the given to the resected poses, by image number, for images with enough points.
 
-    With ``most``, no more than that many of them, at regular intervals, are resected.
+    If ``most`` is given, at most that many images, at regular intervals, are resected.
 
     The points from which an image is resected were triangulated from it as well, so its pose scatters too little: with k views
     of a point, by 1 - 1/k of the true variance, against 1 + 1/k for a new image. The updates are rescaled accordingly.
@@ -91,8 +91,8 @@ def pose_updates(
 def robust_covariance(values: Float[Tensor, "n c"]) -> Float[Tensor, "c c"]:
     """Return an M-estimate of the covariance about zero (Maronna 1976).
 
-    Weights bound the influence of each value. The scale makes the median of the squared Mahalanobis distances that of the
-    chi-squared distribution.
+    Weights bound the influence of each value. The result is scaled so that the median of the squared Mahalanobis
+    distances equals the median of the chi-squared distribution.
     """
     channels = values.shape[1]
     scale = values.square().median(0).values.clamp(min=1e-30)
@@ -149,7 +149,7 @@ class TrackedViews:
         return find_features(self.features) if isinstance(self.features, str) else self.features
 
     def detector_of(self, view: View, number: int) -> Features:
-        """Return a detector for queries with ``view``, which is image ``number``: it reuses the known keypoints."""
+        """Return a detector for queries with ``view``, which is image ``number``; the detector reuses the image's keypoints."""
         return FoundOnce(self.detector, [(view.frame.rgb, self.observations.images[number].keypoints)])
 
     def landmarks(
@@ -188,7 +188,7 @@ class TrackedViews:
 
     @property
     def matched(self) -> TrackedKeypoints:
-        """The keypoints that were matched with those of other images."""
+        """The keypoints that were matched with keypoints of other images."""
         return self.observations[_tracked(self.observations)].compacted()[0]
 
     @property
@@ -197,7 +197,7 @@ class TrackedViews:
         return self.observations.motion
 
     def at(self, T_world_camera: SE3, motion: Float[Tensor, "v 6"] | None = None) -> TrackedViews:
-        """Return the tracks with other poses of the images (v), and with other motions if given."""
+        """Return the tracks with the images' poses (v) replaced, and their motions too if ``motion`` is given."""
         motion = self.motion if motion is None else motion
         images = [
             replace(p, T_ref_camera=T_world_camera[i], motion=motion[i])
@@ -206,7 +206,7 @@ class TrackedViews:
         return replace(self, observations=replace(self.observations, images=images))
 
     def at_distance(self, distance: float) -> TrackedViews:
-        """Return the tracks with a measured ``distance`` (metres) from the camera for every keypoint."""
+        """Return the tracks with ``distance`` (metres, from the camera) as the measured distance of each keypoint."""
         images = [
             replace(p, depth=distance / torch.linalg.vector_norm(p.rays, dim=-1))
             for p in self.observations.images
@@ -214,7 +214,7 @@ class TrackedViews:
         return replace(self, observations=replace(self.observations, images=images))
 
     def matched_anew(self, config: LandmarkConfig) -> TrackedViews:
-        """Return tracks of the same keypoints, matched again with the present poses."""
+        """Match the same keypoints again, with the current poses, and return the new tracks."""
         images = self.observations.images
         pairs = likely_pairs([image.T_ref_camera for image in images], config.neighbours)
         return replace(
@@ -222,12 +222,12 @@ class TrackedViews:
         )
 
     def without(self, images: Sequence[int]) -> TrackedViews:
-        """Return the tracks without the keypoints of the given images, from which known points may be: they are not known then."""
+        """Return the tracks without the keypoints of ``images``, and without known points, which may come from these images."""
         left = ~torch.isin(self.observations.image, torch.tensor(images))
         return replace(self, observations=self.observations[left], points=None)
 
     def of_points_in(self, images: Sequence[int]) -> TrackedViews:
-        """Return the tracks that have a keypoint in one of the given images."""
+        """Return the tracks that have a keypoint in at least one of ``images``."""
         own = torch.isin(self.observations.image, torch.tensor(images))
         left = torch.isin(self.observations.point, self.observations.point[own].unique())
         return replace(self, observations=self.observations[left])
@@ -241,7 +241,7 @@ def tracked_views(
 ) -> TrackedViews:
     """Detect the keypoints of ``views``, match those of likely neighbours, and join the matches into tracks.
 
-    ``known`` returns further matches of the keypoints, which take precedence where they contradict.
+    ``known`` returns further matches of the keypoints, which take precedence over contradicting ones.
 
     ``features`` is a detector or its name, which is stored with the landmarks so that queries use the same detector. Raises
     ``InputError`` if there are no views, for an unknown name, and for unusable keypoints.
@@ -283,7 +283,7 @@ def posed_keypoints(views: Sequence[View], features: Features) -> list[ImageKeyp
 def _located(
     observations: TrackedKeypoints, config: LandmarkConfig, known: Float[Tensor, "p 3"] | None
 ) -> LandmarkMap:
-    """Return the triangulated or ``known`` landmarks, followed by the remaining keypoints' landmarks from measured depth."""
+    """Return the triangulated or ``known`` landmarks, followed by landmarks from the measured depth of the remaining keypoints."""
     kept, positions, covariance = _triangulated(observations, radians(config.parallax), known)
     sightings = kept.sightings
     pixel_noise = noise(sightings, positions)
@@ -300,7 +300,7 @@ def _located(
 
 
 def _tracked(observations: TrackedKeypoints) -> Bool[Tensor, "m"]:
-    """Return a mask of the keypoints whose point has another keypoint."""
+    """Return a mask of the keypoints whose point is observed by at least one other keypoint."""
     return torch.bincount(observations.point)[observations.point] > 1
 
 
@@ -309,7 +309,8 @@ def _triangulated(
 ) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Return the inlier keypoints, their points (metres, world), and the points' covariance for a noise of one pixel.
 
-    ``least`` is the minimum parallax (radians) of a point. ``known`` positions, by number, are taken as they are.
+    ``least`` is the minimum parallax (radians) of a point. If ``known`` positions are given, by
+    number, they are used instead of triangulated ones.
     """
     observations, former = observations[_tracked(observations)].compacted()
     count = observations.count
@@ -328,7 +329,7 @@ def _triangulated(
 def _inliers(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:
     """Return a mask of the keypoints that fit their points, for points with at least two such keypoints.
 
-    Two alone must fit to within 1.5 pixels.
+    If a point has only two, both must fit to within 1.5 pixels.
     """
     fit = fitting(sightings, points, tolerance)
     seen = torch.bincount(sightings.point[fit], minlength=len(points))
@@ -349,7 +350,7 @@ def _mapped(
 
 
 def _counter(stage: str, unit: str, total: int) -> Callable[[], None]:
-    """Return a function that reports one more step of ``total`` to the current job."""
+    """Return a function that reports to the current job that one more of ``total`` steps is done."""
     report, done = counter(stage, unit), iter(range(total + 1))
     report(next(done), total)
     return lambda: report(next(done), total)

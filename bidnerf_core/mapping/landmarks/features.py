@@ -159,14 +159,14 @@ class _Strongest:
 
 
 def strongest(features: Features, count: int) -> Features:
-    """Return a detector of at most the ``count`` strongest keypoints."""
+    """Return a detector that returns at most the ``count`` strongest keypoints."""
     return features.at_most(count) if isinstance(features, LimitedFeatures) else _Strongest(features, count)
 
 
 class FoundOnce:
     """A detector that caches the keypoints of each image during one query.
 
-    ``known`` are images with known keypoints. Threads may share the detector.
+    ``known`` are images whose keypoints are already known. Threads may share the detector.
     """
 
     def __init__(self, features: Features, known: Iterable[tuple[Tensor, Keypoints]] = ()) -> None:
@@ -182,7 +182,7 @@ class FoundOnce:
 
 
 def quantized(descriptors: Float[Tensor, "n d"]) -> UInt8[Tensor, "n d"]:
-    """Return unit descriptors as bytes; if any channel is negative, all are shifted, which preserves distances."""
+    """Return unit descriptors as bytes; if any channel is negative, all channels are shifted, which preserves distances."""
     negative = len(descriptors) > 0 and float(descriptors.min()) < 0
     scaled = descriptors * (NORM / 2 if negative else NORM) + (128 if negative else 0)
     return scaled.round().clamp(0, 255).to(torch.uint8)
@@ -199,9 +199,9 @@ def unrelated_distance(descriptors: UInt8[Tensor, "n d"]) -> float:
 
 
 def byte_of_zero(descriptors: UInt8[Tensor, "n d"]) -> int:
-    """Return the byte that represents 0 in descriptors of equal norm: 0 for SIFT, 128 for those with negative channels.
+    """Return the byte that represents 0 in descriptors of equal norm: 0 for SIFT, 128 for descriptors with negative channels.
 
-    It is the centre of the sphere on which they lie: the byte ``z`` that minimizes the variance of the squared norms of
+    It is the centre of the sphere on which the descriptors lie: the byte ``z`` that minimizes the variance of the squared norms of
     ``descriptors - z``.
     """
     parts = [part.double() for part in descriptors.split(MANY)]
@@ -281,7 +281,8 @@ def image_keypoints(view: View, features: Features) -> ImageKeypoints:
 def measured_depth(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
     """Return the median depth (metres) of the 3x3 pixels around each of ``pixels`` (u, v).
 
-    It is 0 at depth edges, where depth changes by over 5 %, and where fewer than six of the pixels have measured depth.
+    The result is 0 at depth edges, where depth changes by over 5 %, and where fewer than six of the nine pixels have
+    measured depth.
     """
     if frame.depth is None or not len(pixels):
         return torch.zeros(len(pixels), dtype=torch.float64)

@@ -62,7 +62,8 @@ class LandmarkCells:
         """Return the indices of the landmarks in all cells that may be visible in an image, in no particular order.
 
         A landmark is visible if ``|x| <= slopes[0] z`` and ``|y| <= slopes[1] z`` in the camera's frame, the camera is at
-        most ``oblique`` (radians) outside the cone of its directions, and it is not smaller than ``size`` z.
+        most ``oblique`` (radians) outside the cone of the landmark's viewing directions, and the landmark is not smaller than
+        ``size`` z.
         """
         local = T_world_camera.inverse().to(torch.float32).apply(self.centres)
         beyond = (local[:, :2].abs() - slopes * local[:, 2:]) / (1 + slopes.square()).sqrt()

@@ -46,7 +46,7 @@ class Tracks:
     def renumbered(
         self, landmarks: Int[Tensor, "n"] | None = None, images: Int[Tensor, "v"] | None = None
     ) -> Tracks:
-        """Return the tracks with other numbers, given for each number so far; keypoints whose number is -1 are dropped."""
+        """Renumber the landmarks and images, given the new number for each old one; keypoints whose new number is -1 are dropped."""
         landmark = self.landmark if landmarks is None else landmarks.int()[self.landmark.long()]
         image = self.image if images is None else images.int()[self.image.long()]
         known = (landmark >= 0) & (image >= 0)

@@ -1,4 +1,4 @@
-"""Tracks: keypoints in several images of the same point of the scene, from matching likely pairs to landmarks."""
+"""Tracks: keypoints of several images that show the same scene point; from matching likely image pairs to fusing landmarks."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def likely_pairs(poses: Sequence[SE3], neighbours: int) -> Int[Tensor, "p 2"]:
     """Return pairs (i < j) of cameras with similar ``poses`` (T_world_camera), without duplicates.
 
     The dissimilarity is the distance between the centres relative to the mean over all pairs, plus 1 - cosine between the
-    optical axes. Half of the neighbours are those with the most similar poses. The others are spread over the next ones, every
-    third, because successive images of a video have too little baseline for triangulation.
+    optical axes. Half of the neighbours are those with the most similar poses. The other half is
+    every third of the cameras that follow, because successive images of a video have too little baseline for triangulation.
     """
     others = len(poses) - 1
     if others < 1:
@@ -67,8 +67,8 @@ class Matches:
 def epipolar_matches(a: ImageKeypoints, b: ImageKeypoints) -> Matches:
     """Return the pairs of keypoints of ``a`` and ``b`` that are mutual nearest neighbours near the epipolar lines.
 
-    A match must also pass the ratio test among all keypoints of ``b``, because a keypoint that resembles many of them matches
-    one near the line by chance.
+    A match must also pass the ratio test among all keypoints of ``b``, because a keypoint that resembles many of them
+    matches one near the line by chance.
     """
     if not len(a.keypoints) or not len(b.keypoints):
         return Matches(torch.zeros((0, 2), dtype=torch.long), torch.zeros(0))
@@ -94,8 +94,8 @@ def matches_of_points(
 ) -> list[tuple[int, int, Matches]]:
     """Return matches between keypoints at the projections of the same known point, without ambiguity.
 
-    ``observed`` holds the numbers of the points (metres, world) that each image shows. A keypoint belongs to a point if each
-    is the other's nearest, and they are as near as a match to its epipolar line.
+    ``observed`` holds the numbers of the points (metres, world) that each image shows. A keypoint belongs to a point if the
+    keypoint and the point's projection are each other's nearest, and as close as a match must be to its epipolar line.
     """
     rows = list[Int[Tensor, "m 3"]]()  # point, image, keypoint
     for number, (image, points) in enumerate(zip(images, observed, strict=True)):
@@ -165,8 +165,8 @@ def joined_tracks(matches: Sequence[tuple[int, int, Matches]], sizes: Sequence[i
     holds the number of keypoints in each image. The m keypoints of all images are concatenated in image order. Labels are
     indices of keypoints, hence not consecutive; an unmatched keypoint is a track of its own.
 
-    Matches are linked in order of increasing ambiguity. One that would put two keypoints of the same image into one track is
-    dropped, because a single wrong match would otherwise merge two correct tracks.
+    Matches are linked in order of increasing ambiguity. A match that would put two keypoints of the same image into one track
+    is dropped, because a single wrong match would otherwise merge two correct tracks.
     """
     first = np.concatenate([[0], np.cumsum(sizes)])
     ends = np.concatenate(
@@ -247,7 +247,7 @@ class TrackedKeypoints:
 
     @property
     def pixels(self) -> Float[Tensor, "m 2"]:
-        """The places of the keypoints in their images."""
+        """The pixel coordinates of the keypoints in their images."""
         return torch.cat([p.keypoints.pixels for p in self.images])[self.number]
 
     @property
@@ -266,9 +266,9 @@ def fused_landmarks(
     covariance: Float[Tensor, "n 3 3"],
     noise: float,
 ) -> LandmarkMap:
-    """Return landmarks at ``positions`` (metres, world) with their covariance; each needs at least one observation.
+    """Return landmarks at ``positions`` (metres, world) with this covariance; each landmark needs at least one observation.
 
-    ``noise`` is that of a keypoint (pixels). The images' poses are taken as exact: ``pose_covariance`` is 0.
+    ``noise`` is the noise of a keypoint (pixels). The images' poses are taken as exact: ``pose_covariance`` is 0.
     """
     count, sightings = len(positions), observations.sightings
     away = sightings.centre - positions[sightings.point]
@@ -299,7 +299,7 @@ def fused_landmarks(
 def seen_landmarks(
     observations: TrackedKeypoints, positions: Float[Tensor, "n 3"], covariance: Float[Tensor, "n 3 3"]
 ) -> list[SeenLandmarks]:
-    """Return the landmarks, at ``positions`` (metres, world), seen in each image, with the deviation of their distance."""
+    """Return the landmarks, at ``positions`` (metres, world), seen in each image, with the standard deviation of their distance."""
     sightings, image = observations.sightings, observations.image
     away = positions[sightings.point] - sightings.centre
     distance = torch.linalg.vector_norm(away, dim=-1)
@@ -312,7 +312,7 @@ def seen_landmarks(
 def _mean_descriptors(
     descriptors: UInt8[Tensor, "m d"], point: Int[Tensor, "m"], count: int
 ) -> UInt8[Tensor, "n d"]:
-    """Return mean descriptors, rescaled to the mean norm, since a shorter descriptor is closer to all others."""
+    """Return the mean descriptor of each point, rescaled to the mean norm, since a shorter descriptor is closer to all others."""
     total, lengths = torch.zeros((count, descriptors.shape[1])), torch.zeros((count, 1))
     zero = byte_of_zero(descriptors)
     for rows in torch.arange(len(descriptors)).split(MANY):
@@ -334,9 +334,9 @@ ENOUGH_DEPTHS = 30
 
 
 def keypoint_depth_noise(observations: TrackedKeypoints, points: Float[Tensor, "n 3"]) -> float:
-    """Return a robust relative standard deviation of measured depth, from triangulated points.
+    """Return a robust relative standard deviation of measured depth, by comparison with triangulated points.
 
-    If there are too few, return that of an unknown sensor.
+    If there are too few points, return the value for an unknown sensor.
     """
     depth = observations.depth
     known = depth > 0
@@ -358,7 +358,7 @@ def placed(
 ) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Return the inliers, the weighted mean of each track's back-projected points (metres, world), and its covariance.
 
-    ``relative`` is the relative noise of the depth, and ``pixel_noise`` that of the keypoints (pixels). Tracks without a
+    ``relative`` is the relative noise of the depth, and ``pixel_noise`` the noise of the keypoints (pixels). Tracks without a
     majority of inliers are dropped.
     """
     observations, _ = observations[observations.depth > 0].compacted()

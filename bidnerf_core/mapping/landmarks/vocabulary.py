@@ -30,7 +30,7 @@ def k_means(
 ) -> Float[Tensor, "c d"]:
     """Return the centres of k-means clusters (Lloyd 1982) of a sample of twenty descriptors per cluster.
 
-    The centre of an emptied cluster stays where it is.
+    The centre of a cluster that becomes empty is kept.
     """
     sample = torch.randperm(len(descriptors), generator=generator)[: 20 * count]
     values = descriptors[sample.to(descriptors.device)].float()
@@ -64,7 +64,7 @@ class Vocabulary:
         return Vocabulary(k_means(some, min(32, len(some)), generator))
 
     def pooled(self, descriptors: UInt8[Tensor, "n d"], word: Tensor | None = None) -> Float[Tensor, "p"]:
-        """Return the VLAD vector of descriptors, of unit length; ``word`` is each one's nearest word, if known."""
+        """Return the VLAD vector of descriptors, of unit length; ``word`` holds each descriptor's nearest word, if known."""
         word = self.nearest(descriptors) if word is None else word
         sums = torch.zeros_like(self.words).index_add_(0, word, descriptors.float() - self.words[word])
         roots = sums.sign() * sums.abs().sqrt()  # so that repeated structures do not dominate
@@ -94,7 +94,7 @@ def pooled_views(
 def visible(landmarks: LandmarkMap, camera: Intrinsics, T_world_camera: SE3) -> Int[Tensor, "m"]:
     """Return the numbers of the landmarks visible to a camera, ignoring occlusion.
 
-    They count as visible up to 10 degrees beyond their cones of viewing directions.
+    Landmarks count as visible up to 10 degrees beyond their cones of viewing directions.
     """
     slopes = torch.tensor([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy])
     return landmarks.in_view(T_world_camera, slopes, math.radians(10))[0]

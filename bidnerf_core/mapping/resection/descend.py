@@ -1,4 +1,7 @@
-"""Levenberg-Marquardt for h hypotheses at once: damping, acceptance and the end are tensors, so an accelerator's host need not wait."""
+"""Levenberg-Marquardt for h hypotheses at once.
+
+Damping, acceptance and termination are tensors, so the host need not wait for the accelerator.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +47,7 @@ Term = Callable[[States], Normal]
 
 
 def prior(states: States) -> Normal:
-    """Return the standard normal prior of the nuisances; that of the pose is flat."""
+    """Return the prior: standard normal for the nuisances, flat for the pose."""
     z = states.z
     free = constant((0.0,) * 6 + (1.0,) * (P - 6), z).diag_embed()
     return Normal(0.5 * z.square().sum(-1), pad(z, (6, 0)), free.expand(len(z), P, P))
@@ -63,8 +66,8 @@ def descend(
 ) -> tuple[States, Normal]:
     """Minimize the sum of ``terms`` and the prior from each state; a step that does not lower the sum is not taken.
 
-    Steps are damped as updates that rotate about ``pivot`` (metres, the rig's frame), by default the rig's origin: about the middle
-    of the visible scene, rotation and translation decouple. Poses and costs before each step are added to ``path``.
+    Steps are damped as updates that rotate about ``pivot`` (metres, the rig's frame), by default the rig's origin. A pivot in
+    the middle of the visible scene decouples rotation and translation. Poses and costs before each step are added to ``path``.
     """
     here = total(states, terms)
     damping = torch.full_like(here.cost, 1e-3)
@@ -86,7 +89,7 @@ def descend(
 
 @dataclass(frozen=True, eq=False)
 class Quadratic:
-    """The quadratic models of terms about one state of each mode: by linear algebra, they give all explanations of its matches.
+    """Quadratic models of terms, one about a state of each mode; linear algebra then evaluates every explanation of a mode's matches.
 
     The unknowns are the pose's update (metres, radians) and the nuisances in their own units.
     """
@@ -98,7 +101,7 @@ class Quadratic:
 
     @staticmethod
     def of(found: Normal, here: States) -> Quadratic:
-        """Convert equations without priors at ``here`` (g), where no nuisance is fixed."""
+        """Build the models from normal equations, without priors, at the states ``here`` (g), where no nuisance is fixed."""
         unit = here.unit
         return Quadratic(
             here, found.cost, found.gradient * unit, unit[:, :, None] * found.hessian * unit[:, None]
@@ -114,13 +117,13 @@ class Quadratic:
         return Normal(cost, pull * scale, scale[:, :, None] * self.hessian[g] * scale[:, None])
 
     def with_first(self, other: Quadratic) -> Quadratic:
-        """Return the sum with the model of further terms about the state of the first mode."""
+        """Return the sum with a model of further terms, which is about the state of the first mode."""
         names = ("cost", "gradient", "hessian")
         joined = ((getattr(self, name), getattr(other, name)) for name in names)
         return Quadratic(self.here, *(torch.cat([own[:1] + more, own[1:]]) for own, more in joined))
 
     def minimum(self, states: States) -> tuple[States, Normal]:
-        """Return the minimum of the sum with each state's prior; the second step accounts for the curvature of rotations."""
+        """Minimize the sum of the model and each state's prior; the second step accounts for the curvature of rotations."""
         for _ in range(2):
             normal = total(states, [self])
             states = states.retract(-damped_solution(normal, torch.zeros_like(normal.cost)))
@@ -128,7 +131,7 @@ class Quadratic:
 
 
 def _about(pivot: Float[Tensor, "3"]) -> Float[Tensor, "P P"]:
-    """Return the matrix that takes an update whose rotation is about ``pivot`` to the same one about the rig's origin."""
+    """Return the matrix that converts an update with rotation about ``pivot`` to the same update about the rig's origin."""
     found = torch.eye(P, dtype=pivot.dtype, device=pivot.device)
     found[:3, 3:6] = skew(pivot)
     return found
@@ -154,7 +157,7 @@ def damped_solution(
 
 
 def log_det(hessian: Float[Tensor, "h p p"]) -> Float[Tensor, "h"]:
-    """Return the log determinants of positive matrices, infinite for others."""
+    """Return the log determinants of positive definite matrices; infinite for other matrices."""
     factor, info = torch.linalg.cholesky_ex(hessian)
     found = 2 * factor.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).log().sum(-1)
     return torch.where(info == 0, found, torch.inf)

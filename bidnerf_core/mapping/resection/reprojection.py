@@ -90,7 +90,7 @@ class Landmarks:
         return cost, rows.flatten(2), (off * scale[..., None]).flatten(1)
 
     def _of(self, states: States) -> Landmarks:
-        """Return the term with the matches of each state's mode; one mode's are broadcast."""
+        """Return the term with the matches of each state's mode; the matches of a single mode are broadcast."""
         if len(self.points) == 1:
             return self
         names, g = ("points", "sights", "valid", "variance", "focal", "correlation", "share"), states.mode
@@ -99,7 +99,7 @@ class Landmarks:
     def evidence(self, states: States) -> Float[Tensor, "h"]:
         """Return the log likelihood relative to that of outliers alone.
 
-        It is that by the largest noise of any state and without weights, so that it counts matches.
+        It is computed with the largest noise of any state and without weights, so that it counts matches.
         """
         states = replace(states, noise=states.noise.amax().expand_as(states.noise))
         own = self._of(states)
@@ -108,7 +108,7 @@ class Landmarks:
         return (own.valid * gain).sum(-1)
 
     def with_noise(self, states: States) -> States:
-        """Return the states with the noise that follows from their residuals."""
+        """Return the states with their noise estimated from the residuals."""
         own = self._of(states)
         off, valid = own._residuals(states)[1], own.valid > 0
         sizes = torch.where(valid[..., None], off.abs(), torch.nan).flatten(1)
@@ -118,7 +118,7 @@ class Landmarks:
         return replace(states, noise=noise)
 
     def weighted_for(self, best: States) -> Landmarks:
-        """Return the term with the number of independent matches that follows from the residuals at ``best`` (g).
+        """Return the term with the number of independent matches estimated from the residuals at ``best`` (g).
 
         The efficiency is the ratio of the information of an M-estimator to its reweighted Hessian (Huber 1981, 6.3).
         """
@@ -146,13 +146,13 @@ class Landmarks:
         return self._of(states)._residuals(states)
 
     def _odds(self, variance: Float[Tensor, "h m"]) -> Float[Tensor, "h m"]:
-        """Return the density of the residual 0, relative to that of an outlier."""
+        """Return the density of a zero residual relative to the density of an outlier."""
         return self.area / (math.pi * SCALE**2) / variance
 
     def _residuals(
         self, states: States, seen: Projections | None = None
     ) -> tuple[Float[Tensor, "h m"], Float[Tensor, "h m 2"], Float[Tensor, "h m"]]:
-        """Return what ``residuals`` does, of matches that are those of the states' modes."""
+        """Return the same as ``residuals``, for a term that already holds the matches of the states' modes."""
         seen = project(states, self.points, self.sights) if seen is None else seen
         variance = states.noise[:, None].square() + self.variance
         off = (seen.image - self.sights.image) * self.focal[..., None]
@@ -197,8 +197,8 @@ def resections(
     """Estimate the poses of ``images`` (by number) from ``points`` (metres, world), under each of k priors of the motion.
 
     ``correlation`` is the number of sightings that count as one because their errors are correlated. Yields the numbers of b
-    images; their states under the first prior, then under the next, whose poses are right updates of the images' given ones; and
-    the normal equations there. The Hessian is the inverse covariance of an estimate from twenty points or more. All states of
+    images; their states under the first prior, then under the next, with poses as right updates of the images' given poses; and
+    the normal equations at these states. The Hessian is the inverse covariance of an estimate from twenty points or more. All states of
     an image share the noise of the best, so that their evidence can be compared; the last prior should be the widest.
     """
     local, order = sightings.in_camera(points), sightings.view.argsort(stable=True)

@@ -68,11 +68,11 @@ class States:
 
     @property
     def unit(self) -> Float[Tensor, "h P"]:
-        """The factors from derivatives by whitened unknowns to derivatives by the unknowns themselves."""
+        """The factors that convert derivatives with respect to whitened unknowns to those with respect to the unknowns themselves."""
         return torch.cat([torch.ones_like(self.z[:, :6]), 1 / self.deviation.clamp(min=1e-9)], -1)
 
     def retract(self, step: Float[Tensor, "h P"]) -> States:
-        """Return the states after a step, whose poses are ``T exp(step)``, polished; in few operations, without a derivative at 0."""
+        """Return the states after a step, with poses ``T exp(step)``, polished. It takes few operations, but has no derivative at 0."""
         R, t = self.T.rotation, self.T.translation
         twist = (step[:, :6] @ constant(TWISTS, step).view(6, 16)).view(-1, 4, 4)
         squared = step[:, 3:6].square().sum(-1)[:, None, None]
@@ -86,13 +86,13 @@ class States:
         return replace(self, T=SE3(R, t + moved[..., 3]), z=self.z + step[:, 6:])
 
     def where(self, mask: Bool[Tensor, "h"], other: States) -> States:
-        """Return these poses and nuisances where ``mask`` holds, and the ``other`` ones elsewhere."""
+        """Return the poses and nuisances of these states where ``mask`` is true, and of ``other`` elsewhere."""
         R = torch.where(mask[:, None, None], self.T.rotation, other.T.rotation)
         t = torch.where(mask[:, None], self.T.translation, other.T.translation)
         return replace(self, T=SE3(R, t), z=torch.where(mask[:, None], self.z, other.z))
 
     def under(self, mean: Float[Tensor, "N"], deviation: Float[Tensor, "N"]) -> States:
-        """Return the same poses and nuisances with another prior; a nuisance that it fixes takes its mean."""
+        """Return the same poses and nuisances with another prior; a nuisance that the prior fixes takes the prior's mean."""
         free = deviation > 0
         z = torch.where(free, (self.nuisances - mean) / torch.where(free, deviation, 1), 0)
         return replace(self, z=z, mean=mean.expand_as(z), deviation=deviation.expand_as(z))
@@ -152,7 +152,7 @@ def project(states: States, points: Float[Tensor, "*h m 3"], sights: Sights) -> 
 
 
 def imaged(states: States, local: Float[Tensor, "h m 3"], times: Float[Tensor, "*h m"]) -> Projections:
-    """Project points in the frame of the camera at the middle row."""
+    """Project points that are given in the frame of the camera at the middle row."""
     nuisances, times = states.nuisances[:, None], times[..., None]
     w = nuisances[..., 9:12]
     speed = torch.linalg.cross(w, local) + nuisances[..., 6:9]
@@ -198,7 +198,7 @@ def jacobian(states: States, seen: Projections, sights: Sights) -> Float[Tensor,
 def _by_update(
     by_point: Float[Tensor, "h 3 m k"], points: Float[Tensor, "h m 3"]
 ) -> Float[Tensor, "h 6 m k"]:
-    """Return what ``by_update`` does, with the axes in this order."""
+    """Return the same as ``by_update``, with the axes in the order of the annotated result (h 6 m k)."""
     return torch.cat([-by_point, torch.linalg.cross(by_point, points.mT[..., None], dim=1)], 1)
 
 
@@ -221,7 +221,7 @@ def by_camera_point(flat: Float[Tensor, "*m 2"], depth: Float[Tensor, "*m"]) -> 
 
 
 def by_update(by_point: Float[Tensor, "*m k 3"], points: Float[Tensor, "*m 3"]) -> Float[Tensor, "*m k 6"]:
-    """Return derivatives by a right update of a pose, given those by ``points`` in its frame.
+    """Return derivatives with respect to a right update of a pose, given the derivatives with respect to ``points`` in its frame.
 
     A point moves by -rho + p x phi under T exp(rho, phi), and r (p x phi) = (r x p) phi.
     """

@@ -137,7 +137,7 @@ def _fused(
     points: Float[Tensor, "p 3"], rgb: Float[Tensor, "p 3"], bounds: SceneBounds,
     cells: tuple[float, float], keyframes: Sequence[SE3], config: BakeConfig,
 ) -> SurfaceMap:  # fmt: skip
-    """Return the surface of points whose cells are between the finest and the coarsest (metres)."""
+    """Fuse points into a surface; ``cells`` are the finest and the coarsest permitted cell size (metres)."""
     grid = chosen_grid(points, bounds, *cells, config.megabytes)
     _, (positions, colours) = merged(grid.numbers(points), points, rgb)
     surfels = fused_surfels(positions, colours)

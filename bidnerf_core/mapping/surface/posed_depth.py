@@ -102,7 +102,7 @@ def measured_image(view: View, pixels: float) -> PosedDepthImage:
 
 
 def _shrunk(intrinsics: Intrinsics, pixels: float) -> Intrinsics:
-    """Return the camera scaled down to about ``pixels`` pixels; unchanged if it has fewer."""
+    """Return the camera downscaled to about ``pixels`` pixels; unchanged if it has fewer."""
     return intrinsics.scaled(min(1.0, math.sqrt(pixels / (intrinsics.width * intrinsics.height))))
 
 
@@ -115,7 +115,7 @@ def agreed(
 ) -> Bool[Tensor, "p"]:
     """Return a mask of the points of image ``number`` that other images confirm to within ``tolerance`` (metres).
 
-    At least ``needed`` images must confirm a point, and no more than confirm it may see through it.
+    At least ``needed`` images must confirm a point, and no more images may see through it than confirm it.
     """
     agree, against = (torch.zeros(len(points), dtype=torch.int32) for _ in range(2))
     others = witnesses(number, images)
@@ -144,7 +144,7 @@ COARSER = 2**0.25
 def finest_cell(images: Sequence[PosedDepthImage], opacity: float) -> float:
     """Return the finest cell (metres) that the images' resolution and the noise of measured depth justify.
 
-    It is 0.7 times a pixel's footprint, since several images together resolve more than one, and at least two standard
+    It is 0.7 times a pixel's footprint, since several images together resolve more than a single one, and at least two standard
     deviations of depth: with finer cells, a plane would become several layers of surfels. Rendered images are too sparsely
     sampled to distinguish noise from scene structure.
     """
@@ -165,13 +165,13 @@ def spacing(images: Sequence[PosedDepthImage], opacity: float) -> float:
 def depth_noise(images: Sequence[PosedDepthImage], opacity: float) -> float:
     """Return the standard deviation (metres) of an image's depth, from differences between images of the same points.
 
-    It includes pose errors. It is 0 if no two images show the same points.
+    The value includes pose errors, and is 0 if no two images show the same points.
     """
     return _spread(images, opacity, lambda posed, points: posed.smoothly_beyond(points, opacity))
 
 
 def comparison_noise(images: Sequence[PosedDepthImage], opacity: float) -> float:
-    """Return the standard deviation (metres) of the depth differences on which ``agreed`` sets its tolerance, per image.
+    """Return the standard deviation (metres), per image, of the depth differences to which ``agreed`` applies its tolerance.
 
     Like ``depth_noise``, but depth is read from the nearest pixel instead of interpolated, as ``agreed`` does, so the result
     includes the discretization error of the subsampled images.
@@ -208,8 +208,8 @@ def chosen_grid(
 ) -> VoxelGrid:
     """Return a grid with cells of ``finest`` metres, or coarser if points (metres, world) or memory are scarce.
 
-    Points are scarce below 1.32 per occupied cell. At that number, randomly scattered ones leave 5/9 of the cells empty; with
-    fewer, the mean distance between surfels exceeds the radius of their discs, which is 1.5 cells. Cells then grow up to
+    Points are scarce below 1.32 per occupied cell. At that density, randomly scattered points leave 5/9 of the cells empty;
+    with fewer points, the mean distance between surfels exceeds the radius of their discs, which is 1.5 cells. Cells then grow up to
     ``coarsest`` at most, at which each contains a pixel. If the limit of ``megabytes`` makes them larger, an ``InputWarning``
     states by how much. Raises ``InputError`` if no cell size satisfies that limit.
     """
@@ -243,7 +243,7 @@ def surface_bytes(points: Float[Tensor, "p 3"], grid: VoxelGrid) -> float:
 def _depths(
     images: Sequence[PosedDepthImage], opacity: float
 ) -> list[tuple[PosedDepthImage, Float[Tensor, "p"]]]:
-    """Return the images that show a surface, with the depths of their pixels on it (metres)."""
+    """Return the images that show a surface, with the depths (metres) of the pixels that show it."""
     found = [(posed, posed.image.depth[posed.solid(opacity)]) for posed in images]
     return [(posed, depths) for posed, depths in found if len(depths)]
 

@@ -79,7 +79,7 @@ class SurfaceMap(Resident):
 
     @property
     def device(self) -> torch.device:
-        """Device of the surfels, their index and the keyframes, on which rays and query points must be too."""
+        """Device of the surfels, their index and the keyframes, where rays and query points must be as well."""
         return self.surfels.positions.device
 
     def scaled(self, factor: float) -> SurfaceMap:
@@ -159,7 +159,7 @@ class SurfaceMap(Resident):
 
 @dataclass(frozen=True, eq=False)
 class Cast:
-    """The point at which each ray hit the surface or, if it missed, came closest to it in angle."""
+    """The point at which each ray hit the surface or, if the ray missed, came closest to the surface in angle."""
 
     met: Bool[Tensor, "r"]
     along: Float[Tensor, "r"]  # metres along the ray to that point
@@ -177,7 +177,7 @@ def cast(
     of a surfel. A step is as long as the clearance, but at least a cell.
 
     For a ray that misses the grid, the closest point is that nearest to the grid's centre. Rays must be on the surface's
-    device. Where the host must not wait for the device, finished rays are traced to the end, without effect.
+    device. Where the host must not wait for the device, finished rays keep being traced, without effect.
     """
     radius = surface.surfel_radius if radius is None else radius
     rays, cell = surface.grid.rays(origins, directions), surface.grid.cell

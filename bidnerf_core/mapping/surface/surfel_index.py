@@ -34,7 +34,7 @@ cells along each side to share an entry. All surfels are then at least twice tha
 
 @dataclass(frozen=True, eq=False)
 class SurfelIndex:
-    """Nearest-neighbour index of surfels, accurate to about a cell near the surface and to the distance far from it."""
+    """Nearest-neighbour index of surfels, with an error of about a cell near the surface, and up to 87 % of the distance far from it."""
 
     grid: VoxelGrid
     first: Int[Tensor, "x y z"]  # int32: each block's first entry
@@ -84,8 +84,8 @@ class SurfelIndex:
     ) -> tuple[Float[Tensor, "3 1"], Float[Tensor, "3 3"], Int[Tensor, "c"], Int[Tensor, "3 1"]]:
         """Tables that convert points to cell numbers.
 
-        ``offset + rate point`` is a position in each axis' part (starting at ``base``) of a table of terms whose sum is the
-        number. Each part has an extra cell at either end, which repeats the border.
+        ``offset + rate point`` is a position in each axis's part (starting at ``base``) of a table of terms; a cell's number is
+        the sum of its three terms. Each part has an extra cell at either end, which repeats the border.
         """
         longest = max(self.grid.shape) + 2
         _, y, z = block_shape(self.grid)
@@ -144,7 +144,7 @@ def _morton(place: Int[Tensor, "*c 3"]) -> Int[Tensor, "*c"]:
 
 
 def _nearest_to_middles(tree: cKDTree, grid: VoxelGrid, level: UInt8[Tensor, "x y z"]) -> Int[Tensor, "e"]:
-    """Return the surfel nearest to the middle of the cells that share each entry."""
+    """Return, for each entry, the surfel nearest to the middle of the cells that share the entry."""
     corners = torch.cartesian_prod(*3 * [torch.arange(BLOCK_SIDE)])
     corners = corners[_morton(corners).argsort()]
     levels, found = level.view(-1).long(), []
