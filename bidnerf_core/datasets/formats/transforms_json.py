@@ -75,16 +75,18 @@ def read_splits(path: Path) -> list[tuple[FrameRecord, tuple[str, ...]]]:
     if not any(lists.values()):
         return [(frame, ()) for frame in frames]
     by_path = {frame.file_path: frame for frame in frames}
-    splits, unknown = dict[FrameRecord, tuple[str, ...]](), list[str]()  # in the order of the lists
+    splits, unknown = (
+        dict[FrameRecord, tuple[str, ...]](),
+        list[tuple[str, str]](),
+    )  # in the order of the lists
     for split, name in [(split, str(name)) for split, listed in lists.items() for name in listed or []]:
         if (frame := by_path.get(posix_name(name))) is not None:
             splits[frame] = *splits.get(frame, ()), split
         else:
-            unknown.append(name)
+            unknown.append((split, name))
     if unknown:
-        found = (
-            f"the lists of filenames have {len(unknown)} that no frame has, the first of them {unknown[0]!r}"
-        )
+        (split, first), count = unknown[0], len(unknown)
+        found = f"{split}_filenames and the other lists have {count} that no frame has, the first of them {first!r}"
         if not splits:
             raise record.error(found, expected=f"the file_path of one of its {len(by_path)} frames")
         remark(record.where, found)
