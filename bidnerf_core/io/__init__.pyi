@@ -54,6 +54,8 @@ from .rows import Row as Row
 from .rows import parse_rows as parse_rows
 from .rows import read_lines as read_lines
 from .rows import read_rows as read_rows
+from .tensors import TensorKind as TensorKind
+from .tensors import check_tensors as check_tensors
 from .tensors import load_part as load_part
 from .tensors import packed as packed
 from .tensors import read_archive as read_archive

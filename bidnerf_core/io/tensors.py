@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 import os
 import pickle
 import re
-import struct
+import sys
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
@@ -23,7 +25,6 @@ from torch.utils._pytree import tree_leaves
 from bidnerf_core.errors import InputError
 from bidnerf_core.io.archives import Archive
 from bidnerf_core.io.files import open_binary
-from bidnerf_core.io.json import parse_json
 
 _Part = TypeVar("_Part")
 
@@ -89,35 +90,55 @@ def read_tensors_and_metadata(
     """
     with open_binary(path, expected) as file:
         try:
-            metadata = _checked_header(path, file, expected).get("__metadata__") or {}
-            return tensors_from_bytes(file.read()), metadata
-        except InputError:
-            raise
+            length = int.from_bytes(file.read(8), "little")  # of the header
+            if not 0 < length <= os.fstat(file.fileno()).st_size - 8:
+                raise ValueError("its header is truncated")
+            file.seek(0)
+            content = file.read()
+            tensors = tensors_from_bytes(content)  # checks the header against the length of the content
+            if max((tensor.dim() for tensor in tensors.values()), default=0) > 64:
+                raise ValueError("a tensor has more than 64 axes, on which torch cannot compute")
+            return tensors, json.loads(content[8 : 8 + length]).get("__metadata__") or {}
         except (SafetensorError, KeyError, ValueError, RuntimeError, OverflowError, OSError) as error:
             raise InputError(f"not readable ({error})", where=path, expected=expected) from error
 
 
-def _checked_header(path: Path, file: BinaryIO, expected: str) -> dict[str, Any]:
-    """Return the header of a safetensors file, checked against the file's length before memory is allocated."""
-    size = os.fstat(file.fileno()).st_size
-    length = struct.unpack("<Q", file.read(8).ljust(8, b"\xff"))[0]
-    if not length <= min(size - 8, 16 * 2**20):  # a header takes about a hundred bytes per tensor
-        raise InputError("not readable (its header is truncated)", where=path, expected=expected)
-    try:
-        header: dict[str, Any] = parse_json(file.read(length), str(path), expected)
-        parts = [part for name, part in header.items() if name != "__metadata__"]
-        ends = [part["data_offsets"][1] for part in parts]
-        if max((len(part["shape"]) for part in parts), default=0) > 64:  # axes, as in NumPy
-            raise ValueError
-        described = 8 + length + max(ends, default=0)
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
-        raise InputError("not readable (its header is damaged)", where=path, expected=expected) from error
-    if described != size:
-        raise InputError(
-            f"has {size} bytes, but its header describes {described};", where=path, expected=expected
-        )
-    file.seek(0)
-    return header
+@dataclass(frozen=True)
+class TensorKind:
+    """The shape, type and range of a tensor in a file; other values would make later computations fail or overflow."""
+
+    shape: str  # such as "n 3"; a letter is the same number in all tensors of a file, and a capital letter is not 0
+    dtype: torch.dtype = torch.float32
+    least: float = -math.inf
+    most: float = math.inf
+    is_unit: bool = False  # whether the vectors along the last axis have length 1
+    index_of: str = ""  # the letter whose number limits the values, which are indices
+
+
+def check_tensors(tensors: Mapping[str, Tensor], kinds: Mapping[str, TensorKind]) -> None:
+    """Check tensors against their kinds, in order.
+
+    Raises ``KeyError`` for a missing tensor, and ``ValueError`` for one of another shape, type or range, NaN or infinity.
+    """
+    sizes: dict[str, int] = {}
+    for name, kind in kinds.items():
+        value, axes = tensors[name], kind.shape.split()
+        for axis, size in zip(axes, value.shape, strict=False):
+            sizes.setdefault(axis, int(axis) if axis.isdecimal() else max(size, int(axis.isupper())))
+        expected = [sizes.get(axis, axis) for axis in axes]
+        if value.dtype != kind.dtype or list(value.shape) != expected:
+            raise ValueError(f"{name} is {value.dtype} {list(value.shape)}, expected {kind.dtype} {expected}")
+        if value.is_floating_point() and not bool(value.isfinite().all()):
+            raise ValueError(f"{name} holds NaN or infinity")
+        least, most = (0, sizes[kind.index_of] - 1) if kind.index_of else (kind.least, kind.most)
+        if value.numel() and not least <= float(value.min()) <= float(value.max()) <= most:
+            found = " to ".join(
+                f"{end:g}" for end in torch.stack([value.min(), value.max()]).unique().tolist()
+            )
+            limits = "a positive number" if least == sys.float_info.min else f"{least:g} to {most:g}"
+            raise ValueError(f"{name} is {found}, expected {limits}")
+        if kind.is_unit and bool(((torch.linalg.vector_norm(value, dim=-1) - 1).abs() > 1e-3).any()):
+            raise ValueError(f"{name} are not of unit length")
 
 
 def load_part(

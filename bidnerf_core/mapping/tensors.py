@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Mapping
 from dataclasses import astuple
 from typing import Any
 
@@ -12,48 +13,46 @@ from torch import Tensor
 
 from bidnerf_core.fields import LARGEST_LENGTH, VoxelGrid
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import COLOUR_ROUNDING
-from bidnerf_core.mapping.landmarks.landmark_map import PER_LANDMARK, HeldOutTrial, LandmarkMap, Tracks
+from bidnerf_core.io import COLOUR_ROUNDING, TensorKind, check_tensors, packed
+from bidnerf_core.mapping.landmarks.landmark_map import HeldOutTrial, LandmarkMap, Tracks
 from bidnerf_core.mapping.surface.surface_map import SurfaceMap, Surfels
 from bidnerf_core.mapping.surface.surfel_index import CELLS_OF_BLOCK, COARSER_FROM, SurfelIndex, block_shape
 
-Kinds = dict[str, tuple[tuple[int, ...], torch.dtype, float, float]]
-"""Shape (-1: any length), dtype, and least and largest value of named tensors; larger ones would make later computations overflow."""
-TINY, ANY = sys.float_info.min, math.inf
+TINY = sys.float_info.min  # the least number above 0
 SURFELS = ("positions", "normals", "rgb", "rgb_gradient")
-SURFACE_KINDS: Kinds = {
-    "positions": ((-1, 3), torch.float32, -LARGEST_LENGTH, LARGEST_LENGTH),
-    "normals": ((-1, 3), torch.float32, -ANY, ANY),
-    "rgb": ((-1, 3), torch.float32, -COLOUR_ROUNDING, 1 + COLOUR_ROUNDING),
-    "rgb_gradient": ((-1, 3, 3), torch.float32, -ANY, ANY),
-    "keyframes": ((-1, 4, 4), torch.float64, -ANY, ANY),
-    "lower": ((3,), torch.float64, -ANY, ANY),
-    "cell": ((), torch.float64, TINY, ANY),
-    "shape": ((3,), torch.int64, -ANY, ANY),
-    "first": ((-1, -1, -1), torch.int32, -ANY, ANY),
-    "level": ((-1, -1, -1), torch.uint8, -ANY, ANY),
-    "entries": ((-1,), torch.int32, -ANY, ANY),
+SURFACE_KINDS = {
+    "positions": TensorKind("N 3", least=-LARGEST_LENGTH, most=LARGEST_LENGTH),
+    "normals": TensorKind("N 3", is_unit=True),
+    "rgb": TensorKind("N 3", least=-COLOUR_ROUNDING, most=1 + COLOUR_ROUNDING),
+    "rgb_gradient": TensorKind("N 3 3"),
+    "keyframes": TensorKind("K 4 4", torch.float64),
+    "lower": TensorKind("3", torch.float64),
+    "cell": TensorKind("", torch.float64, least=TINY),
+    "shape": TensorKind("3", torch.int64, least=1, most=2**31),
+    "first": TensorKind("X Y Z", torch.int32, least=0),
+    "level": TensorKind("X Y Z", torch.uint8, most=len(COARSER_FROM)),
+    "entries": TensorKind("e", torch.int32, index_of="N"),
 }
-LANDMARK_KINDS: Kinds = {
-    "positions": ((-1, 3), torch.float32, -LARGEST_LENGTH, LARGEST_LENGTH),
-    "deviations": ((-1, 2), torch.float32, 0, LARGEST_LENGTH),
-    "descriptors": ((-1, -1), torch.uint8, -ANY, ANY),
-    "directions": ((-1, 3), torch.float32, -ANY, ANY),
-    "cones": ((-1,), torch.float32, 0, math.pi + 1e-6),
-    "sizes": ((-1,), torch.float32, 0, LARGEST_LENGTH),
-    "views": ((-1,), torch.int32, 1, 2**31),
-    "noise": ((), torch.float64, TINY, ANY),
-    "pose_covariance": ((6, 6), torch.float64, -ANY, ANY),
-    "correlation": ((), torch.float64, TINY, ANY),
-    "usual_matches": ((), torch.float64, 0, ANY),
-    "calibration_scatter": ((4,), torch.float64, TINY, ANY),
-    "trial": ((4,), torch.float64, -ANY, ANY),  # the fields of ``HeldOutTrial`` in order
-    "moving": ((), torch.float64, 0, 1),
+LANDMARK_KINDS = {
+    "positions": TensorKind("n 3", least=-LARGEST_LENGTH, most=LARGEST_LENGTH),
+    "deviations": TensorKind("n 2", least=0, most=LARGEST_LENGTH),
+    "descriptors": TensorKind("n D", torch.uint8),
+    "directions": TensorKind("n 3", is_unit=True),
+    "cones": TensorKind("n", least=0, most=math.pi + 1e-6),
+    "sizes": TensorKind("n", least=0, most=LARGEST_LENGTH),
+    "views": TensorKind("n", torch.int32, least=1),
+    "noise": TensorKind("", torch.float64, least=TINY),
+    "pose_covariance": TensorKind("6 6", torch.float64),
+    "correlation": TensorKind("", torch.float64, least=TINY),
+    "usual_matches": TensorKind("", torch.float64, least=0),
+    "calibration_scatter": TensorKind("4", torch.float64, least=TINY),
+    "trial": TensorKind("4", torch.float64),  # the fields of ``HeldOutTrial`` in order
+    "moving": TensorKind("", torch.float64, least=0, most=1),
 }
-TRACK_KINDS: Kinds = {
-    "track_landmark": ((-1,), torch.int32, 0, ANY),
-    "track_image": ((-1,), torch.int32, 0, ANY),
-    "track_pixel": ((-1, 2), torch.float32, -ANY, ANY),
+TRACK_KINDS = {
+    "track_landmark": TensorKind("m", torch.int32, index_of="n"),
+    "track_image": TensorKind("m", torch.int32, least=0),
+    "track_pixel": TensorKind("m 2"),
 }
 """Optional: earlier versions stored no tracks."""
 
@@ -67,9 +66,8 @@ def surface_tensors(surface: SurfaceMap) -> dict[str, Tensor]:
     return _copies(found, SURFACE_KINDS)
 
 
-def _copies(found: dict[str, Any], kinds: Kinds) -> dict[str, Tensor]:
-    converted = {name: torch.as_tensor(found[name], dtype=kind) for name, (_, kind, _, _) in kinds.items()}
-    return {name: value.contiguous().clone() for name, value in converted.items()}
+def _copies(found: dict[str, Any], kinds: Mapping[str, TensorKind]) -> dict[str, Tensor]:
+    return packed({name: torch.as_tensor(found[name], dtype=kind.dtype) for name, kind in kinds.items()})
 
 
 def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
@@ -77,29 +75,21 @@ def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
 
     Raises ``KeyError`` for a missing tensor, ``ValueError`` for one with the wrong shape, dtype or content.
     """
-    _check_kinds(tensors, SURFACE_KINDS)
-    count = len(tensors["positions"])
-    if any(len(tensors[name]) != count for name in SURFELS) or not count:
-        raise ValueError("expected as many normals and colours of surfels as positions, and at least one")
-    _check_range(tensors, "entries", 0, count - 1)
+    check_tensors(tensors, SURFACE_KINDS)
     cell = float(tensors["cell"])
-    _check_range(tensors, "rgb_gradient", -1000 / cell, 1000 / cell)  # in full scales per cell of the grid
-    _check_unit_length(tensors, "normals")
-    if not len(tensors["keyframes"]) or not bool(SE3.from_matrix(tensors["keyframes"]).is_rigid().all()):
-        raise ValueError("keyframes are missing, or one is not a rigid transform")
+    steepest = 1000 / cell  # in full scales per cell of the grid
+    if float(tensors["rgb_gradient"].abs().max()) > steepest:
+        raise ValueError(f"rgb_gradient exceeds {steepest:g}")
+    if not bool(SE3.from_matrix(tensors["keyframes"]).is_rigid().all()):
+        raise ValueError("a keyframe is not a rigid transform")
     # No look-up may read outside the index.
-    shape: list[int] = tensors["shape"].tolist()
-    if min(shape) < 1 or max(shape) > 2**31:
-        raise ValueError(f"shape is {shape}, expected positive numbers of cells")
-    (x, y, z), (nx, ny, nz) = tensors["lower"].tolist(), shape
+    (x, y, z), (nx, ny, nz) = tensors["lower"].tolist(), tensors["shape"].tolist()
     grid = VoxelGrid((x, y, z), cell, (nx, ny, nz))
     level, first = tensors["level"], tensors["first"]
-    if not block_shape(grid) == tuple(level.shape) == tuple(first.shape):
-        raise ValueError(f"level and first do not have the shape of the blocks of a grid of {shape} cells")
-    if int(level.max()) > len(COARSER_FROM):
-        raise ValueError(f"level has a maximum of {int(level.max())}, expected at most {len(COARSER_FROM)}")
+    if block_shape(grid) != tuple(first.shape):
+        raise ValueError(f"first does not have the shape of the blocks of a grid of {grid.shape} cells")
     ends = first.long() + (CELLS_OF_BLOCK >> 3 * level.long())
-    if int(first.min()) < 0 or int(ends.max()) > len(tensors["entries"]):
+    if int(ends.max()) > len(tensors["entries"]):
         raise ValueError("first refers to entries that do not exist")
     index = SurfelIndex(grid, first, level, tensors["entries"])
     return SurfaceMap(Surfels(*(tensors[name] for name in SURFELS)), index, tensors["keyframes"])
@@ -120,14 +110,8 @@ def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
 
     Raises ``KeyError`` for a missing tensor, ``ValueError`` for one with the wrong shape, dtype or content.
     """
-    _check_kinds(tensors, LANDMARK_KINDS)
-    count = len(tensors["positions"])
-    for name in PER_LANDMARK:
-        if len(tensors[name]) != count:
-            raise ValueError(f"{name} has {len(tensors[name])} landmarks, positions has {count}")
-    if not tensors["descriptors"].shape[1]:
-        raise ValueError("descriptors have no channels")
-    _check_unit_length(tensors, "directions")
+    tracks = TRACK_KINDS if TRACK_KINDS.keys() <= tensors.keys() else {}
+    check_tensors(tensors, LANDMARK_KINDS | tracks)
     covariance = tensors["pose_covariance"]
     if float((covariance - covariance.mT).abs().max()) > 0 or float(torch.linalg.eigvalsh(covariance)[0]) < 0:
         raise ValueError("pose_covariance is not symmetric and positive semidefinite")
@@ -135,39 +119,6 @@ def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
     parts |= {name: float(tensors[name]) for name in ("noise", "correlation", "usual_matches", "moving")}
     images, found, translation, rotation_deg = tensors["trial"].tolist()
     parts["trial"] = HeldOutTrial(int(images), int(found), translation, rotation_deg)
-    if TRACK_KINDS.keys() <= tensors.keys():
-        _check_kinds(tensors, TRACK_KINDS)
-        _check_range(tensors, "track_landmark", 0, count - 1)
-        tracks = Tracks(*(tensors[name] for name in TRACK_KINDS))
-        if not len(tracks.landmark) == len(tracks.image) == len(tracks.pixel):
-            raise ValueError("the tensors of tracks have different lengths")
-        parts["tracks"] = tracks
+    if tracks:
+        parts["tracks"] = Tracks(*(tensors[name] for name in tracks))
     return LandmarkMap(**parts)
-
-
-def _check_kinds(tensors: dict[str, Tensor], kinds: Kinds) -> None:
-    """Raise ``KeyError`` for a missing tensor, ``ValueError`` for a wrong shape, dtype or range, NaN or infinity."""
-    for name, (shape, kind, least, most) in kinds.items():
-        value = tensors[name]
-        fits = len(shape) == value.dim() and all(
-            a in (-1, b) for a, b in zip(shape, value.shape, strict=True)
-        )
-        if not fits or value.dtype != kind:
-            raise ValueError(f"{name} is {value.dtype} {list(value.shape)}, expected {kind} {list(shape)}")
-        if value.is_floating_point() and not bool(value.isfinite().all()):
-            raise ValueError(f"{name} holds NaN or infinity")
-        _check_range(tensors, name, least, most)
-
-
-def _check_range(tensors: dict[str, Tensor], name: str, least: float, most: float) -> None:
-    value = tensors[name]
-    if value.numel() and not (float(value.min()) >= least and float(value.max()) <= most):
-        found = " to ".join(f"{float(end):g}" for end in torch.stack([value.min(), value.max()]).unique())
-        expected = "a positive number" if least == TINY else f"{least:g} to {most:g}"
-        raise ValueError(f"{name} is {found}, expected {expected}")
-
-
-def _check_unit_length(tensors: dict[str, Tensor], name: str) -> None:
-    length = torch.linalg.vector_norm(tensors[name], dim=-1)
-    if length.numel() and float((length - 1).abs().max()) > 1e-3:
-        raise ValueError(f"{name} are not of unit length")
