@@ -136,6 +136,7 @@ def diagnostics_of(found: Localization) -> dict[str, Any]:
     if found.diagnostics is None:
         return {}
     numbers = asdict(found.diagnostics)
+    numbers |= numbers.pop("measures", {})
     known = {
         name: value for name, value in numbers.items() if not isinstance(value, float) or isfinite(value)
     }

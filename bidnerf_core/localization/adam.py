@@ -11,7 +11,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.devices import captured, constant, moved, without_waiting
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.pivots import Pivot
+from bidnerf_core.localization.problem import Pivot
 from bidnerf_core.localization.settings import AdamSettings
 from bidnerf_core.progress import check_cancelled
 

@@ -22,8 +22,7 @@ from bidnerf_core.localization.explanations import CAMERAS, MOVING
 from bidnerf_core.localization.loop import Answer, Loop
 from bidnerf_core.localization.methods import BidConfig, Method, SharedSettings, bid
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.recording import current_record
-from bidnerf_core.localization.result import Localization, Outcome, Verdict
+from bidnerf_core.localization.result import Localization, Outcome, Verdict, current_record
 from bidnerf_core.localization.settings import AutoConfig
 from bidnerf_core.mapping import true_intrinsics
 

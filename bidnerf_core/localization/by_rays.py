@@ -11,8 +11,8 @@ from torch import Tensor
 
 from bidnerf_core.devices import moved
 from bidnerf_core.geometry import SE3, Robust
-from bidnerf_core.localization.pivots import rendered_middle
-from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.accept import Support, support
+from bidnerf_core.localization.problem import Problem, rendered_middle
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.search import Proposals, Stage, states_at
 from bidnerf_core.localization.settings import (
@@ -22,7 +22,6 @@ from bidnerf_core.localization.settings import (
     mean_side,
     rendered_depth_scale,
 )
-from bidnerf_core.localization.support import Support, support
 from bidnerf_core.localization.terms.rays import ALONE, Rays
 from bidnerf_core.mapping import States, damped_solution
 
@@ -104,19 +103,18 @@ def localization_by_rays(
     # A step of the visible scene, relative to its distance, and its turn.
     step = -damped_solution(normal, torch.zeros_like(normal.cost))[0, :6]
     shift = SE3.exp(step).apply(middle) - middle
-    compared = Support(displaced=0.0, other=0.0, plain=0.0)
+    measures: dict[str, float | None] = {"plain": 0.0, "confidence": 0.25}
     if bool(T.matrix().isfinite().all()):
         costs = fresh.plain_costs()
-        compared = support(lambda T: fresh.costs(states_at(T)), T, middle, costs, found.rivals.T)
+        measures = support(lambda T: fresh.costs(states_at(T)), T, middle, costs, found.rivals.T)
     agreement, by_colour = float(here.agreement()[0]), fresh.depth_loss is None and problem.colour_noise
-    compared = replace(
-        compared,
-        determined=float(determined),
-        new_inliers=agreement,
-        further_step=float(torch.cat([shift / middle.norm(), step[3:]]).norm()),
-        colour_ratio=float(here.colour_noise()[0]) / by_colour if by_colour else None,
-        limits={"new_inliers": least_inliers},
-    )
+    measures |= {
+        "determined": float(determined),
+        "new_inliers": agreement,
+        "further_step": float(torch.cat([shift / middle.norm(), step[3:]]).norm()),
+        "colour_ratio": float(here.colour_noise()[0]) / by_colour if by_colour else None,
+    }
+    compared = Support(measures, {"new_inliers": least_inliers})
     verdict = compared.verdict(f"{agreement:.0%} of newly drawn rays agree with the measurements")
     path = found.path if problem.start is None else SE3.cat([problem.start[None], found.path[1:]])
     path = SE3.cat([path[:-1], T[None]])

@@ -20,6 +20,7 @@ from torch.nn.functional import normalize
 from bidnerf_core.devices import moved
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
+from bidnerf_core.localization.accept import Support, support
 from bidnerf_core.localization.by_rays import (
     COLOUR_SIGMA,
     SHAPE_SIGMA,
@@ -27,12 +28,10 @@ from bidnerf_core.localization.by_rays import (
     colour_stages,
     localization_by_rays,
 )
-from bidnerf_core.localization.pivots import Pivot
-from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.problem import Pivot, Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search import Proposals, Stage, halve, image_stages, states_at
 from bidnerf_core.localization.settings import LEAST_POINTS, AutoConfig, ColourSettings, DepthLossSettings
-from bidnerf_core.localization.support import Support, support
 from bidnerf_core.localization.terms.images import ColourScales, Thumbnail, surface_renderer
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.mapping import States, SurfaceMap, cast, descend, trace
@@ -75,7 +74,7 @@ def localize_by_depth(
         found = again if number == 0 or again.scores[0] < found.scores[0] else found
         best, exposed = _exposed(points, found.states[:1], middle)
         evidence = _evidence(exposed, best, found.margin)
-        if evidence.verdict("").accepted:
+        if Support(evidence).verdict("").accepted:
             break
     score = _score(exposed)
     finest = replace(exposed, noise=surface.cell, colour_weight=1.0)
@@ -93,20 +92,18 @@ def localize_by_depth(
             path = SE3.cat([path, *(T for T, _ in steps[1:]), there.T])
             losses = torch.cat([losses, *(cost for _, cost in steps)])
             best, inliers = there, float(term.agreement(there)[0])
-        evidence = replace(_evidence(exposed, best, found.margin), rendered_inliers=inliers)
+        evidence = _evidence(exposed, best, found.margin) | {"rendered_inliers": inliers}
     T = best.T[0].normalized()
-    rivals = support(lambda T: finest.costs(states_at(T)), T, middle)
+    evidence |= support(lambda T: finest.costs(states_at(T)), T, middle)
     covariance, precision = _covariance(problem, refined, best, middle)
     # A map with landmarks would confirm a pose by a camera as stated; where it does not, the alignment must be as tight as by such a camera.
-    evidence = replace(
-        evidence, displaced=rivals.displaced, precision=None if problem.matcher is None else precision
-    )
-    verdict = evidence.verdict(
-        f"{evidence.colour_inliers:.0%} of the measured points match the surface in position and colour"
+    found_by = Support(evidence | {"precision": None if problem.matcher is None else precision})
+    verdict = found_by.verdict(
+        f"{evidence['colour_inliers']:.0%} of the measured points match the surface in position and colour"
     )
     first = path[:1] if problem.start is None else problem.start[None]
     path = SE3.cat([first, path[1:-1], T[None]])
-    return Localization.of(verdict, path, losses, "auto", began, float(score(best)), covariance, evidence)
+    return Localization.of(verdict, path, losses, "auto", began, float(score(best)), covariance, found_by)
 
 
 def localize_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:
@@ -259,8 +256,8 @@ def _exposed(points: Surface, best: States, middle: Float[Tensor, "3"]) -> tuple
     return descend(best, [finest], 4, middle)[0], found
 
 
-def _evidence(points: Surface, best: States, margin: float) -> Support:
-    """Measure how well the points, seen from one pose, fit the surface; each point counts with its inlier weight.
+def _evidence(points: Surface, best: States, margin: float) -> dict[str, float | None]:
+    """Measure how well the points, seen from one pose, fit the surface, as in ``Support``; each point counts with its inlier weight.
 
     Points without a colour are left out of the colour inliers, unless no point has a colour.
     """
@@ -275,10 +272,8 @@ def _evidence(points: Surface, best: States, margin: float) -> Support:
     # Well before the point, as grazing rays hit coarse cells early.
     slack = max(2 * ON_SURFACE * surface.extent, 4 * surface.cell)
     violations = float((met < length - slack).double().mean())
-    return Support(
-        on_surface=float(near.mean()), colour_inliers=float(both.mean()), free_space_violations=violations,
-        runner_up_margin=margin,
-    )  # fmt: skip
+    fractions = {"on_surface": float(near.mean()), "colour_inliers": float(both.mean())}
+    return {**fractions, "free_space_violations": violations, "runner_up_margin": margin}
 
 
 def _covariance(

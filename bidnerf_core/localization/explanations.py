@@ -15,7 +15,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics, cameras_at_size
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.query import Query
+from bidnerf_core.localization.matching import Query
 from bidnerf_core.mapping import LandmarkMap, N, States
 
 # fmt: off

@@ -27,15 +27,12 @@ from bidnerf_core.localization.matching import (
     Matches,
     Nearest,
     Projected,
+    Query,
     log10_nfa,
 )
-from bidnerf_core.localization.posterior import Posterior
-from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.propose import CONVINCING, LEAST_AGREEING, best_consensus, consensus, inliers
-from bidnerf_core.localization.query import Query
-from bidnerf_core.localization.recording import current_record
-from bidnerf_core.localization.refinement import (
+from bidnerf_core.localization.posterior import (
     Minima,
+    Posterior,
     agreement,
     fit,
     fit_noise,
@@ -46,7 +43,9 @@ from bidnerf_core.localization.refinement import (
     settle,
     weigh,
 )
-from bidnerf_core.localization.result import Outcome, Verdict
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.propose import CONVINCING, LEAST_AGREEING, best_consensus, consensus, inliers
+from bidnerf_core.localization.result import Outcome, Verdict, current_record
 from bidnerf_core.localization.terms.rays import Rays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.mapping import (

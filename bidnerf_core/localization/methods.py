@@ -27,6 +27,7 @@ from torch import Generator
 from bidnerf_core.depth import UNKNOWN_SENSOR
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
+from bidnerf_core.localization.accept import Support, support
 from bidnerf_core.localization.adam import follow_gradient, recent_loss
 from bidnerf_core.localization.by_rays import (
     COLOUR_SIGMA,
@@ -36,8 +37,7 @@ from bidnerf_core.localization.by_rays import (
     colour_stages,
     localization_by_rays,
 )
-from bidnerf_core.localization.pivots import middle_of_view, pivot
-from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.problem import Problem, middle_of_view, pivot
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search import Stage, halve, image_stages, neighbours, states_at
 from bidnerf_core.localization.settings import (
@@ -52,7 +52,6 @@ from bidnerf_core.localization.settings import (
     objective_of,
     rendered_depth_scale,
 )
-from bidnerf_core.localization.support import support
 from bidnerf_core.localization.terms.images import ColourScales, field_renderer
 from bidnerf_core.localization.terms.sampled import SampledLoss
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
@@ -211,10 +210,10 @@ def descended(
     )
     rays = RayTerms(config.colour, by_depth, False).term(problem, RAYS, seed, config.descent.level)
     middle = middle_of_view(problem, T if bool(T.matrix().isfinite().all()) else None)
-    found = support(lambda T: rays.costs(states_at(T)), T, middle, rays.plain_costs())
+    measures = support(lambda T: rays.costs(states_at(T)), T, middle, rays.plain_costs())
     most = config.adam.converged_loss
     limits = {"mean_loss": most, "explained": 1 - config.adam.plain_share}
-    found = replace(found, mean_loss=mean, limits=limits)
+    found = Support(measures | {"mean_loss": mean}, limits)
     verdict = found.verdict(f"mean loss {mean:.3g}, must be below {most:.3g}")
     verdict = replace(verdict, reason=f"{ending}; {verdict.reason}")
     if not finite or not math.isfinite(mean):

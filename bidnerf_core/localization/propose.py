@@ -13,8 +13,7 @@ from torch import Tensor
 
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.explanations import Seed, cameras_of_map
-from bidnerf_core.localization.matching import Matches, log10_nfa
-from bidnerf_core.localization.query import Query
+from bidnerf_core.localization.matching import Matches, Query, log10_nfa
 from bidnerf_core.mapping import LandmarkMap, States, project, rays_through
 
 CONVINCING = -20.0

@@ -1,4 +1,8 @@
-"""The result of a localization, common to all methods."""
+"""The result of a localization, common to all methods.
+
+Beside it are the meaning of each outcome and what to try first, and the record of a search for visualization, which is kept only if one
+is requested.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +10,20 @@ import html
 import json
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import (
@@ -28,6 +35,9 @@ from bidnerf_core.geometry import (
     symbol,
 )
 from bidnerf_core.io import from_plain, read_record, to_plain, write_file
+
+if TYPE_CHECKING:
+    from bidnerf_core.localization.loop import Answer
 
 
 class Outcome(StrEnum):
@@ -221,3 +231,115 @@ def _finite(value: Any) -> Any:
     """Return the number or rows of numbers, or None if any number is not finite, which JSON cannot represent."""
     rows = value if isinstance(value, list) else [[value]]
     return value if all(x is not None and math.isfinite(x) for row in rows for x in row) else None
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedStep:
+    """Poses considered in one step of a search."""
+
+    caption: str
+    T: SE3  # T_world_camera (h), best first, on the CPU
+    scores: Float[Tensor, "h"]  # lower is better; only those of one step can be compared
+    kept: int  # number of poses passed on to the next step
+    compared: bool = True  # whether they are scored rivals, instead of a step towards one pose
+
+
+@dataclass(eq=False)
+class SearchRecord:
+    """The steps of a search and the landmark-based answers, in order."""
+
+    steps: list[RecordedStep] = field(default_factory=list)
+    answers: list[Answer] = field(default_factory=list)
+
+    def add(self, caption: str, T: SE3, scores: Float[Tensor, "h"] | None = None, kept: int = 1) -> None:
+        """Record poses T (h) or a single pose; without scores, the poses must be sorted, best first."""
+        T = T if T.translation.ndim == 2 else T[None]
+        compared = scores is not None
+        if scores is None:
+            scores = torch.arange(len(T.translation), dtype=torch.float64)
+        best = scores.argsort()[:400]  # only the best poses of a step are kept
+        T, scores = moved((T[best], scores[best]), "cpu")
+        self.steps.append(RecordedStep(caption, T, scores.double(), min(kept, len(best)), compared))
+
+
+_RECORD: ContextVar[SearchRecord | None] = ContextVar("record", default=None)
+
+
+@contextmanager
+def recorded() -> Iterator[SearchRecord]:
+    """Yield a record, to which this thread's localizations within the block add."""
+    token = _RECORD.set(record := SearchRecord())
+    try:
+        yield record
+    finally:
+        _RECORD.reset(token)
+
+
+def current_record() -> SearchRecord | None:
+    """Return the active record; None if no record was requested."""
+    return _RECORD.get()
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What an outcome means, and what to try first; code is between backticks."""
+
+    meaning: str
+    first: str
+
+
+ADVICE = {
+    Outcome.AMBIGUOUS: Advice(
+        "Another pose explains the image about as well.",
+        "Give several views with known relative poses, or a rough start (`--start`). If there is one such place, check whether the map holds it twice.",
+    ),
+    Outcome.OFF_SURFACE: Advice(
+        "Fewer than 85% of the measured points lie on the map's surface.",
+        "Check the unit and the kind of the depth first, then whether the map covers what the image shows.",
+    ),
+    Outcome.COLOUR_MISMATCH: Advice(
+        "The shape fits, but fewer than 42% of the points have the colour of the surface.",
+        "Check whether red and blue are swapped, then the exposure.",
+    ),
+    Outcome.FREE_SPACE_VIOLATED: Advice(
+        "More than 15% of the lines of sight pass through the surface.",
+        "Update the map if something was removed, else give more views or a start.",
+    ),
+    Outcome.RENDERING_MISMATCH: Advice(
+        "The geometry fits, but the field renders something else.",
+        "Check with `bidnerf render` whether the field is sharp, then whether the light has changed.",
+    ),
+    Outcome.UNDETERMINED: Advice("The image does not fix all six degrees of freedom.", "Add depth or views."),
+    Outcome.NOT_SETTLED: Advice(
+        "Newly drawn rays still ask for a step of more than 0.01.",
+        "Localize again from the pose, or raise `--fine-steps` and `--fine-rays`.",
+    ),
+    Outcome.HIGH_LOSS: Advice(
+        "A descent of `bid` or `inerf` ended where the rendering differs too much from the image.",
+        "Use `auto`, a closer start, more `--max-steps` or several views.",
+    ),
+    Outcome.DIVERGED: Advice(
+        "The loss or the pose is infinite or not a number.",
+        "Check that the start is camera to world with OpenCV axes and lies within the scene, then lower `--learning-rate`.",
+    ),
+    Outcome.MISCALIBRATED: Advice(
+        "The image contradicts the given intrinsics.",
+        "Give the right camera (`--camera`), or mark the focal length as approximate.",
+    ),
+    Outcome.MIRRORED: Advice(
+        "The mirror image fits the map better.",
+        "Turn mirroring off in the front camera, check the image reader for flipped rows, or flip the image.",
+    ),
+    Outcome.IMPRECISE: Advice(
+        "The position is too uncertain.", "Add depth of the same image, or views with known relative poses."
+    ),
+    Outcome.UNCERTAIN: Advice(
+        "The diagnostics together make a wrong pose too likely.",
+        "Take a sharper image, closer to where the map's images were taken.",
+    ),
+    Outcome.TOO_FEW_MATCHES: Advice(
+        "The map has many landmarks, but hardly any appear in the image.",
+        "If the image shows another place, try that place's map; else take a sharper, brighter one from nearer to where the map's images were taken, and check its camera.",
+    ),
+}
+"""Advice for each outcome but ``CONVERGED``; a test compares it with the page."""

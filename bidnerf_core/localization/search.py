@@ -13,9 +13,9 @@ from torch.quasirandom import SobolEngine
 from bidnerf_core.devices import moved, without_waiting
 from bidnerf_core.errors import amount
 from bidnerf_core.geometry import SE3
+from bidnerf_core.localization.accept import DISPLACEMENT, same_pose
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.recording import current_record
-from bidnerf_core.localization.support import DISPLACEMENT, same_pose
+from bidnerf_core.localization.result import current_record
 from bidnerf_core.localization.terms.images import ColourScales, Images, Renderer, Thumbnail
 from bidnerf_core.mapping import States, Term, descend
 from bidnerf_core.progress import check_cancelled

@@ -19,7 +19,7 @@ from bidnerf_core.fields import (
 from bidnerf_core.frames import DrawerName
 from bidnerf_core.geometry import Robust, RobustName
 from bidnerf_core.localization.accept import least_confidence
-from bidnerf_core.localization.pivots import PivotName
+from bidnerf_core.localization.problem import PivotName
 from bidnerf_core.settings import EXPERT, Above, Count, NotNegative, OneOf, Positive, Range, Settings
 
 LEAST_POINTS = 50

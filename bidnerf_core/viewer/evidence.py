@@ -14,8 +14,6 @@ from bidnerf_core.localization import (
     LANDMARK_BOUNDS,
     MIRROR,
     MOVING,
-    NO_RIVAL,
-    SUPPORT_BOUNDS,
     Answer,
     Evidence,
     Localization,
@@ -42,8 +40,8 @@ def contests(found: Localization, record: SearchRecord | None) -> tuple[Json, ..
     shown, answer, support = list[Json](), last_answer(record), found.diagnostics
     if answer is not None and len(answer.modes) > 1:
         shown.append(_of_modes(found, answer))
-    if isinstance(support, Support) and support.displaced is not None:
-        shown.append(_of_support(support, support.displaced))
+    if isinstance(support, Support) and "displaced" in support.measures:
+        shown.append(_of_support(support))
     if answer is not None:
         shown.append(_of_cameras(found, answer))
     return tuple(shown)
@@ -106,15 +104,18 @@ def _of_cameras(found: Localization, answer: Answer) -> Json:
     return _contest("Whose camera took it?", likely, f"Weighed at {pose}." if pose else "", of_pose=False)
 
 
-def _of_support(support: Support, displaced: float) -> Json:
-    rivals = [
-        (f"the pose moved by {DISPLACEMENT:.0%} of its distance to the scene", displaced),
-        ("another pose of the search", support.other),
-        ("an image of a single colour", support.plain),
-    ]
-    weights = [(HERE, 1.0), *((name, odds(-against)) for name, against in rivals if against < NO_RIVAL)]
+def _of_support(support: Support) -> Json:
+    names = {
+        "displaced": f"the pose moved by {DISPLACEMENT:.0%} of its distance to the scene",
+        "other": "another pose of the search",
+        "plain": "an image of a single colour",
+    }
+    against = {name: each for name in names if (each := support.measures.get(name)) is not None}
+    weights = [(HERE, 1.0), *((names[name], odds(-each)) for name, each in against.items())]
     total = sum(weight for _, weight in weights)
-    moved = displaced < min(0.0, support.other, support.plain)
+    moved = against["displaced"] < min(
+        [0.0, *(each for name, each in against.items() if name != "displaced")]
+    )
     remark = "The image fits better when the pose is moved: it is not even a local optimum." if moved else ""
     return _contest("What fits the image best?", [(name, w / total) for name, w in weights], remark)
 
@@ -226,7 +227,6 @@ def _of_landmarks(evidence: Evidence) -> Iterator[Figure]:
 
 
 def _without_landmarks(measured: Support) -> Iterator[Figure]:
-    for bound in SUPPORT_BOUNDS:
-        value, limit = getattr(measured, bound.measure), measured.limits.get(bound.measure, bound.limit)
-        if value is not None and bound.measure in WITHOUT_LANDMARKS:
-            yield Figure.of(WITHOUT_LANDMARKS[bound.measure], value, limit, bound.is_least)
+    for bound, value in measured.bounds:
+        if bound.measure in WITHOUT_LANDMARKS:
+            yield Figure.of(WITHOUT_LANDMARKS[bound.measure], value, bound.limit, bound.is_least)

@@ -19,7 +19,7 @@ from bidnerf_core.localization.explanations import (
     correction_between,
     explanations,
 )
-from bidnerf_core.localization.query import Query
+from bidnerf_core.localization.matching import Query
 from bidnerf_core.mapping import (
     NUISANCES,
     Keypoints,

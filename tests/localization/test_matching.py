@@ -12,8 +12,7 @@ from bidnerf_core.devices import moved
 from bidnerf_core.localization import LandmarkMatcher
 
 # Inside: the matches, of which answers show only the number
-from bidnerf_core.localization.matching import STRONGEST, Matches, Nearest, Projected, log10_nfa
-from bidnerf_core.localization.query import Query
+from bidnerf_core.localization.matching import STRONGEST, Matches, Nearest, Projected, Query, log10_nfa
 from bidnerf_core.mapping import LandmarkMap, Sift, States, build_landmarks, squared_distances
 from bidnerf_core.testing import DEVICE, Elsewhere, unseen
 from conditions import COPY, PINHOLE, point_landmarks, point_view, points, twice

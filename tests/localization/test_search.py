@@ -15,7 +15,7 @@ from bidnerf_core.localization import states_at
 # Inside: the distribution of proposals and the margin over other poses, of which an answer keeps one
 from bidnerf_core.localization.by_rays import centred
 from bidnerf_core.localization.by_surface import by_depth, by_images, hypotheses
-from bidnerf_core.localization.pivots import middle_of_view
+from bidnerf_core.localization.problem import middle_of_view
 from bidnerf_core.localization.search import Stage, halve, neighbours
 from bidnerf_core.mapping import Normal, P, States
 from bidnerf_core.results import pose_error

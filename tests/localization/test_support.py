@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
@@ -19,8 +19,9 @@ from bidnerf_core.fields import FieldValues, RaySampler, SceneBounds, Stratified
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3, look_at
 from bidnerf_core.localization import (
-    NO_RIVAL,
+    SUPPORT_BOUNDS,
     AutoConfig,
+    Bound,
     Localization,
     Outcome,
     Pivot,
@@ -30,7 +31,7 @@ from bidnerf_core.localization import (
 )
 
 # Inside: the odds themselves, far from the values at which they decide
-from bidnerf_core.localization.support import log_odds, same_pose, support
+from bidnerf_core.localization.accept import log_odds, same_pose, support
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
 from problems import FieldMap, localize
 
@@ -153,21 +154,22 @@ def costs_about(best: SE3, noise: float, slope: tuple[float, ...]) -> object:
 
 def test_a_pose_is_determined_if_all_directions_are() -> None:
     T = SE3.identity()
-    full = support(costs_about(T, 0.05, (1.0,) * 3 + (20.0,) * 3), T, MIDDLE)  # type: ignore[arg-type]
-    assert (full.confidence or 0) > 0.99
-    assert full.verdict("").accepted
-    sliding = support(costs_about(T, 0.05, (0.0, 1.0, 1.0, 0.0, 0.0, 20.0)), T, MIDDLE)  # type: ignore[arg-type]
-    assert (sliding.confidence or 1) < 0.8
-    assert sliding.verdict("").outcome is Outcome.UNDETERMINED
+    for slope, is_determined in (((1.0,) * 3 + (20.0,) * 3, True), ((0.0, 1.0, 1.0, 0.0, 0.0, 20.0), False)):
+        measures = support(costs_about(T, 0.05, slope), T, MIDDLE)  # type: ignore[arg-type]
+        verdict = Support(measures).verdict("")
+        assert verdict.outcome is (Outcome.CONVERGED if is_determined else Outcome.UNDETERMINED)
+        assert verdict.confidence is not None
+        assert verdict.confidence > 0.99 if is_determined else verdict.confidence < 0.8
 
 
 def test_only_poses_farther_away_than_the_displacement_are_rivals() -> None:
     T, costs = SE3.identity(), costs_about(SE3.identity(), 0.05, (1.0,) * 6)
     near, far = (torch.tensor([x, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64) for x in (0.1, 1.0))
     alone = support(costs, T, MIDDLE, others=T[None].retract(near[None]))  # type: ignore[arg-type]
-    assert alone.other == NO_RIVAL
+    assert "other" not in alone
     both = support(costs, T, MIDDLE, others=T[None].retract(torch.stack([near, far])))  # type: ignore[arg-type]
-    assert math.isfinite(both.other)
+    assert both["other"] is not None
+    assert math.isfinite(both["other"])
 
 
 def test_odds_are_antisymmetric_and_grow_with_the_number_of_measurements(generator: Generator) -> None:
@@ -180,12 +182,28 @@ def test_odds_are_antisymmetric_and_grow_with_the_number_of_measurements(generat
 
 
 def test_confidence_is_that_of_the_pose_among_its_rivals() -> None:
-    assert Support(0.0, 0.0, 0.0, 0.0).confidence == pytest.approx(0.25)
-    sure = Support(explained=1.0, plain=20.0, displaced=20.0, other=NO_RIVAL)
-    assert (sure.confidence or 0) > 0.999
-    assert replace(sure, other=0.0).confidence == pytest.approx(0.5)
-    assert replace(sure, other=0.0).verdict("").outcome is Outcome.AMBIGUOUS
-    assert replace(sure, displaced=None).confidence is None
+    """A pose that fits no better than three rivals is one of four; the rival that fits best is named."""
+    T = SE3.identity()
+
+    def even(poses: SE3) -> Tensor:
+        return torch.arange(400.0).double().expand(len(poses.translation), 400)
+
+    alike = support(even, T, MIDDLE, even(T[None])[0], T[None].retract(torch.full((1, 6), 9.0).double()))
+    assert alike["confidence"] == pytest.approx(0.25)
+    other = Support({"plain": 20.0, "displaced": 20.0, "other": 0.0, "confidence": 0.5}).verdict("")
+    assert (other.outcome, other.confidence) == (Outcome.AMBIGUOUS, 0.5)
+    assert Support({}).verdict("").confidence is None
+
+
+@pytest.mark.parametrize("bound", SUPPORT_BOUNDS, ids=lambda bound: bound.measure)
+def test_each_bound_alone_rejects_and_a_method_may_have_its_own_limit(bound: Bound) -> None:
+    step = 1e-3 if bound.is_least else -1e-3
+    measures = {"displaced": 0.0, bound.measure: bound.limit + step}
+    assert Support(measures).verdict("").accepted
+    assert Support(measures, {bound.measure: bound.limit + 2 * step}).verdict("").outcome is bound.outcome
+    for value in (bound.limit - step, math.nan):
+        found = Support(measures | {bound.measure: value}).verdict("")
+        assert found.outcome is bound.outcome
 
 
 def test_poses_are_the_same_by_where_they_put_the_middle_and_by_their_angle() -> None:

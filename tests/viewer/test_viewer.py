@@ -231,8 +231,8 @@ def test_poses_are_shown_relative_to_the_origin_of_the_map(
 
 
 def test_the_loss_of_a_descent_is_the_first_figure(answer: Localization) -> None:
-    said = Support(0.9, 5.0, -3.0, 9.0, mean_loss=0.036)
-    lost = replace(answer, confidence=said.confidence, diagnostics=said)
+    said = Support({"plain": 5.0, "displaced": -3.0, "other": 9.0, "confidence": 0.05, "mean_loss": 0.036})
+    lost = replace(answer, confidence=0.05, diagnostics=said)
     first = acceptance_figures(lost, None)[0]
     assert (first.name, first.value, first.threshold, first.passed) == ("mean loss", "0.036", "at most 0.02", False)  # fmt: skip
     assert "not even a local optimum" in contests(lost, None)[0]["remark"]

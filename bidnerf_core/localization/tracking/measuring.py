@@ -13,7 +13,7 @@ from bidnerf_core.depth import DepthSensorModel
 from bidnerf_core.fields import has_field
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import CORNERS_PER_INDEPENDENT, SE3, skew, update_between
-from bidnerf_core.localization.accept import Evidence, judge
+from bidnerf_core.localization.accept import Evidence, Support, judge
 from bidnerf_core.localization.explanations import MOVE, SHARE_AS_MAP, SHARE_MOVING, STATED, TURN
 from bidnerf_core.localization.loop import CELLS, DEPTH_WIDTH
 from bidnerf_core.localization.matching import (
@@ -22,15 +22,14 @@ from bidnerf_core.localization.matching import (
     Matches,
     Nearest,
     Projected,
+    Query,
     log10_nfa,
 )
 from bidnerf_core.localization.posterior import TOLERANCE, Posterior, mass_within
 from bidnerf_core.localization.problem import SceneMap
 from bidnerf_core.localization.propose import LEAST_AGREEING, consensus
-from bidnerf_core.localization.query import Query
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.settings import LEAST_POINTS, TrackerConfig
-from bidnerf_core.localization.support import Support
 from bidnerf_core.localization.terms.rays import ALONE, Rays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
@@ -336,7 +335,7 @@ class Measurer:
             for _ in range(2):
                 states, normal = descend(states, [prediction, rays.fitted(states)], 2)
             share = float(rays.agreement(states))
-            measured = Support(new_inliers=share)
+            measured = Support({"new_inliers": share})
             words = f"{share:.0%} of the rays have the rendered colours"
         else:
             points = replace(points, colour_weight=float(image is not None))
@@ -352,7 +351,8 @@ class Measurer:
             # A point counts half at a distance of four cells from the surface.
             near, alike = replace(points, noise=2 * points.surface.cell).inliers(states)
             share, colours = float(near.mean()), float((near * alike).mean())
-            measured = Support(on_surface=share, colour_inliers=None if image is None else colours)
+            colour_inliers = None if image is None else colours
+            measured = Support({"on_surface": share, "colour_inliers": colour_inliers})
             words = f"{share:.0%} of the measured points lie on the surface"
         information = normal.hessian[0, :6, :6] - hessian[0, :6, :6]
         fused = torch.linalg.inv(normal.hessian[0, :6, :6])

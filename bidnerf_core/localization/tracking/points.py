@@ -23,9 +23,8 @@ from bidnerf_core.depth import DepthNoise
 from bidnerf_core.frames import Frame, visible_at
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.loop import CELLS
-from bidnerf_core.localization.matching import log10_nfa
+from bidnerf_core.localization.matching import THRESHOLD, log10_nfa
 from bidnerf_core.localization.propose import from_poselib, pinhole, to_poselib
-from bidnerf_core.localization.query import THRESHOLD
 from bidnerf_core.mapping import FIRST_CENTRE, Landmarks, Sights, States, measured_depth, point_variance
 
 FRESH = -1
