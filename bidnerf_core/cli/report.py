@@ -30,7 +30,7 @@ def run(
         Names, Option("DATA...", "datasets of the results, from which the worst frames are shown", "no pictures")
     ] = (),
 ) -> None:  # fmt: skip
-    """Write tables, figures and statistical tests of results as one page that works offline.
+    """Write tables and figures of results as one page that works offline.
 
     Trials are compared by map, data, start, method and settings. A trial in several files counts once.
     """

@@ -40,7 +40,6 @@ from .summary import Group as Group
 from .summary import Summary as Summary
 from .summary import grouped as grouped
 from .summary import median as median
-from .summary import pairwise_tests as pairwise_tests
 from .summary import steps_of as steps_of
 from .summary import summarize as summarize
 from .trial import ScalarPoseError as ScalarPoseError

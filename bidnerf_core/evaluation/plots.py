@@ -1,4 +1,4 @@
-"""The figures of an evaluation: success, errors, confidence, convergence and faults; maps side by side.
+"""The figures of an evaluation: success, errors, convergence and faults; maps side by side.
 
 A figure is a grid of equally large panels, so that all figures of a page have the same font size. A condition
 has the same colour in all figures.
@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from bidnerf_core.evaluation.comparison import Comparison
@@ -48,7 +47,6 @@ from bidnerf_core.results import (
     new_figure,
     require_matplotlib,
     save_figure,
-    standard_deviations,
     styled,
 )
 
@@ -126,7 +124,7 @@ class Figures:
 
     def all(self) -> list[Figure]:
         """Draw every figure for which the results have data."""
-        drawn = (self.rates(), self.faults(), self.errors(), self.calibration(), self.convergence())
+        drawn = (self.rates(), self.faults(), self.errors(), self.convergence())
         return [figure for figure in drawn if figure is not None]
 
     @property
@@ -201,31 +199,6 @@ class Figures:
             f"{self.omitted}",
         )  # fmt: skip
 
-    def calibration(self) -> Figure | None:
-        """Draw the rate of right answers by stated confidence, and errors against stated standard deviations."""
-        # The results of a group that pools all sizes are among those of the others.
-        results = {
-            label: [
-                r for g in self.groups if g.label == label and g.situation.size is not None for r in g.results
-            ]
-            for label in self.looks
-        }
-        judged = {label: [r for r in rows if r.confidence is not None] for label, rows in results.items()}
-        measured = {label: [r for r in rows if r.covariance and r.error] for label, rows in results.items()}
-        panels: list[Panel] = []
-        if any(judged.values()):
-            panels.append(("confidence", partial(self._reliability, judged=judged)))
-        if any(measured.values()):
-            panels.append(("translation", partial(self._deviations, measured=measured, kind="translation")))
-            panels.append(("rotation", partial(self._deviations, measured=measured, kind="rotation_deg")))
-        return self._figure(
-            "calibration", panels, self.looks,
-            "Confidence: how often the answers of a confidence are right, in bins of as many trials each, with 95 % intervals;"
-            " on the dashed line, confidences are the frequencies that they claim. Errors against the standard deviations"
-            " that the answers state, filled where the method accepted its answer; on the dashed line they are equal, and if"
-            " the deviations are right, about two thirds of the points lie below.",
-        )  # fmt: skip
-
     # What a panel shows of the groups of a situation.
 
     def _shares(self, axes: Any, groups: Sequence[Group], of: str) -> None:
@@ -264,35 +237,6 @@ class Figures:
         axes.set(xlabel="step", ylabel=QUANTITIES[kind].label.format(unit=unit_of(groups[0].results)))
         axes.set_xlim(left=0)
         _set_logarithmic(axes, "y")
-
-    def _reliability(self, axes: Any, judged: Mapping[str, list[TrialResult]]) -> None:
-        axes.plot([0, 100], [0, 100], **BOUND)
-        for label, results in judged.items():
-            ordered = np.empty(len(results), dtype=object)
-            ordered[:] = sorted(results, key=lambda r: r.confidence or 0.0)
-            bins = max(1, min(6, len(ordered) // 8))  # each has at least eight trials, if there are as many
-            parts = [list(part) for part in np.array_split(ordered, bins) if len(part)]
-            middles = [100 * float(np.mean([r.confidence for r in part])) for part in parts]
-            rates = [rate_of(part, list(map(succeeded, part))) for part in parts]
-            _intervals(axes, middles, rates, linestyle="", color=self.looks[label]["color"])
-        axes.set(xlabel="stated confidence (%)", ylabel="right trials (%)", xlim=(-3, 103), ylim=(-3, 103))
-        axes.grid()
-
-    def _deviations(self, axes: Any, measured: Mapping[str, list[TrialResult]], kind: str) -> None:
-        for label, results in measured.items():
-            for r in results:
-                position, rotation = standard_deviations(torch.tensor(r.covariance, dtype=torch.float64))
-                stated = math.degrees(rotation) if kind == "rotation_deg" else position
-                if 0 < stated < math.inf and getattr(r.error, kind) > 0:
-                    colour = self.looks[label]["color"]
-                    axes.plot(stated, getattr(r.error, kind), "o", markersize=3.5, color=colour, alpha=0.7,
-                              markerfacecolor=colour if r.converged else "none")  # fmt: skip
-        every = [result for results in measured.values() for result in results]
-        unit = "degrees" if kind == "rotation_deg" else unit_of(every)
-        axes.set(xlabel=f"stated deviation ({unit})", ylabel=f"error ({unit})")
-        _set_logarithmic(axes, "x", "y")
-        low, high = axes.get_xlim()
-        axes.axline((low, low), (high, high), **BOUND)
 
     # How panels become a figure.
 

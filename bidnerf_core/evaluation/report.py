@@ -1,4 +1,4 @@
-"""A report of results: tables, figures and statistical tests as one self-contained page."""
+"""A report of results: tables and figures as one self-contained page."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ from bidnerf_core.evaluation.summary import (
     Group,
     applies,
     are_stepwise,
-    pairwise_tests,
     situations,
     succeeded,
 )
@@ -115,10 +114,6 @@ def page(
     template = environment.from_string(source.strip() + "\n")
     groups = table.groups
     titles = {row.situation: row.start for row in table.summary}
-    pairs = [
-        (titles[s], pairwise_tests([g for g in groups if g.situation == s], criterion))
-        for s in situations(groups)
-    ]
     maps = (f"{s.map} ({s.weights.partition('.')[0]}) on {s.data}/{s.split}" for s in situations(groups))
     return template.render(
         mark=Markup(MARK),
@@ -134,14 +129,11 @@ def page(
         figures=[(f.caption, base64.b64encode(f.file.read_bytes()).decode()) for f in figures],
         relative=RELATIVE,
         absolute=ABSOLUTE,
-        pairs=[(start, found) for start, found in pairs if found],
-        count=sum(len(found) for _, found in pairs),
         view=view,
         frames=list(itertools.zip_longest(worst(table.rows)[:LISTED_FRAMES], pictures)),
         succeeded=succeeded,
         wrong=sum(row.converged and not succeeded(row) for row in table.rows),
         refused=sum(not row.converged for row in table.rows),
-        criterion=CRITERION_NAMES[criterion],
         runs=[
             (name, _facts(name, known), list(dict.fromkeys(r.command for r in known))) for name, known in runs
         ],

@@ -1,8 +1,7 @@
-"""Results grouped by situation (what was localized) and condition (what localized it), with statistics and tests."""
+"""Results grouped by situation (what was localized) and condition (what localized it), with statistics."""
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import statistics
@@ -258,59 +257,6 @@ def median(values: Iterable[float | None]) -> float | None:
     known = [math.inf if value is None else float(value) for value in values]
     middle = statistics.median(known) if known else math.inf
     return middle if math.isfinite(middle) else None
-
-
-# Tests.
-
-
-@dataclass(frozen=True)
-class PairTest:
-    """Tests of whether two groups of trials in the same situation differ, by one criterion. All p values are two-sided."""
-
-    first: str
-    second: str
-    trials: tuple[int, int]
-    successes: tuple[int, int]
-    rates_p: float  # of equal success rates, Fisher's exact test
-    median_steps: tuple[float | None, float | None]
-    steps_u: float | None  # Mann-Whitney U of the first group, over the trials that succeeded
-    steps_p: float | None  # of equal steps to success
-    all_p: float  # of equal speed over all trials, where a failure is slower than any success
-
-
-def pairwise_tests(groups: Sequence[Group], criterion: str) -> list[PairTest]:
-    """Return the tests of every pair of groups that share a situation and to which the criterion applies."""
-    fitting = [group for group in groups if applies(criterion, group.results)]
-    pairs = itertools.combinations(fitting, 2)
-    return [compare_pair(a, b, criterion) for a, b in pairs if a.situation == b.situation]
-
-
-def compare_pair(first: Group, second: Group, criterion: str) -> PairTest:
-    """Test whether two groups differ in success rate or in steps to success, by one criterion."""
-    from scipy.stats import fisher_exact, mannwhitneyu  # imported here: it takes a second
-
-    a, b = (steps_of(group.results, criterion) for group in (first, second))
-    good_a, good_b = ([s for s in row if s < NEVER] for row in (a, b))
-    test = mannwhitneyu(good_a, good_b, alternative="two-sided") if good_a and good_b else None
-    # Over all trials, failures tie, behind every success; if all trials tie, nothing differs.
-    last = 1 + max(good_a + good_b, default=0)
-    ranks = [[min(s, last) for s in row] for row in (a, b)]
-    all_p = 1.0
-    if len({*ranks[0], *ranks[1]}) > 1:
-        all_p = float(mannwhitneyu(*ranks, alternative="two-sided", method="asymptotic").pvalue)
-    return PairTest(
-        first=first.label,
-        second=second.label,
-        trials=(len(a), len(b)),
-        successes=(len(good_a), len(good_b)),
-        rates_p=float(
-            fisher_exact([[len(good_a), len(a) - len(good_a)], [len(good_b), len(b) - len(good_b)]]).pvalue
-        ),
-        median_steps=(median(good_a), median(good_b)),
-        steps_u=None if test is None else float(test.statistic),
-        steps_p=None if test is None else float(test.pvalue),
-        all_p=all_p,
-    )
 
 
 class FaultCurve(NamedTuple):

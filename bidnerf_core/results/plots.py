@@ -77,6 +77,7 @@ def save_figure(figure: Any, folder: Path, name: str) -> Path:
     """Save a figure as SVG, and as PNG next to it; return the path of the SVG."""
     folder.mkdir(parents=True, exist_ok=True)
     write_figure(figure, folder / f"{name}.png", dpi=160)
+    figure.set_layout_engine("none")  # what is laid out stays so, and laying it out again takes as long as drawing it
     write_figure(figure, folder / f"{name}.svg", metadata={"Date": None})
     return folder / f"{name}.svg"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import math
@@ -10,9 +11,9 @@ import random
 import shutil
 import signal
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import imageio.v3 as iio
@@ -73,6 +74,12 @@ def blob_trial(seed: int = 0, steps: int = 2) -> Trial:
     return Trial(BLOBS, BLOBS, (f"{seed:04d}",), (0.3,), seed, protocol="bid", method="bid", config=config)
 
 
+@functools.cache
+def ran(seed: int) -> TrialResult:
+    """The result of a trial with two steps."""
+    return run_trial(blob_trial(seed))
+
+
 def trials_of(**options: Any) -> list[Trial]:
     return planned(Plan(**{"protocol": "bid"} | options), BLOBS, BLOBS, closed_form_data(BLOBS))
 
@@ -96,10 +103,13 @@ def test_a_plan_is_its_protocol_for_each_size() -> None:
     assert len({t.frame for t in parallel[:5]}) == 1
 
 
-@pytest.mark.parametrize("shards", [1, 2, 3, 7, 100])
+@pytest.mark.parametrize("shards", [1, 3, 13])
 def test_shards_share_all_trials_between_them(shards: int) -> None:
-    parts = [trials_of(shard=number, shards=shards) for number in range(shards)]
-    assert sorted((t.seed, t.size) for p in parts for t in p) == sorted((t.seed, t.size) for t in trials_of())
+    few = {"trials": 4}
+    parts = [trials_of(shard=number, shards=shards, **few) for number in range(shards)]
+    assert sorted((t.seed, t.size) for p in parts for t in p) == sorted(
+        (t.seed, t.size) for t in trials_of(**few)
+    )
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
     with refused(found=f"shard is {shards}", expected=f"0 to {shards - 1}"):
         Plan(shard=shards, shards=shards)
@@ -178,43 +188,50 @@ def test_closed_form_data_are_a_dataset(name: str) -> None:
 # Resuming.
 
 
-@pytest.mark.slow
-def test_an_evaluation_killed_at_random_moments_equals_one_never_killed(
-    tmp_path: Path, evaluate: Evaluate
-) -> None:
+class Calls:
+    """Counts the calls of the package's functions, and kills this process in number ``last``."""
+
+    def __init__(self, last: int | None = None) -> None:
+        self.count, self.last = 0, last
+
+    def __call__(self, frame: FrameType, event: str, _: object) -> None:
+        self.count += event == "call" and f"{os.sep}bidnerf_core{os.sep}" in frame.f_code.co_filename
+        if self.count == self.last:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_an_evaluation_killed_at_random_moments_equals_one_never_killed(tmp_path: Path) -> None:
     whole, killed = tmp_path / "whole.jsonl", tmp_path / "killed.jsonl"
-    more = ("--trials", 6, "--size", "0.3")
-    assert evaluate(*more, out=whole)[0] == 0
-    began = time.monotonic()
-    assert evaluate(*more, out=tmp_path / "again.jsonl")[0] == 0  # what is imported first is there by now
-    seconds = time.monotonic() - began
+
+    def run(out: Path, calls: Calls | None = None) -> int:
+        sys.setprofile(calls)
+        try:
+            return main(["evaluate", BLOBS, *QUICK, "--trials", "4", "--size", "0.3", "--out", str(out)])
+        finally:
+            sys.setprofile(None)
+
+    assert run(tmp_path / "first.jsonl") == 0  # what is imported first is there from here on
+    every = Calls()
+    assert run(whole, every) == 0
     chance, kills, known = random.Random(0), 0, set[bytes]()
-    for _ in range(40):
+    for _ in range(4):
+        moment = round(chance.uniform(0.3, 0.6) * every.count)
         child = os.fork()
         if child == 0:
-            silent = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(silent, 1)
-            os.dup2(silent, 2)
-            os._exit(main(["evaluate", BLOBS, "--out", str(killed), *QUICK, *map(str, more)]))
-        time.sleep(chance.uniform(0.1, 0.6) * seconds)
-        os.kill(child, signal.SIGKILL)
-        _, status = os.waitpid(child, 0)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+            os._exit(run(killed, Calls(moment)))
+        kills += os.WIFSIGNALED(os.waitpid(child, 0)[1])
         lines = killed.read_bytes().split(b"\n")[:-1] if killed.exists() else []
         assert known <= set(lines), "a finished trial was lost or run again"
         known = set(lines)
-        kills += os.WIFSIGNALED(status)
-        if os.WIFEXITED(status) and kills:
-            break
-        if os.WIFEXITED(status):  # sooner than the one that was timed: once more, with less time for each
-            seconds, known = seconds / 4, set()
-            killed.unlink()
-    assert kills >= 1
-    assert evaluate(*more, out=killed)[0] == 0
+    assert kills >= 3
+    assert known
+    assert run(killed) == 0
     assert timeless(killed) == timeless(whole)
 
 
 def _written(path: Path, *seeds: int) -> list[TrialResult]:
-    results = [run_trial(blob_trial(seed)) for seed in seeds]
+    results = [ran(seed) for seed in seeds]
     ResultTable(tuple(results)).save(path)
     return results
 
@@ -264,10 +281,10 @@ def test_a_file_is_written_by_one_at_a_time(tmp_path: Path, evaluate: Evaluate) 
 def test_results_come_in_the_order_of_the_plan(tmp_path: Path) -> None:
     trials = [blob_trial(seed) for seed in range(3)]
     with ResultsFile(tmp_path / "r.jsonl") as file:
-        for trial in (blob_trial(9), *reversed(trials)):
-            file.add(run_trial(trial))
+        for seed in (9, 2, 1, 0):
+            file.add(ran(seed))
         file.put_in_order(trials)
-        file.add(run_trial(blob_trial(4)))  # still the same file
+        file.add(ran(4))  # still the same file
     assert [r.seed for r in read_results([tmp_path / "r.jsonl"])] == [9, 0, 1, 2, 4]
 
 
@@ -356,7 +373,7 @@ def test_results_of_an_earlier_version_are_resumed_and_reported(
 @pytest.mark.parametrize("replaced", [False, True])
 def test_results_that_are_removed_meanwhile_are_missed(tmp_path: Path, replaced: bool) -> None:
     path = tmp_path / "r.jsonl"
-    results = [run_trial(blob_trial(seed)) for seed in range(2)]
+    results = [ran(seed) for seed in range(2)]
     with ResultsFile(path) as file:
         file.add(results[0])
         path.unlink()
@@ -383,7 +400,7 @@ def test_results_that_are_removed_meanwhile_are_missed(tmp_path: Path, replaced:
 def test_numbers_and_text_that_nothing_can_hold_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, said: str
 ) -> None:
-    line = as_line(to_plain(run_trial(blob_trial(0)))).decode()
+    line = as_line(to_plain(ran(0))).decode()
     assert old in line
     path = tmp_path / "r.jsonl"
     path.write_text(line.replace(old, new))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as iio
 import pytest
@@ -28,6 +30,7 @@ from bidnerf_core.evaluation import (
     trial,
 )
 from bidnerf_core.evaluation.comparison import MapRow, map_bytes, map_labels, measured
+from bidnerf_core.evaluation.run import InThisProcess, own_processes
 from bidnerf_core.evaluation.summary import success_of
 from bidnerf_core.io import from_plain
 from refusals import refused
@@ -68,11 +71,13 @@ def usual(maps: list[Path], data: Path) -> Trial:
 def compared(
     maps: list[Path], data: Path, plan: Plan, tmp_path_factory: pytest.TempPathFactory
 ) -> Comparison:
-    """Run from a folder with a file that bears the name of a module of Python's."""
+    """Run from a folder with a file that bears the name of a module of Python's; one process serves both maps."""
     folder = tmp_path_factory.mktemp("user")
     (folder / "statistics.py").write_text("raise SystemExit('a file of the user was run')")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
+        process = own_processes(1)
+        patch.setattr("bidnerf_core.evaluation.comparison.own_processes", lambda count: process)
         return compare(maps, data, plan)
 
 
@@ -175,14 +180,19 @@ def test_maps_are_named_once(data: Path) -> None:
         compare([], data)
 
 
-def end_process(*_: object) -> None:
-    os._exit(9)
+class Ending(InThisProcess):
+    """A process that ends with its first call."""
+
+    def submit(self, *_: object, **__: object) -> Future[Any]:  # type: ignore[override]
+        future = Future[Any]()
+        future.set_exception(BrokenProcessPool())
+        return future
 
 
 def test_a_process_that_ends_is_told_in_one_line(
     maps: list[Path], data: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bidnerf_core.evaluation.comparison.measured", end_process)
+    monkeypatch.setattr("bidnerf_core.evaluation.comparison.own_processes", lambda count: Ending())
     with refused(where=maps[0], found="frame t_0002 ended", expected="memory"):
         compare([maps[0]], data, plan)
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import pickle
 import signal
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures import Future
 from importlib import import_module
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,6 @@ from bidnerf_core.evaluation import (
     Trial,
     TrialResult,
     forget_peak_memory,
-    local_processes,
     opened,
     peak_memory_bytes,
     read_results,
@@ -153,31 +152,29 @@ def test_results_of_another_map_in_memory_are_not_taken_for_its_own(tmp_path: Pa
         bn.evaluate(second, **given)
 
 
-@pytest.mark.slow
 def test_what_this_process_alone_has_registered_is_not_mistaken_for_what_is_installed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """One other process answers for all: each of its own would import PyTorch anew."""
     monkeypatch.setattr("bidnerf_core.registry.registered", {})
     mine = dataclasses.replace(find_method("bid"), summary="mine")
     bn.register("methods", "bid", mine, replace=True)
     bn.register("methods", "unused", mine)
-    said = "method 'bid' was registered in one process but is unknown in another"
     assert len(bn.evaluate(BLOBS, BLOBS, quick(trials=2)).rows) == 2
-    with local_processes(2) as pool:
 
-        class Lasting(InThisProcess):
-            """The pool, which the end of an evaluation does not end and one process serves."""
+    class Elsewhere(InThisProcess):
+        """What another process does: it gets copies, and nothing is registered there."""
 
-            def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-                future = pool.submit(fn, *args, **kwargs)
-                wait([future])
-                return future
+        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr("bidnerf_core.registry.registered", {})
+                return super().submit(*pickle.loads(pickle.dumps((fn, *args))), **kwargs)
 
-        monkeypatch.setattr("bidnerf_core.evaluation.run.local_processes", lambda count: Lasting())
-        with refused(found=said):
-            bn.evaluate(BLOBS, BLOBS, quick(trials=2), workers=2)
-        assert len(bn.evaluate(BLOBS, BLOBS, quick(trials=2, method="inerf"), workers=2).rows) == 2
+    monkeypatch.setattr("bidnerf_core.evaluation.run.local_processes", lambda count: Elsewhere())
+    monkeypatch.setattr("bidnerf_core.evaluation.comparison.own_processes", lambda count: Elsewhere())
+    said = "method 'bid' was registered in one process but is unknown in another"
+    with refused(found=said):
+        bn.evaluate(BLOBS, BLOBS, quick(trials=2), workers=2)
+    assert len(bn.evaluate(BLOBS, BLOBS, quick(trials=2, method="inerf"), workers=2).rows) == 2
     with refused(found=said):
         bn.compare([BLOBS], BLOBS, quick(trials=1))
 
@@ -336,11 +333,8 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
         bn.compare([scene], BLOBS, quick(sizes=[0.3, 0.5]))
 
 
-@pytest.mark.slow
-def test_maps_in_memory_and_in_folders_are_compared(
-    shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.undo()  # the process of a map in a folder judges as usual
+@pytest.mark.usefixtures("no_processes")
+def test_maps_in_memory_and_in_folders_are_compared(shared: Path, tmp_path: Path) -> None:
     plan = quick(trials=2)
     scene, data = bn.load_map(shared / "map"), shared / "data"
     seen: list[str] = []
@@ -409,13 +403,10 @@ def test_its_error_is_that_of_its_pose(trial: Trial, shared: Path) -> None:
     assert result.error.translation == pytest.approx(float(error.translation), abs=1e-6)
 
 
-@pytest.mark.slow
-def test_the_same_trial_gives_the_same_line_here_and_elsewhere(trial: Trial) -> None:
+def test_the_same_trial_gives_the_same_line(trial: Trial) -> None:
     (first,) = timeless([run_trial(trial)])
     torch.manual_seed(17)
     assert timeless([run_trial(trial)]) == [first]
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        assert timeless([pool.submit(run_trial, trial).result()]) == [first]
     other = run_trial(dataclasses.replace(trial, seed=4))
     assert other.start_error is not None
     assert other.T_world_camera != first.T_world_camera

@@ -15,14 +15,12 @@ from typing import Any
 
 import imageio.v3 as iio
 import pytest
-from scipy.stats import mannwhitneyu
 
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import write_transforms
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import (
-    NEVER,
     ResultTable,
     ScalarPoseError,
     Trace,
@@ -31,17 +29,15 @@ from bidnerf_core.evaluation import (
     grouped,
     median,
     note_run,
-    pairwise_tests,
     provenance,
     script_command,
-    steps_of,
     summarize,
 )
 
-# Inside: statistical tests, groups and figures before they are put on a page
+# Inside: groups and figures before they are put on a page
 from bidnerf_core.evaluation.plots import Figures
 from bidnerf_core.evaluation.report import page
-from bidnerf_core.evaluation.summary import compare_pair, situation_titles, situations
+from bidnerf_core.evaluation.summary import situation_titles, situations
 from bidnerf_core.io import to_plain
 from bidnerf_core.results import success_rate_by_frame
 from trial_results import trial_result
@@ -111,29 +107,6 @@ def test_a_summary_counts(results: list[TrialResult]) -> None:
     assert summarize([lied]).converged_but_wrong == 1
 
 
-def test_comparisons_agree_with_scipy(results: list[TrialResult]) -> None:
-    near, far, both = pairwise_tests(grouped(results), "10%")
-    quick, slow = ([float(r.errors.translation.index(0.001)) for r in rows]
-                   for rows in (results[6:12], results[12:18]))  # fmt: skip
-    test = mannwhitneyu(quick, slow, alternative="two-sided")
-    assert (near.steps_u, near.steps_p) == (test.statistic, test.pvalue)
-    assert near.rates_p == 1
-    assert near.steps_p is not None
-    assert near.steps_p < 0.05
-    assert (far.steps_u, far.steps_p) == (None, None)
-    assert far.rates_p == pytest.approx(1 / 462)  # 2 of choose(12, 6)
-    assert (both.trials, both.successes) == ((12, 12), (12, 6))
-    assert both.all_p < 0.05
-
-
-def test_failures_are_slower_than_any_success_and_equal_among_themselves() -> None:
-    (a, b) = grouped([result(0, 3), result(1, None), result(0, None, level=1), result(1, None, level=1)])
-    assert steps_of(a.results, "10%") == [3, NEVER]
-    assert compare_pair(a, b, "10%").all_p == pytest.approx(compare_pair(b, a, "10%").all_p)
-    assert compare_pair(b, b, "10%").all_p == 1
-    assert compare_pair(a, a, "10%").all_p == pytest.approx(1)
-
-
 class Page(HTMLParser):
     """Collects what a page would fetch, its pictures, and its text."""
 
@@ -165,7 +138,7 @@ def read(folder: Path) -> Page:
     return page
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_the_page_needs_nothing_beside_it(
     tmp_path: Path, results: list[TrialResult], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -181,12 +154,11 @@ def test_the_page_needs_nothing_beside_it(
         ET.fromstring(base64.b64decode(picture.partition(",")[2]))
     for said in (
         "Mine & yours", "24 trials", "bidnerf evaluate 'a <map>' photos", "2 local processes", "bid, level none",
-        "100.0 %6/6 on 1 frame, 21 to 100 %", "50.0 %6/12 on 1 frame, 5 to 95 %", "Fisher",
+        "100.0 %6/6 on 1 frame, 21 to 100 %", "50.0 %6/12 on 1 frame, 5 to 95 %",
     ):  # fmt: skip
         assert said in page.text
     for name in ("rates", "errors", "convergence"):
-        assert iio.imread(tmp_path / "out" / f"{name}.png").std() > 1
-        assert (tmp_path / "out" / f"{name}.svg").stat().st_size > 2000
+        assert (tmp_path / "out" / f"{name}.png").is_file()
     out = capsys.readouterr().out
     assert re.search(r"bid, all sizes\n.*\n  bid, level none +12 +1 +50 % \(5-95\) +50 % \(5-95\) +50 %", out)
 
@@ -210,7 +182,7 @@ def test_without_matplotlib_a_report_tells_what_to_install(
 
 
 def test_figures_are_the_same_each_time(tmp_path: Path, results: list[TrialResult]) -> None:
-    first, second = (Figures(grouped(results), tmp_path / name, "10%").errors() for name in ("a", "b"))
+    first, second = (Figures(grouped(results[:2]), tmp_path / name, "10%").rates() for name in ("a", "b"))
     assert first.file.read_bytes() == second.file.read_bytes()
 
 
@@ -313,18 +285,14 @@ def test_a_report_without_starts_uses_no_share_of_their_error(
     assert main(["report", str(mixed), "--out", str(out), "--criterion", "10%"]) == 0
 
 
-def test_a_method_without_steps_has_confidence_and_deviations_instead(tmp_path: Path) -> None:
-    """Nothing is said or drawn of steps that there are not."""
-    spread = tuple(tuple(1e-4 * (i == j) for j in range(6)) for i in range(6))
+@pytest.mark.usefixtures("undrawn")
+def test_nothing_is_said_or_drawn_of_steps_that_there_are_not(tmp_path: Path) -> None:
     results = [
-        trial_result(
-            Trial("house", "photos", (f"{n}",), (), n), [0.01 * n], confidence=n / 40, covariance=spread,
-            start_error=None, converged=n % 2 == 0,
-        )
-        for n in range(40)
-    ]  # fmt: skip
+        trial_result(Trial("house", "photos", (f"{n}",), (), n), [0.01 * n], start_error=None)
+        for n in range(4)
+    ]
     assert main(["report", str(write(tmp_path / "r.jsonl", *results)), "--out", str(tmp_path / "out")]) == 0
-    assert {path.stem for path in (tmp_path / "out").glob("*.svg")} == {"rates", "errors", "calibration"}
+    assert {path.stem for path in (tmp_path / "out").glob("*.svg")} == {"rates", "errors"}
     for text in ("ms per step", "steps to", "10 %"):
         assert text not in read(tmp_path / "out").text
 
@@ -369,8 +337,8 @@ HOSTILE = (
 
 
 def hostile_result(place: int) -> TrialResult:
-    """Return a result that holds every fourth hostile text wherever a file may hold any text."""
-    texts, usual = HOSTILE[place::4], result(place, 2 + place, protocol="none")
+    """Return a result that holds every second hostile text wherever a file may hold any text."""
+    texts, usual = HOSTILE[place::2], result(place, 2 + place, protocol="none")
     text, name = "".join(texts), "".join(texts).replace("\0", "")
     trial = dataclasses.replace(usual.trial, map=name, data=name, split=text, device=text, depth_points=name)
     return dataclasses.replace(
@@ -386,7 +354,7 @@ def harmless(text: str) -> bool:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_hostile_names_are_harmless_everywhere(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    file = write(tmp_path / "r.jsonl", *map(hostile_result, range(4)))
+    file = write(tmp_path / "r.jsonl", *map(hostile_result, range(2)))
     run = provenance(HOSTILE[4], "\x1b]0;title\x07")
     for text in HOSTILE:
         note_run(file, dataclasses.replace(run, command=text, cpu=text, versions={text: text}))
@@ -414,6 +382,8 @@ def test_hostile_names_are_harmless_everywhere(tmp_path: Path, capfd: pytest.Cap
     assert len(drawings) == len(page.pictures) == 3
     for drawing in drawings:
         ET.parse(drawing)
+        assert iio.imread(drawing.with_suffix(".png")).std() > 1
+        assert drawing.stat().st_size > 2000
 
 
 def test_a_name_that_no_folder_can_have_is_refused(
@@ -461,6 +431,7 @@ def test_warnings_of_other_libraries_cannot_control_the_terminal(
     assert harmless(said)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_report_links_to_the_frames_from_the_worst_to_the_best(tmp_path: Path) -> None:
     first = ResultTable.load(Path(__file__).with_name("earlier_results.jsonl")).rows[0]
     near, far, hostile = ScalarPoseError(0.01, 1.0), ScalarPoseError(0.3, 1.0), "<script>alert(1)</script>"
@@ -483,6 +454,7 @@ def test_a_report_links_to_the_frames_from_the_worst_to_the_best(tmp_path: Path)
     assert "my%20map.html" not in (tmp_path / "out" / "index.html").read_text()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_worst_frames_are_shown_as_the_method_received_them(tmp_path: Path) -> None:
     """They are shown with their faults; results name a dataset, of which the reader may have a copy anywhere."""
     views = tiny.views(2)
