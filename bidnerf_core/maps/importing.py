@@ -175,12 +175,7 @@ def _of_structure(
     if structure.keypoints:
         read, tracked = _described(structure, features, origin)
     else:
-        read = read_views(capture, replace(options.images, split="all")).about(origin)
-        points = [of_image[of_image >= 0].unique() for of_image in structure.observed]
-        positions = structure.positions + offset
-        tracked = tracked_views(
-            read.views, features, known=lambda images: matches_of_points(images, points, positions)
-        )
+        read, tracked = read_views(capture, replace(options.images, split="all")).about(origin), None
     bounds = bounds_about(structure.positions[structure.positions.isfinite().all(-1)] + offset)
     _report_extent(found, str(capture.path), unit)
     info = MapInfo(
@@ -192,6 +187,12 @@ def _of_structure(
         scene = replace(scene, info=write_parts(place, info, TrainingState(0, {}, {})), folder=place)
     if not bake:
         return scene
+    if tracked is None:
+        points = [of_image[of_image >= 0].unique() for of_image in structure.observed]
+        positions = structure.positions + offset
+        tracked = tracked_views(
+            read.views, features, known=lambda images: matches_of_points(images, points, positions)
+        )
     scene, _ = scene.with_landmarks(read.views, tracked=tracked)
     if scene.landmarks is None:
         raise InputError("its images give no landmarks", where=capture.path)

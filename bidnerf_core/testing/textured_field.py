@@ -70,7 +70,7 @@ def view(T: SE3, name: str = "", seed: int = 0) -> View:
 
 def seen(T: SE3, camera: Intrinsics, name: str = "", seed: int = 0) -> View:
     """Return an image of the ground from any camera, with its depth."""
-    image = render_image(ground(seed), camera, T, BOUNDS)
+    image = render_image(ground(seed), camera, T, BOUNDS, chunk=512)  # whose waves stay in the cache
     return View(Frame(name, image.rgb, camera, torch.where(image.opacity > 0.95, image.depth, 0)), T)
 
 

@@ -43,7 +43,7 @@ def test_half_of_the_views_may_lack_depth() -> None:
 
 
 def test_silhouettes_leave_nothing_beyond_the_box() -> None:
-    bare = [replace(view, frame=replace(view.frame, depth=None)) for view in tiny.views()]
+    bare = [replace(view, frame=replace(view.frame, depth=None)) for view in tiny.views(3)]
     assert not estimate_bounds(bare).contracted
     opaque = [replace(view, frame=replace(view.frame, alpha=None)) for view in bare]
     assert estimate_bounds(opaque).contracted
@@ -115,7 +115,7 @@ def test_landmarks_tell_what_a_pixel_shows() -> None:
 
 
 def test_without_distances_a_pixel_is_taken_to_show_the_middle_of_the_scene() -> None:
-    bare = [replace(view, frame=replace(view.frame, depth=None)) for view in tiny.views()]
+    bare = [replace(view, frame=replace(view.frame, depth=None)) for view in tiny.views(3)]
     bounds = estimate_bounds(bare)
     away = [math.dist(view.T_ref_camera.translation.tolist(), bounds.centre) for view in bare]
     assert bounds.footprint == pytest.approx(statistics.median(away) / tiny.CAMERA.fx, rel=1e-4)
@@ -128,7 +128,7 @@ def test_a_camera_amid_the_scene_is_taken_to_show_what_is_half_its_side_away() -
 
 def test_a_single_wrong_distance_does_not_tell_what_pixels_show() -> None:
     """Silhouettes give the box, so they also tell the distance; and so do the cameras where there are too few landmarks."""
-    bare = [replace(view, frame=replace(view.frame, depth=None)) for view in tiny.views()]
+    bare = [replace(view, frame=replace(view.frame, depth=None)) for view in tiny.views(3)]
     far = torch.zeros(tiny.SIZE, tiny.SIZE)
     far[0, 0] = 500.0
     astray = replace(bare[0], frame=replace(bare[0].frame, depth=far))

@@ -9,7 +9,6 @@ import shutil
 import sqlite3
 import sys
 import types
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,17 +20,15 @@ import torch
 import bidnerf_core as bn
 import tiny
 from bidnerf_core import SE3, Frame, View
-from bidnerf_core.backend import load_backend, quick_config
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import read_posed_images, stored_keypoints
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, Keypoints, tracked_views
 from bidnerf_core.maps import IMPORTERS
-from bidnerf_core.progress import Progress
 from photo_room import CAMERA, looking, photograph, walk, write_photos
 from refusals import refused
 
-COUNT = 10
+COUNT = 6
 pytestmark = pytest.mark.skipif(
     "colmap" not in IMPORTERS, reason="bidnerf was installed before it had this importer: reinstall it"
 )
@@ -126,9 +123,10 @@ def model(original: Model, tmp_path: Path) -> Model:
 
 @pytest.fixture(scope="module")
 def imported(original: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of the map imported by the photos."""
-    folder = tmp_path_factory.mktemp("imported") / "map"
+    """The folder of the map imported by the photos, which are only read."""
+    folder, before = tmp_path_factory.mktemp("imported") / "map", original.digests
     bn.import_map(original.folder, folder)
+    assert original.digests == before
     return folder
 
 
@@ -157,16 +155,17 @@ def test_an_affine_shape_has_the_scale_of_a_circle_of_its_area(
 
 @pytest.mark.parametrize("source", ["photos", "database"])
 def test_a_model_becomes_a_map_of_landmarks_in_its_own_frame(
-    model: Model, source: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    model: Model, imported: Path, source: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    folder = imported
     if source == "database":
         model.write_database(model.folder / "database.db")
-    before = model.digests
-    with caplog.at_level(logging.INFO, "bidnerf"):
-        bn.import_map(model.folder, tmp_path / "map")
-    assert model.digests == before
-    assert ("the keypoints and their descriptors" in caplog.text) == (source == "database")
-    scene = bn.load_map(tmp_path / "map")
+        before, folder = model.digests, tmp_path / "map"
+        with caplog.at_level(logging.INFO, "bidnerf"):
+            bn.import_map(model.folder, folder)
+        assert model.digests == before
+        assert "the keypoints and their descriptors" in caplog.text
+    scene = bn.load_map(folder)
     assert not scene.has_field
     assert "landmarks alone localize photos" in str(scene.describe())
     assert [camera.name for camera in scene.info.cameras] == [f"{number:03d}" for number in range(COUNT)]
@@ -174,7 +173,7 @@ def test_a_model_becomes_a_map_of_landmarks_in_its_own_frame(
     for camera, T in zip(scene.info.cameras, model.poses, strict=True):
         assert camera.intrinsics == CAMERA
         torch.testing.assert_close(camera.pose.matrix(), T.matrix())
-    found = bn.Localizer(tmp_path / "map")(unseen())
+    found = bn.Localizer(scene)(unseen())
     assert found.converged, found.reason
     assert error_of(found, UNSEEN) < 0.01
 
@@ -193,9 +192,9 @@ def test_keypoints_of_another_model_are_not_used(
 ) -> None:
     model.write_database(model.folder / "database.db", drop=1)
     with caplog.at_level(logging.INFO, "bidnerf"):
-        scene = bn.import_map(model.folder)
+        scene = bn.import_map(model.folder, bake=False)
     assert "not used: it has" in caplog.text
-    assert error_of(bn.Localizer(scene)(unseen()), UNSEEN) < 0.01
+    assert len(scene.info.cameras) == COUNT
     given = {"keypoints": str(model.folder / "database.db")}
     with refused(where="database.db", found="keypoints of 000.png, the model", expected="the keypoints of"):
         bn.import_map(model.folder, None, given)
@@ -236,7 +235,7 @@ def test_each_photo_that_is_left_out_has_a_reason(model: Model, caplog: pytest.L
     lines[2 + 2 * 5] = ""
     (model.folder / "sparse" / "images.txt").write_text("\n".join(lines) + "\n")
     with caplog.at_level(logging.INFO, "bidnerf"):
-        scene = bn.import_map(model.folder)
+        scene = bn.import_map(model.folder, bake=False)
     assert len(scene.info.cameras) == COUNT - 2
     assert "left out: 003.png: no such photo" in caplog.text
     assert "left out: 005.png: it observes fewer than 6 points" in caplog.text
@@ -244,6 +243,7 @@ def test_each_photo_that_is_left_out_has_a_reason(model: Model, caplog: pytest.L
 
 def test_a_model_is_scaled_and_placed(model: Model) -> None:
     place = SE3.exp(torch.tensor([5.0, -3.0, 1.0, 0.4, 0.2, -0.7], dtype=torch.float64))
+    model.write_database(model.folder / "database.db")
     scene = bn.import_map(model.folder, options=bn.ImportOptions(scale=2.0, T_world_file=place))
     found = bn.Localizer(scene)(unseen())
     assert found.converged
@@ -283,15 +283,15 @@ def test_training_adds_a_field_and_keeps_landmarks_and_cameras(
 ) -> None:
     shutil.copytree(imported, tmp_path / "map")
     before = bn.load_map(tmp_path / "map")
-    after = bn.train(original.folder, out=tmp_path / "map", config=tiny.config(20))
+    after = bn.train(original.folder, out=tmp_path / "map", config=tiny.config(), bake=False)
     assert after.has_field
     assert after.info.cameras == before.info.cameras
     assert after.landmarks is not None
     assert before.landmarks is not None
     assert torch.equal(after.landmarks.positions, before.landmarks.positions)
-    assert bn.load_map(tmp_path / "map").info.step == 20
+    assert bn.load_map(tmp_path / "map").info.step == tiny.STEPS
     with pytest.raises(InputError, match=r"not empty|holds"):
-        bn.train(original.folder, out=tmp_path / "map", config=tiny.config(20))
+        bn.train(original.folder, out=tmp_path / "map", config=tiny.config())
 
 
 def test_damaged_landmarks_are_named_before_a_field_is_added(
@@ -301,52 +301,4 @@ def test_damaged_landmarks_are_named_before_a_field_is_added(
     (file,) = (tmp_path / "map").glob("landmarks-*")
     file.write_bytes(file.read_bytes()[:100])
     with refused(where=file):
-        bn.train(original.folder, out=tmp_path / "map", config=tiny.config(20))
-
-
-# Training in parts.
-
-
-def stopping_at(stage: str) -> Iterator[Any]:
-    """Yield a progress callback and a cancel function that stop a job in a stage."""
-    reached: list[str] = []
-
-    def progress(now: Progress) -> None:
-        if now.stage == stage:
-            reached.append(stage)
-
-    yield progress
-    yield lambda: bool(reached)
-
-
-@pytest.mark.parametrize(
-    ("stage", "kept"), [("training", "landmarks and field"), ("baking", "landmarks and field")]
-)
-def test_what_was_finished_is_kept_when_a_stage_is_cancelled_and_finish_ends_it(
-    model: Model, stage: str, kept: str, tmp_path: Path
-) -> None:
-    progress, cancel = stopping_at(stage)
-    with pytest.raises(bn.Cancelled) as stopped:
-        bn.train(model.folder, out=tmp_path / "map", config=tiny.config(20), progress=progress, cancel=cancel)
-    half = bn.load_map(tmp_path / "map")
-    assert bn.Localizer(half)(unseen()).converged
-    if stage == "baking":
-        assert f"the map has its {kept} so far" in str(stopped.value)
-    else:
-        assert 0 < half.info.step < 20
-    done = bn.resume(tmp_path / "map", model.folder, finish=True)
-    assert done.info.complete
-    assert done.info.step == half.info.step
-    assert done.landmarks is not None
-    assert half.landmarks is not None
-    assert torch.equal(done.landmarks.positions, half.landmarks.positions)
-    with refused(found="nothing to resume"):
-        bn.resume(tmp_path / "map", model.folder)
-
-
-def test_quick_training_takes_the_backends_quick_settings(model: Model, tmp_path: Path) -> None:
-    progress, cancel = stopping_at("training")
-    with pytest.raises(bn.Cancelled):
-        bn.train(model.folder, out=tmp_path / "map", config="quick", progress=progress, cancel=cancel)
-    info = bn.load_map(tmp_path / "map").info
-    assert info.config["steps"] == quick_config(load_backend("hashgrid")).steps
+        bn.train(original.folder, out=tmp_path / "map", config=tiny.config())

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import subprocess
-import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -17,6 +15,7 @@ from torch import nn
 
 import bidnerf_core as bn
 import tiny
+from bidnerf_core.backend import load_backend, quick_config
 from bidnerf_core.evaluation import perturb
 from bidnerf_core.io import FileInUse, to_plain
 from bidnerf_core.localization import settings_of
@@ -24,6 +23,7 @@ from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps import load_info, rendering_scores
 from bidnerf_core.progress import Progress
 from bidnerf_core.registry import PluginError
+from bidnerf_core.testing import training_views, unseen
 from bidnerf_hashgrid import backend as hashgrid
 from refusals import refused
 
@@ -140,6 +140,40 @@ def test_cancelled_and_resumed_equals_uninterrupted(whole: bn.Map, tmp_path: Pat
         bn.resume(tmp_path / "half", tiny.views())
 
 
+def stopping_at(stage: str) -> dict[str, Any]:
+    """Return the options of a job that is cancelled in a stage."""
+    seen = list[str]()
+    return {"progress": lambda now: seen.append(now.stage), "cancel": lambda: stage in seen}
+
+
+@pytest.mark.parametrize("stage", ["training", "baking"])
+def test_what_was_finished_is_kept_when_a_stage_is_cancelled_and_finish_ends_it(
+    stage: str, tmp_path: Path
+) -> None:
+    out, views = tmp_path / "map", [replace(v, frame=v.frame.replace(depth=None)) for v in training_views()]
+    with pytest.raises(bn.Cancelled) as stopped:
+        bn.train(views, out=out, config=tiny.config(), bake=BAKE, **stopping_at(stage))
+    half = bn.load_map(out)
+    assert half.landmarks is not None
+    assert bn.Localizer(half)(unseen().frame).converged
+    if stage == "baking":
+        assert "the map has its landmarks and field so far" in str(stopped.value)
+    else:
+        assert 0 < half.info.step < tiny.STEPS
+    done = bn.resume(out, views, bake=BAKE, finish=True)
+    assert (done.info.complete, done.info.step) == (True, half.info.step)
+    assert done.landmarks is not None
+    assert torch.equal(done.landmarks.positions, half.landmarks.positions)
+    with refused(found="nothing to resume"):
+        bn.resume(out, views)
+
+
+def test_quick_training_takes_the_backends_quick_settings(tmp_path: Path) -> None:
+    with pytest.raises(bn.Cancelled):
+        trained(tmp_path / "map", config="quick", **stopping_at("training"))
+    assert load_info(tmp_path / "map").config["steps"] == quick_config(load_backend("hashgrid")).steps
+
+
 def test_cancelling_before_training_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(bn.Cancelled):
         trained(tmp_path / "map", cancel=lambda: True)
@@ -209,22 +243,6 @@ def test_of_two_threads_that_train_into_one_folder_the_second_is_refused(tmp_pat
         go_on.set()
         assert first.result().info.complete
     assert load_info(tmp_path / "map").complete
-
-
-@pytest.mark.slow
-def test_a_process_that_trains_into_the_folder_of_a_thread_is_refused(tmp_path: Path) -> None:
-    tiny.write_dataset(tmp_path / "data")
-    program = "import sys; from bidnerf_core.cli import main; sys.exit(main())"
-    words = ["train", str(tmp_path / "data"), "--out", str(tmp_path / "map"), "--overwrite", *tiny.options()]
-    ran = list[subprocess.CompletedProcess[str]]()
-
-    def compete(now: Progress) -> None:
-        if not ran:
-            command = [sys.executable, "-c", program, *words]
-            ran.append(subprocess.run(command, capture_output=True, text=True, timeout=300))
-
-    assert trained(tmp_path / "map", progress=compete).info.complete
-    assert (ran[0].returncode, "another bidnerf process is writing here" in ran[0].stderr) == (1, True)
 
 
 def test_baking_stores_what_it_made_where_the_map_is(scene: bn.Map, tmp_path: Path) -> None:

@@ -216,11 +216,13 @@ def chosen_grid(
     grid = VoxelGrid.covering(bounds, finest)
     while grid.cell < coarsest and len(points) < 1.32 * len(grid.numbers(points).unique()):
         grid = VoxelGrid.covering(bounds, min(COARSER * grid.cell, coarsest))
-    wished, needed = grid, surface_bytes(points, grid)
-    while surface_bytes(points, grid) > 1e6 * megabytes:
+    wished = grid
+    needed = taken = surface_bytes(points, grid)
+    while taken > 1e6 * megabytes:
         if grid.cell > max(bounds.size):
             raise InputError(f"no surface fits into {megabytes:g} MB; allow more megabytes")
         grid = VoxelGrid.covering(bounds, COARSER * grid.cell)
+        taken = surface_bytes(points, grid)
     if grid is not wished:
         size = "too many cells" if math.isinf(needed) else f"{needed / 1e6:.0f} MB"
         warnings.warn(
