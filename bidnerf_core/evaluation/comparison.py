@@ -159,53 +159,44 @@ def compare(
     importable main module. Maps in memory, and all maps if the data is in memory, run in this process. One trial runs at a time, so that a change
     in the machine's load affects all maps alike. Raises ``InputError`` and ``Cancelled`` as ``evaluate`` does.
     """
-    if isinstance(scenes, str | Path | Map):
-        raise InputError(
-            f"scenes is the one map {name_of(scenes)}", expected="a list of maps, or a dictionary of them"
-        )
-    named = dict(scenes) if isinstance(scenes, Mapping) else _named(scenes)
-    if not named:
-        raise InputError("no maps to compare", expected="at least one")
+    named = named_maps(scenes)
     plan = plan or Plan()
     if plan.sizes is None:
         plan = replace(plan, sizes=plan.starts()[:1])
     if len(plan.starts()) > 1 or len(plan.faults) > 1:
         raise InputError("maps are compared from one kind of start", expected="one size and one fault")
-    with job_context(progress, cancel):
+    with job_context(progress, cancel), ExitStack() as stack:
         for scene in named.values():
             if not isinstance(scene, Map) and not is_closed_form(str(scene)):
-                load_info(Path(scene))
-        in_memory = not isinstance(data, str | Path)
+                load_info(Path(scene))  # raises before any work for what is not a map
         here = {
-            name: open_both(scene, data, plan) if in_memory or isinstance(scene, Map) else None
+            name: open_both(scene, data, plan)
             for name, scene in named.items()
+            if isinstance(scene, Map) or not isinstance(data, str | Path)
         }
-        dataset = next((scene[1] for scene in here.values() if scene is not None), None)
-        if dataset is None:
-            dataset = open_data(data, plan.reading)
+        dataset = next((capture for _, capture in here.values()), None) or open_data(data, plan.reading)
         starts = planned(plan, "", name_of(data), dataset)
-        with ExitStack() as stack:
-            places = {
-                name: stack.enter_context(ended_on_failure(InThisProcess() if scene else own_processes(1)))
-                for name, scene in here.items()
-            }
-            found: dict[str, list[tuple[TrialResult, float]]] = {name: [] for name in named}
-            for number, (start, (name, scene)) in enumerate(product(starts, named.items()), start=1):
-                check_cancelled("comparison")
-                trial = replace(
-                    start, map=name if here[name] else str(scene), device=device_name(scene, plan.device)
-                )
-                running = places[name].submit(measured, trial, here[name], registered_for(trial))
-                try:
-                    found[name].append(running.result())
-                except BrokenProcessPool as error:
-                    raise InputError(
-                        f"the process that localized frame {trial.frame} ended", where=trial.map,
-                        expected="a result; was memory short, or does the main module begin work outside of"
-                        " 'if __name__ == \"__main__\"'?",
-                    ) from error  # fmt: skip
-                total, text = len(starts) * len(named), f"{trial.frame} in {name}"
-                report_progress(Progress("comparison", number, total, "trials", text))
+        executors = {
+            name: stack.enter_context(ended_on_failure(InThisProcess() if name in here else own_processes(1)))
+            for name in named
+        }
+        turns = list(product(starts, named))
+        found: dict[str, list[tuple[TrialResult, float]]] = {name: [] for name in named}
+        for number, (start, name) in enumerate(turns, start=1):
+            check_cancelled("comparison")
+            device = device_name(named[name], plan.device)
+            trial = replace(start, map=name if name in here else str(named[name]), device=device)
+            try:
+                running = executors[name].submit(measured, trial, here.get(name), registered_for(trial))
+                found[name].append(running.result())
+            except BrokenProcessPool as error:
+                raise InputError(
+                    f"the process that localized frame {trial.frame} ended", where=trial.map,
+                    expected="a result; was memory short, or does the main module begin work outside of"
+                    " 'if __name__ == \"__main__\"'?",
+                ) from error  # fmt: skip
+            text = f"{trial.frame} in {name}"
+            report_progress(Progress("comparison", number, len(turns), "trials", text))
     results = {name: tuple(result for result, _ in pairs) for name, pairs in found.items()}
     rows = tuple(
         MapRow.of(name, map_bytes(scene), results[name], [samples for _, samples in found[name]])
@@ -250,22 +241,29 @@ def map_bytes(stored: Scene) -> int:
     return sum((folder / name).stat().st_size for name in (DESCRIPTION, load_info(folder).weights))
 
 
-def _named(scenes: Sequence[Scene]) -> dict[str, Scene]:
-    """Return the maps by the shortest names that distinguish them; maps in memory with the same backend are numbered."""
-    folders = [str(scene) for scene in scenes if not isinstance(scene, Map)]
-    if len({Path(folder).resolve() for folder in folders}) != len(folders):
-        raise InputError(f"{', '.join(folders)}: one is named twice", where="maps", expected="different ones")
-    labels = iter(map_labels(folders))
+def named_maps(scenes: Sequence[Scene] | Mapping[str, Scene]) -> dict[str, Scene]:
+    """Return the maps by name, given or the shortest that distinguishes them; maps in memory of one backend are numbered.
+
+    Folders are named by as few of their last parts as make the names unique. Raises ``InputError`` without maps, for a single map
+    that is not in a list, and for a folder that is named twice.
+    """
+    if isinstance(scenes, str | Path | Map):
+        raise InputError(
+            f"scenes is the one map {name_of(scenes)}", expected="a list of maps, or a dictionary of them"
+        )
+    if not scenes:
+        raise InputError("no maps to compare", expected="at least one")
+    if isinstance(scenes, Mapping):
+        return dict(scenes)
+    folders = {str(scene): Path(scene).resolve().parts for scene in scenes if not isinstance(scene, Map)}
+    if len(set(folders.values())) < sum(not isinstance(scene, Map) for scene in scenes):
+        raise InputError(
+            f"{', '.join(map(str, scenes))}: one is named twice", where="maps", expected="different ones"
+        )
+    length = next(n for n in count(1) if len({parts[-n:] for parts in folders.values()}) == len(folders))
     found: dict[str, Scene] = {}
     for scene in scenes:
-        base = name_of(scene) if isinstance(scene, Map) else next(labels)
+        base = name_of(scene) if isinstance(scene, Map) else "/".join(folders[str(scene)][-length:])
         names = (f"{base} {number}" if number > 1 else base for number in count(1))
         found[next(name for name in names if name not in found)] = scene
     return found
-
-
-def map_labels(maps: Sequence[str]) -> list[str]:
-    """Return the folders' names, prefixed with as few of their parents as make them unique."""
-    parts = [Path(m).resolve().parts for m in maps]
-    length = next(n for n in count(1) if len({p[-n:] for p in parts}) == len(parts))
-    return ["/".join(p[-length:]) for p in parts]

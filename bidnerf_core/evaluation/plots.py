@@ -1,4 +1,4 @@
-"""The figures of an evaluation: success, errors, convergence and faults; maps side by side.
+"""The figures of an evaluation: errors, times and convergence; maps side by side.
 
 A figure is a grid of equally large panels, so that all figures of a page have the same font size. A condition
 has the same colour in all figures.
@@ -16,33 +16,24 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from bidnerf_core.evaluation.comparison import Comparison
-from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT
+from bidnerf_core.evaluation.faults import NO_FAULT
 from bidnerf_core.evaluation.summary import (
     NEVER,
-    FaultCurve,
     Group,
     Situation,
     applies,
     are_stepwise,
-    fault_curves,
-    rate_of,
     situation_titles,
     situations,
     steps_of,
     succeeded,
-    success_of,
     unit_of,
 )
 from bidnerf_core.evaluation.trial import TrialResult
 from bidnerf_core.results import (
-    COLOURS,
-    CRITERIA,
     CRITERION_NAMES,
-    SHORT_CRITERION_NAMES,
-    Rate,
     line_look,
     new_figure,
     require_matplotlib,
@@ -54,16 +45,10 @@ WIDTH, COLUMNS = 10.8, 3
 """Width of a figure in inches, and number of panels side by side."""
 PER_INCH = 13
 """Average number of characters per inch of text."""
-MOST_LINES, MOST_SITUATIONS = 150, 16
-"""Maximum numbers of groups and of situations in a figure; larger figures can be neither drawn nor read."""
+MOST_SITUATIONS = 16
+"""Maximum number of situations in a figure; larger figures can be neither drawn nor read."""
 BOUND: dict[str, Any] = {"color": "#999", "linewidth": 0.8, "linestyle": (0, (4, 3))}
-"""The look of a bound, or of where two quantities are equal."""
-SHARES: dict[str, tuple[Callable[[TrialResult], bool], str]] = {
-    "right": (succeeded, COLOURS[2]),
-    "accepted": (lambda result: result.converged, COLOURS[0]),
-    "accepted, but wrong": (lambda result: result.converged and not succeeded(result), COLOURS[1]),
-}
-"""The lines of a panel of faults: which trials each counts, and its colour."""
+"""The look of a bound."""
 
 
 class Quantity(NamedTuple):
@@ -109,77 +94,33 @@ class Figure:
 class Figures:
     """Draws figures of ``groups`` and saves them as PNG and SVG in ``folder``. Raises ``InputError`` without matplotlib.
 
-    ``criterion`` defines success in the figures that show a single criterion. Only the first ``MOST_LINES`` groups and
-    ``MOST_SITUATIONS`` situations are drawn.
+    ``criterion`` defines success by step. Images without faults are drawn, if there are any, in at most ``MOST_SITUATIONS`` situations.
     """
 
     def __init__(self, groups: Sequence[Group], folder: Path, criterion: str) -> None:
         require_matplotlib()
-        self.groups, self.folder, self.criterion = list(groups), folder, criterion
-        self.looks = {
-            label: line_look(place) for place, label in enumerate(dict.fromkeys(g.label for g in groups))
-        }
+        self.folder, self.criterion = folder, criterion
+        self.groups = [g for g in groups if g.situation.fault == NO_FAULT] or list(groups)
+        labels = dict.fromkeys(group.label for group in groups)
+        self.looks = {label: line_look(place) for place, label in enumerate(labels)}
         self.titles = situation_titles(situations(groups))
-        self.clean = [g for g in self.groups if g.situation.fault == NO_FAULT] or self.groups
 
     def all(self) -> list[Figure]:
         """Draw every figure for which the results have data."""
-        drawn = (self.rates(), self.faults(), self.errors(), self.convergence())
-        return [figure for figure in drawn if figure is not None]
+        return [figure for figure in (self.errors(), self.convergence()) if figure is not None]
 
     @property
     def omitted(self) -> str:
         """A sentence about what is not drawn; empty if everything is drawn."""
-        places = situations(self.groups)
-        if len(self.groups) <= MOST_LINES and len(places) <= MOST_SITUATIONS:
+        count = len(situations(self.groups))
+        if count <= MOST_SITUATIONS:
             return ""
-        return (
-            f" At most {MOST_LINES} of {len(self.groups)} groups and {MOST_SITUATIONS} of {len(places)} situations are"
-            " drawn; the tables have all."
-        )
-
-    def rates(self) -> Figure:
-        """Draw success rates with intervals: a panel for each criterion that applies, a line for each group."""
-        shown = self.groups[:MOST_LINES]
-        named = [
-            _wrapped(f"{self.titles[g.situation]}  ·  {g.label}", 5.0, 2) + f"  (n = {len(g.results)})"
-            for g in shown
-        ]
-        criteria = [name for name in CRITERIA if any(applies(name, group.results) for group in shown)]
-        with styled():
-            figure = new_figure(WIDTH, 0.9 + 0.27 * len(shown))
-            axes = figure.subplots(1, len(criteria), squeeze=False, sharey=True)[0]
-            for panel, criterion in zip(axes, criteria, strict=True):
-                for place, group in enumerate(shown):
-                    if (found := success_of(group.results, criterion)) is not None:
-                        _intervals(panel, [place], [found.rate], True, color=self.looks[group.label]["color"])
-                title = SHORT_CRITERION_NAMES[criterion]
-                panel.set(title=title, xlabel="successful trials (%)", xlim=(-3, 103))
-                panel.grid(axis="x")
-            axes[0].set_yticks(range(len(shown)), named)
-            axes[0].set_ylim(len(shown) - 0.3, -0.7)
-            file = save_figure(figure, self.folder, "rates")
-        return Figure(file, f"Success rates with Wilson's 95 % intervals.{self.omitted}")
-
-    def faults(self) -> Figure | None:
-        """Draw a panel for each curve of ``fault_curves``; None if no fault was tried on its own."""
-        curves = fault_curves(self.groups)[: COLUMNS * MOST_SITUATIONS]
-        titles = situation_titles([curve.situation for curve in curves])
-        panels: list[Panel] = []
-        for curve in curves:
-            places = [titles[curve.situation]] + ([curve.label] if len(self.looks) > 1 else [])
-            panels.append((f"{curve.name}\n{', '.join(places)}", partial(_draw_curve, curve=curve)))
-        handles = {name: {"color": colour, "marker": "o"} for name, (_, colour) in SHARES.items()}
-        return self._figure(
-            "faults", panels, handles,
-            "Trials by fault of the images and its size, with 95 % intervals: right (within 5 degrees and 0.05 units),"
-            f" accepted by the method itself, and accepted but wrong.{self.omitted}",
-        )  # fmt: skip
+        return f" At most {MOST_SITUATIONS} of {count} situations are drawn; the tables have all."
 
     def errors(self) -> Figure | None:
         """Draw, for each situation, the share of trials within each error, and the share answered rightly within each time."""
         return self._by_situation(
-            "errors", self.clean, self.cumulative(),
+            "errors", self.groups, self.cumulative(),
             "Cumulative errors: the share of all trials whose final error is at most that on the axis; answers that the"
             " method itself refused count as well, and the dashed lines are 0.05 and 5 degrees. Right: the share of all"
             f" trials that were answered rightly (within both) in at most that time.{self.omitted}",
@@ -193,7 +134,7 @@ class Figures:
         """Draw errors and success after each step, for methods that work in steps; None if there are none."""
         draw = [*(partial(self._quartiles, kind=kind) for kind in ERRORS), partial(self._shares, of="steps")]
         return self._by_situation(
-            "convergence", [group for group in self.clean if are_stepwise(group.results)], draw,
+            "convergence", [group for group in self.groups if are_stepwise(group.results)], draw,
             "Errors after each step: median and quartiles of all trials; the dashed lines are 0.05 and 5 degrees. Right: the"
             f" share of all trials that meet the criterion ({CRITERION_NAMES[self.criterion]}) from each step on."
             f"{self.omitted}",
@@ -279,44 +220,17 @@ class Figures:
             return Figure(save_figure(figure, self.folder, name), caption)
 
 
-def _intervals(
-    axes: Any, places: Sequence[float] | Float[np.ndarray, "n"], rates: Sequence[Rate], across: bool = False, **look: Any
-) -> None:  # fmt: skip
-    """Draw rates (%) with their intervals at ``places`` on the horizontal axis, or on the vertical axis if ``across``."""
-    middle = 100 * np.array([rate.rate for rate in rates])
-    spread = np.abs(100 * np.array([[rate.low for rate in rates], [rate.high for rate in rates]]) - middle)
-    look = {"marker": "o", "markersize": 4, "elinewidth": 1, "linewidth": 1.4} | look
-    axes.errorbar(
-        *(middle, places) if across else (places, middle), **{"xerr" if across else "yerr": spread}, **look
-    )
-
-
-def _draw_curve(axes: Any, curve: FaultCurve) -> None:
-    """Draw the shares of trials by the size of a fault; sizes are evenly spaced, since they may span orders of magnitude."""
-    fault, places = FAULTS.load(curve.name), np.arange(len(curve.points))
-    for turn, (share, colour) in enumerate(SHARES.values()):
-        rates = [rate_of(group.results, list(map(share, group.results))) for _, group in curve.points]
-        _intervals(axes, places + 0.06 * (turn - 1), rates, color=colour)
-    sizes = ["none" if size == fault.neutral else f"{size:g}" for size, _ in curve.points]
-    axes.set_xticks(
-        places, [f"{s}\nn={len(g.results)}" for s, (_, g) in zip(sizes, curve.points, strict=True)]
-    )
-    axes.set(xlabel=fault.unit, ylabel="trials (%)", ylim=(-3, 103), xlim=(-0.5, len(places) - 0.5))
-    axes.grid(axis="y")
-
-
-def _set_logarithmic(axes: Any, *names: str) -> None:
-    """Give axes a logarithmic scale with plain numbers, and a grid."""
+def _set_logarithmic(axes: Any, name: str) -> None:
+    """Give the axis ``name`` a logarithmic scale with plain numbers, and a grid."""
     from matplotlib.ticker import LogLocator
 
-    for name in names:
-        axes.set(**{f"{name}scale": "log"})
-        axis = getattr(axes, f"{name}axis")
-        axis.set_major_formatter("{x:g}")
-        low, high = getattr(axes, f"get_{name}lim")()
-        if high < 10 * low:  # at most one power of ten is in view
-            axis.set_minor_locator(LogLocator(subs=(1.5, 2, 3, 5)))
-        axis.set_minor_formatter("{x:g}" if high < 10 * low else "")
+    axes.set(**{f"{name}scale": "log"})
+    axis = getattr(axes, f"{name}axis")
+    axis.set_major_formatter("{x:g}")
+    low, high = getattr(axes, f"get_{name}lim")()
+    if high < 10 * low:  # at most one power of ten is in view
+        axis.set_minor_locator(LogLocator(subs=(1.5, 2, 3, 5)))
+    axis.set_minor_formatter("{x:g}" if high < 10 * low else "")
     axes.grid(which="major")
 
 

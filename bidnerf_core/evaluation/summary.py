@@ -7,11 +7,10 @@ import math
 import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import Any
 
 from bidnerf_core.errors import amount
-from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, parse_faults
+from bidnerf_core.evaluation.faults import NO_FAULT
 from bidnerf_core.evaluation.trial import TrialResult
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.results import CRITERIA, Rate, Reduced, steps_to_success, success_rate_by_frame
@@ -257,31 +256,3 @@ def median(values: Iterable[float | None]) -> float | None:
     known = [math.inf if value is None else float(value) for value in values]
     middle = statistics.median(known) if known else math.inf
     return middle if math.isfinite(middle) else None
-
-
-class FaultCurve(NamedTuple):
-    """The trials of one condition under one kind of fault, by the fault's size in ascending order."""
-
-    situation: Situation  # without fault
-    label: str  # of the condition
-    name: str  # of the fault
-    points: list[tuple[float, Group]]
-
-
-def fault_curves(groups: Sequence[Group]) -> list[FaultCurve]:
-    """Return a curve for each fault that was tried on its own.
-
-    Trials without any fault belong to every curve of their situation and condition whose fault has a neutral size.
-    """
-    found: dict[tuple[Situation, str, str], dict[float, Group]] = {}
-    for group in groups:
-        parts = parse_faults(group.situation.fault)
-        if len(parts) == 1 and group.situation.size is not None:
-            key = replace(group.situation, fault=NO_FAULT), group.label, parts[0].name
-            found.setdefault(key, {})[parts[0].size] = group
-    clean = {(group.situation, group.label): group for group in groups}
-    for (situation, label, name), points in found.items():
-        neutral = FAULTS.load(name).neutral
-        if neutral is not None and (situation, label) in clean:
-            points.setdefault(neutral, clean[situation, label])
-    return [FaultCurve(*key, sorted(points.items(), key=itemgetter(0))) for key, points in found.items()]

@@ -31,7 +31,6 @@ from .overlays import save_gif as save_gif
 from .overlays import tile as tile
 from .plots import COLOURS as COLOURS
 from .plots import CRITERION_NAMES as CRITERION_NAMES
-from .plots import SHORT_CRITERION_NAMES as SHORT_CRITERION_NAMES
 from .plots import draw_capture as draw_capture
 from .plots import line_look as line_look
 from .plots import new_figure as new_figure

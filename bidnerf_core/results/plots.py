@@ -34,11 +34,6 @@ CRITERION_NAMES = {
     "5deg 0.05": "under 5° and 0.05 units",
     "1deg 0.02": "under 1° and 0.02 units",
 }
-SHORT_CRITERION_NAMES = {
-    "10%": "translation: 10 % of the start's",
-    "5deg 0.05": "5° and 0.05 units",
-    "1deg 0.02": "1° and 0.02 units",
-}
 
 
 def require_matplotlib() -> Any:
@@ -77,7 +72,9 @@ def save_figure(figure: Any, folder: Path, name: str) -> Path:
     """Save a figure as SVG, and as PNG next to it; return the path of the SVG."""
     folder.mkdir(parents=True, exist_ok=True)
     write_figure(figure, folder / f"{name}.png", dpi=160)
-    figure.set_layout_engine("none")  # what is laid out stays so, and laying it out again takes as long as drawing it
+    figure.set_layout_engine(
+        "none"
+    )  # what is laid out stays so, and laying it out again takes as long as drawing it
     write_figure(figure, folder / f"{name}.svg", metadata={"Date": None})
     return folder / f"{name}.svg"
 

@@ -29,7 +29,7 @@ from bidnerf_core.evaluation import (
     run_trial,
     trial,
 )
-from bidnerf_core.evaluation.comparison import MapRow, map_bytes, map_labels, measured
+from bidnerf_core.evaluation.comparison import MapRow, map_bytes, measured, named_maps
 from bidnerf_core.evaluation.run import InThisProcess, own_processes
 from bidnerf_core.evaluation.summary import success_of
 from bidnerf_core.io import from_plain
@@ -169,8 +169,8 @@ def test_without_a_start_there_is_no_share_of_its_error(tmp_path: Path) -> None:
 
 
 def test_maps_have_the_shortest_names_that_tell_them_apart() -> None:
-    assert map_labels(["/x/a", "/x/b"]) == ["a", "b"]
-    assert map_labels(["/x/a", "/y/a", "/y/b"]) == ["x/a", "y/a", "y/b"]
+    assert list(named_maps(["/x/a", "/x/b"])) == ["a", "b"]
+    assert list(named_maps(["/x/a", "/y/a", "/y/b"])) == ["x/a", "y/a", "y/b"]
 
 
 def test_maps_are_named_once(data: Path) -> None:

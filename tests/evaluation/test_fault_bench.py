@@ -22,23 +22,18 @@ from bidnerf_core.evaluation import (
     Plan,
     ResultsFile,
     Trial,
-    TrialResult,
     faulty,
-    grouped,
     key_of,
     left_to_do,
     planned,
 )
 
-# Inside: the values of curves, which a report shows as pictures, and the images of a trial
-from bidnerf_core.evaluation.plots import Figures
+# Inside: the images of a trial
 from bidnerf_core.evaluation.run import InThisProcess
-from bidnerf_core.evaluation.summary import fault_curves
 from bidnerf_core.evaluation.trial import trial_views
 from bidnerf_core.registry import registered
 from bidnerf_core.scenes import closed_form_data
 from refusals import refused
-from trial_results import trial_result
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 pytestmark = pytest.mark.usefixtures("small_images")
@@ -109,47 +104,6 @@ def test_results_notice_when_a_fault_has_changed(tmp_path: Path, monkeypatch: py
         monkeypatch.setitem(registered, ("faults", "exposure"), other)
         with refused(where=tmp_path / "r.jsonl", found="made with other images"):
             left_to_do(trials, file)
-
-
-def result(fault: str, seed: int, right: bool, converged: bool) -> TrialResult:
-    """Return a result without a start that is right or wrong, and converged or not."""
-    error = 0.001 if right else 1.0
-    return trial_result(trial(fault, seed), [error], [error], converged=converged, start_error=None)
-
-
-@pytest.fixture
-def results() -> list[TrialResult]:
-    """Ten trials a fault; the larger its size, the more are wrong, all of which converged."""
-    wrong = {"none": 0, "focal:0.95": 6, "focal:1.02": 3, "mirror:1": 10, "blur:3+focal:0.9": 5}
-    return [result(fault, seed, seed >= n, True) for fault, n in wrong.items() for seed in range(10)]
-
-
-def test_reports_group_by_fault_and_order_by_size(results: list[TrialResult]) -> None:
-    groups = grouped(results)
-    assert [g.situation.start for g in groups] == [
-        "no start", "no start, focal:0.95", "no start, focal:1.02", "no start, mirror:1", "no start, blur:3+focal:0.9",
-    ]  # fmt: skip
-    focal, mirror = fault_curves(groups)
-    assert [size for size, _ in focal.points] == [
-        0.95,
-        1.0,
-        1.02,
-    ]  # images without fault are at the neutral size
-    assert [size for size, _ in mirror.points] == [0.0, 1.0]
-    assert [len(group.results) for _, group in focal.points] == [10, 10, 10]
-    assert fault_curves(groups[:1]) == []
-
-
-@pytest.mark.slow
-def test_the_figure_shows_success_acceptance_and_silent_errors(
-    results: list[TrialResult], tmp_path: Path
-) -> None:
-    pytest.importorskip("matplotlib")
-    drawn = Figures(grouped(results), tmp_path, "5deg 0.05").faults()
-    assert drawn is not None
-    assert drawn.file.with_suffix(".png").stat().st_size > 5000
-    assert Figures(grouped(results[:10]), tmp_path / "none", "5deg 0.05").faults() is None
-    assert "Trials by fault of the images" in drawn.caption
 
 
 # The benchmark.

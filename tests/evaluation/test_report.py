@@ -149,7 +149,7 @@ def test_the_page_needs_nothing_beside_it(
     assert page.fetched == []
     assert page.open == 0, "an element is not closed"
     assert "url(" not in (tmp_path / "out" / "index.html").read_text()
-    assert len(page.pictures) == 3
+    assert len(page.pictures) == 2
     for picture in page.pictures:
         ET.fromstring(base64.b64decode(picture.partition(",")[2]))
     for said in (
@@ -157,7 +157,7 @@ def test_the_page_needs_nothing_beside_it(
         "100.0 %6/6 on 1 frame, 21 to 100 %", "50.0 %6/12 on 1 frame, 5 to 95 %",
     ):  # fmt: skip
         assert said in page.text
-    for name in ("rates", "errors", "convergence"):
+    for name in ("errors", "convergence"):
         assert (tmp_path / "out" / f"{name}.png").is_file()
     out = capsys.readouterr().out
     assert re.search(r"bid, all sizes\n.*\n  bid, level none +12 +1 +50 % \(5-95\) +50 % \(5-95\) +50 %", out)
@@ -182,7 +182,7 @@ def test_without_matplotlib_a_report_tells_what_to_install(
 
 
 def test_figures_are_the_same_each_time(tmp_path: Path, results: list[TrialResult]) -> None:
-    first, second = (Figures(grouped(results[:2]), tmp_path / name, "10%").rates() for name in ("a", "b"))
+    first, second = (Figures(grouped(results[:2]), tmp_path / name, "10%").errors() for name in ("a", "b"))
     assert first.file.read_bytes() == second.file.read_bytes()
 
 
@@ -234,14 +234,14 @@ def test_an_interrupted_report_is_written_again(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(Figures, "errors", interrupt)
+        patch.setattr(Figures, "convergence", interrupt)
         assert main(["report", str(file), "--out", str(out)]) == 130
-    assert (out / "rates.png").exists()
+    assert (out / "errors.png").exists()
     assert main(["report", str(file), "--out", str(out)]) == 0
     assert read(out).fetched == []
     written = (out / "index.html").read_bytes()
     with monkeypatch.context() as patch:  # the page of before stays until the new one is whole
-        patch.setattr(Figures, "errors", interrupt)
+        patch.setattr(Figures, "convergence", interrupt)
         assert main(["report", str(file), "--out", str(out)]) == 130
     assert (out / "index.html").read_bytes() == written
 
@@ -292,7 +292,7 @@ def test_nothing_is_said_or_drawn_of_steps_that_there_are_not(tmp_path: Path) ->
         for n in range(4)
     ]
     assert main(["report", str(write(tmp_path / "r.jsonl", *results)), "--out", str(tmp_path / "out")]) == 0
-    assert {path.stem for path in (tmp_path / "out").glob("*.svg")} == {"rates", "errors"}
+    assert {path.stem for path in (tmp_path / "out").glob("*.svg")} == {"errors"}
     for text in ("ms per step", "steps to", "10 %"):
         assert text not in read(tmp_path / "out").text
 
@@ -379,7 +379,7 @@ def test_hostile_names_are_harmless_everywhere(tmp_path: Path, capfd: pytest.Cap
     ):
         assert shown in page.text
     drawings = list((tmp_path / "out").glob("*.svg"))
-    assert len(drawings) == len(page.pictures) == 3
+    assert len(drawings) == len(page.pictures) == 2
     for drawing in drawings:
         ET.parse(drawing)
         assert iio.imread(drawing.with_suffix(".png")).std() > 1
@@ -401,14 +401,14 @@ def test_a_name_that_no_folder_can_have_is_refused(
 
 
 def test_more_than_can_be_drawn_is_in_the_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bidnerf_core.evaluation.plots.MOST_LINES", 3)
+    monkeypatch.setattr("bidnerf_core.evaluation.plots.MOST_SITUATIONS", 3)
     many = [result(seed, 2, protocol="none") for seed in range(8)]
     many = [dataclasses.replace(r, trial=dataclasses.replace(r.trial, map=f"map {r.seed}")) for r in many]
     table = ResultTable(tuple(many))
     figures, whole = (Figures(groups, tmp_path, "5deg 0.05") for groups in (table.groups, table.groups[:3]))
-    assert "At most 3 of 8 groups" in figures.omitted
+    assert "At most 3 of 8 situations" in figures.omitted
     assert whole.omitted == ""
-    heights = [iio.imread(each.rates().file.with_suffix(".png")).shape[0] for each in (figures, whole)]
+    heights = [iio.imread(each.errors().file.with_suffix(".png")).shape[0] for each in (figures, whole)]
     assert heights[0] == heights[1]
     assert "map 7" in page("Many", table, [], "5deg 0.05")
 
@@ -422,7 +422,7 @@ def test_warnings_of_other_libraries_cannot_control_the_terminal(
         warnings.warn("Glyph \x1b[31m missing", UserWarning, stacklevel=1)
         raise InputError("enough")
 
-    monkeypatch.setattr(Figures, "rates", warn)
+    monkeypatch.setattr(Figures, "errors", warn)
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *place: print(message, file=sys.stderr)  # type: ignore[assignment]
         assert main(["report", str(file), "--out", str(tmp_path / "out")]) == 1
