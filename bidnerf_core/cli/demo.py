@@ -72,11 +72,11 @@ def run(
             config = from_flat(config, {"steps": steps}, f"backend {backend!r}")
         except InputError as error:
             raise UsageError(error) from error
-    scene, camera = demo_object(), Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
-    radius, background = 3.5, scene.bounds.background
-    seen = views(scene, camera, orbit(radius, TRAINING_VIEWS, seed=seed))
-    unseen = views(scene, camera, orbit(radius, frames, elevation=(15.0, 50.0), seed=seed + 1))
     with output_folder(out, overwrite):
+        scene, camera = demo_object(), Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
+        radius, background = 3.5, scene.bounds.background
+        seen = views(scene, camera, orbit(radius, TRAINING_VIEWS, seed=seed))
+        unseen = views(scene, camera, orbit(radius, frames, elevation=(15.0, 50.0), seed=seed + 1))
         began = time.monotonic()
         options = TrainOptions(DatasetOptions(background=background), overwrite=True)
         with working():

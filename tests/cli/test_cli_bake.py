@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import shutil
 from collections.abc import Sequence
@@ -25,7 +27,7 @@ from bidnerf_core.maps import Map, TrainOptions, load_info, load_map
 from bidnerf_core.scenes import HomogeneousBall
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid import backend as hashgrid
-from commands import Run, assert_refused
+from commands import CommandResult, Run, assert_refused
 
 pytestmark = pytest.mark.slow
 
@@ -52,26 +54,35 @@ def folder(sharp: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def once(sharp: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The map once it is baked from the images."""
-    out = shutil.copytree(sharp / "map", tmp_path_factory.mktemp("baked") / "map")
-    assert main(["bake", str(out), "--data", str(sharp / "data"), *COARSE]) == 0
-    return Path(out)
+def once(sharp: Path, tmp_path_factory: pytest.TempPathFactory) -> CommandResult:
+    """What the command printed that baked the map from the images into ``sharp / "baked"``."""
+    words = [
+        "bake",
+        str(shutil.copytree(sharp / "map", sharp / "baked")),
+        "--data",
+        str(sharp / "data"),
+        *COARSE,
+    ]
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:
+        status = main(words)
+    return CommandResult(status, out.getvalue(), err.getvalue())
 
 
 @pytest.fixture
-def baked(once: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(once, tmp_path / "baked"))
+def baked(sharp: Path, once: CommandResult, tmp_path: Path) -> Path:
+    assert once.status == 0
+    return Path(shutil.copytree(sharp / "baked", tmp_path / "baked"))
 
 
 @pytest.fixture
 def _ball(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is baked is a ball, whatever the map shows."""
+    """What is baked is the surface of a ball, whatever the map shows, and no landmarks."""
 
     def ball(folder: Path, *place: str, **options: bool) -> Map:
         return replace(load_map(folder, *place, **options), field=HomogeneousBall(0.5, 300.0))
 
     monkeypatch.setattr("bidnerf_core.maps.load_map", ball)
+    monkeypatch.setattr(Map, "with_landmarks", lambda scene, *_: (scene, None))
 
 
 @pytest.fixture
@@ -82,12 +93,11 @@ def _landmarks_only(sharp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bidnerf_core.maps.baking.rendered_views", lambda *_: photos[:12])
 
 
-def test_a_baked_map_needs_no_start(sharp: Path, folder: Path, bidnerf: Run) -> None:
-    data = sharp / "data"
-    unbaked = bidnerf("info", folder, "--draw", folder.parent / "capture.png")
+def test_a_baked_map_needs_no_start(sharp: Path, baked: Path, once: CommandResult, bidnerf: Run) -> None:
+    data, folder, err = sharp / "data", baked, once.err
+    unbaked = bidnerf("info", sharp / "map", "--draw", folder.parent / "capture.png")
     assert_refused(unbaked, 1, "no record of its photos")
-    status, out, err = bidnerf("bake", folder, "--data", data, *COARSE)
-    assert (status, out) == (0, "")
+    assert once.out == ""
     assert "from 24 measured views" in err
     facts = json.loads(bidnerf("info", folder, "--json").out)
     assert facts["surfels"] > 1000
@@ -239,10 +249,12 @@ def test_damaged_landmarks_of_photos_are_replaced(baked: Path, bidnerf: Run) -> 
     assert load_map(baked).landmarks is not None
 
 
-def test_landmarks_of_photos_are_built_once_for_training_and_baking(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_landmarks_of_photos_are_built_once_for_training_and_baking(
+    sharp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Without depth or silhouettes, training takes distances from landmarks, and the map keeps those landmarks."""
-    monkeypatch.setattr(tiny, "CAMERA", Intrinsics(85.0, 85.0, 32.0, 32.0, 64, 64))
-    photos = [replace(v, frame=replace(v.frame, depth=None, alpha=None)) for v in tiny.views(24)]
+    views = open_dataset(sharp / "data", tiny.BACKGROUND).views("train")
+    photos = [replace(v, frame=replace(v.frame, depth=None, alpha=None)) for v in views]
     built, seen = [], []
 
     def tracked(views: Sequence[View], features: str, **options: Any) -> TrackedViews:

@@ -1,11 +1,9 @@
-"""``bidnerf localize`` with photos, folders and whole splits; lazy imports and names on the terminal."""
+"""``bidnerf localize`` with photos, folders and whole splits; names on the terminal."""
 
 from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -224,7 +222,7 @@ def test_an_interrupted_run_keeps_its_answers(
         assert [each["frame"] for each in found] == ["t_0000", "t_0001"]
 
 
-# Maps, names and imports.
+# Maps and names.
 
 
 def test_a_map_that_was_not_baked_is_baked_by_resume(
@@ -252,11 +250,3 @@ def test_names_cannot_control_the_terminal(bidnerf: Run, map_folder: Path, tmp_p
         _, said, err = bidnerf(*words)
         assert "\x1b" not in said + err
         assert "\\x1b" in said + err
-
-
-def test_localizing_imports_nothing_that_only_other_work_needs() -> None:
-    program = "import bidnerf_core.cli.localize, bidnerf_core as bn; bn.Localizer, bn.load_map"
-    others = "imageio scipy.optimize matplotlib viser pycolmap av jinja2 uvicorn torch._dynamo"
-    program = f"import sys\n{program}\nprint(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert not {*others.split()} & {*done.stdout.splitlines()[-1].split()}

@@ -12,9 +12,12 @@ import re
 import shutil
 import signal
 import socket
+import subprocess
+import sys
 import tempfile
 import threading
 import time
+import warnings
 from base64 import b64encode
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -41,6 +44,7 @@ from bidnerf_core.service.models import Localization, MapFacts, PhotoForm
 from bidnerf_core.service.pool import Pool
 from bidnerf_core.service.server import named
 from bidnerf_core.service.web import SAFE, Gate
+from bidnerf_core.service.worker import main as hold_maps
 from bombs import png_of
 from commands import Run, assert_refused
 
@@ -434,16 +438,15 @@ def test_nothing_is_lost_when_a_worker_is_killed(service: Service, place: Place)
     assert service.metric("worker_restarts_total", reason="died") == before + 1
 
 
-def holder_of_maps() -> psutil.Process:
-    """Return the process from which workers are forked; other tests may have left children of their own."""
-    children = psutil.Process().children()
-    (found,) = (child for child in children if "bidnerf_core.service.worker" in child.cmdline())
-    return found
+def holder_of_maps(service: Service) -> psutil.Process:
+    """Return the process from which workers are forked."""
+    assert service.pool._maps is not None
+    return psutil.Process(service.pool._maps[0].pid)
 
 
 @pytest.mark.slow
 def test_nothing_is_lost_when_the_process_with_the_maps_is_killed(service: Service, place: Place) -> None:
-    maps = holder_of_maps()
+    maps = holder_of_maps(service)
     with stopped(service) as process:
         waiting = request(service, place)
         quickly(lambda: service.metric("requests_in_progress") == 1)
@@ -452,19 +455,24 @@ def test_nothing_is_lost_when_the_process_with_the_maps_is_killed(service: Servi
         assert waiting.result(150).status == 200
 
 
-@pytest.mark.slow
-def test_a_process_with_the_maps_that_does_not_answer_is_replaced(
-    service: Service, place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("bidnerf_core.service.pool.FORK_SECONDS", 0.5)
-    maps, before = holder_of_maps(), service.metric("worker_restarts_total", reason="maps")
-    maps.suspend()
-    with stopped(service) as process:
-        os.kill(process, signal.SIGKILL)
-        quickly(lambda: service.metric("worker_restarts_total", reason="maps") > before)
-        monkeypatch.setattr("bidnerf_core.service.pool.FORK_SECONDS", 60.0)
-        assert request(service, place).result(150).status == 200
-    assert not maps.is_running()
+def test_a_process_with_the_maps_that_does_not_answer_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    pool, worker, (ours, theirs) = Pool({"maps": {}}, LIMITS), object(), socket.socketpair()
+    silent = subprocess.Popen(["sleep", "60"])
+
+    async def loaded() -> None:
+        async def fork() -> Any:
+            return worker
+
+        monkeypatch.setattr(pool, "_fork", fork)
+
+    monkeypatch.setattr("bidnerf_core.service.pool.FORK_SECONDS", 0.05)
+    monkeypatch.setattr("bidnerf_core.service.pool.PAUSE", 0.0)
+    monkeypatch.setattr(pool, "_maps", (silent, ours))
+    monkeypatch.setattr(pool, "_load", loaded)
+    with theirs:
+        assert asyncio.run(pool._replacement()) is worker
+    assert (silent.returncode, ours.fileno()) == (-signal.SIGKILL, -1)
+    assert pool.metric("worker_restarts_total", reason="maps") == 1
 
 
 def test_maps_are_kept_while_a_worker_cannot_begin(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -740,7 +748,28 @@ def test_startup_of_another_server_starts_the_pool(monkeypatch: pytest.MonkeyPat
     assert told == ["started", "lifespan.startup.complete", "ended", "lifespan.shutdown.complete"]
 
 
-@pytest.mark.slow
-def test_a_folder_without_a_map_is_refused(place: Place, bidnerf: Run) -> None:
-    """The process that would hold the maps refuses it, and the command prints its line."""
-    assert_refused(bidnerf("serve", place.folder / "data"), 1, place.folder / "data", "no map.json")
+def test_a_folder_without_a_map_is_refused(
+    place: Place, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The process that would hold the maps refuses it, which is a thread here, and the command prints its line."""
+
+    class Threaded:
+        pid = 2**30  # no process has this number
+
+        def __init__(self, words: list[str], pass_fds: list[int], **options: Any) -> None:
+            monkeypatch.setattr(sys, "argv", [words[-2], str(os.dup(pass_fds[0]))])
+            self.thread = threading.Thread(target=hold_maps)
+            self.thread.start()
+
+        def kill(self) -> None: ...
+
+        def wait(self) -> None:
+            self.thread.join()
+
+    monkeypatch.setattr("bidnerf_core.service.pool.subprocess.Popen", Threaded)
+    monkeypatch.setattr("bidnerf_core.service.worker.signal.signal", lambda *_: None)
+    monkeypatch.setattr("bidnerf_core.service.worker.os.getpgrp", os.getpid)
+    monkeypatch.setattr("cv2.setNumThreads", lambda _: None)
+    with warnings.catch_warnings():
+        refused = bidnerf("serve", place.folder / "data")
+    assert_refused(refused, 1, place.folder / "data", "no map.json")

@@ -63,13 +63,17 @@ class Client:
 
 @contextlib.contextmanager
 def serving(
-    room: Map, token: str | None = None, camera: CameraSource | None = None, method: str = "auto"
+    room: Map,
+    token: str | None = None,
+    camera: CameraSource | None = None,
+    method: str = "auto",
+    config: Any = None,
 ) -> Iterator[Client]:
     """Run a viewer of the room, with one photo to choose; ``camera`` is that of other photos."""
     stop, ready = threading.Event(), SimpleQueue[str]()
     with tempfile.TemporaryDirectory() as folder:
         source = Photos([viewed.photo_file(Path(folder))], DatasetOptions(CameraSource(assumed=(CAMERA,))))
-        shown = LiveView(Localizer(room, method), source, camera=camera)
+        shown = LiveView(Localizer(room, method, config), source, camera=camera)
         options = {"token": token, "limits": LIMITS, "ready": ready.put, "stop": stop, "port": 0}
         thread = threading.Thread(target=serve_view, args=[shown], kwargs=options)
         thread.start()

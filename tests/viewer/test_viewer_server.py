@@ -120,7 +120,7 @@ def test_images_are_chosen_by_number_among_those_given(client: Client) -> None:
 def test_the_start_and_the_seed_of_a_photo_are_used(room: Map, tmp_path: Path) -> None:
     content = viewed.photo_file(tmp_path).read_bytes()
     start = json.dumps(viewed.walk(15)[5].matrix().tolist())
-    with serving(room, method="bid") as client:
+    with serving(room, method="bid", config=settings_of("bid", {"max_steps": 3, "rays": 64})) as client:
         assert "needs a start" in answer_of(client, client.post("/api/photo?hfov=58.19", content))["reason"]
         path = f"/api/photo?hfov=58.19&seed=3&start={quote(start)}"
         assert answer_of(client, client.post(path, content))["method"] == "bid"
