@@ -24,10 +24,6 @@ from .encoding import frequency_encoding as frequency_encoding
 from .encoding import octaves as octaves
 from .encoding import query_network as query_network
 from .encoding import spherical_harmonics as spherical_harmonics
-from .pieces import LARGEST_ALPHA as LARGEST_ALPHA
-from .pieces import LEAST_ALPHA as LEAST_ALPHA
-from .pieces import Meeting as Meeting
-from .pieces import PieceField as PieceField
 from .rendering import Observations as Observations
 from .rendering import RenderedImage as RenderedImage
 from .rendering import Rendering as Rendering

@@ -13,8 +13,6 @@ from torch import Tensor
 from bidnerf_core.fields import (
     FieldValues,
     HitField,
-    Meeting,
-    PieceField,
     RayHits,
     Rays,
     Stratified,
@@ -106,40 +104,3 @@ def test_the_contract_accepts_them_and_tells_what_is_wrong() -> None:
     for message, change in changes.items():
         with pytest.raises(AssertionError, match=message):
             check_hits(Changed(change=change))
-
-
-class Levels(PieceField):
-    """Level pieces, each of which stops half of the light."""
-
-    heights: Tensor
-
-    def __init__(self, heights: list[float]) -> None:
-        super().__init__()
-        self.register_buffer("heights", torch.tensor(heights))
-        self.register_tree(len(heights))
-        centres = torch.nn.functional.pad(self.heights[:, None], (2, 0))
-        halves = torch.tensor([1.0, 1.0, 0.01]).expand_as(centres)
-        self.rebuild(centres, halves, torch.ones(len(heights), dtype=torch.bool))
-
-    def meet(self, index: Tensor, origins: Tensor, directions: Tensor) -> Meeting:
-        distance = (self.heights[index] - origins[:, 2]) / directions[:, 2]
-        return Meeting(distance, torch.full_like(distance, 0.5), distance)
-
-    def colours(self, index: Tensor, meeting: Meeting, directions: Tensor) -> Tensor:
-        return torch.ones_like(directions)
-
-    def profile(self, meeting: Meeting) -> Tensor:
-        return (meeting.distance.abs() < 0.1) / 0.2
-
-    def half_length(self, meeting: Meeting) -> Tensor:
-        return torch.full_like(meeting.distance, 0.1)
-
-
-def test_samples_lie_about_pieces_and_divide_what_overlaps() -> None:
-    """The second ray ends within the interval of the last piece."""
-    down, zero = torch.tensor([[0.0, 0.0, -1.0]] * 2), torch.zeros(2)
-    rays = Rays(torch.tensor([[0.0, 0.0, 3.0]] * 2), down, zero, torch.tensor([10.0, 4.05]))
-    samples = Levels([-1.0, 0.12, 0.0]).sampler(rays)
-    assert bool(samples.valid.all())
-    torch.testing.assert_close(samples.starts, torch.tensor([[2.78, 2.94, 3.9]] * 2))
-    torch.testing.assert_close(samples.ends, torch.tensor([[2.94, 3.1, 4.1], [2.94, 3.1, 4.05]]))

@@ -10,9 +10,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from bidnerf_core.fields import LARGEST_ALPHA, LEAST_ALPHA, Meeting, PieceField, SceneBounds, Splats
+from bidnerf_core.fields import SceneBounds, Splats
 from bidnerf_core.settings import Range
 from bidnerf_gaussians.gaussians import COEFFICIENTS, Gaussians
+from bidnerf_gaussians.pieces import LARGEST_ALPHA, LEAST_ALPHA, Meeting, PieceField
 from bidnerf_gaussians.quaternions import matrices, turned_back
 from bidnerf_gaussians.spherical_harmonics import colours
 

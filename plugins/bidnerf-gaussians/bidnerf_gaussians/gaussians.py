@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields import LEAST_ALPHA
+from bidnerf_gaussians.pieces import LEAST_ALPHA
 from bidnerf_gaussians.quaternions import product, quaternion_of
 from bidnerf_gaussians.spherical_harmonics import rotated
 

@@ -9,11 +9,13 @@ from importlib import import_module
 
 import pytest
 import torch
+from torch import Tensor
 
 from bidnerf_core.devices import without_waiting
-from bidnerf_core.fields import LEAST_ALPHA, Rays, SceneBounds, SplatField, render, scaled_field
+from bidnerf_core.fields import Rays, SceneBounds, SplatField, render, scaled_field
 from bidnerf_core.geometry import SE3
 from bidnerf_gaussians import Gaussians, GaussiansConfig, GaussiansField, quaternions
+from bidnerf_gaussians.pieces import LEAST_ALPHA, Meeting, PieceField
 from bidnerf_gaussians.spherical_harmonics import basis, colours
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.01, 10.0)
@@ -95,7 +97,7 @@ def test_in_known_shapes_the_same_is_seen(
     expected = render(field, along)
     points = rays(50, 5).at(torch.full((50, 1), 3.0))[:, 0]
     density = field.query(points, along.directions[:50])
-    monkeypatch.setattr(import_module("bidnerf_core.fields.pieces"), "may_wait", lambda device: False)
+    monkeypatch.setattr(import_module("bidnerf_gaussians.pieces"), "may_wait", lambda device: False)
     with without_waiting():
         found = render(field, along)
         again = field.query(points, along.directions[:50])
@@ -108,7 +110,7 @@ def test_many_boxes_are_tested_in_parts(
 ) -> None:
     field, along = field_of(some(300)), rays()
     expected = field.hits(along)
-    monkeypatch.setattr("bidnerf_core.fields.pieces.MOST_PAIRS", 400)
+    monkeypatch.setattr("bidnerf_gaussians.pieces.MOST_PAIRS", 400)
     found = field.hits(along)
     assert torch.equal(found.alpha, expected.alpha)
 
@@ -160,3 +162,40 @@ def test_splats_are_the_gaussians_as_points(some: Callable[..., Gaussians]) -> N
     torch.testing.assert_close(found.rgb[inside], linear.mean(1)[inside], atol=0.02, rtol=0)
     torch.testing.assert_close(grown.splats().positions, 2 * found.positions)
     torch.testing.assert_close(grown.splats().radius, 2 * found.radius)
+
+
+class Levels(PieceField):
+    """Level pieces, each of which stops half of the light."""
+
+    heights: Tensor
+
+    def __init__(self, heights: list[float]) -> None:
+        super().__init__()
+        self.register_buffer("heights", torch.tensor(heights))
+        self.register_tree(len(heights))
+        centres = torch.nn.functional.pad(self.heights[:, None], (2, 0))
+        halves = torch.tensor([1.0, 1.0, 0.01]).expand_as(centres)
+        self.rebuild(centres, halves, torch.ones(len(heights), dtype=torch.bool))
+
+    def meet(self, index: Tensor, origins: Tensor, directions: Tensor) -> Meeting:
+        distance = (self.heights[index] - origins[:, 2]) / directions[:, 2]
+        return Meeting(distance, torch.full_like(distance, 0.5), distance)
+
+    def colours(self, index: Tensor, meeting: Meeting, directions: Tensor) -> Tensor:
+        return torch.ones_like(directions)
+
+    def profile(self, meeting: Meeting) -> Tensor:
+        return (meeting.distance.abs() < 0.1) / 0.2
+
+    def half_length(self, meeting: Meeting) -> Tensor:
+        return torch.full_like(meeting.distance, 0.1)
+
+
+def test_samples_lie_about_pieces_and_divide_what_overlaps() -> None:
+    """The second ray ends within the interval of the last piece."""
+    down, zero = torch.tensor([[0.0, 0.0, -1.0]] * 2), torch.zeros(2)
+    rays = Rays(torch.tensor([[0.0, 0.0, 3.0]] * 2), down, zero, torch.tensor([10.0, 4.05]))
+    samples = Levels([-1.0, 0.12, 0.0]).sampler(rays)
+    assert bool(samples.valid.all())
+    torch.testing.assert_close(samples.starts, torch.tensor([[2.78, 2.94, 3.9]] * 2))
+    torch.testing.assert_close(samples.ends, torch.tensor([[2.94, 3.1, 4.1], [2.94, 3.1, 4.05]]))

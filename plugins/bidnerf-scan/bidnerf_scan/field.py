@@ -10,8 +10,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from bidnerf_core.fields import LARGEST_ALPHA, Meeting, PieceField, SceneBounds
+from bidnerf_core.fields import SceneBounds
 from bidnerf_core.settings import NotNegative, Range
+from bidnerf_gaussians.pieces import LARGEST_ALPHA, Meeting, PieceField
 from bidnerf_scan.pieces import Pieces
 
 

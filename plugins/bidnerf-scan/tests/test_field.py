@@ -57,7 +57,7 @@ def test_a_mesh_of_a_sphere_is_a_sphere() -> None:
     place = rays.origins + expected[:, None] * rays.directions
     assert float((seen.rgb / seen.opacity[:, None] - (place / 2 + 0.5))[sure].abs().max()) < 0.02
     with without_waiting(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(import_module("bidnerf_core.fields.pieces"), "may_wait", lambda device: False)
+        patch.setattr(import_module("bidnerf_gaussians.pieces"), "may_wait", lambda device: False)
         again = render(field, rays)
     assert torch.allclose(again.rgb, seen.rgb, atol=1e-4)
 

@@ -19,7 +19,7 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import pad
 
 from bidnerf_core.devices import may_wait
-from bidnerf_core.fields.contract import FieldValues, RayHits, Rays, RaySamples
+from bidnerf_core.fields import FieldValues, RayHits, Rays, RaySamples
 
 LEAST_ALPHA = 1 / 255
 """Opacity of a piece along a ray below which it is not seen."""
