@@ -24,9 +24,8 @@ from .map import Localizer as Localizer
 from .map import Map as Map
 from .map import frozen_field as frozen_field
 from .map import load_map as load_map
-from .store import load_capture as load_capture
-from .store import load_surface as load_surface
 from .store import map_folder as map_folder
+from .store import read_part as read_part
 from .store import write_parts as write_parts
 from .summary import MapSummary as MapSummary
 from .summary import RenderingScores as RenderingScores

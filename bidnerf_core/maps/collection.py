@@ -30,7 +30,7 @@ from bidnerf_core.localization import (
 from bidnerf_core.mapping import LandmarkMap, Vocabulary, detected, find_features, pooled_views
 from bidnerf_core.maps.description import DESCRIPTION, cameras_of, load_info
 from bidnerf_core.maps.map import Map, load_map
-from bidnerf_core.maps.store import load_landmarks
+from bidnerf_core.maps.store import read_part
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context
 
 log = logging.getLogger("bidnerf")
@@ -188,7 +188,11 @@ class MapCollection:
         count, landmarks = counter("reading", "maps"), dict[str, LandmarkMap]()
         for number, (name, scene) in enumerate(self._maps.items(), start=1):
             check_cancelled("reading maps")
-            found = scene.landmarks if isinstance(scene, Map) else load_landmarks(scene, self._infos[name])
+            found = (
+                scene.landmarks
+                if isinstance(scene, Map)
+                else read_part(scene, self._infos[name], "landmarks")
+            )
             if found is not None and len(found):
                 landmarks[name] = found.to("cpu")
             count(number, len(self._maps))

@@ -58,11 +58,9 @@ from bidnerf_core.maps.description import DESCRIPTION, Anchor, MapInfo, load_inf
 from bidnerf_core.maps.store import (
     checked_weights,
     content_digest,
-    load_capture,
-    load_landmarks,
     load_state,
-    load_surface,
     map_folder,
+    read_part,
     read_parts,
     with_images,
     write_parts,
@@ -165,7 +163,7 @@ class Map:
         """
         if self.record is not None or self.folder is None:
             return self.record
-        return load_capture(self.folder, self.info)
+        return read_part(self.folder, self.info, "capture")
 
     @cached_property
     def training(self) -> str:
@@ -320,7 +318,7 @@ class Map:
             photos = self.landmarks
             if photos is None and self.folder is not None:
                 try:
-                    photos = load_landmarks(self.folder, self.info)
+                    photos = read_part(self.folder, self.info, "landmarks")
                 except InputError as error:  # damaged, so that they are replaced
                     log.info(str(error))
             if photos is not None:
@@ -412,9 +410,9 @@ class Map:
             return self
         surface, landmarks, info = self.surface, self.landmarks, self.info
         if surface is None:
-            surface = load_surface(self.folder, info)
+            surface = read_part(self.folder, info, "surface")
         if landmarks is None:
-            landmarks = load_landmarks(self.folder, info)
+            landmarks = read_part(self.folder, info, "landmarks")
         if info.anchor is None:
             info = replace(info, anchor=load_info(self.folder).anchor)
         return replace(self, info=info, surface=surface, landmarks=landmarks)

@@ -10,15 +10,15 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import os
 import re
 import secrets
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
-import torch
 from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor, nn
 
@@ -47,11 +47,44 @@ from bidnerf_core.mapping import (
 from bidnerf_core.maps.description import ANCHOR, DESCRIPTION, PART_NAMES, MapInfo, load_info
 from bidnerf_core.training import TrainingState
 
-PARTS = r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|(capture|anchor)-\d{8,}-[0-9a-f]{8}\.json)"
-EXPECTED_PART = "a safetensors file, without which the map is incomplete"
+NEEDED = "a safetensors file, without which the map is incomplete"
 BAKED = "a safetensors file, which 'bidnerf bake' can recreate"
-OURS = re.compile(rf"{PARTS}|\.({PARTS}|map\.json)\.[0-9a-f]{{8}}")
+RECORDED = "a capture record, which 'bidnerf bake' with --data can recreate"
+_NAMES = r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|(capture|anchor)-\d{8,}-[0-9a-f]{8}\.json)"
+OURS = re.compile(rf"{_NAMES}|\.({_NAMES}|map\.json)\.[0-9a-f]{{8}}")
 """Names of the files that saving may leave behind, of earlier versions as well; other files are never removed."""
+
+
+@dataclass(frozen=True)
+class PartFile:
+    """How one kind of part is stored in a file of its own."""
+
+    encode: Callable[[Any], bytes]
+    read: Callable[[Path], Any]
+    ending: str = "safetensors"
+
+
+def _json(value: Any) -> bytes:
+    return json.dumps(to_plain(value), indent=1, allow_nan=False).encode()
+
+
+_STATE = PartFile(lambda tensors: tensors_to_bytes(packed(tensors)), lambda path: read_tensors(path, NEEDED))
+PARTS = {
+    "weights": _STATE,
+    "training": _STATE,
+    "surface": PartFile(
+        lambda surface: tensors_to_bytes(surface_tensors(surface)),
+        lambda path: load_part(path, surface_from_tensors, "a baked surface", BAKED),
+    ),
+    "landmarks": PartFile(
+        lambda landmarks: tensors_to_bytes(landmark_tensors(landmarks)),
+        lambda path: load_part(path, landmarks_from_tensors, "landmarks", BAKED),
+    ),
+    "capture": PartFile(
+        _json, lambda path: from_plain(CaptureReport, read_json(path, RECORDED), str(path)), "json"
+    ),
+}
+"""The parts of a map, by the keys of ``map.json`` that name their files."""
 
 
 def write_parts(
@@ -77,20 +110,12 @@ def write_parts(
     """
     if landmarks is not None and not landmarks.features:
         raise InputError("the landmarks' detector has no name;", where=folder, expected="a registered one")
-    parts: dict[str, Callable[[], bytes]] = {}
+    contents: dict[str, Any] = {"surface": surface, "landmarks": landmarks, "capture": capture}
     if state is not None:
-        parts["weights"] = lambda: tensors_to_bytes(packed(state.field))
-        if not info.complete:
-            parts["training"] = lambda: tensors_to_bytes(packed(state.optimizer))
-    if surface is not None:
-        parts["surface"] = lambda: tensors_to_bytes(surface_tensors(surface))
-    if landmarks is not None:
-        parts["landmarks"] = lambda: tensors_to_bytes(landmark_tensors(landmarks))
-    if capture is not None:
-        parts["capture"] = lambda: _json(capture)
+        contents |= {"weights": state.field, "training": None if info.complete else state.optimizer}
+    contents = {part: content for part, content in contents.items() if content is not None}
     names: dict[str, Any] = {
-        part: f"{part}-{info.step:08d}-{secrets.token_hex(4)}.{'json' if part == 'capture' else 'safetensors'}"
-        for part in parts
+        part: f"{part}-{info.step:08d}-{secrets.token_hex(4)}.{PARTS[part].ending}" for part in contents
     }
     if state is not None:
         names = dict.fromkeys(PART_NAMES) | ({"landmarks": info.landmarks} if keep else {}) | names
@@ -98,7 +123,7 @@ def write_parts(
         stored = load_info(folder)
         if stored.weights != info.weights:
             raise InputError(
-                f"was retrained while its {next(iter(parts))} was built; bake it again", where=folder
+                f"was retrained while its {next(iter(contents))} was built; bake it again", where=folder
             )
         info, given = stored, info
         if landmarks is not None:
@@ -112,8 +137,8 @@ def write_parts(
     folder.mkdir(parents=True, exist_ok=True)
     _adopt_anchor(folder)
     try:
-        for part, content in parts.items():
-            write_file(folder / names[part], content())
+        for part, content in contents.items():
+            write_file(folder / names[part], PARTS[part].encode(content))
         write_file(folder / DESCRIPTION, description)
     finally:
         _sweep(folder)
@@ -133,10 +158,11 @@ def read_parts(
     # apart, so that each further failure takes a disk slower than that.
     for _ in range(5):
         try:
-            weights = read_tensors(folder / info.weights, EXPECTED_PART)
-            if not baked:
-                return info, weights, None, None
-            return info, weights, load_surface(folder, info), load_landmarks(folder, info)
+            weights = read_part(folder, info, "weights") or {}
+            surface, landmarks = (
+                read_part(folder, info, part) if baked else None for part in ("surface", "landmarks")
+            )
+            return info, weights, surface, landmarks
         except InputError as error:
             before, info = info, load_info(folder)
             if replace(before, bidnerf="") == replace(info, bidnerf=""):
@@ -153,32 +179,18 @@ def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingSta
         raise InputError(
             f"training is complete ({amount(info.step, 'step')}), nothing to resume", where=folder
         )
-    path = folder / info.weights
-    weights = checked_weights(trained_field(field), read_tensors(path, EXPECTED_PART), path)
-    return TrainingState(info.step, weights, read_tensors(folder / info.training, EXPECTED_PART))
+    weights = checked_weights(trained_field(field), read_part(folder, info, "weights"), folder / info.weights)
+    return TrainingState(info.step, weights, read_part(folder, info, "training"))
 
 
-def load_surface(folder: Path, info: MapInfo) -> SurfaceMap | None:
-    """Load the baked surface of a map, or None if the map has none. Raises ``InputError`` if the file is not a surface."""
-    if info.surface is None:
-        return None
-    return load_part(folder / info.surface, surface_from_tensors, "a baked surface", BAKED)
+def read_part(folder: Path, info: MapInfo, part: str) -> Any:
+    """Return a part of the map that ``info`` describes: its "surface", "landmarks", "capture" record and so on.
 
-
-def load_landmarks(folder: Path, info: MapInfo) -> LandmarkMap | None:
-    """Load the landmarks of a map, or None if the map has none. Raises ``InputError`` if the file does not hold landmarks."""
-    if info.landmarks is None:
-        return None
-    return with_images(load_part(folder / info.landmarks, landmarks_from_tensors, "landmarks", BAKED), info)
-
-
-def load_capture(folder: Path, info: MapInfo) -> CaptureReport | None:
-    """Load the capture record of a map, or None if the map has none. Raises ``InputError`` if the file is not a record."""
-    if info.capture is None:
-        return None
-    path = folder / info.capture
-    expected = "a capture record, which 'bidnerf bake' with --data can recreate"
-    return from_plain(CaptureReport, read_json(path, expected), str(path))
+    The result is None if the map has no such part. Raises ``InputError`` if its file is damaged.
+    """
+    name = getattr(info, part)
+    found = PARTS[part].read(folder / name) if name else None
+    return with_images(found, info) if part == "landmarks" and found is not None else found
 
 
 def with_images(landmarks: LandmarkMap, info: MapInfo) -> LandmarkMap:
@@ -199,49 +211,38 @@ def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path
         except InputError as error:
             raise InputError(error, where=path) from error
     module = cast(nn.Module, field)
-    expected = module.state_dict()
+    expected, trained = module.state_dict(), {name for name, _ in module.named_parameters()}
     for name, value in expected.items():
         if name not in tensors:
             raise InputError(f"no tensor {name!r}", where=path, expected=f"one of shape {list(value.shape)}")
         found = tensors[name]
-        if found.shape != value.shape:
+        if (found.shape, found.is_floating_point()) != (value.shape, value.is_floating_point()):
+            kinds = [f"dtype {t.dtype}, shape {list(t.shape)}".replace("torch.", "") for t in (found, value)]
+            raise InputError(f"tensor {name!r} has {kinds[0]}", where=path, expected=kinds[1])
+        # Products of larger weights would overflow in float32; trained ones stay far below it.
+        largest = 1e9 if name in trained else math.inf
+        if found.is_floating_point() and not bool((found.abs() <= largest).all()):
             raise InputError(
-                f"tensor {name!r} has shape {list(found.shape)}", where=path, expected=list(value.shape)
+                f"tensor {name!r} holds NaN or numbers above {largest:g}",
+                where=path,
+                expected="trained weights",
             )
-        if found.is_floating_point() != value.is_floating_point():
-            kinds = [str(kind).removeprefix("torch.") for kind in (found.dtype, value.dtype)]
-            raise InputError(f"tensor {name!r} has dtype {kinds[0]}", where=path, expected=kinds[1])
     if surplus := sorted(tensors.keys() - expected.keys()):
         raise InputError(
             f"tensor {surplus[0]!r} is not part of the field that map.json describes", where=path
         )
-    largest = 1e9  # products of larger weights would overflow in float32; trained ones stay far below it
-    for name, _ in module.named_parameters():
-        if name in tensors and not bool((tensors[name].abs() <= largest).all()):
-            raise InputError(
-                f"tensor {name!r} holds NaN, infinity or numbers above {largest:g}",
-                where=path,
-                expected="trained weights",
-            )
-    for name, _ in module.named_buffers():
-        if name in tensors and bool(tensors[name].isnan().any()):
-            raise InputError(f"tensor {name!r} holds NaN", where=path, expected="numbers")
     return tensors
 
 
 def content_digest(field: RadianceField, surface: SurfaceMap | None, landmarks: LandmarkMap | None) -> str:
     """Return a hexadecimal digest of a map's content."""
-    trained = trained_field(field)
-    parts: list[Mapping[str, Tensor]] = []
-    if isinstance(trained, nn.Module):
-        parts.append(packed(trained.state_dict()))
+    trained, hashed = trained_field(field), hashlib.blake2b(digest_size=8)
     if isinstance(field, ScaledField):
-        parts.append({"scale": torch.tensor(field.scale, dtype=torch.float64)})
-    parts += [] if surface is None else [packed(surface_tensors(surface))]
-    parts += [] if landmarks is None else [packed(landmark_tensors(landmarks))]
-    hashed = hashlib.blake2b(digest_size=8)
-    for part in parts:
-        hashed.update(tensors_to_bytes(dict(part)))
+        hashed.update(repr(field.scale).encode())
+    weights = trained.state_dict() if isinstance(trained, nn.Module) else None
+    for part, content in (("weights", weights), ("surface", surface), ("landmarks", landmarks)):
+        if content is not None:
+            hashed.update(PARTS[part].encode(content))
     return hashed.hexdigest()
 
 
@@ -262,10 +263,6 @@ def map_folder(out: Path, overwrite: bool) -> Iterator[None]:
 
     with output_folder(out, overwrite, is_leftover, describe):
         yield
-
-
-def _json(value: Any) -> bytes:
-    return json.dumps(to_plain(value), indent=1, allow_nan=False).encode()
 
 
 def _adopt_anchor(folder: Path) -> None:

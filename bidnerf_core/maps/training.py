@@ -43,7 +43,7 @@ from bidnerf_core.mapping import (
 from bidnerf_core.maps.checkpoints import USUAL_SECONDS, Checkpoints
 from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info, longest_side
 from bidnerf_core.maps.map import USUAL_BAKE, Map, build_field, frozen_field, load_map
-from bidnerf_core.maps.store import load_landmarks, load_state, map_folder, write_parts
+from bidnerf_core.maps.store import load_state, map_folder, read_part, write_parts
 from bidnerf_core.maps.views import Images, ReadViews, chosen_origin, read_views
 from bidnerf_core.progress import (
     Cancel,
@@ -296,7 +296,7 @@ def resume(
                 stored = write_parts(out, done, TrainingState(info.step, field, {}), keep=True)
                 scene = replace(scene, info=stored)
             return _completed(scene, views, tracked, options, baking, out=out)
-        scene, state = Map(info, NoField(), None, load_landmarks(out, info), out), None
+        scene, state = Map(info, NoField(), None, read_part(out, info, "landmarks"), out), None
         if info.step:
             state = load_state(out, info, build_field(info, str(out)))
             log.info(f"{out}: resuming from step {info.step}")

@@ -20,7 +20,7 @@ from bidnerf_core.cli import main
 from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import TrackedViews, tracked_views
-from bidnerf_core.maps import cameras_of, load_capture, load_info, read_views
+from bidnerf_core.maps import cameras_of, load_info, read_part, read_views
 from commands import Run, assert_refused
 from landmark_scene import Points, ring
 from trainings import assert_same_map, stop_at
@@ -113,7 +113,7 @@ def test_photos_that_are_baked_later_have_the_refined_poses(
     out = Path(shutil.copytree(refined, tmp_path / "map"))
     assert bidnerf("bake", out, "--data", shared / "data", "--measured", 5000, "--cells", 5000).status == 0
     info = load_info(out)
-    capture = load_capture(out, info)
+    capture = read_part(out, info, "capture")
     assert capture is not None
     photos = capture.photos
     for photo, (_, T) in zip(photos, cameras_of(info), strict=True):

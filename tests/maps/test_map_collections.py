@@ -153,7 +153,7 @@ def test_folders_of_one_name_are_told_apart_by_those_around_them(
     grounds: list[Map], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(collections_module, "load_info", lambda _: grounds[0].info)
-    monkeypatch.setattr(collections_module, "load_landmarks", lambda *_: None)
+    monkeypatch.setattr(collections_module, "read_part", lambda *_: None)
     folders = [tmp_path / name for name in ("A/day/MAP", "B/day/MAP", "B/night/MAP", "B/other")]
     for folder in folders:
         folder.mkdir(parents=True)
@@ -179,7 +179,7 @@ def test_the_command(
 
     monkeypatch.setattr(collections_module, "load_info", lambda folder: known[folder.name].info)
     monkeypatch.setattr(
-        collections_module, "load_landmarks", lambda folder, info: known[folder.name].landmarks
+        collections_module, "read_part", lambda folder, info, part: known[folder.name].landmarks
     )
     monkeypatch.setattr(collections_module, "load_map", load)
     for name in known:

@@ -34,9 +34,9 @@ from bidnerf_core.maps import (
     Anchor,
     Map,
     MapInfo,
-    load_capture,
     load_info,
     load_map,
+    read_part,
     store,
     write_parts,
 )
@@ -381,7 +381,7 @@ def test_a_part_comes_back_as_it_was_and_the_rest_of_the_map_stays(name: str, tm
 @given(capture=record(CaptureReport))
 def test_any_capture_record_comes_back_as_it_was(capture: CaptureReport, tmp_path: Path) -> None:
     saved = write_parts(tmp_path, info(), TrainingState(5, {"w": torch.ones(1)}, {}), capture=capture)
-    assert load_capture(tmp_path, saved) == capture
+    assert read_part(tmp_path, saved, "capture") == capture
 
 
 @baked_part
