@@ -1,6 +1,6 @@
 """The posterior over the explanations of one query: probabilities by Laplace's approximation, and the pose as a mixture.
 
-Before it are the steps of the loop that depend on tensors alone, each of which a GPU replays as one graph.
+Beside it are the steps of the loop that depend on tensors alone, each of which a GPU replays as one graph.
 """
 
 from __future__ import annotations

@@ -14,14 +14,14 @@ import contextlib
 import copy
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any, cast
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map, tree_map_only
 
 from bidnerf_core import devices
 from bidnerf_core.devices import moved, without_waiting
@@ -157,7 +157,7 @@ class Elsewhere(TorchDispatchMode):
 
 
 def _run(func: Any, args: Any, kwargs: dict[str, Any], mode: Elsewhere | None) -> Any:
-    flat = tree_leaves((args, kwargs))
+    flat = _leaves((*args, *kwargs.values()))
     there = any(isinstance(part, _There) for part in flat)
     wanted = None if kwargs.get("device") is None else torch.device(kwargs["device"]).type
     if any(isinstance(part, Tensor) and part.is_meta and not isinstance(part, _There) for part in flat):
@@ -166,32 +166,61 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any], mode: Elsewhere | None) -
         )
     if not there and wanted != DEVICE.type:
         return func(*args, **kwargs)
-    name, schema = func._schema.name.removeprefix("aten::"), func._schema
+    name, is_returned, places = _signature(func)
     if mode is not None and (fault := _waiting(name, args, flat, there, wanted)) is not None:
         if mode._strict:
             raise DeviceFault(fault)
         mode.waits[name] += 1
     # PyTorch itself moves numbers, and the indices of a tensor on the device.
     indexed = name in INDEXED and isinstance(args[0], _There)
-    here = [part for part in _on_cpu(tree_leaves(args[2:]) if indexed else flat) if part.ndim > 0]
+    here = [part for part in _on_cpu(_leaves(args[2:]) if indexed else flat) if part.ndim > 0]
     if there and here and name not in ("_to_copy", "copy_"):
         shapes = ", ".join(str(tuple(part.shape)) for part in here)
         raise DeviceFault(f"{name} mixes devices: a tensor of shape {shapes} is on the CPU")
     if wanted == DEVICE.type or func is _aten._to_copy.default:
         kwargs = kwargs | {"device": torch.device("cpu")}
-    plain_args, plain_kwargs = tree_map_only(_There, lambda part: part.held, (args, kwargs))
-    found = func(*plain_args, **plain_kwargs)
+    found = func(
+        *[_each(_held, part) for part in args], **{key: _each(_held, part) for key, part in kwargs.items()}
+    )
     if wanted == "cpu":
         return found.clone() if isinstance(found, Tensor) else found
     # A result that is written in place is the argument itself.
-    written = [
-        args[place] if place < len(args) else kwargs.get(argument.name)
+    written = [args[place] if place < len(args) else kwargs.get(key) for place, key in places]
+    if written and is_returned:
+        return written[0] if len(func._schema.returns) == 1 else tuple(written)
+    return _each(lambda part: _There(part) if type(part) is Tensor else part, found)
+
+
+@cache
+def _signature(func: Any) -> tuple[str, bool, list[tuple[int, str]]]:
+    """Return the name of an operation, whether it returns anything, and the places and names of the arguments that it writes."""
+    schema = func._schema
+    places = [
+        (place, argument.name)
         for place, argument in enumerate(schema.arguments)
         if argument.alias_info is not None and argument.alias_info.is_write
     ]
-    if written and schema.returns:
-        return written[0] if len(schema.returns) == 1 else tuple(written)
-    return tree_map(lambda part: _There(part) if type(part) is Tensor else part, found)
+    return schema.name.removeprefix("aten::"), bool(schema.returns), places
+
+
+def _leaves(parts: Iterable[Any]) -> list[Any]:
+    """Return the arguments of an operation, whose lists are never nested; far faster than PyTorch's own ``tree_leaves``."""
+    found = list[Any]()
+    for part in parts:
+        if isinstance(part, list | tuple):
+            found.extend(part)
+        else:
+            found.append(part)
+    return found
+
+
+def _each(change: Callable[[Any], Any], part: Any) -> Any:
+    """Return an argument or a result with ``change`` applied, to each element if it is a list."""
+    return type(part)([change(each) for each in part]) if isinstance(part, list | tuple) else change(part)
+
+
+def _held(part: Any) -> Any:
+    return part.held if isinstance(part, _There) else part
 
 
 def _on_cpu(parts: Iterable[Any]) -> list[Tensor]:

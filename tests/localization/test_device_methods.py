@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from importlib import import_module
 from dataclasses import replace
 from typing import Any
 
@@ -65,14 +66,16 @@ def on_both(
 
 def test_auto_by_depth() -> None:
     (view,) = module_fields.shown(1, seed=5)
-    here = on_both(blobs(), view.frame, **SETTINGS)
+    near = view.T_ref_camera.retract(torch.full((6,), 0.02, dtype=torch.float64))
+    here = on_both(blobs(), view.frame, start=near, **SETTINGS | {"hypotheses": 8})
     assert here.converged, here.reason
     assert float(pose_error(here.T_world_camera, view.T_ref_camera).translation) < 0.01
 
 
-@pytest.mark.slow
-def test_auto_by_colour() -> None:
+def test_auto_by_colour(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is rejected, as a part of the image is in one colour."""
+    by_surface = import_module("bidnerf_core.localization.by_surface")
+    monkeypatch.setattr(by_surface, "IMAGE_STAGES", ((16, 0, 4), (16, 8, 2), (48, 6, 2)))
     (view,) = module_fields.shown(1, seed=5)
     frame = without_depth(view.frame)
     rgb = frame.rgb.clone()
@@ -81,23 +84,18 @@ def test_auto_by_colour() -> None:
     assert "newly drawn rays" in here.reason
 
 
-@pytest.mark.parametrize("depth", [True, False])
-def test_auto_by_landmarks(depth: bool) -> None:
-    view = unseen()
-    here = on_both(ground(), view.frame if depth else without_depth(view.frame), **SETTINGS)
+@pytest.mark.parametrize(("depth", "most"), [(False, 22), (True, 30)])
+def test_auto_by_landmarks_for_which_the_host_waits_a_handful_of_times(depth: bool, most: int) -> None:
+    """It uploads and reads once for the matches, for each round of matching by projection, and for each measurement."""
+    frame, config = unseen().frame if depth else without_depth(unseen().frame), AutoConfig(**SETTINGS)
+    here = Localizer(ground(), config=config)(frame)
     assert here.converged, here.reason
     assert ("fused with depth and rendering" if depth else "fused with rendering") in here.reason
-
-
-@pytest.mark.parametrize(("depth", "most"), [(False, 22), (True, 30)])
-def test_the_host_waits_a_handful_of_times_for_a_query(depth: bool, most: int) -> None:
-    """It uploads and reads once for the matches, for each round of matching by projection, and for each measurement."""
-    frame = unseen().frame if depth else without_depth(unseen().frame)
     with Elsewhere() as mode:
-        localizer = Localizer(ground(), device=DEVICE)
-        localizer(frame)
+        localizer = Localizer(ground(), config=config, device=DEVICE)
+        same(here, localizer(frame))
         mode.waits.clear()
-        assert localizer(frame).converged
+        localizer(frame)
     assert 0 < sum(mode.waits.values()) <= most, mode.waits
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import replace
+from importlib import import_module
 
 import pytest
 import torch
@@ -196,23 +197,24 @@ def test_few_points_make_cells_coarser_but_no_coarser_than_their_spacing(generat
     assert chosen_grid(few[:1], baked.BOUNDS, 0.02, 0.1, 200.0).cell == 0.1
 
 
-@pytest.mark.slow
 def test_memory_is_bounded_and_a_warning_says_so(
     generator: Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    points = scattered(200_000, generator)
+    points = scattered(20_000, generator)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        free = chosen_grid(points, baked.BOUNDS, 0.01, 0.01, 200.0)
-    with pytest.warns(InputWarning, match=r"MB with cells of 0\.01; cells of .* within 1 MB.*--megabytes"):
-        bounded = chosen_grid(points, baked.BOUNDS, 0.01, 0.01, 1.0)
-    assert surface_bytes(points, bounded) <= 1e6 < surface_bytes(points, free)
-    assert bounded.cell < 0.06  # no coarser than needed
-    monkeypatch.setattr("bidnerf_core.mapping.surface.posed_depth.MOST_CELLS", 2**20)
-    with pytest.warns(InputWarning, match="too many cells"):
-        assert math.prod(chosen_grid(points, baked.BOUNDS, 1e-4, 1e-4, 200.0).shape) < 2**20
+        free = chosen_grid(points, baked.BOUNDS, 0.03, 0.03, 200.0)
+    with pytest.warns(InputWarning, match=r"MB with cells of 0\.03; cells of .* within 0\.2 MB.*--megabytes"):
+        bounded = chosen_grid(points, baked.BOUNDS, 0.03, 0.03, 0.2)
+    assert surface_bytes(points, bounded) <= 0.2e6 < surface_bytes(points, free)
+    assert bounded.cell < 0.18  # no coarser than needed
     with pytest.raises(InputError, match="allow more megabytes"):
-        chosen_grid(points, baked.BOUNDS, 0.3, 0.3, 1e-5)
+        chosen_grid(points, baked.BOUNDS, 0.03, 0.03, 1e-5)
+    posed_depth = import_module("bidnerf_core.mapping.surface.posed_depth")
+    assert posed_depth.MOST_CELLS <= 2**31
+    monkeypatch.setattr(posed_depth, "MOST_CELLS", 2**22)
+    with pytest.warns(InputWarning, match="too many cells"):
+        assert math.prod(chosen_grid(points, baked.BOUNDS, 0.01, 0.01, 200.0).shape) <= 2**22
 
 
 def walls(size: tuple[float, float, float], step: float) -> Tensor:

@@ -114,7 +114,7 @@ def distances(index: SurfelIndex, positions: Tensor, points: Tensor) -> tuple[Te
 
 
 @given(seed=st.integers(0, 2**31), count=st.integers(1, 60))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_the_surfel_found_is_nearly_the_nearest(seed: int, count: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     positions, points = inside(count, generator), inside(500, generator)
