@@ -19,7 +19,7 @@ from bidnerf_core.devices import run_on
 from bidnerf_core.fields import has_field
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.accept import Evidence, judge
+from bidnerf_core.localization.accept import LANDMARK_BOUNDS, Evidence, judge
 from bidnerf_core.localization.explanations import MOVING, USUAL, Explanations, Seed, explanations
 from bidnerf_core.localization.matching import (
     STRONGEST,
@@ -370,7 +370,9 @@ class Loop:
         # Rays add to landmarks if the projection of the scene that these determine is uncertain by more than 0.6 pixels.
         position = float(found.mixture()[:3, :3].trace().sqrt().nan_to_num(math.inf))
         blurred = float(landmarks.focal.max()) * position / landmarks.distance(found.chosen) > 0.6
-        if problem is not None and self.rays and found.mode == 0 and blurred:
+        # Rays move a pose too little to make enough matches agree that was found by chance.
+        by_chance = searched and self._log10_nfa(modes[0], found.chosen) > LANDMARK_BOUNDS[0].limit
+        if problem is not None and self.rays and found.mode == 0 and blurred and not by_chance:
             where = "cpu" if problem.device == self.device else None
             rays = Rays.of(problem.views, problem.field, problem.bounds, self.rays, self.seed, device=where)
             fused.append("rendering")
@@ -393,6 +395,11 @@ class Loop:
         )
         answer = self._judged(found, mass, modes, landmarks, given, searched, others)
         return replace(answer, fused=tuple(fused))
+
+    def _log10_nfa(self, mode: Mode, state: States) -> float:
+        """Return log10 of the false alarms of the matches by descriptors that agree with a state of a mode."""
+        agreeing = int(inliers(mode.query, self.landmarks, mode.by_descriptors, state).sum())
+        return log10_nfa(len(mode.by_descriptors), agreeing, mode.query.by_chance)
 
     def _posterior(self, minima: Minima, landmarks: Landmarks, systematic: Tensor | float = 0.0) -> Posterior:
         quadratic, states, normal = minima
@@ -425,9 +432,8 @@ class Loop:
         covariance = HEAVY_TAILS * (found.mixture() + self.landmarks.pose_covariance)
         position = float(covariance[:3, :3].trace().sqrt().nan_to_num(math.inf, math.inf))
         row = found.states.row
-        agreeing = int(inliers(query, self.landmarks, mode.by_descriptors, state).sum())
         evidence = Evidence(
-            log10_nfa=log10_nfa(len(mode.by_descriptors), agreeing, query.by_chance) if searched else 0.0,
+            log10_nfa=self._log10_nfa(mode, state) if searched else 0.0,
             inliers=count, by_chance=chance, recall=count / max(1, min(seen.visible, len(query.view))),
             spread=len(cells.unique()) / CELLS**2 / len(query.images),
             noise_ratio=float(state.noise) / self.landmarks.noise,
