@@ -74,12 +74,13 @@ def localize_by_depth(
         found = again if number == 0 or again.scores[0] < found.scores[0] else found
         best, exposed = _exposed(points, found.states[:1], middle)
         evidence = _evidence(exposed, best, found.margin)
-        if Support(evidence).verdict("").accepted:
+        supported = Support(evidence).verdict("").accepted
+        if supported:
             break
     score = _score(exposed)
     finest = replace(exposed, noise=surface.cell, colour_weight=1.0)
     refined, path, losses = finest.fitted_noise(best), found.path, found.losses
-    if config.refine_steps:
+    if config.refine_steps and supported:
         terms = RayTerms(ColourSettings(), DepthLossSettings(depth_weight=1.0))
         # The pose is nearly right, hence a small uncertainty of the field's surfaces.
         term = terms.term(problem, config.refine_rays, seed, sigma=SHAPE_SIGMA / 4)

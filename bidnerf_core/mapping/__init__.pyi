@@ -70,6 +70,7 @@ from .resection.states import N as N
 from .resection.states import P as P
 from .resection.states import Sights as Sights
 from .resection.states import States as States
+from .resection.states import by_update as by_update
 from .resection.states import imaged as imaged
 from .resection.states import jacobian as jacobian
 from .resection.states import pinhole as pinhole

@@ -23,6 +23,7 @@ from bidnerf_core.mapping import (
     Sights,
     States,
     SurfaceMap,
+    by_update,
     rays_by_camera,
     rays_through,
 )
@@ -132,23 +133,20 @@ class Surface:
         share = self.independent / len(self)
         cost = share * 2 * (1 - inlier).sum(-1)
         weight = share * inlier.square() / self.noise**2
-        R = here.T.rotation
-        gradient, hessian = torch.zeros_like(here.z[:, :1]), torch.zeros_like(here.z[:, :1, None])
+        residuals, slopes, weights = r[..., None], normal[..., None, :], weight[..., None]
         if self.colour_weight:
             difference, slope = self._colours(index, along)
             alike = self._alike(difference)
-            weight = weight * (1 + self.colour_weight * alike)
             cost = cost + share * 2 * self.colour_weight * (1 - inlier * alike).sum(-1)
+            by_distance = weight * (1 + self.colour_weight * alike)
             by_colour = 4 * share * self.colour_weight * inlier * alike.square() / COLOUR**2
-            for channel in range(3):
-                rows = self._rows(here, slope[..., channel, :].double() @ R, local, rays)
-                pull = (by_colour * difference[..., channel])[..., None]
-                gradient = gradient + (pull * rows).sum(1)
-                hessian = hessian + (rows * by_colour[..., None]).mT @ rows
-        rows = self._rows(here, normal @ R, local, rays)
-        gradient = gradient + ((weight * r)[..., None] * rows).sum(1)
-        found = Normal(cost, gradient, hessian + (rows * weight[..., None]).mT @ rows)
-        return moved(found, states.z.device)
+            residuals = torch.cat([residuals, difference.double()], -1)
+            slopes = torch.cat([slopes, slope.double()], -2)
+            weights = torch.stack([by_distance, *3 * [by_colour]], -1)
+        rows = self._rows(here, slopes, local, rays).flatten(1, 2)
+        weighted = (rows * weights.flatten(1)[..., None]).mT
+        gradient = (weighted @ residuals.flatten(1)[..., None])[..., 0]
+        return moved(Normal(cost, gradient, weighted @ rows), states.z.device)
 
     def inliers(self, states: States) -> tuple[Float[Tensor, "h n"], Float[Tensor, "h n"]]:
         """Return each point's inlier weights by distance and by colour."""
@@ -226,14 +224,17 @@ class Surface:
         beyond = (along.norm(dim=-1) - 1.5 * self.surface.cell).clamp(min=0)
         return across, across.square() + beyond.square(), normal, index, along, local, rays
 
-    def _rows(self, states: States, normal: Tensor, local: Tensor, rays: Tensor) -> Float[Tensor, "h n P"]:
+    def _rows(
+        self, states: States, normals: Float[Tensor, "h n k 3"], local: Tensor, rays: Tensor
+    ) -> Float[Tensor, "h n k P"]:
+        """Return the derivatives of the points (world) along ``normals`` with respect to the unknowns."""
         sights = self.sights
+        by_rig = (normals.flatten(1, 2) @ states.T.rotation).view_as(normals)
         rig = (sights.rotation @ local[..., None])[..., 0] + sights.translation
-        by_pose = torch.cat([normal, torch.linalg.cross(rig, normal)], -1)
-        own = (normal[..., None, :] @ sights.rotation)[..., 0, :]  # in the camera's frame
-        scale = (self.z * states.nuisances[:, DEPTH, None].exp())[..., None]
-        by_camera = (own[..., None] * rays_by_camera(rays, states)).sum(-2) * scale
-        by_row = torch.cat([own, torch.linalg.cross(local, own)], -1)
-        by_motion = by_row * sights.times[:, None] * states.deviation[:, None, MOTION]
-        by_depth = (own * (local - self.fixed)).sum(-1, keepdim=True) * states.deviation[:, None, DEPTH:]
-        return torch.cat([by_pose, by_camera, by_motion, by_depth], -1)
+        own = by_rig @ sights.rotation
+        scale = (self.z * states.nuisances[:, DEPTH, None].exp())[..., None, None]
+        by_camera = own @ (rays_by_camera(rays, states) * scale)
+        times = sights.times[:, None, None]
+        by_motion = -by_update(own, local) * times * states.deviation[:, None, None, MOTION]
+        by_depth = own @ (local - self.fixed)[..., None] * states.deviation[:, None, None, DEPTH:]
+        return torch.cat([-by_update(by_rig, rig), by_camera, by_motion, by_depth], -1)

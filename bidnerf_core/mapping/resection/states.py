@@ -248,9 +248,9 @@ def true_intrinsics(stated: Intrinsics, camera: Float[Tensor, "6"]) -> Intrinsic
 def rays_through(states: States, image: Float[Tensor, "m 2"]) -> Float[Tensor, "h m 3"]:
     """Return the points on the plane z = 1 of the true cameras that appear at ``image`` on that of the stated camera."""
     nuisances = states.nuisances
-    shifted = (image - nuisances[:, None, 1:3])[..., None]
-    bent = torch.linalg.solve_triangular(linear(states)[:, None], shifted, upper=True)[..., 0]
-    flat = bent
+    x, y = (image - nuisances[:, None, 1:3]).unbind(-1)
+    (a, c), (_, b) = (row.unbind(-1) for row in linear(states)[:, None].unbind(-2))
+    bent = flat = torch.stack([(x - c * y / b) / a, y / b], -1)
     for _ in range(4):  # fixed-point iteration as in OpenCV's undistortPoints
         flat = bent / (1 + nuisances[:, None, 3:4] * flat.square().sum(-1, keepdim=True))
     return torch.cat([flat, torch.ones_like(flat[..., :1])], -1)
