@@ -226,7 +226,7 @@ class Plugins(Mapping[str, Plugin], Generic[Plugin]):
         return iter(dict.fromkeys(info.name for info in infos))
 
     def __len__(self) -> int:
-        return len(list(self))
+        return sum(1 for _ in self)  # list() asks for the length
 
     def __contains__(self, name: object) -> bool:
         return any(info.name == name for info in list_plugins(self._group))

@@ -7,9 +7,9 @@ from .faults import expand_faults as expand_faults
 from .faults import faulty as faulty
 from .faults import parse_faults as parse_faults
 from .faults import random_units as random_units
-from .faults.camera import rolling_shutter as rolling_shutter
-from .faults.camera import warped as warped
-from .faults.scene import texture as texture
+from .faults.changes import rolling_shutter as rolling_shutter
+from .faults.changes import texture as texture
+from .faults.changes import warped as warped
 from .plan import PROTOCOLS as PROTOCOLS
 from .plan import Plan as Plan
 from .plan import Size as Size

@@ -143,7 +143,7 @@ class MethodContract(Named):
         if "_kept" not in vars(type(self)):
             found = self._localized(textured_map(surface=True), unseen().frame, unseen().T_ref_camera)
             type(self)._kept = found  # type: ignore[attr-defined]
-        return vars(type(self))["_kept"]  # type: ignore[no-any-return]
+        return vars(type(self))["_kept"]
 
     def _localized(self, scene: MapWithLandmarks, frame: Frame, truth: SE3) -> Localization:
         near = truth.to("cpu", torch.float64).retract(torch.tensor(START_OFF, dtype=torch.float64))

@@ -60,6 +60,10 @@ class TestTransforms(ReaderContract):
         type(self).folder = capture
 
 
+def test_plugins_are_a_mapping() -> None:
+    assert len(FAULTS) == len(list(FAULTS)) > 20
+
+
 @pytest.mark.parametrize("name", FAULTS)
 def test_every_bundled_fault_fulfils_the_contract(name: str) -> None:
     assert_fulfilled(FaultContract, name=name)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Generator, Tensor
 
 from bidnerf_core.errors import InputError
@@ -66,24 +66,6 @@ def random_units(count: int, generator: Generator) -> Float[Tensor, "n 3"]:
     """Return unit vectors, uniform on the sphere (float64)."""
     normal = torch.randn((count, 3), generator=generator, dtype=torch.float64)
     return torch.nn.functional.normalize(normal, dim=-1)
-
-
-def random_direction(generator: Generator) -> tuple[float, float]:
-    """Return a uniformly distributed unit vector in the image plane."""
-    angle = 2 * math.pi * uniform_number(generator)
-    return math.cos(angle), math.sin(angle)
-
-
-def uniform_number(generator: Generator, low: float = 0.0, high: float = 1.0) -> float:
-    """Return a uniformly distributed number between two limits."""
-    return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
-
-
-def random_pixel(mask: Bool[Tensor, "h w"], generator: Generator) -> tuple[int, int]:
-    """Return the row and column of a random pixel of ``mask``, which marks at least one."""
-    places = mask.nonzero()
-    row, column = places[int(torch.randint(len(places), (), generator=generator))].tolist()
-    return row, column
 
 
 # Faults as text, alone or composed.
