@@ -1,4 +1,3 @@
-from .checkpoints import Checkpoints as Checkpoints
 from .collection import MapCollection as MapCollection
 from .collection import Placement as Placement
 from .collection import maps_in as maps_in
@@ -24,6 +23,7 @@ from .map import Localizer as Localizer
 from .map import Map as Map
 from .map import frozen_field as frozen_field
 from .map import load_map as load_map
+from .store import Checkpoints as Checkpoints
 from .store import map_folder as map_folder
 from .store import read_part as read_part
 from .store import write_parts as write_parts

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import itertools
 import logging
 import math
-import time
 from collections.abc import Container, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -30,11 +28,11 @@ from bidnerf_core.datasets import (
     open_dataset,
     photo_files,
 )
-from bidnerf_core.errors import Cancelled, InputError, amount
-from bidnerf_core.fields import RadianceField, render_image, trained_field
+from bidnerf_core.errors import InputError, amount
+from bidnerf_core.fields import NoField, device_of, render_image, trained_field
 from bidnerf_core.frames import Frame, SeenLandmarks, View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import from_plain, locked
+from bidnerf_core.io import from_plain, locked, to_plain
 from bidnerf_core.localization import Localizer, Outcome, landmark_cameras
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
@@ -44,13 +42,12 @@ from bidnerf_core.mapping import (
     concatenated,
     tracked_views,
 )
-from bidnerf_core.maps.baking import bake_landmarks, with_tracks_in
-from bidnerf_core.maps.checkpoints import Checkpoints
+from bidnerf_core.maps.baking import with_tracks_in
 from bidnerf_core.maps.description import load_info, longest_side
 from bidnerf_core.maps.map import USUAL_BAKE, Map, load_map
+from bidnerf_core.maps.training import TrainOptions, train_field
 from bidnerf_core.maps.views import Images, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context
-from bidnerf_core.training import TrainingStopped
 
 log = logging.getLogger("bidnerf")
 
@@ -227,7 +224,7 @@ def _extended(
     config: BakeConfig,
 ) -> Map:
     """Return the map with new photos; ``complete`` states whether ``old`` are its own photos, not renderings."""
-    began, where, everything = time.monotonic(), scene.name, [*old, *new]
+    where, everything = scene.name, [*old, *new]
     given = everything if complete else new
     tracked = tracked_views(given, scene.info.landmark_features)
     seeing = list(given)
@@ -242,15 +239,13 @@ def _extended(
             for part in (old, new)
         ]
         weighted = [*old] * min(3, max(1, round(pixels[1] / pixels[0]))) + seeing
-    field, done = _trained_on(scene, weighted, steps, len(new) / max(1, len(everything)))
+    grown = _trained_on(scene, weighted, steps, len(new) / max(1, len(everything)))
     info = replace(
-        scene.info,
+        grown.info,
         cameras=(*scene.info.cameras, *stored_cameras(new)),
-        step=scene.info.step + done,
         added=scene.info.added + len(new),
-        seconds=scene.info.seconds + time.monotonic() - began,
     )
-    grown = replace(scene, info=info, field=info.in_map_unit(field), folder=None, record=scene.capture)
+    grown = replace(grown, info=info)
     # The surface is baked from measured depth and, unlike by ``bake_surface``, also from depth rendered from the other
     # cameras: the photos of these are not at hand, and what they measured must not be lost.
     measured = [view for view in seeing if view.frame.has_dense_depth]
@@ -260,13 +255,11 @@ def _extended(
         grown = replace(grown, surface=bake(grown.field, grown.bounds, others, measured, config))
     except InputError as error:
         log.info(f"the surface is unchanged: {error}")
-    check_cancelled("extending")
     if complete:
-        info, landmarks, tracked = bake_landmarks(info, grown.field, seeing, where, tracked)
-        grown = replace(grown, info=info, landmarks=landmarks).with_survey(seeing, tracked)
-        info = grown.info
+        grown, tracked_again = grown.with_landmarks(seeing, tracked=tracked)
+        grown = grown.with_survey(seeing, tracked_again)
     else:
-        landmarks = scene.landmarks
+        check_cancelled("extending")
         try:
             more = with_tracks_in(
                 info, tracked.landmarks(DEFAULT_LANDMARKS), [view.frame.name for view in new]
@@ -274,11 +267,10 @@ def _extended(
         except InputError as error:  # one photo, or photos without overlap
             log.info(f"no new landmarks: {error}")
         else:
-            if landmarks is None or not len(more):
-                landmarks = landmarks or more
-            else:
-                landmarks = concatenated([landmarks, more[~_present(landmarks, more)]])
-    grown = grown.with_parts(None, landmarks or scene.landmarks)
+            own = scene.landmarks
+            if own is not None and len(more):
+                more = concatenated([own, more[~_present(own, more)]])
+            grown = grown.with_parts(None, more if own is None or len(more) else own)
     before, after = (0 if m.landmarks is None else len(m.landmarks) for m in (scene, grown))
     log.info(f"{where}: {before} landmarks before, {after} now; {amount(len(info.cameras), 'image')}")
     if scene.folder is None:
@@ -287,14 +279,12 @@ def _extended(
     if stored.weights != scene.info.weights:
         raise InputError("was retrained meanwhile; extend it again", where=where)
     check_cancelled("extending")
-    return replace(grown, info=replace(info, anchor=stored.anchor)).stored_in(scene.folder)
+    return replace(grown, info=replace(grown.info, anchor=stored.anchor)).stored_in(scene.folder)
 
 
-def _trained_on(
-    scene: Map, views: Sequence[View], steps: int | None, share: float
-) -> tuple[RadianceField, int]:
-    """Continue training a copy of the field; return the copy, in its own training unit, and the number of steps."""
-    info = scene.info
+def _trained_on(scene: Map, views: Sequence[View], steps: int | None, share: float) -> Map:
+    """Return the map in memory, with its baked parts and a copy of its field that is trained further."""
+    info, field = scene.info, trained_field(scene.field)
     backend = load_backend(info.backend, str(scene.folder or ""))
     settings: Any = from_plain(backend.config_type, info.config, "config")
     usual = getattr(settings, "steps", None)
@@ -302,20 +292,15 @@ def _trained_on(
         settings = replace(settings, steps=steps or max(1, math.ceil(usual * max(share, 0.25))))
     elif steps is not None:
         raise InputError(f"steps is {steps}, but backend {info.backend!r} has no such setting; leave it out")
-    if not isinstance(trained := trained_field(scene.field), nn.Module):
-        raise InputError(
-            f"the map's field is a {type(trained).__name__}", expected="an nn.Module of a backend"
-        )
-    field = copy.deepcopy(trained).requires_grad_(True).train()
+    if not isinstance(field, nn.Module):
+        raise InputError(f"the map's field is a {type(field).__name__}", expected="an nn.Module of a backend")
     if info.field_frame is not None:
         views = [_in_field_unit(view, 1 / info.field_frame.scale) for view in views]
-    report = Checkpoints(replace(info, step=0, complete=False))
-    try:
-        backend.train(cast(RadianceField, field), views, settings, report)
-    except TrainingStopped as stopped:
-        raise Cancelled(f"cancelled after step {stopped.step}; the map is unchanged") from stopped
-    field.requires_grad_(False).eval()
-    return cast(RadianceField, field), int(getattr(settings, "steps", report.info.step))
+    begun = replace(info, step=0, complete=False, config=to_plain(settings, "config"))
+    options = TrainOptions(device=device_of(scene.field))
+    grown = train_field(views, Map(begun, NoField()), options, weights=field.state_dict())
+    info = replace(info, step=info.step + grown.info.step, seconds=grown.info.seconds)
+    return replace(scene, info=info, field=grown.field, folder=None, record=scene.capture)
 
 
 def _in_field_unit(view: View, factor: float) -> View:

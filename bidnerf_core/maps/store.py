@@ -14,6 +14,7 @@ import math
 import os
 import re
 import secrets
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,7 +46,8 @@ from bidnerf_core.mapping import (
     surface_tensors,
 )
 from bidnerf_core.maps.description import ANCHOR, DESCRIPTION, PART_NAMES, MapInfo, load_info
-from bidnerf_core.training import TrainingState
+from bidnerf_core.progress import Progress, current_job
+from bidnerf_core.training import TrainingState, TrainingStep
 
 NEEDED = "a safetensors file, without which the map is incomplete"
 BAKED = "a safetensors file, which 'bidnerf bake' can recreate"
@@ -53,6 +55,10 @@ RECORDED = "a capture record, which 'bidnerf bake' with --data can recreate"
 _NAMES = r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|(capture|anchor)-\d{8,}-[0-9a-f]{8}\.json)"
 OURS = re.compile(rf"{_NAMES}|\.({_NAMES}|map\.json)\.[0-9a-f]{{8}}")
 """Names of the files that saving may leave behind, of earlier versions as well; other files are never removed."""
+
+
+USUAL_SECONDS = 60.0
+"""Time between checkpoints."""
 
 
 @dataclass(frozen=True)
@@ -171,6 +177,69 @@ def read_parts(
     raise InputError(
         "is being replaced faster than it can be read; try again later", where=folder
     ) from latest
+
+
+class Checkpoints:
+    """The ``Report`` of a training run, which saves checkpoints.
+
+    States are saved to ``folder``, or not at all if that is None; ``info`` describes the last saved state.
+    Progress is reported to the current job, which may also stop the training. ``state`` is the training state
+    to resume from, ``seconds`` is the time between checkpoints, and ``landmarks`` are stored with the first
+    checkpoint if they are not in the folder yet.
+    """
+
+    def __init__(
+        self,
+        info: MapInfo,
+        folder: Path | None = None,
+        state: TrainingState | None = None,
+        seconds: float = USUAL_SECONDS,
+        landmarks: LandmarkMap | None = None,
+    ) -> None:
+        self.info, self.folder = info, folder
+        self._state, self._seconds, self._job = state, seconds, current_job()
+        self._step = self._total = info.step
+        self._landmarks = landmarks
+        self._earlier, self._began = info.seconds, time.monotonic()
+        self._saved = self._began
+
+    @property
+    def stopping(self) -> bool:
+        return self._job.cancel is not None and self._job.cancel()
+
+    def resume(self) -> TrainingState | None:
+        return self._state
+
+    def step(self, progress: TrainingStep) -> None:
+        self._state = None  # free it: it is as large as the field and its optimizer
+        self._step, self._total = progress.step, progress.total
+        if self._job.progress is None:
+            return
+        figures = f"loss {progress.loss:.5f}  PSNR {progress.psnr:.2f} dB"
+        if not math.isnan(progress.samples_per_ray):  # not every recipe reports it
+            figures += f"  {progress.samples_per_ray:.1f} samples per ray"
+        self._job.progress(Progress("training", progress.step, progress.total, "steps", figures))
+
+    def due(self, step: int) -> bool:
+        waited = self.folder is not None and time.monotonic() - self._saved > self._seconds
+        return step == self._total or waited
+
+    def save(self, state: TrainingState) -> None:
+        seconds = self._earlier + time.monotonic() - self._began
+        info = replace(self.info, step=state.step, complete=state.step >= self._total, seconds=seconds)
+        if self.folder is not None:
+            if info.weights:  # the first save may replace another map, whose anchor does not count
+                info = replace(info, anchor=load_info(self.folder).anchor)
+            info = write_parts(self.folder, info, state, landmarks=self._landmarks, keep=True)
+            self._landmarks = None
+        self.info = info
+        self._saved = time.monotonic()
+
+    def finish(self, field: RadianceField) -> None:
+        """Save once more if the backend ended without reporting its last step."""
+        if not self.info.complete and isinstance(field, nn.Module):
+            self._total = self._step
+            self.save(TrainingState(self._step, field.state_dict(), {}))
 
 
 def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingState:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, cast, get_args
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from bidnerf_core.backend import load_backend, quick_config
 from bidnerf_core.camera import Intrinsics
@@ -40,10 +40,9 @@ from bidnerf_core.mapping import (
     find_features,
     tracked_views,
 )
-from bidnerf_core.maps.checkpoints import USUAL_SECONDS, Checkpoints
 from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info, longest_side
 from bidnerf_core.maps.map import USUAL_BAKE, Map, build_field, frozen_field, load_map
-from bidnerf_core.maps.store import load_state, map_folder, read_part, write_parts
+from bidnerf_core.maps.store import USUAL_SECONDS, Checkpoints, load_state, map_folder, read_part, write_parts
 from bidnerf_core.maps.views import Images, ReadViews, chosen_origin, read_views
 from bidnerf_core.progress import (
     Cancel,
@@ -410,7 +409,7 @@ def _completed(
         tracked = tracked_views(views, scene.info.landmark_features)
     scene = replace(scene, folder=out or scene.folder)
     if not scene.info.complete:
-        scene = _trained(views, scene, options, state)
+        scene = train_field(views, scene, options, state)
     if baking is not None and scene.has_field:
         if scene.surface is None:
             scene = baked_if_possible(scene, lambda whole: whole.with_surface(views, baking))
@@ -421,14 +420,25 @@ def _completed(
     return scene
 
 
-def _trained(views: Sequence[View], scene: Map, options: TrainOptions, state: TrainingState | None) -> Map:
-    """Train the field described by a map to completion, from ``state`` or from scratch."""
+def train_field(
+    views: Sequence[View],
+    scene: Map,
+    options: TrainOptions,
+    state: TrainingState | None = None,
+    weights: dict[str, Tensor] | None = None,
+) -> Map:
+    """Train the field described by a map to completion: from ``state``, from the ``weights`` of a field, or from scratch.
+
+    The views are in the unit of the training.
+    """
     out, device = scene.folder, working_device(options.device)
     backend, where = load_backend(scene.info.backend, str(out or "")), scene.name
     unsaved = scene.landmarks if scene.info.landmarks is None else None
     report = Checkpoints(scene.info, out, state, options.checkpoint_seconds, unsaved)
     del state  # the report frees it once training resumes from it
     field = moved(build_field(scene.info, where), device)
+    if weights is not None:
+        cast(nn.Module, field).load_state_dict(weights)
     config: Any = from_plain(backend.config_type, scene.info.config, f"{where}: config")
     try:
         backend.train(field, views, config, report)
@@ -443,9 +453,8 @@ def _trained(views: Sequence[View], scene: Map, options: TrainOptions, state: Tr
     log.info(
         f"{where}: field trained for {amount(report.info.step, 'step')}, {duration_text(report.info.seconds)}"
     )
-    weights = packed(cast(nn.Module, field).state_dict())
-    trained = frozen_field(report.info, weights, out)
-    return Map(report.info, trained, None, scene.landmarks, out, scene.record).to(device)
+    frozen = frozen_field(report.info, packed(cast(nn.Module, field).state_dict()), out)
+    return Map(report.info, frozen, None, scene.landmarks, out, scene.record).to(device)
 
 
 def baked_if_possible(scene: Map, bake: Callable[[Map], Map]) -> Map:
