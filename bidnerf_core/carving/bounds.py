@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bidnerf_core.carving.cells import occupied_cells
+from bidnerf_core.carving.free_space import occupied_cells
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds, crossed_box
 from bidnerf_core.frames import SeenLandmarks, View

@@ -1,4 +1,6 @@
-"""The free space of a view: how far its pixels see before any matter, and which spheres lie entirely within it.
+"""Carving: the cells of a box that no views see through, and the free space of a view, up to which its pixels see no matter.
+
+A cell is represented by its circumscribed sphere, which must lie entirely within the free space of a view.
 
 When in doubt, space counts as occupied: where nothing was measured, and beyond the depth that
 any neighbouring pixel sees.
@@ -7,18 +9,24 @@ any neighbouring pixel sees.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.devices import moved, threads_at_most
+from bidnerf_core.fields import VoxelGrid
 from bidnerf_core.frames import Frame, View
 
+CPU = torch.device("cpu")
+BLOCK = 8
+"""Cells along the side of a block. Processing a block for a view that does not see it costs next to nothing."""
 AROUND = np.ones((3, 3), np.uint8)
 """A pixel and its eight neighbours."""
 
@@ -111,3 +119,74 @@ def _edges(camera: Intrinsics) -> Float[Tensor, "4 3"]:
     (left, top, _), (right, bottom, _) = border.amin(dim=0).tolist(), border.amax(dim=0).tolist()
     normals = torch.tensor([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom]])
     return functional.normalize(normals, dim=-1).float()
+
+
+def occupied_voxels(
+    views: Sequence[View], grid: VoxelGrid, device: torch.device = CPU
+) -> Bool[Tensor, "x y z"]:
+    """Return which cells of ``grid`` may hold matter, see ``occupied_cells``.
+
+    The relative tolerance of depth is 5 %, since sensors err by a few per cent, and an emptied cell is never filled again.
+    In contracted space, the inner half of the grid, whose shape is divisible by 4, is the box; cells outside of the box
+    are always kept.
+    """
+    inner, middle = grid, [slice(None)] * 3
+    if grid.contracted is not None:
+        quarter = grid.shape[0] // 4
+        inner = VoxelGrid.cube(replace(grid.contracted, contracted=False), 2 * quarter)
+        middle = [slice(quarter, quarter + inner.shape[0])] * 3
+    occupied = torch.ones(grid.shape, dtype=torch.bool, device=device)
+    occupied[middle[0], middle[1], middle[2]] = occupied_cells(
+        views, inner.lower, inner.upper, inner.shape, 0.05, device=device
+    )
+    return occupied
+
+
+def occupied_cells(
+    views: Sequence[View],
+    lower: Sequence[float],
+    upper: Sequence[float],
+    shape: tuple[int, int, int],
+    tolerance: float = 0.02,
+    footprint: int = 8,
+    device: torch.device = CPU,
+) -> Bool[Tensor, "nx ny nz"]:
+    """Return on ``device`` which cells of the box ``lower``..``upper`` (metres, world) may hold matter.
+
+    A cell is emptied when two views (one, if there is only one) see all of it as free: as background (alpha 0), or nearer
+    than the measured depth by more than a fraction ``tolerance`` of that depth. Pixels without a measurement empty nothing, nor
+    does a view in which the cell's radius is over ``footprint`` pixels.
+
+    Cells are processed in blocks, which may reach beyond the box.
+    """
+    counts = [-(-count // BLOCK) for count in shape]
+    first = torch.tensor(lower, dtype=torch.float64)
+    size = (torch.tensor(upper, dtype=torch.float64) - first) / torch.tensor(shape)  # of a cell
+    radius = torch.linalg.vector_norm(size).item() / 2
+    blocks, cells = _indices(counts), _indices([BLOCK] * 3)
+    votes = torch.zeros(blocks.shape[1], BLOCK**3, dtype=torch.uint8, device=device)
+    needed = 1 if len(views) < 2 else 2
+    undecided = torch.ones(len(votes), dtype=torch.bool, device=device)
+    at_once = 128 if device.type == "cpu" else max(1, len(votes))  # so few blocks stay in the cache
+    with threads_at_most(1):  # the operations are short
+        for view in (view for view in views if view.frame.has_depth or view.frame.alpha is not None):
+            space = moved(FreeSpace.seen_by(view, tolerance, footprint), device)
+            # In double precision, since the world's origin may be far away.
+            T_camera_world = view.T_ref_camera.to(torch.float64).inverse()
+            # The middles of the blocks' first cells, and the offsets of a block's cells from them (metres, camera frame)
+            step = T_camera_world.rotation * size
+            corner = T_camera_world.apply(first + size / 2)[:, None] + step @ (blocks * BLOCK).double()
+            corners, within = moved((corner.float(), (step @ cells.double()).float()), device)
+            seen = space.may_free(corners + within.mean(dim=1, keepdim=True), BLOCK * radius)
+            for rows in (seen & undecided).nonzero()[:, 0].split(at_once):
+                points = (corners[:, rows, None] + within[:, None, :]).flatten(1)
+                freed = space.frees(points, radius).unflatten(0, (-1, BLOCK**3))
+                votes[rows] = (votes[rows] + freed).clamp(max=needed)  # a byte would overflow with many views
+                undecided[rows] = (votes[rows] < needed).any(dim=1)
+        whole = (votes < needed).reshape(*counts, BLOCK, BLOCK, BLOCK).permute(0, 3, 1, 4, 2, 5)
+        whole = whole.reshape([count * BLOCK for count in counts])
+        return whole[: shape[0], : shape[1], : shape[2]].contiguous()
+
+
+def _indices(counts: Sequence[int]) -> Int[Tensor, "3 n"]:
+    return torch.cartesian_prod(*(torch.arange(count) for count in counts)).T

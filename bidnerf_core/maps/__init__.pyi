@@ -16,14 +16,15 @@ from .importers import bounds_about as bounds_about
 from .importers import importer_of as importer_of
 from .importing import ImportOptions as ImportOptions
 from .importing import import_map as import_map
+from .importing import sphere as sphere
 from .known_lengths import ScaleFit as ScaleFit
 from .known_lengths import factor_of_distance as factor_of_distance
 from .known_lengths import factor_of_poses as factor_of_poses
 from .map import Localizer as Localizer
 from .map import Map as Map
-from .map import frozen_field as frozen_field
 from .map import load_map as load_map
 from .store import Checkpoints as Checkpoints
+from .store import frozen_field as frozen_field
 from .store import map_folder as map_folder
 from .store import read_part as read_part
 from .store import write_parts as write_parts
@@ -36,6 +37,5 @@ from .training import TrainOptions as TrainOptions
 from .training import interrupted as interrupted
 from .training import resume as resume
 from .training import train as train
-from .viewpoints import sphere as sphere
 from .views import Images as Images
 from .views import read_views as read_views

@@ -42,9 +42,9 @@ from bidnerf_core.mapping import (
     concatenated,
     tracked_views,
 )
-from bidnerf_core.maps.baking import with_tracks_in
 from bidnerf_core.maps.description import load_info, longest_side
 from bidnerf_core.maps.map import USUAL_BAKE, Map, load_map
+from bidnerf_core.maps.store import with_tracks_in
 from bidnerf_core.maps.training import TrainOptions, train_field
 from bidnerf_core.maps.views import Images, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context

@@ -5,32 +5,32 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
-from bidnerf_core.backend import load_backend
 from bidnerf_core.captures import (
     CaptureReport,
     UpDirection,
     at_stored_poses,
     given_up,
+    pose_updates,
     poses_of,
     stored_cameras,
     summary,
     surveyed,
+    tried_landmarks,
     up_direction,
 )
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.fields import (
     LARGEST_LENGTH,
-    NoField,
     RadianceField,
     RenderedImage,
     SceneBounds,
@@ -41,7 +41,7 @@ from bidnerf_core.fields import (
 )
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import LengthUnit
-from bidnerf_core.io import from_plain, locked
+from bidnerf_core.io import locked
 from bidnerf_core.localization import LOADERS, on_device, origin_of
 from bidnerf_core.localization import Localizer as Localizer  # from the door, with maps to load
 from bidnerf_core.mapping import (
@@ -50,19 +50,23 @@ from bidnerf_core.mapping import (
     LandmarkMap,
     SurfaceMap,
     TrackedViews,
+    bake,
     colour_noise,
     find_features,
+    rendered_views,
+    tracked_views,
+    update_scatter,
 )
-from bidnerf_core.maps.baking import bake_landmarks, bake_surface, check_alike
-from bidnerf_core.maps.description import DESCRIPTION, Anchor, MapInfo, load_info
+from bidnerf_core.maps.description import Anchor, LandmarkSource, MapInfo, cameras_of, load_info
 from bidnerf_core.maps.store import (
-    checked_weights,
     content_digest,
+    frozen_field,
     load_state,
     map_folder,
     read_part,
     read_parts,
     with_images,
+    with_tracks_in,
     write_parts,
 )
 from bidnerf_core.maps.summary import MapSummary
@@ -285,8 +289,21 @@ class Map:
                 own = {(camera.name, camera.T_world_camera) for camera in self.info.cameras}
                 if own and not any((c.name, c.T_world_camera) in own for c in stored_cameras(views)):
                     # None of them was used to build the map: they may be of another scene.
-                    check_alike(self.info, self.field, views, self.name)
+                    self.check_alike(views, self.name)
             return scene.with_baked_parts(views, config, rendered_landmarks)
+
+    def check_alike(self, views: Sequence[View], where: str) -> None:
+        """Raise ``InputError`` if photos differ too much from the field's renderings, whether or not the map was built from them."""
+        # The difference (RMS) between rendered and photographed colours indicates another scene if it is large relative to that of
+        # the photos the map was built from, or in itself if that is unknown, as in a map that was never baked.
+        off, usual = colour_noise(self.field, self.bounds, views), self.colour_noise
+        if off > (0.3 if usual is None else max(0.2, 2 * usual)):
+            raise InputError(
+                f"built from {self.info.data or 'other views'!r}, and its renderings differ from the photos by"
+                f" {off:.0%} of the range of colours;",
+                where=where,
+                expected="photos of the same scene, with poses in the coordinates of the map",
+            )
 
     def with_baked_parts(
         self,
@@ -309,9 +326,10 @@ class Map:
     ) -> tuple[Map, TrackedViews | None]:
         """Return the map with new landmarks, and the tracked keypoints from which they were built.
 
-        Landmarks are built from ``views`` or, without views, from rendered images, which require a field.
-        Without views, existing landmarks from photos are kept unless ``rendered`` is set, and no keypoints are
-        returned for them. The caller must hold the folder's lock, as for ``with_parts``.
+        Landmarks are built from ``views`` or, without views, from rendered images, which require a field; there
+        are none if the images show too little texture. Without views, existing landmarks from photos are kept
+        unless ``rendered`` is set, and no keypoints are returned for them. The caller must hold the folder's
+        lock, as for ``with_parts``.
         """
         check_cancelled("landmarks")
         if not views and not rendered and self.info.landmark_source != "rendered images":
@@ -326,7 +344,34 @@ class Map:
                     f"{self.name}: its landmarks from photos are kept; --rendered-landmarks replaces them"
                 )
                 return replace(self, landmarks=photos), None
-        info, landmarks, tracked = bake_landmarks(self.info, self.field, views, self.name, tracked)
+        began, info, landmarks = time.monotonic(), self.info, None
+        source: LandmarkSource = "photos" if views else "rendered images"
+        images = views or rendered_views(self.field, info.bounds, cameras_of(info))
+        if not images:
+            raise self._no_cameras()
+        if tracked is None:
+            tracked = tracked_views(images, info.landmark_features)
+        if views and not info.distances:
+            tracked = tracked.at_distance(info.bounds.side / 2)  # the directions are still informative
+        counter("trying the landmarks on images", "stage")(0, 1)
+        try:
+            landmarks = tried_landmarks(tracked, images, report=log.info)
+        except InputError as error:
+            log.info(f"{self.name}: no landmarks: {error}")
+        else:
+            # New poses are compared with others from the same source as the given ones. If training kept those,
+            # except for some wrong ones, their errors are negligible.
+            by_source = update_scatter(pose_updates(info.cameras))
+            landmarks = replace(landmarks, pose_covariance=landmarks.pose_covariance + by_source)
+            if views:
+                landmarks = with_tracks_in(info, landmarks, [view.frame.name for view in views])
+            else:
+                landmarks = replace(landmarks, tracks=None)  # in rendered images, which are not stored
+            info = replace(info, landmark_source=source, landmark_features=landmarks.features)
+            log.info(
+                f"{self.name}: {len(landmarks)} landmarks ({landmarks.megabytes:.1f} MB) from {len(images)} {source},"
+                f" {time.monotonic() - began:.1f} s"
+            )
         return replace(self, info=info).with_parts(None, landmarks), tracked
 
     def with_surface(
@@ -334,10 +379,32 @@ class Map:
     ) -> Map:
         """Return the map with a new surface: ``surface`` if given, else a baked one.
 
-        Baking uses the measured depth of the views, or else depth rendered by the field.
+        Baking uses the measured depth of the views, or else depth rendered by the field from the map's cameras or,
+        if it has none, from those of the views. Raises ``InputError`` if there are no cameras at all, and if the
+        images do not agree on a surface.
         """
         check_cancelled("surface")
-        return self.with_parts(surface or bake_surface(self.info, self.field, views, config, self.name))
+        if surface is not None:
+            return self.with_parts(surface)
+        began = time.monotonic()
+        cameras = cameras_of(self.info) or [(view.frame.intrinsics, view.T_ref_camera) for view in views]
+        if not cameras:
+            raise self._no_cameras()
+        measured = [view for view in views if view.frame.has_depth]
+        if not any(view.frame.has_dense_depth for view in measured):
+            measured = []  # a few points do not make a surface
+        surface = bake(self.field, self.bounds, [] if measured else cameras, measured, config)
+        source = f"{len(measured)} measured" if measured else f"{len(cameras)} rendered"
+        log.info(
+            f"{self.name}: surface of {len(surface.surfels)} surfels from {source} views,"
+            f" {time.monotonic() - began:.1f} s"
+        )
+        return self.with_parts(surface)
+
+    def _no_cameras(self) -> InputError:
+        return InputError(
+            "holds no cameras to render from; give a dataset of its views with --data", where=self.name
+        )
 
     def with_survey(self, views: Sequence[View], tracked: TrackedViews | None) -> Map:
         """Return the map with the capture record of the photos ``views`` and the field's colour error on them.
@@ -432,51 +499,3 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
 
 
 LOADERS.append(load_map)  # a Localizer opens a folder
-
-
-def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None = None) -> RadianceField:
-    """Build the field described by ``info`` with the weights ``tensors``; no parameter requires a gradient.
-
-    ``folder`` locates the files that error messages name. Raises ``InputError`` if the backend cannot build the
-    field, or the weights do not match it.
-    """
-    if not info.step:
-        return info.in_map_unit(NoField())
-    where, path, checked = str((folder or Path()) / DESCRIPTION), (folder or Path()) / info.weights, False
-    # This is outside of the context below, in which the tensors of its module would have no values.
-    load_backend(info.backend, where)
-    try:  # only the shapes, before memory is allocated for a field of whatever size map.json describes
-        with torch.device("meta"):
-            outline = build_field(info, where)
-    except InputError:
-        raise
-    except Exception:  # a backend may raise anything for missing values
-        log.debug("%s: backend %r needs real tensors to build its field", where, info.backend)
-    else:
-        tensors, checked = checked_weights(outline, tensors, path), True
-    field = build_field(info, where)
-    if not checked:
-        tensors = checked_weights(field, tensors, path)
-    cast(nn.Module, field).load_state_dict(tensors)
-    cast(nn.Module, field).requires_grad_(False).eval()
-    return info.in_map_unit(field)
-
-
-def build_field(info: MapInfo, where: str) -> RadianceField:
-    """Build the untrained field (an ``nn.Module``) that ``info`` describes.
-
-    Raises ``InputError`` as ``frozen_field`` does.
-    """
-    backend = load_backend(info.backend, where)
-    config: Any = from_plain(backend.config_type, info.config, f"{where}: config")
-    try:
-        field = backend.build(config, info.bounds if info.field_frame is None else info.field_frame.bounds)
-    except ValueError as error:
-        raise InputError(f"backend {info.backend!r} rejects its config: {error}", where=where) from error
-    if not (isinstance(field, nn.Module) and isinstance(field, RadianceField)):
-        raise InputError(
-            f"backend {info.backend!r} built a {type(field).__name__}",
-            where=where,
-            expected="an nn.Module with query and sampler",
-        )
-    return field

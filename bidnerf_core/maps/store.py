@@ -10,23 +10,25 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import logging
 import math
 import os
 import re
 import secrets
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
+import torch
 from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor, nn
 
-from bidnerf_core.backend import UpgradingField
+from bidnerf_core.backend import UpgradingField, load_backend
 from bidnerf_core.captures import CaptureReport
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.fields import RadianceField, ScaledField, trained_field
+from bidnerf_core.fields import NoField, RadianceField, ScaledField, trained_field
 from bidnerf_core.io import (
     from_plain,
     load_part,
@@ -48,6 +50,8 @@ from bidnerf_core.mapping import (
 from bidnerf_core.maps.description import ANCHOR, DESCRIPTION, PART_NAMES, MapInfo, load_info
 from bidnerf_core.progress import Progress, current_job
 from bidnerf_core.training import TrainingState, TrainingStep
+
+log = logging.getLogger("bidnerf")
 
 NEEDED = "a safetensors file, without which the map is incomplete"
 BAKED = "a safetensors file, which 'bidnerf bake' can recreate"
@@ -268,6 +272,15 @@ def with_images(landmarks: LandmarkMap, info: MapInfo) -> LandmarkMap:
     return replace(landmarks, cameras=cameras, features=info.landmark_features)
 
 
+def with_tracks_in(info: MapInfo, landmarks: LandmarkMap, names: Sequence[str]) -> LandmarkMap:
+    """Return landmarks built from images with these ``names``, with tracks that refer to the images of the map."""
+    if landmarks.tracks is None:
+        return landmarks
+    numbers = {camera.name: number for number, camera in enumerate(info.cameras)}
+    images = torch.tensor([numbers.get(name, -1) for name in names])
+    return replace(landmarks, tracks=landmarks.tracks.renumbered(images=images))
+
+
 def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
     """Check the tensors of a field from a file, after upgrading those of earlier versions, and return them.
 
@@ -301,6 +314,54 @@ def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path
             f"tensor {surplus[0]!r} is not part of the field that map.json describes", where=path
         )
     return tensors
+
+
+def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None = None) -> RadianceField:
+    """Build the field described by ``info`` with the weights ``tensors``; no parameter requires a gradient.
+
+    ``folder`` locates the files that error messages name. Raises ``InputError`` if the backend cannot build the
+    field, or the weights do not match it.
+    """
+    if not info.step:
+        return info.in_map_unit(NoField())
+    where, path, checked = str((folder or Path()) / DESCRIPTION), (folder or Path()) / info.weights, False
+    # This is outside of the context below, in which the tensors of its module would have no values.
+    load_backend(info.backend, where)
+    try:  # only the shapes, before memory is allocated for a field of whatever size map.json describes
+        with torch.device("meta"):
+            outline = build_field(info, where)
+    except InputError:
+        raise
+    except Exception:  # a backend may raise anything for missing values
+        log.debug("%s: backend %r needs real tensors to build its field", where, info.backend)
+    else:
+        tensors, checked = checked_weights(outline, tensors, path), True
+    field = build_field(info, where)
+    if not checked:
+        tensors = checked_weights(field, tensors, path)
+    cast(nn.Module, field).load_state_dict(tensors)
+    cast(nn.Module, field).requires_grad_(False).eval()
+    return info.in_map_unit(field)
+
+
+def build_field(info: MapInfo, where: str) -> RadianceField:
+    """Build the untrained field (an ``nn.Module``) that ``info`` describes.
+
+    Raises ``InputError`` as ``frozen_field`` does.
+    """
+    backend = load_backend(info.backend, where)
+    config: Any = from_plain(backend.config_type, info.config, f"{where}: config")
+    try:
+        field = backend.build(config, info.bounds if info.field_frame is None else info.field_frame.bounds)
+    except ValueError as error:
+        raise InputError(f"backend {info.backend!r} rejects its config: {error}", where=where) from error
+    if not (isinstance(field, nn.Module) and isinstance(field, RadianceField)):
+        raise InputError(
+            f"backend {info.backend!r} built a {type(field).__name__}",
+            where=where,
+            expected="an nn.Module with query and sampler",
+        )
+    return field
 
 
 def content_digest(field: RadianceField, surface: SurfaceMap | None, landmarks: LandmarkMap | None) -> str:

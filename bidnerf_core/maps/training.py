@@ -41,8 +41,17 @@ from bidnerf_core.mapping import (
     tracked_views,
 )
 from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info, longest_side
-from bidnerf_core.maps.map import USUAL_BAKE, Map, build_field, frozen_field, load_map
-from bidnerf_core.maps.store import USUAL_SECONDS, Checkpoints, load_state, map_folder, read_part, write_parts
+from bidnerf_core.maps.map import USUAL_BAKE, Map, load_map
+from bidnerf_core.maps.store import (
+    USUAL_SECONDS,
+    Checkpoints,
+    build_field,
+    frozen_field,
+    load_state,
+    map_folder,
+    read_part,
+    write_parts,
+)
 from bidnerf_core.maps.views import Images, ReadViews, chosen_origin, read_views
 from bidnerf_core.progress import (
     Cancel,

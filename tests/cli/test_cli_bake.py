@@ -89,8 +89,8 @@ def _ball(monkeypatch: pytest.MonkeyPatch) -> None:
 def _landmarks_only(sharp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The surface is left alone, and what the map renders is as sharp as photos."""
     photos = open_dataset(sharp / "data", tiny.BACKGROUND).views("train")
-    monkeypatch.setattr("bidnerf_core.maps.map.bake_surface", lambda *_: None)
-    monkeypatch.setattr("bidnerf_core.maps.baking.rendered_views", lambda *_: photos[:12])
+    monkeypatch.setattr("bidnerf_core.maps.map.Map.with_surface", lambda scene, *_: scene)
+    monkeypatch.setattr("bidnerf_core.maps.map.rendered_views", lambda *_: photos[:12])
 
 
 def test_a_baked_map_needs_no_start(sharp: Path, baked: Path, once: CommandResult, bidnerf: Run) -> None:
@@ -265,9 +265,9 @@ def test_landmarks_of_photos_are_built_once_for_training_and_baking(
         seen.append(sum(len(v.landmarks.distance) for v in views if v.landmarks is not None))
         hashgrid.train(field, views, *rest)
 
-    for part in ("maps.baking", "captures.training_views"):
+    for part in ("maps.map", "captures.training_views"):
         monkeypatch.setattr(f"bidnerf_core.{part}.tracked_views", tracked)
-    monkeypatch.setattr("bidnerf_core.maps.map.bake_surface", lambda *_: None)
+    monkeypatch.setattr("bidnerf_core.maps.map.Map.with_surface", lambda scene, *_: scene)
     watched = SimpleNamespace(summary="", config_type=HashGridConfig, build=hashgrid.build, train=trained)
     monkeypatch.setattr("bidnerf_core.maps.training.load_backend", lambda *_: watched)
     stored = train(
@@ -312,10 +312,10 @@ def test_photos_of_another_scene_are_not_baked_into_a_map(
     known = json.loads((baked / "map.json").read_text())
     (baked / "map.json").write_text(json.dumps(known | {"colour_noise": 0.1}))
     before = {file.name: file.read_bytes() for file in baked.iterdir()}
-    monkeypatch.setattr("bidnerf_core.maps.baking.colour_noise", lambda *_: 0.31)
+    monkeypatch.setattr("bidnerf_core.maps.map.colour_noise", lambda *_: 0.31)
     for never_baked_or_baked in (folder, baked):
         refused = bidnerf("bake", never_baked_or_baked, "--data", tmp_path / "other")
         assert_refused(refused, 1, "differ from the photos", "by 31%")
     assert {file.name: file.read_bytes() for file in baked.iterdir()} == before
-    monkeypatch.setattr("bidnerf_core.maps.baking.colour_noise", lambda *_: 0.15)  # of the same scene
+    monkeypatch.setattr("bidnerf_core.maps.map.colour_noise", lambda *_: 0.15)  # of the same scene
     assert bidnerf("bake", baked, "--data", tmp_path / "other").status == 0

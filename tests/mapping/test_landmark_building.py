@@ -25,7 +25,7 @@ from bidnerf_core.mapping import (
 
 # Inside: triangulation, tracks and cells, each against an exhaustive computation
 from bidnerf_core.mapping.geometry.triangulation import intersected, parallax, refined_points
-from bidnerf_core.mapping.landmarks.landmark_cells import MOST_IN_CELL, LandmarkCells
+from bidnerf_core.mapping.landmarks.landmark_map import MOST_IN_CELL, LandmarkCells
 from bidnerf_core.mapping.landmarks.tracks import Matches, _mean_descriptors, joined_tracks
 from bidnerf_core.progress import Progress, job_context
 from landmark_scene import PINHOLE, Points, looking_in, ring

@@ -22,7 +22,7 @@ from bidnerf_core.geometry import SE3, Similarity
 from bidnerf_core.maps import ImportedField, ImportOptions, bounds_about, importer_of
 
 # Inside: viewpoints of given fields and bounds, whose number a map does not state
-from bidnerf_core.maps.viewpoints import VIEWS, viewpoints
+from bidnerf_core.maps.importing import VIEWS, viewpoints
 from bidnerf_core.registry import registered
 from bidnerf_core.scenes import demo_object
 from bidnerf_core.training import Silent
@@ -70,7 +70,7 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A file that exactly one importer reads; where it has no photos, the field is seen from few places."""
     monkeypatch.setitem(registered, ("importers", "tiny"), TinyImporter())
     for name, value in (("VIEWS", FEW), ("CAMERA", Intrinsics.from_hfov(70, 32, 32))):
-        monkeypatch.setattr(f"bidnerf_core.maps.viewpoints.{name}", value)
+        monkeypatch.setattr(f"bidnerf_core.maps.importing.{name}", value)
     path = tmp_path / "field.tiny"
     path.touch()
     return path

@@ -115,7 +115,7 @@ def test_backends_are_imported_where_tensors_have_values(
         devices.append(torch.zeros(1).device.type)
         return load_backend(name, wanted_by)
 
-    monkeypatch.setattr("bidnerf_core.maps.map.load_backend", load)
+    monkeypatch.setattr("bidnerf_core.maps.store.load_backend", load)
     write_parts(tmp_path, info(), state())
     load_map(tmp_path)
     assert devices[0] == "cpu"
