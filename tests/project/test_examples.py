@@ -18,6 +18,8 @@ pytestmark = pytest.mark.slow
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
 QUICK = {"--steps": ["4"], "--descent": ["3"], "--trials": ["2"], "--backends": ["hashgrid", "vanilla"]}
+SHORTENED = {"steps: int = 80": "steps: int = 4", '"max_steps": 100': '"max_steps": 3'}
+"""The same in an example without options."""
 
 
 @pytest.mark.usefixtures("small_images")
@@ -32,16 +34,25 @@ def test_example_runs(
     module = sys.modules[closed_form_data.__module__]  # a function of the same name shadows it
     monkeypatch.setattr(module, "orbit", lambda radius, count, **more: orbit(radius, min(count, 8), **more))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", [str(example), *words])
+    for steps, fewer in SHORTENED.items():
+        text = text.replace(steps, fewer)
+    shortened = tmp_path / example.name
+    shortened.write_text(text)
+    monkeypatch.setattr(sys, "argv", [str(shortened), *words])
     monkeypatch.setattr(registry, "registered", dict(registry.registered))
     before = dict(DEPTH_RESIDUALS)
     try:
-        runpy.run_path(str(example), run_name="__main__")
+        runpy.run_path(str(shortened), run_name="__main__")
     finally:
         DEPTH_RESIDUALS.clear()
         DEPTH_RESIDUALS.update(before)
     printed = capsys.readouterr().out
     assert "off by" in printed or "success" in printed
+
+
+def test_what_is_shortened_is_there() -> None:
+    text = "".join(example.read_text() for example in EXAMPLES)
+    assert [steps for steps in SHORTENED if steps not in text] == []
 
 
 def test_examples_are_short_and_import_the_door_and_faces_alone() -> None:

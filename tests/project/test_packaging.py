@@ -51,16 +51,6 @@ def installed(built: Built, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
-def _python(installed: Path, *arguments: str) -> str:
-    """Run Python with the installed wheel and the dependencies, but not the checkout.
-
-    ``-S`` leaves out the ``.pth`` file by which an editable install puts the checkout on the path.
-    """
-    dependencies = [entry for entry in sys.path if entry.endswith(("site-packages", "dist-packages"))]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(installed), *dependencies])}
-    return quietly([sys.executable, "-S", *arguments], cwd=installed, env=environment)
-
-
 def _inside(wheel: Path) -> set[str]:
     with zipfile.ZipFile(wheel) as archive:
         return set(archive.namelist())
@@ -94,27 +84,33 @@ def test_the_source_archive_can_be_worked_with(built: Built) -> None:
     assert names.issuperset(f"backends/{name}" for package in PACKAGES[1:] for name in _sources(package))
 
 
-def test_an_installed_wheel_offers_and_loads_its_backends(installed: Path) -> None:
+def test_an_installed_wheel_offers_and_loads_its_backends_and_has_the_command(installed: Path) -> None:
+    """Python runs with the installed wheel and the dependencies, but not the checkout.
+
+    ``-S`` leaves out the ``.pth`` file by which an editable install puts the checkout on the path.
+    """
     program = (
-        "import json\n"
-        "from bidnerf_core import registry\n"
-        "from bidnerf_core.backend import load_backend\nfrom bidnerf_core.registry import list_plugins\n"
-        "mine = [i for i in list_plugins('backends') if i.distribution == 'bidnerf']\n"
-        "loaded = {i.name: type(load_backend(i.name)).__module__ for i in mine}\n"
+        "import json, runpy, sys\n"
         "from importlib.util import find_spec\n"
+        "from bidnerf_core import registry\n"
+        "from bidnerf_core.backend import load_backend\n"
+        "mine = [i for i in registry.list_plugins('backends') if i.distribution == 'bidnerf']\n"
+        "loaded = {i.name: type(load_backend(i.name)).__module__ for i in mine}\n"
         "others = [n for n in ('backends', 'tests', 'plugins') if find_spec(n)]\n"
-        "print(json.dumps([registry.__file__, [[i.name, i.value, i.fault] for i in mine], loaded, others]))"
+        "print(json.dumps([registry.__file__, [[i.name, i.value, i.fault] for i in mine], loaded, others]))\n"
+        "sys.argv = ['bidnerf', 'backends', '--json']\n"
+        "runpy.run_path('bin/bidnerf', run_name='__main__')"
     )
-    place, listed, loaded, others = json.loads(_python(installed, "-c", program))
+    dependencies = [entry for entry in sys.path if entry.endswith(("site-packages", "dist-packages"))]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(installed), *dependencies])}
+    printed = quietly([sys.executable, "-S", "-c", program], cwd=installed, env=environment)
+    found, _, by_command = printed.partition("\n")
+    place, listed, loaded, others = json.loads(found)
     assert Path(place).is_relative_to(installed)
     assert listed == [[name, value, None] for name, value in sorted(BACKENDS.items())]
     assert set(loaded) == set(BACKENDS)
     assert others == []  # which would hide folders of the user's
-
-
-def test_the_command_is_installed(installed: Path) -> None:
-    listed = json.loads(_python(installed, str(installed / "bin" / "bidnerf"), "backends", "--json"))
-    assert set(BACKENDS) <= {entry["name"] for entry in listed}
+    assert set(BACKENDS) <= {entry["name"] for entry in json.loads(by_command)}
 
 
 def test_every_bundled_backend_is_packaged_and_declared() -> None:

@@ -77,8 +77,8 @@ def write_map(folder: Path, views: list[View]) -> None:
         "hashgrid", to_plain(config), bounds, config.steps, complete=True, cameras=stored_cameras(views)
     )
     state = TrainingState(config.steps, dict(field.state_dict()), {})
-    seen = views_of(demo_object(), dataclasses.replace(tiny.CAMERA), orbit(3.5, 24))
-    surface = bake(field, bounds, [], seen, BakeConfig(rays=20_000, cells=20_000))
+    seen = views_of(demo_object(), tiny.CAMERA, orbit(3.5, 12))
+    surface = bake(field, bounds, [], seen, BakeConfig(rays=6_000, cells=6_000))
     write_parts(folder, info, state, surface)
 
 
