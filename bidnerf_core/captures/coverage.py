@@ -113,12 +113,8 @@ def _around(
     named = [Gap(round(step, 1), *ends) for step, *ends in zip(steps.tolist(), names, names[1:] + names[:1], strict=True)]  # fmt: skip
     widest = steps.argsort(descending=True).tolist()
     is_open = float(steps[widest[0]]) >= 120
-    # Random directions have exponentially distributed steps: among n, one exceeds mean * log(n / p) with
-    # probability p. Gaps below 15 degrees do no harm, since SIFT matches well across them. Those above 45 count however irregular
-    # the capture: from their middle, SIFT matches neither side well.
-    mean = float(steps.median()) / math.log(2)
-    least = min(max(15.0, mean * math.log(len(names) / 0.01)), 45.0)
-    gaps = tuple(named[i] for i in widest[int(is_open) :] if float(steps[i]) > least)
+    # From the middle of a wider gap, SIFT matches neither side well.
+    gaps = tuple(named[i] for i in widest[int(is_open) :] if float(steps[i]) > 45)
     return "one side" if is_open else "around", named[widest[0]] if is_open else None, gaps, heights
 
 

@@ -24,13 +24,13 @@ one, which suppresses noise that would be mistaken for detail.
 """
 
 
-def photo_measures(views: Sequence[View]) -> Float[Tensor, "4 v"]:
+def photo_measures(views: Sequence[View]) -> Float[Tensor, "3 v"]:
     """Measure each photo on its own.
 
-    Returns the sharpness (see ``sharpness``), the brightness (log2 of the median linear brightness), and the fractions of the
-    pixels that are overexposed and underexposed: with the brightest channel at either end of its range.
+    Returns the sharpness (see ``sharpness``), and the fractions of the pixels that are overexposed and underexposed: with the
+    brightest channel at either end of its range.
     """
-    return torch.tensor([_measured(view.frame) for view in views], dtype=torch.float64).reshape(-1, 4).mT
+    return torch.tensor([_measured(view.frame) for view in views], dtype=torch.float64).reshape(-1, 3).mT
 
 
 def detail_kept(views: Sequence[View]) -> Float[Tensor, "v"]:
@@ -53,24 +53,13 @@ def standing_out(values: Float[Tensor, "v"], least: float) -> Bool[Tensor, "v"]:
     return values > max(least, 4 * mad_deviation(values))
 
 
-def _measured(frame: Frame) -> tuple[float, float, float, float]:
+def _measured(frame: Frame) -> tuple[float, float, float]:
     image = _clean(frame.rgb)
     inside = np.ones(image.shape[:2], bool) if frame.alpha is None else frame.alpha.cpu().numpy() > 0.5
     inside &= True if frame.hidden is None else ~frame.hidden.cpu().numpy()
-    shown = image[inside] if inside.any() else image.reshape(-1, 3)
-    brightest = shown.max(-1)
-    light = float(np.median(log_light(shown.mean(-1))))
-    return sharpness(image.mean(-1), frame.hidden), light, float((brightest >= 254 / 255).mean()), float(
-        (brightest <= 4 / 255).mean()
-    )  # fmt: skip
-
-
-def log_light(values: np.ndarray) -> np.ndarray:
-    """Return log2 of the linear light of image values in [0, 1].
-
-    The exponent is approximately that of sRGB. The darkest pixels count as equal, since quantization makes them incomparable.
-    """
-    return 2.2 * np.log2(np.maximum(values, 2 / 255))
+    brightest = (image[inside] if inside.any() else image.reshape(-1, 3)).max(-1)
+    clipped = float((brightest >= 254 / 255).mean()), float((brightest <= 4 / 255).mean())
+    return sharpness(image.mean(-1), frame.hidden), *clipped
 
 
 def sharpness(grey: np.ndarray, hidden: Bool[Tensor, "h w"] | None = None) -> float:
@@ -136,14 +125,11 @@ def excess(values: Float[Tensor, "v"], near: Nearby) -> Float[Tensor, "v"]:
     return torch.where(found, values - _medians(values[other], photo, len(values)), 0.0)
 
 
-def exposures(
-    views: Sequence[View], seen: TrackedKeypoints, brightness: Float[Tensor, "v"], near: Nearby
-) -> Float[Tensor, "v"]:
-    """Return the exposure of each photo (stops) relative to the median of all.
+def exposures(views: Sequence[View], seen: TrackedKeypoints) -> Float[Tensor, "v"]:
+    """Return the exposure of each photo (stops) relative to the median of all; NaN if it shows fewer than ten landmarks.
 
     The brightness of a landmark in a photo is the landmark's own brightness times the photo's exposure. Both
-    are estimated alternately, as medians. Photos that show fewer than ten landmarks are compared with the photos
-    ``near`` them by overall brightness.
+    are estimated alternately, as medians.
     """
     image, point, count = seen.image, seen.point, len(views)
     light = torch.zeros(len(image), dtype=torch.float64)  # log2 of the linear light around each keypoint
@@ -152,14 +138,16 @@ def exposures(
         smooth = cv2.blur(_clean(views[index].frame.rgb).mean(-1), (5, 5))
         u, v = seen.pixels[own].floor().long().unbind(-1)
         rows, columns = v.clamp(0, smooth.shape[0] - 1).numpy(), u.clamp(0, smooth.shape[1] - 1).numpy()
-        light[own] = torch.from_numpy(log_light(smooth[rows, columns])).double()
+        # The exponent is approximately that of sRGB. Quantization makes the darkest pixels incomparable: they count as equal.
+        linear = 2.2 * np.log2(np.maximum(smooth[rows, columns], 2 / 255))
+        light[own] = torch.from_numpy(linear).double()
     enough = torch.bincount(image, minlength=count) >= 10
     found = torch.zeros(count, dtype=torch.float64)
     for _ in range(20 if bool(enough.any()) else 0):  # alternations
         of_points = _medians(light - found[image], point, seen.count)
         own = _medians(light - of_points[point], image, count)
-        found = torch.where(enough, own - own[enough].median(), 0.0)
-    return torch.where(enough, found, excess(brightness - found, near))
+        found = own - own[enough].median()
+    return torch.where(enough, found, torch.nan)
 
 
 def _medians(values: Float[Tensor, "m"], index: Int[Tensor, "m"], count: int) -> Float[Tensor, "n"]:

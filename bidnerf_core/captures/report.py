@@ -58,7 +58,9 @@ class PhotoRecord:
     position: tuple[float, float, float]  # of the camera, metres, world
     direction: tuple[float, float, float]  # of the optical axis, unit, world
     sharpness: float  # log2 of the ratio of fine to coarse energy, relative to nearby photos
-    exposure: float  # stops: brightness of the same landmarks, relative to the other photos
+    exposure: (
+        float | None
+    )  # stops: brightness of the same landmarks, relative to the other photos; None if it shows too few
     overexposed: float  # fraction of the pixels
     underexposed: float
     keypoints: int
@@ -167,7 +169,10 @@ def sentences(report: CaptureReport) -> list[str]:
         are = "is" if len(names) == 1 else "are"
         remarks.append((bool(names), f"{', '.join(names[:6])}{more} {are} {what}: {advice}"))
     remarks.append((few, f"{photos}: hardly enough for a map; take twenty or more, with much overlap"))
+    dark = [photo.name for photo in report.photos if photo.exposure is None]
+    unknown = bool(dark) and len(dark) < len(report.photos)
     remarks += [
+        (unknown, f"too few landmarks to compare the exposure of {', '.join(dark[:6])}{' ...' if len(dark) > 6 else ''}"),
         *((True, f"there are no photos {gap}: take some there, every 10 to 15°") for gap in covered.gaps),
         (covered.open_side is not None, f"there are no photos {covered.open_side}: take some there if you expect queries from that"
          " side"),

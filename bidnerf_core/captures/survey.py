@@ -56,17 +56,19 @@ def surveyed(
     """
     seen, positions = tracked.triangulated(config)
     links = linked(seen)
-    sharp, brightness, overexposed, underexposed = photo_measures(views)
+    sharp, overexposed, underexposed = photo_measures(views)
     group = groups(links)
     near = nearby(views, group)
     count = torch.bincount(seen.image, minlength=len(views))
     doubtful = suspects(seen, links)
     posed: dict[int, Relocation | None] = dict(_by_own_landmarks(seen, positions, views))
     posed |= dict.fromkeys(doubtful) | relocated(tracked, views, doubtful, config)
-    exposure, sharpness = exposures(views, seen, brightness, near), excess(sharp, near)
-    clipped = torch.maximum(excess(overexposed, near), excess(underexposed, near))
+    exposure, sharpness = exposures(views, seen), excess(sharp, near)
+    compared = exposure.isfinite()
+    is_badly_exposed = torch.maximum(excess(overexposed, near), excess(underexposed, near)) > 0.25
     # Training corrects differences of less than a stop.
-    is_badly_exposed = standing_out(exposure.abs(), 1.0) | (clipped > 0.25)
+    if bool(compared.any()):
+        is_badly_exposed[compared] |= standing_out(exposure[compared].abs(), 1.0)
     defects: dict[PhotoProblem, Tensor] = {"blurred": blurred(-sharpness), "badly exposed": is_badly_exposed}
     grouped = bool((group >= 0).any())  # if no photos are linked at all, no photo is reported as unlinked
     photos = []
@@ -84,7 +86,7 @@ def surveyed(
                 position=(*pose.translation.tolist(),),
                 direction=(*pose.rotation[:, 2].tolist(),),
                 sharpness=float(sharpness[i]),
-                exposure=float(exposure[i]),
+                exposure=float(exposure[i]) if compared[i] else None,
                 overexposed=float(overexposed[i]),
                 underexposed=float(underexposed[i]),
                 keypoints=len(image.keypoints),
@@ -103,7 +105,7 @@ def surveyed(
     wrong = {"mirrored", "turned", "badly posed", "apart"}
     sound = [v for v, photo in zip(views, photos, strict=True) if not wrong & set(photo.problems)] or views
     covered = coverage(sound, tracked.matched, seen, positions, config.parallax, up)
-    low, high = exposure.quantile(torch.tensor([0.1, 0.9], dtype=exposure.dtype))
+    low, high = exposure.nan_to_num().quantile(torch.tensor([0.1, 0.9], dtype=exposure.dtype))
     return CaptureReport(tuple(photos), covered, trial or HeldOutTrial(), float(high - low))
 
 

@@ -26,7 +26,7 @@ def updates(metres: float, radians: float, seed: int) -> Tensor:
 
 def capture(noise: float, off: Tensor, moved: Tensor | None = None) -> tuple[Points, list[View], SE3]:
     """Views of a ring of cameras, named by numbers, whose given poses are off by right updates, and the true poses."""
-    points = Points(noise=noise)
+    points = Points(150, noise)
     poses = SE3.stack([looking_in(0.105 * i, 0.3 * (i % 3)) for i in range(VIEWS)])
     given, motions = poses.retract(off), [None] * VIEWS if moved is None else moved
     views = [points.view(poses[i], T_ref_camera=given[i], seed=i, motion=motions[i]) for i in range(VIEWS)]

@@ -18,7 +18,7 @@ from bidnerf_core.localization import LandmarkMatcher, Loop, Outcome
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, posed_keypoints, tracked_views
 from landmark_scene import Points, looking_in
 
-EACH = 30
+EACH = 20
 AWAY = torch.tensor([6.0, 0.0, 0.0], dtype=torch.float64)
 WRONG = torch.tensor([4.0, 2.0, 4.0, 0.0, 0.7, 0.0], dtype=torch.float64)  # 6 m and 40 degrees
 
@@ -29,10 +29,10 @@ def moved(T: SE3, by: Tensor) -> SE3:
 
 def capture(rooms: int, wrong: int | None = None) -> tuple[Points, list[View], list[SE3]]:
     """Photos of as many copies of the points, each from all sides and from places of its own, and their true poses."""
-    points, views, poses = Points(noise=0.3), list[View](), list[SE3]()
+    points, views, poses = Points(150, 0.3), list[View](), list[SE3]()
     for number in range(rooms * EACH):
         room, i = divmod(number, EACH)
-        T = looking_in(0.21 * i + 0.08 * room, 0.3 * (i % 3) + 0.12 * room, 4.0 - 0.35 * room)
+        T = looking_in(0.315 * i + 0.08 * room, 0.3 * (i % 3) + 0.12 * room, 4.0 - 0.35 * room)
         poses.append(moved(T, room * AWAY))
         given = poses[-1].retract(WRONG) if number == wrong else poses[-1]
         view = points.view(T, T_ref_camera=given, seed=number)
@@ -73,7 +73,7 @@ def test_a_photo_of_either_room_is_not_accepted_in_the_other() -> None:
         assert float((here - there).norm()) == pytest.approx(float(AWAY.norm()), abs=0.05)
 
 
-@pytest.mark.parametrize(("rooms", "wrong"), [(1, 7), (2, 7), (2, 40)])
+@pytest.mark.parametrize(("rooms", "wrong"), [(1, 7), (2, 27)])
 def test_a_wrong_pose_is_found_and_no_other_photo_is_moved(rooms: int, wrong: int) -> None:
     """In which of two identical rooms a photo was taken does not show in it: either is a repair."""
     found, _, _, poses = trained(rooms, wrong)

@@ -21,6 +21,7 @@ from landmark_scene import Points, looking_in, ring
 from refusals import refused
 
 COUNT = 150  # points: as many as tell all readings apart
+IMAGES = 13  # enough for another order as text
 CYCLED = torch.tensor([[0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
 
 
@@ -31,7 +32,7 @@ def images(points: Points, poses: list[SE3]) -> list[ImageKeypoints]:
     return [replace(image, T_ref_camera=T) for image, T in zip(found, poses, strict=True)]
 
 
-def true_poses(count: int = 14) -> list[SE3]:
+def true_poses(count: int = IMAGES) -> list[SE3]:
     return [view.T_ref_camera for view in ring(Points(), count)]
 
 
@@ -50,20 +51,16 @@ def is_explained(found: PoseContradiction | None, given: list[SE3], truth: list[
     return torch.allclose(found.reading.understand(SE3.stack(given)).matrix(), SE3.stack(truth).matrix())
 
 
-WORLDS = [SE3.identity(), SE3.exp(torch.tensor([1.0, -2.0, 0.5, 0.7, -1.1, 2.0], dtype=torch.float64))]
-
-
-@pytest.mark.parametrize("T_world", WORLDS)
-def test_right_poses_are_in_the_expected_convention_in_any_world(T_world: SE3) -> None:
+def test_right_poses_are_in_the_expected_convention_in_any_world() -> None:
+    T_world = SE3.exp(torch.tensor([1.0, -2.0, 0.5, 0.7, -1.1, 2.0], dtype=torch.float64))
     assert judged([T_world @ pose for pose in true_poses()]) is None
 
 
-@pytest.mark.parametrize("height", [0.3, 0.0])
-@pytest.mark.parametrize("axes", [torch.eye(3, dtype=torch.float64), REVERSED])
+@pytest.mark.parametrize(("axes", "height"), [(torch.eye(3, dtype=torch.float64), 0.0), (REVERSED, 0.3)])
 def test_inverse_matrices_are_recognised(axes: Tensor, height: float) -> None:
     """Also of cameras that turn about one axis only: other axes explain their rotations as well as the inverses do."""
     points = Points(COUNT, 0.4, 0.2)
-    truth = [looking_in(0.105 * i, height * (i % 3)) for i in range(14)]
+    truth = [looking_in(0.105 * i, height * (i % 3)) for i in range(IMAGES)]
     seen = posed_keypoints([points.view(T, seed=i) for i, T in enumerate(truth)], points)
     given = [with_axes(T, axes).inverse() for T in truth]
     found = pose_contradiction([replace(p, T_ref_camera=T) for p, T in zip(seen, given, strict=True)])
@@ -76,7 +73,7 @@ def test_a_few_wrong_poses_are_accepted_and_random_ones_refused_without_a_readin
     some = true_poses()
     some[3], some[8] = with_axes(some[3], REVERSED), with_axes(some[8], CYCLED)
     assert judged(some) is None
-    tangents = 2 * torch.randn(14, 6, dtype=torch.float64, generator=generator)
+    tangents = 2 * torch.randn(IMAGES, 6, dtype=torch.float64, generator=generator)
     found = judged([SE3.exp(tangent) for tangent in tangents])
     assert found is not None
     assert found.reading is None
@@ -96,14 +93,13 @@ def looking_at(centre: list[float], target: list[float]) -> SE3:
     return SE3(torch.stack([x, torch.linalg.cross(z, x), z], dim=-1), place)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_right_poses_before_a_wall_are_not_refused(seed: int) -> None:
+def test_right_poses_before_a_wall_are_not_refused() -> None:
     """Two rotations fit the images of a plane, so rotations alone would contradict right poses."""
     points = Points(2 * COUNT, 0.4, 0.1)
     points.positions[:, 2] = 0
-    places = [-2 + 0.3 * i for i in range(14)]
+    places = [-2 + 0.3 * i for i in range(IMAGES)]
     poses = [looking_at([x, -0.3, -3.0], [0.5 * x + 1, 0.0, 0.0]) for x in places]
-    views = [points.view(T, seed=14 * seed + i) for i, T in enumerate(poses)]
+    views = [points.view(T, seed=i) for i, T in enumerate(poses)]
     seen = posed_keypoints(views, points)
     assert pose_contradiction(seen) is None
     given = [with_axes(T, REVERSED) for T in poses]
@@ -115,7 +111,7 @@ def test_pure_rotation_and_pure_translation_are_not_refused() -> None:
     points = Points(COUNT, 0.4)
     start = looking_in(0.0)
     for step in ([0, 0, 0, 0, 0.02, 0], [0.05, 0, 0, 0, 0, 0], [0, 0, 0.05, 0, 0, 0]):
-        poses = [start @ SE3.exp(i * torch.tensor(step, dtype=torch.float64)) for i in range(14)]
+        poses = [start @ SE3.exp(i * torch.tensor(step, dtype=torch.float64)) for i in range(IMAGES)]
         views = [points.view(T, seed=i) for i, T in enumerate(poses)]
         assert pose_contradiction(posed_keypoints(views, points)) is None
 
@@ -165,9 +161,9 @@ WRONG: dict[str, tuple[Callable[[SE3], SE3], str]] = {
     "quaternions": (lambda T: reordered(T, [1, 2, 3, 0]), "x y z w, but w x y z"),
     "quaternions of COLMAP": (lambda T: reordered(T.inverse(), [1, 2, 3, 0]).inverse(), "quaternions"),
     "Unity": (opengl(lambda T: mirrored(T, [1, 1, -1])), "left-handed"),
-    "next image": (lambda T: T[[*range(1, 14), 13]], "that of the next image"),
-    "text order": (lambda T: T[sorted(range(14), key=str)], "text order"),
-    "reverse": (lambda T: T[list(range(14))[::-1]], "reverse order"),
+    "next image": (lambda T: T[[*range(1, IMAGES), IMAGES - 1]], "that of the next image"),
+    "text order": (lambda T: T[sorted(range(IMAGES), key=str)], "text order"),
+    "reverse": (lambda T: T[list(range(IMAGES))[::-1]], "reverse order"),
 }
 
 
@@ -183,12 +179,13 @@ def test_mistakes_are_refused_with_the_remedy_that_works(mistake: str) -> None:
     assert found.agreeing >= 0.9 * found.pairs
     assert found.agreeing_as_given < 0.3 * found.pairs
     corrected = found.reading.understand(given)
-    known = corrected.translation.isfinite().all(-1).tolist()
-    seen = seen_from(truth, corrected, COUNT)
-    assert pose_contradiction([image for image, there in zip(seen, known, strict=True) if there]) is None
+    known = corrected.translation.isfinite().all(-1)
+    corrected, expected = corrected[known], truth[known]
+    relative = [(T[0].inverse() @ T).matrix() for T in (corrected, expected)]  # in whatever world
+    torch.testing.assert_close(*relative)
 
 
-def irregular_poses(count: int = 14) -> list[SE3]:
+def irregular_poses(count: int = IMAGES) -> list[SE3]:
     """Cameras that look at the points from places on no ring, so that no two mistakes look alike."""
     generator = torch.Generator().manual_seed(4)
     shifts = 0.25 * torch.randn(count, 6, dtype=torch.float64, generator=generator)
@@ -224,10 +221,10 @@ def test_images_in_no_order_are_judged_as_well() -> None:
 
 def test_every_reading_has_words_and_keeps_the_number_of_poses() -> None:
     T = SE3.stack(irregular_poses())
-    for reading in readings(14):
+    for reading in readings(IMAGES):
         assert reading.clause
         assert reading.remedy
-        assert reading.understand(T).rotation.shape == (14, 3, 3)
+        assert reading.understand(T).rotation.shape == (IMAGES, 3, 3)
 
 
 def test_training_refuses_contradicting_poses_unless_they_are_trusted() -> None:

@@ -188,8 +188,8 @@ def test_poses_of_motion_capture_are_refined_and_those_of_a_renderer_are_not(
     data_dir: Path, scene: str, refined: bool
 ) -> None:
     dataset = open_dataset(data_dir / scene)
-    views = dataset.views("train", dataset.frame_names("train")[:24])
-    features = Sift(count=500)
+    views = dataset.views("train", dataset.frame_names("train")[:12])
+    features = Sift(count=300)
     found = training_poses(tracked_views(views, features), views)
     assert found.refined == refined
     assert found.consistency is not None
