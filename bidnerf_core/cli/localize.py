@@ -271,7 +271,7 @@ class Run:
         with uninterrupted():
             if total > 1:
                 scene = answers.scene
-                more = f" in {len(scene)} maps" if isinstance(scene, MapCollection) else answers.question
+                more = f" in {len(scene)} maps" if isinstance(scene, MapCollection) else ""
                 say(f"{len(answers.accepted)} of {total} converged{more}")
             if answers.remark is not None:
                 say(answers.remark)

@@ -217,7 +217,7 @@ def _summarize(path: Answers, seconds: float, frame_seconds: float) -> None:
             " are farther apart, set --frame-seconds"
         )
     if not path.accepted:
-        say(f"no pose of {amount(len(path), 'frame')} was accepted{path.question}")
+        say(f"no pose of {amount(len(path), 'frame')} was accepted")
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ from .export import head as head
 from .export import ply as ply
 from .overlays import Painter as Painter
 from .overlays import TrackingVideo as TrackingVideo
-from .overlays import as_array as as_array
 from .overlays import as_picture as as_picture
 from .overlays import check_video as check_video
 from .overlays import overlay as overlay

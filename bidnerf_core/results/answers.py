@@ -24,7 +24,6 @@ from bidnerf_core.io import write_file
 from bidnerf_core.localization import (
     Localization,
     Localizer,
-    Outcome,
     SceneMap,
     unit_of,
 )
@@ -206,18 +205,6 @@ class Answers:
     def answers(self) -> list[Answer]:
         """The answers, without the failures."""
         return [answer for answer in self.given if isinstance(answer, Answer)]
-
-    @property
-    def question(self) -> str:
-        """A question to append to a summary if several images were tried and none shows the map's scene, else empty."""
-        recognised = {
-            Outcome.CONVERGED, Outcome.IMPRECISE, Outcome.MIRRORED, Outcome.MISCALIBRATED, Outcome.UNCERTAIN,
-            Outcome.AMBIGUOUS,
-        }  # fmt: skip
-        outcomes = [answer.found.outcome for answer in self.answers]
-        # One or two rejected images are no reason to doubt that the map is the right one.
-        is_other = len(outcomes) >= 3 and recognised.isdisjoint(outcomes)
-        return "; do they show the scene of this map?" if is_other else ""
 
     @property
     def remark(self) -> str | None:

@@ -147,10 +147,6 @@ def steps_to_success(trace: PoseError, criterion: Criterion) -> int | None:
     return first if first < len(trace.translation) else None
 
 
-CONFIDENCE = 0.95
-"""Probability with which the interval of a rate contains the true one."""
-
-
 @dataclass(frozen=True)
 class Rate:
     """A success rate and its Wilson interval, which accounts for repeated trials of the same frame."""
@@ -202,7 +198,7 @@ def success_rate_by_frame(outcomes: Sequence[bool], frames: Sequence[Hashable]) 
 
         squares = sum((sum(own) - share * len(own)) ** 2 for own in grouped.values())
         variance = count / (count - 1) * squares / trials**2
-        quantiles = t.ppf(1 - (1 - CONFIDENCE) / 2, [trials - 1, count - 1])
+        quantiles = t.ppf(0.975, [trials - 1, count - 1])
         correction = float(quantiles[0] / quantiles[1]) ** 2
         found = correction * share * (1 - share) / variance if variance > 0 else math.inf
         effective = min(max(found, 1.0), float(trials))
@@ -211,7 +207,7 @@ def success_rate_by_frame(outcomes: Sequence[bool], frames: Sequence[Hashable]) 
 
 def _with_interval(successes: int, trials: int, effective: float, frames: int | None = None) -> Rate:
     """Return a rate with Wilson's interval for ``effective`` independent trials, which need not be an integer."""
-    share, z = successes / trials, NormalDist().inv_cdf(1 - (1 - CONFIDENCE) / 2)
+    share, z = successes / trials, NormalDist().inv_cdf(0.975)
     middle = (share + z * z / (2 * effective)) / (1 + z * z / effective)
     half = (
         z / (1 + z * z / effective) * math.sqrt(share * (1 - share) / effective + (z / (2 * effective)) ** 2)

@@ -83,7 +83,7 @@ class Painter:
 
 def as_picture(image: ArrayLike | Tensor, what: str = "image") -> UInt8[np.ndarray, "h w 3"]:
     """Convert an image (h w 3) or (h w) of floats in [0, 1] to 8 bits, clipped; NaN becomes black."""
-    array = as_array(image)
+    array = image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
     if array.ndim == 2:
         array = np.repeat(array[..., None], 3, axis=-1)
     if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
@@ -126,10 +126,6 @@ def tile(image: ArrayLike | Tensor, caption: str) -> UInt8[np.ndarray, "H W 3"]:
     return np.asarray(canvas)
 
 
-def as_array(values: ArrayLike | Tensor) -> np.ndarray:
-    return values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
-
-
 def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float = 8.0) -> None:
     """Write a looping animation of one or more images (h w 3) of the same size."""
     import imageio.v3 as iio  # imported here, since few commands draw
@@ -155,8 +151,6 @@ def check_video(file: Path) -> None:
 
 
 CODECS = {".mp4": "libx264", ".mkv": "libx264", ".webm": "libvpx-vp9"}
-USUAL_RATE = 30.0
-"""Frames per second of sequences without time stamps."""
 
 
 class TrackingVideo:
@@ -196,7 +190,8 @@ class TrackingVideo:
             tile(painter.rendered(found.T_world_camera), caption),
         )
         picture = Image.fromarray(np.concatenate(tiles, axis=1))
-        time = answer.number / USUAL_RATE if answer.time is None else answer.time
+        # Without time stamps, the rate is the usual one.
+        time = answer.number / 30 if answer.time is None else answer.time
         if self._stream is None:
             self._output, self._began = av.open(str(self._partial), "w"), time
             # The quality is almost without visible loss.

@@ -36,9 +36,6 @@ from bidnerf_core.testing.textured_field import (
 
 # Methods.
 
-START_OFF = (0.02, -0.015, 0.02, 0.01, -0.008, 0.012)
-"""Tangent vector (metres, radians) from the true pose to the start of methods that need one."""
-
 
 class MethodContract(Named):
     """Tests of a localization method; to use them, derive a class whose name begins with ``Test`` and set ``name``.
@@ -146,7 +143,9 @@ class MethodContract(Named):
         return vars(type(self))["_kept"]
 
     def _localized(self, scene: MapWithLandmarks, frame: Frame, truth: SE3) -> Localization:
-        near = truth.to("cpu", torch.float64).retract(torch.tensor(START_OFF, dtype=torch.float64))
+        # A tangent vector (metres, radians) from the true pose to the start of methods that need one.
+        off = torch.tensor((0.02, -0.015, 0.02, 0.01, -0.008, 0.012), dtype=torch.float64)
+        near = truth.to("cpu", torch.float64).retract(off)
         with calling(self._who):
             localizer = Localizer(scene, self.name, self.config, warm_up=False)
             return localizer(frame, near if self._part(METHODS.load).needs_start else None)
@@ -160,8 +159,6 @@ def _difference(found: SE3, truth: SE3) -> float:
 
 SHIFT = 6
 """Pixels by which an image is shifted."""
-NEAR = 1.5
-"""Largest distance (pixels) between keypoints that count as the same."""
 
 
 class FeaturesContract(Named):
@@ -240,7 +237,8 @@ class FeaturesContract(Named):
         shared = ((moved > 0) & (moved < torch.tensor([width - SHIFT, height - SHIFT]))).all(1)
         nearest = squared_distances(first.descriptors, second.descriptors).argmin(1)
         off = torch.linalg.vector_norm(second.pixels[nearest] - moved, dim=-1)
-        share = float((off[shared] <= NEAR).double().mean()) if bool(shared.any()) else 0.0
+        # Keypoints at most 1.5 pixels apart count as the same.
+        share = float((off[shared] <= 1.5).double().mean()) if bool(shared.any()) else 0.0
         require(
             self._who,
             (

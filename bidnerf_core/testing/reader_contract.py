@@ -24,10 +24,6 @@ from bidnerf_core.testing.faults import Named, are_colours, calling, equal, is_d
 
 ENOUGH_POINTS = 30
 """Smallest number of points that several images must agree on for their poses to be judged."""
-UNUSUAL_RATIO = 0.1
-"""Largest relative difference between measured depth and triangulated depth."""
-MOST_VIEWS = 24
-"""Largest number of images that are compared with each other."""
 
 
 class ReaderContract(Named):
@@ -114,7 +110,7 @@ class ReaderContract(Named):
         require(
             self._who,
             (
-                ratio is None or abs(ratio - 1) <= UNUSUAL_RATIO,
+                ratio is None or abs(ratio - 1) <= 0.1,
                 f"depth is {ratio or math.nan:.3g} times the depth that the poses and images imply, expected planar z (not"
                 " the distance along the ray) in the unit of the poses, metres",
             ),
@@ -152,7 +148,7 @@ class ReaderContract(Named):
         data = self._dataset()
         split = split or data.splits[0]
         with calling(f"{self._who}: views of {split!r}"):
-            return data.views(split, data.frame_names(split)[:MOST_VIEWS])
+            return data.views(split, data.frame_names(split)[:24])  # as many are compared with each other
 
     def _tracked(self) -> TrackedViews:
         """Return the keypoints of the images, joined into tracks; computed once per test class."""

@@ -193,7 +193,7 @@ def test_without_an_accepted_pose_no_file_is_written(
     status, _, err = bidnerf(*doubtful, "--out", tmp_path / "poses.txt")
     assert status == 1
     assert "no pose converged" in err
-    assert "0 of 3 converged; do they show the scene of this map?" in err
+    assert "0 of 3 converged" in err
     assert list(tmp_path.iterdir()) == []
     assert bidnerf(*doubtful, "--out", tmp_path / "none" / "poses.txt").status == 1
 

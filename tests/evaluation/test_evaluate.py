@@ -238,12 +238,6 @@ def test_frames_that_masks_hide_wholly_are_named_and_left_out(
     assert "--mask-hides" in caught.error.found
 
 
-def test_frames_of_one_name_are_refused() -> None:
-    views = [dataclasses.replace(v, frame=dataclasses.replace(v.frame, name="image")) for v in tiny.views(2)]
-    with refused(found="2 frames named 'image'", expected="different names"):
-        bn.evaluate(BLOBS, views, quick(trials=1))
-
-
 def test_a_file_of_results_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     out = tmp_path / "file" / "r.jsonl"
@@ -305,7 +299,7 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
     for one, named in ((BLOBS, BLOBS), (Path("map"), "map"), (closed_form_map(BLOBS), "closed-form")):
         with refused(found=f"scenes is the one map {named}", expected="a list of maps"):
             bn.compare(one, BLOBS)  # type: ignore[arg-type]
-    scene = closed_form_map(BLOBS)
+    scene, view = closed_form_map(BLOBS), tiny.views(1)[0]
     wrong: list[tuple[dict[str, Any], str, str | None]] = [
         ({"workers": 2}, "workers is 2", "1: other processes read the map"),
         ({"trials": 0}, "trials is 0", "a whole number, 1 to 100,000"),
@@ -323,6 +317,7 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
         ({"sizes": ["far"]}, "sizes is ['far']", "a list of numbers"),
         ({"data": 3}, "data is a int", "a folder, a dataset or a list of views"),
         ({"data": [1]}, "data is a list", "a folder, a dataset or a list of views"),
+        ({"data": [view, view]}, "data holds 2 frames named '0000'", "different names"),
     ]
     for change, found, expected in wrong:
         given = {"scene": scene, "data": BLOBS, "workers": 1} | change
@@ -449,30 +444,16 @@ def test_peak_memory_is_of_what_went_on_since() -> None:
     assert peak_memory_bytes() < before + 100_000_000
 
 
-@pytest.mark.slow
-def test_two_dask_workers_give_the_results_of_one_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_dask_workers_give_the_results_of_one_process(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")
-    monkeypatch.undo()  # the workers draw images of the usual size
     six = ("--trials", "6")
     alone, together = tmp_path / "alone.jsonl", tmp_path / "together.jsonl"
     assert main(["evaluate", "demo:blobs", "--out", str(alone), *WORDS, *six]) == 0
     # Workers that are threads of this process: what they get and send goes through sockets all the same, and nothing is imported anew.
-    cluster = distributed.LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        processes=False,
-        protocol="tcp",
-        dashboard_address=None,
-        silence_logs=50,
-    )
-    with cluster:
-        address = cluster.scheduler_address
-        assert (
-            main(["evaluate", "demo:blobs", "--out", str(together), "--dask", address, *six, *WORDS[:-2]])
-            == 0
-        )
+    options = {"protocol": "tcp", "dashboard_address": None, "silence_logs": 50}
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, **options) as cluster:
+        words = ["evaluate", "demo:blobs", "--out", str(together), "--dask", cluster.scheduler_address]
+        assert main([*words, *six, *WORDS[:-2]]) == 0
     lines = [[json.loads(line) for line in path.read_text().splitlines()] for path in (alone, together)]
     for line in (*lines[0], *lines[1]):
         del line["seconds"], line["peak_memory_bytes"]
@@ -481,7 +462,6 @@ def test_two_dask_workers_give_the_results_of_one_process(
     assert run["workers"] == "dask, 2 threads"
 
 
-@pytest.mark.slow
 def test_a_scheduler_that_is_not_there_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
