@@ -32,7 +32,7 @@ from typing import Any
 import _lab
 from scipy.stats import fisher_exact, mannwhitneyu
 
-from bidnerf_core.cli.progress import displayed, stopped_by_ctrl_c
+from bidnerf_core.cli.running import displayed
 from bidnerf_core.errors import Cancelled
 from bidnerf_core.evaluation import (
     NEVER,
@@ -153,12 +153,7 @@ def run_part(trials: Sequence[Trial], path: Path, workers: int, minutes: float |
         return minutes is not None and time.monotonic() - began > 60 * minutes
 
     with ResultsFile(path) as file:
-        with (
-            displayed(),
-            stopped_by_ctrl_c() as ctrl_c,
-            suppress(Cancelled),
-            job_context(cancel=lambda: ctrl_c() or late()),
-        ):
+        with displayed(), suppress(Cancelled, KeyboardInterrupt), job_context(cancel=late):
             run_trials(trials, file, workers=workers)
         done = [trial for trial in trials if trial in file]
         if not done or (len(done) < len(trials) and minutes is None):

@@ -35,6 +35,9 @@ GROUPS: Mapping[str, str] = {
 """The kinds of object that can be registered, and the noun for each. The entry-point group has the prefix
 ``bidnerf.``."""
 
+USUAL_BACKEND, USUAL_METHOD, USUAL_FEATURES = "hashgrid", "auto", "sift"
+"""The plugins that are used unless others are named."""
+
 TABLE = "*"
 """The name of an entry point whose object is a mapping of plugins by name. Listing its group imports it."""
 

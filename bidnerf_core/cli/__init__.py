@@ -1,4 +1,4 @@
-"""The command line ``bidnerf COMMAND ...``, with a module for each command or a few small ones."""
+"""The command line ``bidnerf COMMAND ...``: each module of the package holds one command or a few."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, TextIO
 
-from bidnerf_core.cli.interruptions import Interrupted, interruptions
+from bidnerf_core.cli.running import Interrupted, interruptions
 from bidnerf_core.errors import Cancelled, InputError, InputWarning, UsageError, printable, spelling_hint
 
 COMMANDS = {
@@ -37,13 +37,11 @@ COMMANDS = {
     "report": "make one page of tables, figures and tests from an evaluation",
 }
 
-FUNCTIONS = {
-    "backends": ("plugins", "run_backends"),
-    "info": ("maps", "info"),
-    "export": ("maps", "export"),
-    "scale": ("maps", "scale"),
-}
-"""The module and the function of a command, where these are not its own module and ``run``."""
+MODULES = {
+    "backends": "plugins", "poses": "train", "serve": "view", "compare": "evaluate", "report": "evaluate",
+    **dict.fromkeys(("import", "bake", "info", "extend", "export", "scale", "render"), "maps"),
+}  # fmt: skip
+"""The module of a command that has none of its own. A command is the function ``run_COMMAND`` there."""
 DONE, BAD_INPUT, WRONG_USAGE, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
 """Exit statuses; the last two are 128 plus the number of the signal, as is customary for shells. For SIGTERM and SIGHUP the
 status is 143 and 129."""
@@ -73,10 +71,10 @@ def _guarded(name: str, given: list[str]) -> int:
             return _dispatch(given)
     except SystemExit as stopped:  # the parser has already printed the reason
         return stopped.code if isinstance(stopped.code, int) else DONE if stopped.code is None else BAD_INPUT
-    except Interrupted as stopped:
-        return _failed(name, "interrupted", 128 + stopped.number)
-    except KeyboardInterrupt:
-        return _failed(name, "interrupted", INTERRUPTED)
+    except KeyboardInterrupt as stopped:
+        return _failed(
+            name, "interrupted", 128 + stopped.number if isinstance(stopped, Interrupted) else INTERRUPTED
+        )
     except Cancelled as stopped:
         return _failed(name, str(stopped), INTERRUPTED)
     except BrokenPipeError:
@@ -111,8 +109,8 @@ def _dispatch(given: list[str]) -> int:
         raise UsageError("an argument holds a NUL character", expected="text")
     from bidnerf_core.cli.parser import parse  # imported here for the sake of a quick --version
 
-    module, function = FUNCTIONS.get(given[0], (given[0], "run"))
-    parse(given[0], getattr(importlib.import_module(f"bidnerf_core.cli.{module}"), function), given[1:])
+    module = importlib.import_module(f"bidnerf_core.cli.{MODULES.get(given[0], given[0])}")
+    parse(given[0], getattr(module, f"run_{given[0]}"), given[1:])
     return DONE
 
 

@@ -6,11 +6,12 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
-from bidnerf_core.cli.options import DEFAULT_BACKEND, Seed
+from bidnerf_core.cli.options import Seed
 from bidnerf_core.cli.output import console, print_table, say, show
 from bidnerf_core.cli.parser import Flag, Option
-from bidnerf_core.cli.progress import working
+from bidnerf_core.cli.running import working
 from bidnerf_core.errors import InputError, UsageError
+from bidnerf_core.registry import USUAL_BACKEND
 from bidnerf_core.settings import WholeNumbers
 
 if TYPE_CHECKING:
@@ -40,8 +41,8 @@ class Trial(NamedTuple):
         return pose_error(poses, self.view.T_ref_camera, self.auto.unit)
 
 
-def run(
-    backend: Annotated[str, Option("NAME", "one of 'bidnerf backends'")] = DEFAULT_BACKEND,
+def run_demo(
+    backend: Annotated[str, Option("NAME", "one of 'bidnerf backends'")] = USUAL_BACKEND,
     out: Annotated[Path, Option("DIR", "folder for the map, the images and the pictures")] = Path("demo-out"),
     frames: Annotated[int, WholeNumbers(1), Option("N", "number of unseen frames to localize")] = 4,
     steps: Annotated[

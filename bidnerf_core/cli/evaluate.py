@@ -1,17 +1,19 @@
-"""``bidnerf evaluate``."""
+"""``bidnerf evaluate``, ``compare`` and ``report``: trials of localization and their results."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+from urllib.parse import quote
 
-from bidnerf_core.cli.options import TEST_IMAGES, Device, MethodOptions, Names, wrong_usage
-from bidnerf_core.cli.output import require_outside_maps, show
-from bidnerf_core.cli.parser import Option, Without
-from bidnerf_core.cli.progress import working
+from bidnerf_core.cli.options import TEST_IMAGES, Device, Json, MethodOptions, Names, wrong_usage
+from bidnerf_core.cli.output import check_folder, console, print_json, require_outside_maps, say, show
+from bidnerf_core.cli.parser import Flag, Option, Without
+from bidnerf_core.cli.running import displayed, working
 from bidnerf_core.datasets import DatasetOptions
-from bidnerf_core.errors import UsageError, amount
+from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.settings import WholeNumbers
 
 if TYPE_CHECKING:
@@ -105,7 +107,7 @@ class WorkOptions:
     shard: Annotated[int, Option("I", "the part to run, from 0")] = 0
 
 
-def run(
+def run_evaluate(
     map: Annotated[str, Option("MAP", "folder of a map, or demo:blobs", positional=True)],
     out: Annotated[Path, Option("RESULTS.jsonl", "results file; trials already in it are not run again")],
     data: Annotated[
@@ -139,3 +141,110 @@ def run(
     with working("waiting for the trials under way (Ctrl-C again: at once)"):
         found = evaluate(map, data or map, plan, out=out, workers=work.dask or work.workers)
     show(f"{amount(len(found.rows), 'trial')} in {out}; 'bidnerf report {out}' shows them")
+
+
+def run_compare(
+    folders: Annotated[
+        tuple[str, ...],
+        Option(
+            "MAP... DATA",
+            "folders of maps, followed by the folder of a dataset of the same scene",
+            positional=True,
+        ),
+    ] = (),
+    out: Annotated[
+        Path | None, Option("DIR", "write compare.json, compare.png and compare.svg there")
+    ] = None,
+    size: Annotated[
+        str | None,
+        Option("SIZE", "error of the start: e_t, or METRES:DEGREES for perturb", "the protocol's first"),
+    ] = None,
+    *,
+    starts: Annotated[TrialOptions, Without("size")],
+    json: Json = False,
+    overwrite: Annotated[Flag, Option(None, "replace the contents of --out")] = False,
+    images: Annotated[DatasetOptions, Without("largest", "background")] = TEST_IMAGES,
+    method: MethodOptions,
+) -> None:
+    """Localize the same frames from the same starts in several maps, and compare success, time and memory.
+
+    Each map has its own process, and the maps take turns at each start.
+    """
+    from bidnerf_core.evaluation import compare, comparison_figure
+    from bidnerf_core.io import output_folder, to_plain
+
+    if len(folders) < 2:
+        raise UsageError(
+            f"{len(folders)} folder{'s' if len(folders) != 1 else ''} given",
+            expected="the folders of one or more maps, then that of a dataset",
+        )
+    *maps, data = folders
+    plan = replace(starts, size=() if size is None else (size,)).plan(method, images)
+    if out is None:
+        with displayed():
+            found = compare(maps, data, plan)
+    else:
+        check_folder(out, folders)
+        with output_folder(out, overwrite), displayed():
+            found = compare(maps, data, plan)
+            found.save(out / "compare.json")
+            try:
+                say(f"look at {comparison_figure(out, found).with_suffix('.png')}")
+            except InputError as error:  # matplotlib is optional
+                say(str(error))
+    if json:
+        print_json(to_plain(replace(found, results=())))
+        return
+    for line in str(found).split("\n"):
+        show(line)
+
+
+def run_report(
+    results: Annotated[
+        tuple[Path, ...], Option("RESULTS...", "files written by 'bidnerf evaluate'", positional=True)
+    ] = (),
+    out: Annotated[Path, Option("DIR", "folder for index.html and the figures as PNG and SVG")] = Path("report"),
+    criterion: Annotated[
+        Literal["10%", "5deg 0.05", "1deg 0.02"] | None,
+        Option(None, "success criterion for displays that use only one", "10%; 5deg 0.05 if trials had no start"),
+    ] = None,
+    title: Annotated[str, Option("TEXT", "title of the page")] = "Localization results",
+    view: Annotated[
+        Path | None, Option("PAGE.html", "page of 'bidnerf view --results', whose frames the report links to", "")
+    ] = None,
+    data: Annotated[
+        Names, Option("DATA...", "datasets of the results, from which the worst frames are shown", "no pictures")
+    ] = (),
+) -> None:  # fmt: skip
+    """Write tables and figures of results as one page that works offline.
+
+    Trials are compared by map, data, start, method and settings. A trial in several files counts once.
+    """
+    # Imported when a report is made, since help pages do not need it.
+    from bidnerf_core.evaluation import ResultTable, chosen_criterion, read_runs, write_report
+
+    if not results:
+        raise UsageError("no results file", expected="at least one written by 'bidnerf evaluate'")
+    table = ResultTable.load(*results)
+    with wrong_usage():
+        chosen = chosen_criterion(criterion, table.groups)
+    if view is not None and not view.is_file():
+        raise InputError(
+            "no such page", where=view, expected="one written by 'bidnerf view MAP --results ... --save'"
+        )
+    if missing := [folder for folder in data if not Path(folder).is_dir()]:
+        raise InputError("no such folder", where=missing[0], expected="a dataset that the results are of")
+    check_folder(out, (*results, *data))
+    runs = [(path.name, read_runs(path)) for path in results]
+    with console.status("drawing"):
+        page = write_report(
+            table, out, title, chosen, runs, None if view is None else link_to(view, out), data
+        )
+    for line in str(table).split("\n"):
+        show(line)
+    show(f"look at {page}")
+
+
+def link_to(page: Path, folder: Path) -> str:
+    """Return the link to a page from another page in a folder."""
+    return quote(Path(os.path.relpath(page.resolve(), folder.resolve())).as_posix())

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from bidnerf_core.cli.interruptions import uninterrupted
 from bidnerf_core.cli.options import (
     TEST_IMAGES,
     Json,
@@ -20,8 +19,8 @@ from bidnerf_core.cli.options import (
     require_one,
 )
 from bidnerf_core.cli.output import check_folder, check_output, print_json, say, show
-from bidnerf_core.cli.parser import FLAG, Option, Without
-from bidnerf_core.cli.progress import displayed
+from bidnerf_core.cli.parser import Option, Without
+from bidnerf_core.cli.running import displayed, uninterrupted
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount, enumeration
 
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from bidnerf_core.geometry import SE3
     from bidnerf_core.localization import Localizer
     from bidnerf_core.maps import MapCollection
-    from bidnerf_core.results import Answer, Answers, Failure, PoseError
+    from bidnerf_core.results import Answer, Answers, Failure
 
 
 @dataclass(frozen=True)
@@ -45,10 +44,9 @@ class StartOptions:
         tuple[float, float] | None,
         Option("T R", "start from the dataset's pose moved by T metres and R degrees"),
     ] = None
-    no_start: Annotated[bool, FLAG, Option(None, "no start is known")] = False
 
     def __post_init__(self) -> None:
-        require_one({"--start": self.start, "--perturb": self.perturb, "--no-start": self.no_start or None})
+        require_one({"--start": self.start, "--perturb": self.perturb})
 
     def of_queries(self, seed: int) -> Callable[[Query], SE3 | None]:
         """Return a function that returns the start of a query, if any. Raises ``UsageError`` if the perturbation is out of range."""
@@ -104,7 +102,7 @@ class OutputOptions:
         return self.draw / f"overlay-{name}.png"
 
 
-def run(
+def run_localize(
     map: MapFolder,
     query: Annotated[
         tuple[Path, ...],
@@ -239,7 +237,7 @@ class Run:
         if isinstance(answer, Failure):
             return
         if not self.output.json:
-            for line in answer_lines(answer, self.start(query), self.total == 1):
+            for line in answer_lines(answer, self.total == 1):
                 show(line)
         if self.output.draw is not None:
             scene = self.answers.scene
@@ -285,42 +283,34 @@ class Run:
             raise InputError(f"{failed} of {total} queries could not be read or localized, see above")
 
 
-def answer_lines(answer: Answer, start: SE3 | None, full: bool) -> list[str]:
-    """Return an answer as text: one line or, if ``full``, also its errors (if the truth is known), uncertainty and matrix."""
+def answer_lines(answer: Answer, full: bool) -> list[str]:
+    """Return an answer as text: a line, one for the runner-up among several maps and, if ``full``, the uncertainty and the matrix."""
     from bidnerf_core.geometry import symbol
-    from bidnerf_core.results import OPENCV_AXES, pose_error, standard_deviations
-
-    def shown(error: PoseError) -> str:
-        return f"{float(error.translation):.4f} {symbol(error.unit)}, {float(error.rotation_deg):.3f} deg"
+    from bidnerf_core.results import OPENCV_AXES, standard_deviations
 
     found, error, placement = answer.found, answer.error, answer.placement
     verdict = "converged" if found.converged else f"NOT converged: {found.outcome.value}"
     verdict = f"{verdict} ({found.reason})"
+    world, runner_up = "", []
     if placement is not None:
         where = "in" if found.converged else "in none of the maps; nearest"
-        verdict = f"{where} {placement.map}: {verdict}"
-    took = f"{amount(found.steps, 'step')}, {found.seconds:.2f} s"
-    known = "" if error is None else f"error {shown(error)}; "
-    lines = [f"{answer.name}: {verdict}" if full else f"{answer.name}: {known}{verdict}; {took}"]
+        verdict, world = f"{where} {placement.map}: {verdict}", f"in the frame of {placement.map}, "
     if placement is not None and placement.runner_up is not None:
         name, other = placement.runner_up
-        lines.append(
-            f"  runner-up {name}: {'converged too' if other.converged else other.outcome} ({other.reason})"
-        )
-    if not full:
-        return lines
-    if error is not None and answer.truth is not None:
-        before = "no start" if start is None else shown(pose_error(start, answer.truth, found.unit))
-        lines += [f"  start error  {before}", f"  final error  {shown(error)}"]
-    if found.covariance is not None:
+        outcome = "converged too" if other.converged else other.outcome
+        runner_up = [f"  runner-up {name}: {outcome} ({other.reason})"]
+    if error is not None:
+        off = f"{float(error.translation):.4f} {symbol(error.unit)}, {float(error.rotation_deg):.3f} deg"
+        verdict = f"error {off}; {verdict}"
+    lines = [f"{answer.name}: {verdict}; {amount(found.steps, 'step')}, {found.seconds:.2f} s", *runner_up]
+    if full and found.covariance is not None:
         position, rotation = standard_deviations(found.covariance)
         lines.append(
             f"  uncertainty  {position:.4f} {symbol(found.unit)}, {math.degrees(rotation):.3f} deg (one standard deviation)"
         )
-    world = "" if placement is None else f"in the frame of {placement.map}, "
-    lengths = "metres" if found.unit == "metres" else "units of the map"
-    lines.append(f"  {took}, loss {found.loss:.5f}, method {found.method}")
-    lines.append(f"  T_world_camera ({world}{OPENCV_AXES}; lengths in {lengths})")
-    return lines + [
-        "    " + " ".join(f"{value: .6f}" for value in row) for row in found.T_world_camera.matrix().tolist()
-    ]
+    if full:
+        lengths = "metres" if found.unit == "metres" else "units of the map"
+        rows = found.T_world_camera.matrix().tolist()
+        lines.append(f"  T_world_camera ({world}{OPENCV_AXES}; lengths in {lengths})")
+        lines += ["    " + " ".join(f"{value: .6f}" for value in row) for row in rows]
+    return lines

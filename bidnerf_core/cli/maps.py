@@ -1,17 +1,40 @@
-"""``bidnerf info``, ``export`` and ``scale``: what is done with a map alone."""
+"""``bidnerf info``, ``render``, ``export``, ``scale``, ``bake``, ``extend`` and ``import``: what is done with a map."""
 
 from __future__ import annotations
 
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
-from bidnerf_core.cli.options import Json, MapFolder, require_one
+from bidnerf_core.cli.options import (
+    TEST_IMAGES,
+    BakeSettings,
+    Device,
+    Json,
+    MapFolder,
+    MapOptions,
+    Names,
+    require_one,
+    wrong_usage,
+)
 from bidnerf_core.cli.output import check_folder, check_output, print_json, say, show
-from bidnerf_core.cli.parser import Flag, Option
-from bidnerf_core.errors import InputError, UsageError
+from bidnerf_core.cli.parser import Flag, Option, Settings, Without
+from bidnerf_core.cli.running import displayed, working
+from bidnerf_core.datasets import DatasetOptions
+from bidnerf_core.errors import InputError, UsageError, amount
+from bidnerf_core.progress import counter
+from bidnerf_core.settings import Above, WholeNumbers
+
+if TYPE_CHECKING:
+    from bidnerf_core.datasets import Capture
+    from bidnerf_core.fields import RenderedImage
+    from bidnerf_core.frames import View
+    from bidnerf_core.maps import Map
 
 
-def info(
+def run_info(
     map: MapFolder,
     json: Json = False,
     draw: Annotated[
@@ -44,7 +67,7 @@ def info(
         show(line)
 
 
-def export(
+def run_export(
     map: MapFolder,
     to: Annotated[
         str,
@@ -66,7 +89,7 @@ def export(
         show(f"{file}: {file.stat().st_size / 1e6:.2f} MB")
 
 
-def scale(
+def run_scale(
     map: MapFolder,
     distance: Annotated[
         tuple[str, str, str] | None,
@@ -87,6 +110,7 @@ def scale(
         float | None, Option("F", "metres per unit of the map; 1 states that its unit is the metre")
     ] = None,
     out: Annotated[Path | None, Option("MAP2", "leave the map unchanged and write a new one")] = None,
+    overwrite: Annotated[Flag, Option(None, "replace the map in --out")] = False,
 ) -> None:
     """Convert a map to metres: its field, bounds, surface, landmarks, capture record and anchor.
 
@@ -103,10 +127,10 @@ def scale(
     except ValueError as error:
         raise UsageError(f"METRES is {length!r}", where="--distance", expected="a number") from error
     if out is not None:
-        check_folder(out, (map,))
+        check_folder(out, (map,), may_be_map=overwrite)
     load_info(map)  # raises if there is no map
     # The map is locked before it is read, so that nobody changes it meanwhile.
-    with map_folder(out or map, overwrite=out is None):
+    with map_folder(out or map, overwrite or out is None):
         scene = load_map(map)
         if poses is not None:
             fit = factor_of_poses(scene, read_positions(poses))
@@ -120,3 +144,255 @@ def scale(
     show(
         f"{out or map}: all lengths multiplied by {factor:.6g}; the scene is now in metres, in a box of {sides}"
     )
+
+
+def run_render(
+    map: MapFolder,
+    data: Annotated[Path, Option("DATA", "folder of a dataset, or a .r3d file", positional=True)],
+    out: Annotated[Path, Option("DIR", "folder for the images")],
+    frame: Annotated[Names, Option("NAME...", "render only these frames", "all of the split")] = (),
+    level: Annotated[
+        int | None, Option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
+    ] = None,
+    overwrite: Annotated[Flag, Option(None, "replace images in --out")] = False,
+    images: Annotated[DatasetOptions, Without("masks", "mask_hides", "largest", "background")] = TEST_IMAGES,
+) -> None:
+    """Render a map from the poses of a dataset.
+
+    Writes NAME.png (8-bit RGB) and NAME.depth.png (16-bit, planar z in mm, 0 where rays hit nothing) per frame into --out, and
+    prints PSNR and depth error against the dataset's images.
+    """
+    from bidnerf_core.io import output_folder
+    from bidnerf_core.maps import load_info, load_map
+
+    check_folder(out, (map, data))
+    with output_folder(out, overwrite), displayed():
+        dataset = replace(images, background=load_info(map).bounds.background).open(data)
+        names = list(frame) or dataset.frame_names(images.split)
+        if not names:
+            raise InputError(f"split {images.split!r} has no frames", where=data)
+        scene = load_map(map)
+        views = dataset.views(images.split, names)
+        names = [view.frame.name for view in views]
+        for name in {f"{name}.depth" for name in names} & set(names):
+            raise InputError(
+                f"frame {name!r} would overwrite the depth of {name.removesuffix('.depth')!r}; render them one by one"
+                " with --frame, into different folders"
+            )
+        _render_views(scene, level, views, out)
+
+
+def _render_views(scene: Map, level: int | None, views: Sequence[View], out: Path) -> None:
+    import torch
+
+    from bidnerf_core.geometry import symbol
+    from bidnerf_core.maps import RenderingScores, rendering_scores
+
+    scores, count = [], counter("rendering", "images")
+    for number, view in enumerate(views):
+        image = scene.render(view, level)
+        write_images(out, view.frame.name, image)
+        scores.append(rendering_scores(image, view.frame, scene.unit))
+        show(f"{view.frame.name}  {scores[-1]}")
+        count(number + 1, len(views))
+    errors = torch.cat([score.depth_errors for score in scores])
+    mean = RenderingScores(statistics.fmean(score.psnr for score in scores), errors, scene.unit)
+    error = "-" if mean.depth_error is None else f"{mean.depth_error:.4f}"
+    show(
+        f"mean of {len(scores)}: PSNR {mean.psnr:.2f} dB; median depth error over all pixels {error} {symbol(scene.unit)}"
+    )
+
+
+def write_images(out: Path, name: str, image: RenderedImage) -> None:
+    """Write ``NAME.png`` and ``NAME.depth.png``."""
+    import numpy as np
+    import torch
+
+    from bidnerf_core.io import png_bytes, write_file
+
+    write_file(out / f"{name}.png", png_bytes((image.rgb * 255).round().to(torch.uint8).numpy()))
+    millimetres = (image.depth * 1000).round().numpy()
+    deepest = np.iinfo(np.uint16).max
+    if millimetres.max() > deepest:
+        say(
+            f"{name}: depth beyond {deepest / 1000} units does not fit a 16-bit image in steps of 0.001 and is clipped"
+        )
+    depth = millimetres.clip(0, deepest).astype(np.uint16)
+    write_file(out / f"{name}.depth.png", png_bytes(depth))
+
+
+def run_bake(
+    map: MapFolder,
+    data: Annotated[
+        Path | None,
+        Option(
+            "DATA",
+            "dataset whose photos give landmarks and whose measured depth gives the surface",
+            "rendered images only",
+        ),
+    ] = None,
+    rendered_landmarks: Annotated[
+        Flag, Option(None, "replace landmarks of photos by landmarks of rendered images")
+    ] = False,
+    landmark_features: Annotated[
+        str | None,
+        Option("NAME", "detector of the landmarks, one of 'bidnerf plugins features'", "the map's"),
+    ] = None,
+    device: Device = "cpu",
+    *,
+    images: Annotated[DatasetOptions, Without("background")],
+    config: BakeSettings = None,
+) -> None:
+    """Find the surface and the landmarks of a map, and store them in the map.
+
+    Depth is rendered from the poses of the training images; what several of these views agree on is kept. With --data,
+    measured depth is used directly where views have it, and landmarks are built from the photos; without --data they are built
+    from images rendered by the field, which are only as sharp as the field. Landmarks from photos are kept unless --data gives
+    new photos or --rendered-landmarks is set.
+    """
+    from bidnerf_core.mapping import find_features
+    from bidnerf_core.maps import load_map
+
+    if rendered_landmarks and data is not None:
+        raise UsageError(
+            "--rendered-landmarks uses no photos, but --data gives some;", expected="only one of them"
+        )
+    if images.masks is not None and data is None:
+        raise UsageError("--masks was given without --data", expected="the dataset that they belong to")
+    if landmark_features is not None:
+        find_features(landmark_features)
+    # The parts that are baked may be damaged, and are replaced anyway.
+    scene = load_map(map, device, baked=False)
+    with working():
+        scene.bake(
+            data, config, images=images, rendered_landmarks=rendered_landmarks, features=landmark_features
+        )
+
+
+def run_extend(
+    map: MapFolder,
+    new: Annotated[
+        Path,
+        Option("NEW", "photo, folder of photos, or dataset (whose own poses are ignored)", positional=True),
+    ],
+    data: Annotated[
+        Path | None,
+        Option(
+            "DATA", "dataset that the map was built from", "none: images rendered by the field replace it"
+        ),
+    ] = None,
+    steps: Annotated[
+        int | None,
+        WholeNumbers(1),
+        Option(
+            "N", "training steps", "in proportion to the new photos, at least a quarter of the usual number"
+        ),
+    ] = None,
+    *,
+    images: Annotated[DatasetOptions, Without("masks", "mask_hides", "largest", "background")],
+    config: BakeSettings = None,
+) -> None:
+    """Add photos of the same scene to a map: localize them, continue training the field, and update landmarks and surface.
+
+    Photos are left out if they cannot be read, if they are not localized in the map, or if the map was built from them. The map
+    is replaced only when everything is done: after Ctrl-C, or a kill, it is unchanged, and localizers may keep reading it
+    meanwhile.
+    """
+    from bidnerf_core.datasets import find_reader
+    from bidnerf_core.maps import extend, load_info
+
+    info = load_info(map)
+    given = {
+        "--camera": images.camera, "--register-depth": images.register_depth, "--depth-unit": images.depth_unit
+    }  # fmt: skip
+    stated = [name for name, value in given.items() if value is not None]
+    paths = [new] if data is None else [new, data]
+    datasets = [path for path in paths if stated and find_reader(path) is not None]
+    if stated and not datasets:
+        raise UsageError(f"{stated[0]} is for a dataset, but {new} is none; leave it out")
+    options = replace(images, background=info.bounds.background)
+    opened: dict[Path, Path | Capture] = {path: options.open(path) for path in datasets}
+    known = None if data is None else opened.get(data, data)
+    with working():
+        scene = extend(map, opened.get(new, new), known, split=images.split, steps=steps, config=config)
+    added, total = len(scene.info.cameras) - len(info.cameras), len(scene.info.cameras)
+    show(f"{map}: {amount(added, 'photo')} added, {amount(total, 'image')} in all")
+
+
+def _importer_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
+    """Return the default settings of the importer that the arguments select, or None if they select none."""
+    from bidnerf_core.maps import IMPORTERS, importer_of
+
+    if values["as_"] is not None:
+        with wrong_usage():
+            return IMPORTERS.load(values["as_"]).config_type()
+    for word in words:
+        try:
+            if not word.startswith("-"):
+                return importer_of(Path(word))[1].config_type()
+        except InputError:  # not the file; or an invalid one, which is reported later
+            continue
+    return None
+
+
+@dataclass(frozen=True)
+class WorldOptions:
+    """How the coordinates of the file are taken to the world."""
+
+    scale: Annotated[float, Above(0.0), Option("FACTOR", "metres per unit of length in the file")] = 1.0
+    T_world_file: Annotated[
+        Path | None,
+        Option(
+            "POSE", "file of a pose (JSON, 4x4) that takes the scaled coordinates of the file to the world"
+        ),
+    ] = None
+
+
+def run_import(
+    file: Annotated[
+        Path,
+        Option("FILE", "file or folder of a trained field, or folder of a COLMAP project", positional=True),
+    ],
+    out: Annotated[Path, Option("MAP", "folder for the map")],
+    as_: Annotated[
+        str | None, Option("NAME", "one of 'bidnerf plugins importers'", "the one that recognizes the file")
+    ] = None,
+    *,
+    world: WorldOptions,
+    photos: Annotated[
+        Path | None,
+        Option(
+            "DATA", "dataset whose photos, with poses in the world, provide the landmarks", "rendered images"
+        ),
+    ] = None,
+    target: MapOptions,
+    images: Annotated[
+        DatasetOptions,
+        Without("register_depth", "depth_unit", "masks", "mask_hides", "largest", "background"),
+    ],
+    config: Annotated[Any, Settings(_importer_settings, "settings of the importer")] = None,
+) -> None:
+    """Build a map from a field that was trained elsewhere, or from an existing COLMAP model.
+
+    The installed importer that recognizes the file reads it. The command reports what it found: counts, what was left out, and
+    the extent, since most files store no unit. With --photos, landmarks are built from photos, as in 'train'; otherwise from
+    images rendered by the field, which match photos less well.
+
+    The points and tracks of a COLMAP model (a project folder or the model in it) become the landmarks, and answers are in its
+    world; its files are not changed. Such a map localizes photos without a field, which 'bidnerf train FILE --out MAP' adds.
+    """
+    from bidnerf_core.devices import working_device
+    from bidnerf_core.maps import ImportOptions, import_map
+    from bidnerf_core.results import read_pose
+
+    check_folder(out, (file, photos), may_be_map=True)
+    working_device(target.device)
+    pose = None
+    if world.T_world_file is not None:
+        with wrong_usage():
+            pose = read_pose(world.T_world_file)
+    options = ImportOptions(
+        images, target.landmark_features, target.device, target.overwrite, as_, world.scale, pose
+    )
+    with working():
+        import_map(file, out, config, photos=photos, bake=not target.no_bake, options=options)

@@ -13,6 +13,7 @@ from bidnerf_core.cli.output import say
 from bidnerf_core.cli.parser import FLAG, Option, Settings
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
+from bidnerf_core.registry import USUAL_FEATURES, USUAL_METHOD
 from bidnerf_core.settings import LARGEST_SEED, WholeNumbers
 
 if TYPE_CHECKING:
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from bidnerf_core.datasets import QuerySource
     from bidnerf_core.maps import Map
 
-DEFAULT_BACKEND, USUAL_METHOD, USUAL_FEATURES = "hashgrid", "auto", "sift"
 TEST_IMAGES = DatasetOptions(split="test")
 """The default options of images on which a map is tried."""
 

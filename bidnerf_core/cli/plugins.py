@@ -10,7 +10,7 @@ from bidnerf_core.cli.parser import Option
 from bidnerf_core.registry import GROUPS, PluginInfo, list_plugins
 
 
-def run(
+def run_plugins(
     group: Annotated[
         str | None,
         Option("[GROUP]", f"one kind of plugin: {', '.join(GROUPS)}", "all kinds", positional=True),

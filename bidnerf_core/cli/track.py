@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from bidnerf_core import localization  # its parts are loaded when they are used
-from bidnerf_core.cli.interruptions import uninterrupted
-from bidnerf_core.cli.options import USUAL_METHOD, CameraOptions, MapFolder
+from bidnerf_core.cli.options import CameraOptions, MapFolder
 from bidnerf_core.cli.output import check_output, print_json, print_table, say
 from bidnerf_core.cli.parser import Flag, Option, Settings, Without
-from bidnerf_core.cli.progress import displayed
+from bidnerf_core.cli.running import displayed, uninterrupted
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount
+from bidnerf_core.registry import USUAL_METHOD
 from bidnerf_core.settings import WholeNumbers
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class TrackingOptions:
     )
 
 
-def run(
+def run_track(
     map: MapFolder,
     sequence: Annotated[
         Path,

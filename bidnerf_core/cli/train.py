@@ -1,4 +1,4 @@
-"""``bidnerf train``."""
+"""``bidnerf poses`` and ``train``."""
 
 from __future__ import annotations
 
@@ -8,21 +8,50 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from bidnerf_core.cli.options import (
-    DEFAULT_BACKEND,
-    USUAL_FEATURES,
+    Json,
     MapOptions,
     PointChoice,
     wrong_usage,
 )
-from bidnerf_core.cli.output import check_folder
+from bidnerf_core.cli.output import check_folder, print_json
 from bidnerf_core.cli.parser import Flag, Option, Settings
-from bidnerf_core.cli.progress import working
+from bidnerf_core.cli.running import working
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
+from bidnerf_core.registry import USUAL_BACKEND, USUAL_FEATURES
 from bidnerf_core.settings import Range
 
 if TYPE_CHECKING:
     from bidnerf_core.maps import MapInfo
+
+
+def run_poses(
+    photos: Annotated[Path, Option("PHOTOS", "folder of photos, or a video, without poses", positional=True)],
+    out: Annotated[Path, Option("DATASET", "folder for the dataset")],
+    camera: Annotated[
+        Path | None,
+        Option(
+            "CAMERA.json",
+            "file with the intrinsics of all photos, which are then kept fixed",
+            "estimated, starting from EXIF",
+        ),
+    ] = None,
+    overwrite: Annotated[Flag, Option(None, "replace the poses in --out")] = False,
+    json: Json = False,
+) -> None:
+    """Find the poses of photos by structure from motion, and write them as a dataset.
+
+    The dataset refers to the photos in place; its poses.json lists those that were left out, and why. The unit of length is
+    arbitrary. Ctrl-C stops, and the same command resumes. 'bidnerf train PHOTOS' performs this step first.
+    """
+    from bidnerf_core.io import to_plain
+    from bidnerf_core.structure import find_poses
+
+    check_folder(out, (photos,))
+    with working("stopping (Ctrl-C again: at once); what was found is kept"):
+        found = find_poses(photos, out, camera, overwrite)
+    if json:
+        print_json(to_plain(found))
 
 
 def _backend_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
@@ -33,7 +62,7 @@ def _backend_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
     resumed = _resumed(out) if (values["resume"] or values["finish"]) and name is None else None
     if resumed is not None and resumed.backend:
         return load_backend(resumed.backend, str(out)).config_type()
-    backend = load_backend(name or DEFAULT_BACKEND)
+    backend = load_backend(name or USUAL_BACKEND)
     return quick_config(backend) if values["quick"] else backend.config_type()
 
 
@@ -51,7 +80,7 @@ def _resumed(out: Any) -> MapInfo | None:
 class TrainingOptions:
     """Which training, and how far it goes."""
 
-    backend: Annotated[str | None, Option("NAME", "one of 'bidnerf backends'", DEFAULT_BACKEND)] = None
+    backend: Annotated[str | None, Option("NAME", "one of 'bidnerf backends'", USUAL_BACKEND)] = None
     quick: Annotated[Flag, Option(None, "train a short time: settings of the backend for a first map")] = (
         False
     )
@@ -93,7 +122,7 @@ class DepthPointsOptions:
     model_points: PointChoice = None
 
 
-def run(
+def run_train(
     data: Annotated[
         Path, Option("DATA", "folder of a dataset or of photos without poses, or a video", positional=True)
     ],
@@ -157,7 +186,7 @@ def run(
     )  # fmt: skip
     with working():
         if not resumes:
-            train(data, training.backend or DEFAULT_BACKEND, out, config, bake=bake, options=options)
+            train(data, training.backend or USUAL_BACKEND, out, config, bake=bake, options=options)
             return
         try:
             resume(out, data, bake=bake, finish=training.finish, options=options)

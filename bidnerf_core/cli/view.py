@@ -1,15 +1,16 @@
-"""``bidnerf view``."""
+"""``bidnerf view`` and ``serve``: localization for browsers and for other programs."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from bidnerf_core import service, viewer
 from bidnerf_core.cli.options import (
     TEST_IMAGES,
-    USUAL_METHOD,
     Device,
     Host,
     MapFolder,
@@ -20,12 +21,15 @@ from bidnerf_core.cli.options import (
 )
 from bidnerf_core.cli.output import check_output, console, say, show
 from bidnerf_core.cli.parser import Option, Without
-from bidnerf_core.cli.progress import displayed
+from bidnerf_core.cli.running import displayed
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, spelling_hint
+from bidnerf_core.io import read_file, read_record
 from bidnerf_core.progress import counter
+from bidnerf_core.registry import USUAL_METHOD
+from bidnerf_core.service import LEAST_TOKEN, ServiceLimits
+from bidnerf_core.service import serve as serve_maps
 from bidnerf_core.settings import WholeNumbers
-from bidnerf_core.viewer import PORT
 
 if TYPE_CHECKING:
     from bidnerf_core.datasets import Query, QuerySource
@@ -55,12 +59,12 @@ class ServerOptions:
     """The server of the page."""
 
     host: Host = None
-    port: Port = PORT
+    port: Port = viewer.PORT
     device: Device = "cpu"
     method: Method = USUAL_METHOD
 
 
-def run(
+def run_view(
     map: MapFolder,
     query: Annotated[
         tuple[Path, ...],
@@ -162,3 +166,73 @@ class Chosen:
     def read(self, place: int) -> Query:
         """Read the chosen query at index ``place``."""
         return self._source.read(self._places[place])
+
+
+TOKEN = "BIDNERF_TOKEN"
+"""The environment variable that may hold the token; a command-line argument would be visible to all users of
+the machine."""
+
+
+def run_serve(
+    maps: Annotated[
+        tuple[str, ...],
+        Option(
+            "MAP...",
+            "folders of maps; NAME=MAP serves one under another name than its folder's",
+            positional=True,
+        ),
+    ] = (),
+    host: Host = None,
+    port: Port = service.PORT,
+    token_file: Annotated[
+        Path | None,
+        Option(
+            "FILE",
+            f"file with the token that clients must send, at least {LEAST_TOKEN} characters; or set {TOKEN} to the token",
+            "none, but with --host one is generated and printed",
+        ),
+    ] = None,
+    method: Method = USUAL_METHOD,
+    config: Annotated[
+        Path | None,
+        Option(
+            "FILE",
+            "JSON object with settings of the method, as 'bidnerf localize --method NAME --help-all' lists them:"
+            ' {"refine_steps": 20}',
+            "the method's own",
+        ),
+    ] = None,
+    device: Device = "cpu",
+    *,
+    limits: ServiceLimits,
+) -> None:
+    """Serve localization over HTTP: photos in, the JSON of 'bidnerf localize' out. Ctrl-C stops it.
+
+    A photo is sent as a form or as the body of a request, with its camera, depth image or start if known:
+    curl -F photo=@photo.jpg -F hfov=68 http://127.0.0.1:8000/localize
+
+    /docs describes all paths, as does /openapi.json, and /health and /metrics are for monitoring. Each request is logged as a line of
+    JSON on stderr.
+    """
+    if not maps:
+        raise UsageError("no MAP", expected="folders of maps")
+    stated = os.environ.get(TOKEN)
+    if token_file is not None:
+        try:
+            stated = read_file(token_file, "a file with a token", 4096).decode().strip()
+        except UnicodeDecodeError as error:
+            raise InputError("is not text", where=token_file, expected="a token") from error
+        if not stated:
+            raise InputError("is empty", where=token_file, expected="a token")
+
+    def announce(address: str, token: str | None) -> None:
+        """Print the address of the service and, if it was generated, the token; a token that the user gave must not be logged."""
+        say(f"serving at {address}; Ctrl-C ends")
+        if token is not None:
+            shown = "TOKEN, the one that was given" if stated else token
+            say(f"clients need the header  Authorization: Bearer {shown}")
+
+    serve_maps(
+        maps, host=host, port=port, token=stated, method=method, device=device, limits=limits,
+        config=None if config is None else read_record(config).values, ready=announce,
+    )  # fmt: skip

@@ -54,6 +54,7 @@ from bidnerf_core.localization.settings import (
 )
 from bidnerf_core.localization.terms.images import ColourScales, field_renderer
 from bidnerf_core.localization.terms.sampled import SampledLoss
+from bidnerf_core.registry import USUAL_METHOD as USUAL_METHOD
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 from bidnerf_core.settings import Settings, from_flat
 
@@ -105,8 +106,6 @@ def _defects(method: Any) -> Iterator[str]:
 
 METHODS: Plugins[Method] = Plugins("methods", _defects, first=("auto", "bid", "inerf", "bid-lm", "inerf-lm"))
 """The methods by name."""
-USUAL_METHOD = "auto"
-"""The name of the default method."""
 
 
 def find_method(name: str) -> Method:

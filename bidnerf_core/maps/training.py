@@ -60,7 +60,7 @@ from bidnerf_core.progress import (
     duration_text,
     job_context,
 )
-from bidnerf_core.registry import PluginError
+from bidnerf_core.registry import USUAL_BACKEND, PluginError
 from bidnerf_core.structure import lacks_poses
 from bidnerf_core.training import TrainingState, TrainingStopped
 
@@ -125,7 +125,7 @@ class OtherSettings(InputError):
 
 def train(
     data: Images,
-    backend: str = "hashgrid",
+    backend: str = USUAL_BACKEND,
     out: str | Path | None = None,
     config: Any = None,
     *,

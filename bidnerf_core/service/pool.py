@@ -20,7 +20,7 @@ import sys
 import tempfile
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -95,15 +95,6 @@ class Pool:
         text = "Requests that are uploading, waiting or at work."
         gauge("bidnerf_requests_in_progress", text).set_function(lambda: self.taken)
         gauge("bidnerf_workers", "Workers that are alive.").set_function(lambda: len(self.workers))
-        text = "Resident memory; pages shared by processes count for each."
-        memory = gauge("bidnerf_resident_bytes", text, ["process"])
-        processes: dict[str, Callable[[], Sequence[int]]] = {
-            "service": lambda: [os.getpid()],
-            "maps": lambda: [] if self._maps is None else [self._maps[0].pid],
-            "workers": lambda: [worker.pid for worker in self.workers],
-        }
-        for kind, numbers in processes.items():
-            memory.labels(process=kind).set_function(partial(_resident_bytes, numbers))
 
     def metric(self, name: str, **labels: str) -> float:
         """Return the current value of a metric, or 0 if it was never counted."""
@@ -271,11 +262,3 @@ async def _greeting(
         writer.close()
         raise
     return found, reader, writer
-
-
-def _resident_bytes(processes: Callable[[], Sequence[int]]) -> float:
-    total = 0
-    for process in processes():
-        with contextlib.suppress(psutil.Error):
-            total += psutil.Process(process).memory_info().rss
-    return total

@@ -13,7 +13,7 @@ from dataclasses import is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.service.settings import ServiceLimits, checked_token
 from bidnerf_core.settings import to_flat
 
@@ -27,7 +27,7 @@ NEEDS = "the service needs the extra 'serve' (pip install 'bidnerf[serve]')"
 
 
 Scenes: TypeAlias = str | Path | Sequence[str | Path] | Mapping[str, str | Path]
-"""The folders of maps, named by themselves or explicitly."""
+"""The folders of maps: each has the name of its folder, unless it is given as ``NAME=MAP`` or in a mapping by name."""
 
 
 def service_app(
@@ -76,7 +76,8 @@ def serve(
 ) -> None:
     """Serve maps over HTTP until the process is interrupted, or ``stop`` is set.
 
-    ``scenes`` is the folder of a map, a list of folders, or a mapping from the names that clients use to folders.
+    ``scenes`` is the folder of a map, a list of folders (``NAME=MAP`` gives one another name than its folder's), or a mapping
+    from the names that clients use to folders.
     Only programs on this machine are answered unless a ``host``, such as 0.0.0.0, is given: clients then need the
     ``token``, which is generated if none is given. With ``port`` 0, a free port is picked. ``options`` are
     ``method``, ``config``, ``device`` and ``limits`` of ``service_app``. ``ready`` is called with the address and the
@@ -157,19 +158,26 @@ def run_app(
 
 
 def named(scenes: Scenes) -> dict[str, Path]:
-    """Return the folders of maps by name; the default name is that of the folder. Raises ``InputError`` for invalid names."""
-    if isinstance(scenes, str | Path):
-        scenes = [scenes]
-    pairs = (
-        [*scenes.items()] if isinstance(scenes, Mapping) else [(Path(m).resolve().name, m) for m in scenes]
-    )
+    """Return the folders of maps by name. Raises ``UsageError`` for names that are invalid or not unique."""
+    if isinstance(scenes, Mapping):
+        pairs = [*scenes.items()]
+    else:
+        folders = [scenes] if isinstance(scenes, str | Path) else scenes
+        pairs = [_name_and_folder(str(folder)) for folder in folders]
     if not pairs:
-        raise InputError("no map to serve", expected="folders of maps")
+        raise UsageError("no MAP", expected="folders of maps")
     names = [name for name, _ in pairs]
     for name, folder in pairs:
         if not re.fullmatch(r"[\w.-]{1,100}", name) or name in (".", "..") or names.count(name) > 1:
-            raise InputError(
+            raise UsageError(
                 f"its name is {name!r}", where=folder,
                 expected="another one for each map, of letters, digits, '.', '-' and '_'; give it a name: NAME=MAP",
             )  # fmt: skip
     return {name: Path(folder) for name, folder in pairs}
+
+
+def _name_and_folder(given: str) -> tuple[str, str]:
+    name, equals, folder = given.partition("=")
+    if equals and not Path(given).is_dir():  # a folder's own name may contain an equals sign
+        return name, folder
+    return Path(given).resolve().name, given

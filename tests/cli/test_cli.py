@@ -7,6 +7,7 @@ import json
 import math
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -28,7 +29,7 @@ from bidnerf_core.backend import load_backend
 from bidnerf_core.cli import COMMANDS, main
 
 # Inside: a line of progress, without a training that takes as long as the line says
-from bidnerf_core.cli.progress import displayed
+from bidnerf_core.cli.running import displayed
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import Localizer
@@ -161,7 +162,7 @@ def test_names_that_do_not_exist_are_told_with_those_that_do(
         ([*train, "--split", "trian"], 1, (data, "'trian'", "train, test")),
         ([*train, "--background", "pink"], 2, ("'pink'", '"white"')),
         ([*localize, *QUICK, "--frame", "t_001"], 1, (data, "'t_001'", "mean 't_0001'")),
-        ([*localize, "--frame", "t_0001", "--no-start", "--method", "x"], 2, ("'x'",)),
+        ([*localize, "--frame", "t_0001", "--method", "x"], 2, ("'x'",)),
         ([*render, "--frame", "r_0000"], 1, (data, "'test'", "'r_0000'")),
         ([*render, "--level", "2"], 1, (place, "level 2", "0 to 1")),
         ([*render, "--level", "-1"], 1, (place, "level -1", "0 to 1")),
@@ -402,10 +403,8 @@ WRONG_USAGE = """
     localize {map} x.png --focal 30 --perturb 1 2
     localize {map} x.png --focal 30 --depth a.png b.png
     localize {map} x.png --focal 30 --out poses.csv
-    localize {map} {data} --no-start --frame
-    localize {map} {data} --frame t_0000 --no-start --perturb 1 2
-    localize {map} {data} --frame t_0000 --no-start --start p.json
-    localize {map} {data} --frame t_0000 --no-start --method guess
+    localize {map} {data} --frame
+    localize {map} {data} --frame t_0000 --method guess
     localize {map} {data} --frame t_0000 --start p.json --perturb 1 2
     localize {map} {data} --frame t_0000 --perturb 1
     localize {map} {data} --frame t_0000 --perturb 1 2 --seed -1
@@ -574,8 +573,7 @@ def test_inerf_takes_one_image(bidnerf: Run, shared: Path) -> None:
 def test_localize_without_json_prints_to_stdout_too(bidnerf: Run, shared: Path) -> None:
     found = bidnerf("localize", shared / "map", shared / "data", "--frame", "t_0001", *QUICK)
     assert (found.status, found.err) == (0, "")
-    assert found.out.startswith("t_0001: ")
-    assert "0.1000 m, 5.000 deg" in found.out
+    assert re.match(r"t_0001: error \d\.\d{4} m, \d+\.\d{3} deg; NOT converged", found.out)
 
 
 def test_an_answer_that_is_not_finite_is_no_answer(
@@ -589,7 +587,7 @@ def test_an_answer_that_is_not_finite_is_no_answer(
 
 
 def test_no_start_is_refused_by_methods_and_maps_that_need_one(bidnerf: Run, shared: Path) -> None:
-    place = ["localize", shared / "map", shared / "data", "--frame", "t_0000", "--no-start"]
+    place = ["localize", shared / "map", shared / "data", "--frame", "t_0000"]
     assert_refused(bidnerf(*place, "--method", "bid"), 1, "'bid' needs a start", "--start", "'auto'")
     assert_refused(bidnerf(*place), 1, "needs a start", "'bidnerf bake'")
 

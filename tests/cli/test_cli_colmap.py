@@ -83,7 +83,7 @@ def test_localization_takes_the_points_that_the_frames_observe(
 def test_with_a_surface_the_points_take_the_place_of_a_start(
     bidnerf: Run, shared: Path, given: Path, map_folder: Path
 ) -> None:
-    frames = ["--frame", "t_0002", "--window", 3, "--no-start", "--json"]
+    frames = ["--frame", "t_0002", "--window", 3, "--json"]
     place = ["localize", map_folder, given / "data", *frames, "--depth-points", given / "sparse"]
     assert_refused(bidnerf(*place), 1, "needs a start", after_remarks=True)
     assert bidnerf("bake", map_folder, "--data", shared / "data", "--cells", 20_000).status == 0

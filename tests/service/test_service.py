@@ -696,7 +696,7 @@ def test_a_token_that_is_given_is_not_shown(
     def announced(maps: Any, *, token: str | None, ready: Any, **more: Any) -> None:
         ready("http://localhost:1", token or "made-up-0123456789")
 
-    monkeypatch.setattr("bidnerf_core.cli.serve.serve_maps", announced)
+    monkeypatch.setattr("bidnerf_core.cli.view.serve_maps", announced)
     (tmp_path / "token").write_text("secret-0123456789")
     given = bidnerf("serve", tmp_path, "--token-file", tmp_path / "token")
     assert "Bearer" in given.out + given.err
@@ -706,9 +706,9 @@ def test_a_token_that_is_given_is_not_shown(
 
 
 def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidnerf: Run) -> None:
-    assert named({"a": "x"}) == {"a": Path("x")}
+    assert named({"a": "x"}) == named(["a=x"]) == {"a": Path("x")}
     for maps, part in (
-        ([], "no map"),
+        ([], "no MAP"),
         ({"a/b": "x"}, "its name is 'a/b'"),
         (["x/a", "y/a"], "its name is 'a'"),
     ):

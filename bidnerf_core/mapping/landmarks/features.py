@@ -21,6 +21,7 @@ from bidnerf_core.camera import AT_REST, Intrinsics, exposure_times, reduced_siz
 from bidnerf_core.errors import enumeration
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
+from bidnerf_core.registry import USUAL_FEATURES as USUAL_FEATURES
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 from bidnerf_core.settings import Range, Settings
 
@@ -109,8 +110,6 @@ SIFT = Sift()
 """OpenCV's SIFT (Lowe 2004), with root normalisation."""
 
 
-USUAL_FEATURES = "sift"
-"""The name of the default detector."""
 FEATURES: Plugins[Features] = Plugins(
     "features",
     lambda features: interface_defects(features, (), {"__call__": ("rgb",)}),

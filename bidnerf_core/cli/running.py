@@ -1,0 +1,183 @@
+"""What surrounds the work of a command: the signals that stop it, so that results can be saved, and the display of its progress."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from types import FrameType
+
+from rich.progress import (
+    BarColumn,
+    ProgressColumn,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.progress import Progress as Bar
+
+from bidnerf_core.cli.output import console, say
+from bidnerf_core.errors import Cancelled
+from bidnerf_core.progress import Progress, duration_text, job_context
+
+# Windows has no SIGHUP.
+ASKED_TO_STOP = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+
+
+class Interrupted(KeyboardInterrupt):
+    """Raised when a signal asks the command to stop."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+class _Handler:
+    """A signal handler that raises ``Interrupted`` in the process that installed it, at once or when the work allows it."""
+
+    def __init__(self) -> None:
+        self.process = os.getpid()
+        self.writes = False  # every signal waits until results are written
+        self.works = False  # the first Ctrl-C waits for the next check of the work
+        self.waiting: int | None = None
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if os.getpid() != self.process:  # a forked worker ends as it would without this handler
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+        elif self.writes or (self.works and number == signal.SIGINT and self.waiting is None):
+            self.waiting = number
+        else:
+            raise Interrupted(number)
+
+
+@contextlib.contextmanager
+def interruptions() -> Iterator[None]:
+    """Make SIGINT, SIGTERM and SIGHUP raise ``Interrupted``. Signals that are ignored, as under nohup, stay ignored.
+
+    Has no effect outside the main thread, the only thread that may handle signals.
+    """
+    in_main = threading.current_thread() is threading.main_thread()
+    usual, handler = (signal.SIG_DFL, signal.default_int_handler), _Handler()
+    handled = [number for number in ASKED_TO_STOP if in_main and signal.getsignal(number) in usual]
+    before = {number: signal.signal(number, handler) for number in handled}
+    try:
+        yield
+    finally:
+        for number, handler_before in before.items():
+            signal.signal(number, handler_before)
+
+
+def _handler() -> _Handler:
+    """Return the handler that ``interruptions`` installed, or one that receives no signals."""
+    handlers = map(signal.getsignal, ASKED_TO_STOP)
+    return next((found for found in handlers if isinstance(found, _Handler)), _Handler())
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Defer interruptions to the end of the context, so that results are written completely."""
+    handler = _handler()
+    handler.writes = True
+    try:
+        yield
+    finally:
+        handler.writes = False
+    if handler.waiting is not None:
+        raise Interrupted(handler.waiting)
+
+
+class Display:
+    """Displays the progress that it is called with: as a bar for each stage on a terminal, else as occasional lines.
+
+    A stage begins when its name first appears, or when it is reported with nothing done. A stage with a single unit
+    shows only the elapsed time, or nothing if stderr is not a terminal.
+    """
+
+    def __init__(self) -> None:
+        self._stage, self._first = "", 0
+        self._began = self._spoke = time.monotonic()
+        self.bar: Bar | None = None
+
+    def __call__(self, now: Progress) -> None:
+        if now.stage != self._stage or not now.done:
+            self._begin(now)
+        elapsed = time.monotonic() - self._began
+        each = elapsed / max(1, now.done - self._first)
+        rate = f"{each:.1f} s each" if each >= 1 else f"{1 / each:.1f} per second" if each > 1e-6 else ""
+        text = now.text or rate
+        if self.bar is not None:
+            self.bar.update(self.bar.task_ids[0], completed=now.done, total=now.total, text=text)
+            return
+        last = now.done == now.total and (bool(now.text) or self._spoke > self._began)
+        # If stderr is not a terminal, a line every ten seconds is enough.
+        if now.total > 1 and now.done and (last or time.monotonic() - self._spoke > 10):
+            self._spoke = time.monotonic()
+            counted = Progress(now.stage, now.done, now.total, now.unit, text)
+            say(f"{counted}, {duration_text(each * (now.total - now.done))} left")
+
+    def _begin(self, now: Progress) -> None:
+        self._stage, self._first = now.stage, max(0, now.done - 1)
+        self._began = self._spoke = time.monotonic()
+        if not console.is_terminal:
+            return
+        if self.bar is not None:
+            self.bar.stop()
+        columns: tuple[ProgressColumn, ...] = (
+            TextColumn(now.stage), BarColumn(), TextColumn("{task.completed}/{task.total} " + now.unit),
+            TextColumn("{task.fields[text]}"), TextColumn("left"), TimeRemainingColumn(),
+        )  # fmt: skip
+        if now.total == 1:
+            columns = (SpinnerColumn(), TextColumn(now.stage), TimeElapsedColumn())
+        # Results on the same terminal appear above the bar.
+        self.bar = Bar(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty())
+        self.bar.add_task("", total=now.total, text="")
+        self.bar.start()
+
+
+@contextlib.contextmanager
+def displayed() -> Iterator[None]:
+    """Display the progress of the work in the context."""
+    display = Display()
+    try:
+        with job_context(display):
+            yield
+    finally:
+        if display.bar is not None:
+            display.bar.stop()
+
+
+@contextlib.contextmanager
+def working(
+    announcement: str = "stopping after this step (Ctrl-C again: at once, back to the last checkpoint)",
+) -> Iterator[None]:
+    """Display the progress of the work in the context, and let Ctrl-C stop it at its next check; a second one stops it at once.
+
+    Once the work has stopped, a line says what was kept, and ``Interrupted`` is raised.
+    """
+    handler, announced = _handler(), threading.Event()
+
+    def cancel() -> bool:
+        if (
+            handler.waiting is not None and not announced.is_set()
+        ):  # not in the handler, which may interrupt a print
+            announced.set()
+            say(announcement)
+        return handler.waiting is not None
+
+    handler.works = True
+    try:
+        with job_context(cancel=cancel), displayed():
+            yield
+    except Cancelled as stopped:
+        if handler.waiting is None:  # something other than Ctrl-C stopped it
+            raise
+        say(str(stopped))
+        raise Interrupted(handler.waiting) from stopped
+    finally:
+        handler.works, handler.waiting = False, None
