@@ -19,7 +19,7 @@ from bidnerf_core.errors import InputError
 
 CameraKind = TypeVar("CameraKind", Intrinsics, Lens, Camera)
 WAYS = "--camera FILE, --focal PX or --hfov DEG (camera=, focal=, hfov= in Python)"
-WAYS_OF_PHOTO = "--camera FILE, --focal PX or --hfov DEG (in Python camera=, focal=, hfov=, or assumed= with a map's cameras)"
+WAYS_OF_PHOTO = "--camera FILE, --focal PX or --hfov DEG (in Python camera=, focal=, hfov=, or the photo's path for a localizer, which assumes its map's cameras)"
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from bidnerf_core.settings import WholeNumbers
 
 if TYPE_CHECKING:
     from bidnerf_core.depth import DepthCamera
-    from bidnerf_core.frames import Frame
+    from bidnerf_core.frames import Frame, MaskFile
     from bidnerf_core.localization import Tracker
     from bidnerf_core.results import Answers, TrackingVideo
 
@@ -228,7 +228,7 @@ class FrameRequest:
     depth: Path | None = None
     time: float | None = None  # seconds
     depth_unit: float | None = None  # metres per step
-    mask: Path | None = None  # black is ignored
+    mask: MaskFile | None = None
 
     @staticmethod
     def parse(line: str) -> FrameRequest:
@@ -248,7 +248,7 @@ class FrameRequest:
             None if depth is None else Path(depth),
             request.number("time"),
             request.number("depth_unit"),
-            None if mask is None else Path(mask),
+            None if mask is None else MaskFile(Path(mask)),
         )
 
     def read(self, images: DatasetOptions, sensor: DepthCamera | None) -> Frame:

@@ -2,7 +2,6 @@ from .capture import HOLD_OUT_EVERY as HOLD_OUT_EVERY
 from .capture import BreaksOff as BreaksOff
 from .capture import Capture as Capture
 from .capture import DepthFile as DepthFile
-from .capture import MaskFile as MaskFile
 from .capture import Shot as Shot
 from .capture import TimedFrame as TimedFrame
 from .capture import hold_out as hold_out

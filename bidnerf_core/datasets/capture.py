@@ -33,7 +33,7 @@ from bidnerf_core.errors import InputError, InputWarning, amount, refuse_text, s
 from bidnerf_core.frames import (
     BLACK,
     Frame,
-    HiddenColour,
+    MaskFile,
     MaskFolder,
     View,
     WhollyHidden,
@@ -73,14 +73,6 @@ class DepthFile:
     path: Path | str  # for messages; a ``Path`` is a file, without which there is no depth
     read: Callable[[], DepthImage]
     sensor: DepthCamera | None = None
-
-
-@dataclass(frozen=True)
-class MaskFile:
-    """A mask of a shot, and the mask colour that marks pixels to ignore."""
-
-    path: Path
-    hides: HiddenColour = "black"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

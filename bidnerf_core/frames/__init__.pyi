@@ -6,6 +6,7 @@ from .frame import View as View
 from .frame import as_floats as as_floats
 from .masks import INVERTED as INVERTED
 from .masks import HiddenColour as HiddenColour
+from .masks import MaskFile as MaskFile
 from .masks import MaskFolder as MaskFolder
 from .masks import WhollyHidden as WhollyHidden
 from .masks import hides_everything as hides_everything

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -28,7 +27,7 @@ from bidnerf_core.camera import (
 from bidnerf_core.depth import DepthCamera, depth_image, read_depth_image
 from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.frames.masks import HiddenColour, WhollyHidden, read_mask
+from bidnerf_core.frames.masks import MaskFile, WhollyHidden, read_mask
 from bidnerf_core.frames.photos import fit_depth, pinhole_of
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import (
@@ -108,8 +107,7 @@ class Frame:
 
     def __post_init__(self) -> None:
         where, camera = f"frame {self.name}", self.intrinsics
-        if not isinstance(camera, Intrinsics):
-            raise InputError(f"intrinsics is a {type(camera).__name__}", where=where, expected="Intrinsics")
+        _check_camera(where, camera)
         if camera.distortion and not _has_rays(replace(camera, distortion=tuple(camera.distortion))):
             found = f"distortion is {camera.distortion}, which maps no ray to some of its pixels;"
             raise InputError(found, where=where, expected="coefficients of a real lens")
@@ -121,6 +119,8 @@ class Frame:
             self.__dict__["rgb"] = (self.rgb_bytes * 255).round_().clamp_(0, 255).to(torch.uint8)
         if self.depth is not None and not _is_finite(self.depth):
             self.__dict__["depth"] = self.depth.nan_to_num(0.0, 0.0, 0.0)
+        if self.hidden is not None and self.hidden.device.type == "cpu" and not bool(self.hidden.any()):
+            self.__dict__["hidden"] = None
         if self.hidden is None:
             return
         if self.hidden.device.type == "cpu" and bool(self.hidden.all()):
@@ -149,39 +149,31 @@ class Frame:
         camera: Intrinsics | str | Path | None = None,
         focal: float | None = None,
         hfov: float | None = None,
-        assumed: Sequence[Intrinsics] = (),
         depth_unit: float | None = None,
-        background: Background | None = None,
         largest: int | None = None,
         mask: str | Path | None = None,
-        mask_hides: HiddenColour = "black",
     ) -> Frame:
         """Read a photo, turn it upright according to its EXIF orientation, and find its camera.
 
         The camera is given by at most one of ``camera`` (intrinsics, or a file, see
         ``bidnerf_core.camera.files``; photos from fisheye lenses are undistorted), ``focal`` (focal length in
         pixels of the image file) and ``hfov`` (horizontal field of view of the upright image, degrees).
-        Otherwise it comes from the focal length in EXIF or, failing that, from the ``assumed`` cameras, for
-        instance those of a map's landmarks (``map.landmarks.cameras``). A camera for another resolution is
-        scaled, and one that describes the image as stored is turned with it. ``camera_source`` of the result
+        Otherwise it comes from the focal length in EXIF. A camera for another resolution is scaled, and one that describes the image as stored is turned with it. ``camera_source`` of the result
         states in one line where the camera comes from.
 
         ``depth`` is an image or a ``.npy`` file of planar z, in steps of ``depth_unit`` metres. Without a
         unit, 0.001 m is assumed for integers and 1 m for floats, with an ``InputWarning``, which also lists
         values that mean "nothing measured" (NaN, infinite, negative, 65535, 1e10 and the like); they become
-        0. Depth at another resolution is resampled to the nearest measurement. ``background`` (rgb in [0, 1],
-        "white" or "black") lies behind transparent pixels, by default that of the map in which the frame is localized. If the longer side exceeds ``largest`` pixels, the
-        image is downscaled to that size. ``mask`` is an image whose black pixels (white ones with
-        ``mask_hides="white"``) are ignored: they become ``hidden``.
+        0. Depth at another resolution is resampled to the nearest measurement. Transparent pixels get the background of the map in
+        which the frame is localized. If the longer side exceeds ``largest`` pixels, the image is downscaled to that size. ``mask``
+        is an image whose black pixels are ignored: they become ``hidden``. ``read`` takes another background, inverted masks and
+        cameras to assume.
 
         Raises ``InputError`` if a file cannot be read or exceeds 100 megapixels, if the camera is unknown or
         given twice, and if camera or depth belong to an image of another aspect ratio.
         """
-        given = CameraSource(camera, focal, hfov, tuple(assumed))
-        return Frame.read(
-            path, given, depth=depth, depth_unit=depth_unit, background=background, largest=largest,
-            mask=mask, mask_hides=mask_hides,
-        )  # fmt: skip
+        given, hides = CameraSource(camera, focal, hfov), None if mask is None else MaskFile(Path(mask))
+        return Frame.read(path, given, depth=depth, depth_unit=depth_unit, largest=largest, mask=hides)
 
     @staticmethod
     def read(
@@ -193,10 +185,13 @@ class Frame:
         sensor: DepthCamera | None = None,
         background: Background | None = None,
         largest: int | None = None,
-        mask: str | Path | None = None,
-        mask_hides: HiddenColour = "black",
+        mask: MaskFile | None = None,
     ) -> Frame:
-        """Read a photo as ``open`` does; depth is registered to it from ``sensor``, if given."""
+        """Read a photo as ``open`` does, with any source of its camera.
+
+        Depth is registered to it from ``sensor``, if given. ``background`` (rgb in [0, 1], "white" or "black") lies behind
+        transparent pixels, by default that of the map in which the frame is localized.
+        """
         path, behind = Path(path), BLACK if background is None else background_colour(background)
         header, exif = read_header(path), read_exif(path)
         raster = Raster(header.width, header.height, exif.orientation)
@@ -223,7 +218,7 @@ class Frame:
             exif.orientation.upright(rgb),
             metres,
             None if alpha is None else exif.orientation.upright(alpha),
-            None if mask is None else read_mask(Path(mask), raster, size, mask_hides),
+            None if mask is None else read_mask(mask.path, raster, size, mask.hides),
             camera_source=found.description,
             focal_is_approximate=found.approximate,
             orientation=exif.orientation,
@@ -257,7 +252,6 @@ class Frame:
                 depth = torch.from_numpy(camera.resampled(depth.numpy(), nearest=True))
             if alpha is not None:
                 alpha = torch.from_numpy(camera.resampled(alpha.numpy()))
-        hidden = hidden if hidden is not None and bool(hidden.any()) else None
         return Frame(name, rgb, intrinsics, depth, alpha, hidden=hidden, **about)  # type: ignore[arg-type]
 
     def over(self, background: tuple[float, float, float]) -> Frame:
@@ -302,17 +296,7 @@ class Frame:
         belong to an image of another aspect ratio.
         """
         where = f"frame {name}"
-        given: Any = camera
-        if not isinstance(given, Intrinsics):
-            found = type(given).__name__
-            raise InputError(
-                f"camera is a {found}",
-                where=where,
-                expected=(
-                    "Intrinsics(fx=..., fy=..., cx=..., cy=..., width=..., height=...) or, from a matrix,"
-                    " Intrinsics.from_opencv(K, distortion, (width, height))"
-                ),
-            )
+        _check_camera(where, camera)
         colour, cover = split_alpha(pixel_array(rgb, f"{where}: rgb"))
         if alpha is not None:
             if cover is not None:
@@ -340,8 +324,6 @@ class Frame:
                 warnings.warn(f"{where}: {remark}", InputWarning, stacklevel=2)
         laid = over(colour, cover, BLACK if background is None else background_colour(background))
         unused = None if hidden is None else torch.as_tensor(hidden)
-        if unused is not None and unused.dtype == torch.bool and not bool(unused.any()):
-            unused = None
         awaits = background is None and cover is not None
         return Frame(name, laid, intrinsics, metres, cover, hidden=unused, awaits_background=awaits)
 
@@ -394,6 +376,15 @@ class Frame:
     def has_dense_depth(self) -> bool:
         """Whether depth was measured at more than a few points."""
         return self.measured_share >= SPARSE
+
+
+def _check_camera(where: str, camera: object) -> None:
+    if not isinstance(camera, Intrinsics):
+        expected = (
+            "Intrinsics(fx=..., fy=..., cx=..., cy=..., width=..., height=...) or, from a matrix,"
+            " Intrinsics.from_opencv(K, distortion, (width, height))"
+        )
+        raise InputError(f"camera is a {type(camera).__name__}", where=where, expected=expected)
 
 
 def _check_image(where: str, what: str, image: object, camera: Intrinsics) -> None:

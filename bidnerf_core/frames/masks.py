@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Literal, get_args
 
@@ -24,6 +25,14 @@ from bidnerf_core.io import IMAGE_SUFFIXES, decode, resampled
 HiddenColour = Literal["black", "white"]
 """The colour in masks of the pixels that are ignored."""
 INVERTED = "if it marks what should be used, the masks are inverted (--mask-hides, mask_hides in Python)"
+
+
+@dataclass(frozen=True)
+class MaskFile:
+    """A mask of an image, and the mask colour that marks pixels to ignore."""
+
+    path: Path
+    hides: HiddenColour = "black"
 
 
 class WhollyHidden(InputError):

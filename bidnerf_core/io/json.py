@@ -35,7 +35,7 @@ EXPECTED = {
 }  # fmt: skip
 """What messages expect, by the type of pydantic's error; pydantic's own text for others."""
 STRICT: dict[str, dict[str, Any]] = {
-    "bool": {"strict": True}, "str": {"strict": True}, "float": {"strict": True}, "list": {"fail_fast": True},
+    "bool": {"strict": True}, "str": {"strict": True}, "float": {"strict": True, "allow_inf_nan": False}, "list": {"fail_fast": True},
     "int": {"strict": True, "ge": -LARGEST_INTEGER, "le": LARGEST_INTEGER}, "tuple": {"fail_fast": True},
 }  # fmt: skip
 """What is added to the parts of pydantic's schemas, by their types: text is no number, but a list may stand for a tuple."""

@@ -99,9 +99,15 @@ def read_ply(path: Path, expected: str = "a PLY file") -> dict[str, np.ndarray]:
             kind = np.dtype(list(element.properties.items()))
             try:
                 if header.is_text:
-                    found[name] = np.array(
-                        [tuple(file.readline().split()) for _ in range(element.count)], kind
-                    )
+                    rows = [file.readline().split() for _ in range(element.count)]
+                    columns = np.array(rows, np.float64).reshape(element.count, len(element.properties)).T
+                    found[name] = np.zeros(element.count, kind)
+                    for column, (part, of) in zip(columns, element.properties.items(), strict=True):
+                        with np.errstate(invalid="ignore", over="ignore"):
+                            found[name][part] = column
+                        # Programs write 255.0 for a byte, but 256 or 0.5 is none.
+                        if np.dtype(of).kind in "iu" and (found[name][part] != column).any():
+                            raise ValueError(f"{part} is not of its type")
                 elif kind.itemsize:
                     found[name] = np.frombuffer(file.read(element.count * kind.itemsize), kind)
             except (ValueError, TypeError, OverflowError) as error:

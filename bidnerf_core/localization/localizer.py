@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera import CameraSource, Intrinsics
 from bidnerf_core.depth import DepthSensorModel, find_depth_sensor
 from bidnerf_core.devices import constant, set_threads_here, threads_at_most, wait_for
 from bidnerf_core.errors import InputError
@@ -193,7 +193,7 @@ class Localizer:
         """
         T_world_camera = None if start is None else start_pose(start)
         if isinstance(query, str | Path):
-            query = Frame.open(query, assumed=self.assumed_cameras)
+            query = Frame.read(query, CameraSource(assumed=self.assumed_cameras))
         views = [view.over(self.scene.bounds.background) for view in _views(query)]
         return rig(self.scene, views, T_world_camera, depth_rays, self.matcher)
 

@@ -20,8 +20,8 @@ GOOD = {"rgb": torch.rand(16, 24, 3), "depth": torch.rand(16, 24), "alpha": torc
 NO_VALUES = torch.zeros(16, 24, 3)
 FINITE, MEASURED = "finite numbers", "measured values"
 WRONG: list[tuple[dict[str, Any], str, str | None]] = [
-    ({"intrinsics": None}, "intrinsics is a NoneType", "Intrinsics"),
-    ({"intrinsics": {"fx": 1}}, "intrinsics is a dict", "Intrinsics"),
+    ({"intrinsics": None}, "camera is a NoneType", "Intrinsics"),
+    ({"intrinsics": {"fx": 1}}, "camera is a dict", "Intrinsics"),
     (
         {"intrinsics": replace(LENS, distortion=(-1e6,) * 14)},
         "maps no ray to some of its pixels",

@@ -11,6 +11,7 @@ import torch
 from PIL import Image, ImageOps
 
 from bidnerf_core import Frame, InputWarning, Intrinsics
+from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.frames import photos_in
 from photo_files import noise, write_photo
@@ -93,12 +94,12 @@ def test_transparent_pixels_show_the_background(tmp_path: Path) -> None:
     path = write_photo(tmp_path / "a.png", pixels)
     raw = torch.from_numpy(pixels).float() / 255
     for background, colour in (((0.0, 0.0, 0.0), 0.0), ("white", 1.0), ((0.5, 0.5, 0.5), 0.5)):
-        frame = Frame.open(path, focal=30.0, background=background)
+        frame = Frame.read(path, CameraSource(focal=30.0), background=background)
         torch.testing.assert_close(frame.alpha, raw[..., 3])
         over = raw[..., :3] * raw[..., 3:] + colour * (1 - raw[..., 3:])
         torch.testing.assert_close(frame.rgb, over, atol=0.501 / 255, rtol=0)  # rounded to bytes
     with refused(found="background is 'pink'", expected="black"):
-        Frame.open(path, focal=30.0, background="pink")
+        Frame.read(path, CameraSource(focal=30.0), background="pink")
 
 
 @pytest.mark.parametrize("code", [1, 6])

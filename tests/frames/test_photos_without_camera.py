@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from bidnerf_core import Frame, Intrinsics, Localizer
+from bidnerf_core.camera import CameraSource
 from bidnerf_core.evaluation import faulty
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import LandmarkMap
@@ -81,7 +82,7 @@ def test_a_map_without_landmarks_does_not_tell_a_focal_length(
 @pytest.mark.parametrize("factor", [0.7, 2.0])
 def test_a_wrong_focal_length_from_the_photo_gives_way_to_that_of_the_map(photo: Path, factor: float) -> None:
     wrong = replace(CAMERA, fx=CAMERA.fx * factor, fy=CAMERA.fy * factor)
-    frame = Frame.open(photo, assumed=[wrong])
+    frame = Frame.read(photo, CameraSource(assumed=(wrong,)))
     assert frame.focal_is_approximate
     localizer = Localizer(replace(textured_map(surface=True), landmarks=landmarks_of(CAMERA)))
     for given, remark in (
@@ -115,7 +116,8 @@ def test_colours_alone_do_not_tell_an_approximate_focal_length(
     photo: Path, factor: float, has_landmarks: bool
 ) -> None:
     """Neither landmarks of unknown cameras nor colours: the ground looks nearly flat."""
-    frame = Frame.open(photo, assumed=[replace(CAMERA, fx=CAMERA.fx * factor, fy=CAMERA.fy * factor)])
+    wrong = replace(CAMERA, fx=CAMERA.fx * factor, fy=CAMERA.fy * factor)
+    frame = Frame.read(photo, CameraSource(assumed=(wrong,)))
     known = landmarks_of() if has_landmarks else None
     assert not Localizer(replace(textured_map(surface=True), landmarks=known))(frame).converged
 

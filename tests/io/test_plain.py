@@ -126,3 +126,9 @@ class Colour(Enum):
 def test_what_json_cannot_hold_is_refused(value: Outer, found: str, expected: str) -> None:
     with refused(found=found, expected=expected):
         to_plain(value)
+
+
+@pytest.mark.parametrize("kind", [list[float], tuple[float, ...]])
+def test_numbers_in_a_list_are_finite_too(kind: type) -> None:
+    with refused(where="here", found="found nan", expected="float"):
+        from_plain(kind, [1.0, math.nan], "here")

@@ -67,3 +67,16 @@ def test_a_text_row_that_does_not_fit_its_properties_is_refused(tmp_path: Path, 
     path = ply(tmp_path / "a.ply", *lines, form="ascii", content=row.encode())
     with refused(where=path, expected="1 rows of 3 numbers"):
         read_ply(path)
+
+
+@pytest.mark.parametrize(
+    ("number", "is_byte"), [("255.0", True), ("0", True), ("256", False), ("0.5", False)]
+)
+def test_a_byte_in_a_text_may_be_written_as_a_float(tmp_path: Path, number: str, is_byte: bool) -> None:
+    lines = ["element vertex 1", "property float x", "property uchar red"]
+    path = ply(tmp_path / "a.ply", *lines, form="ascii", content=f"0.5 {number}\n".encode())
+    if is_byte:
+        assert read_ply(path)["vertex"].tolist() == [(0.5, float(number))]
+    else:
+        with refused(where=path, expected="red is not of its type"):
+            read_ply(path)

@@ -15,6 +15,7 @@ import bidnerf_core as bn
 
 # Inside: the share of landmarks in view, and a worker of the service without its processes
 import bidnerf_core.maps.collection as collections_module
+from bidnerf_core.camera import CameraSource
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.fields import NoField
 from bidnerf_core.mapping import BakeConfig, bake, build_landmarks
@@ -81,11 +82,11 @@ def test_transparent_pixels_show_the_background_of_the_map(grounds: list[Map], t
         for frame in (
             bn.Frame.open(tmp_path / "cut.png", camera=CAMERA),
             bn.Frame.from_numpy(rgba, CAMERA),
-            bn.Frame.open(tmp_path / "cut.png", camera=CAMERA, background=background),
+            bn.Frame.read(tmp_path / "cut.png", CameraSource(CAMERA), background=background),
         ):
             (seen,) = localizer.problem(frame).views
             np.testing.assert_allclose(seen.frame.rgb[-1, -1], behind, atol=1 / 255)
-    white = bn.Frame.open(tmp_path / "cut.png", camera=CAMERA, background="white")
+    white = bn.Frame.read(tmp_path / "cut.png", CameraSource(CAMERA), background="white")
     assert float(bn.Localizer(grounds[0], warm_up=False).problem(white).views[0].frame.rgb[-1, -1].min()) == 1
 
 

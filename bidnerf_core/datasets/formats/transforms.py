@@ -29,12 +29,13 @@ from functools import partial
 from pathlib import Path
 
 from bidnerf_core.camera import Camera, CameraSource, PanoramaFace, same_aspect
-from bidnerf_core.datasets.capture import SPLITS, Capture, DepthFile, MaskFile, Shot, remark
+from bidnerf_core.datasets.capture import SPLITS, Capture, DepthFile, Shot, remark
 from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames
 from bidnerf_core.datasets.formats.transforms_json import FrameRecord, file_of, read_splits
 from bidnerf_core.datasets.reader import DatasetOptions, Format
 from bidnerf_core.depth import DepthReader
 from bidnerf_core.errors import InputError
+from bidnerf_core.frames import MaskFile
 from bidnerf_core.io import background_colour, is_file, read_header
 
 
