@@ -173,7 +173,7 @@ def test_a_model_becomes_a_map_of_landmarks_in_its_own_frame(
     for camera, T in zip(scene.info.cameras, model.poses, strict=True):
         assert camera.intrinsics == CAMERA
         torch.testing.assert_close(camera.pose.matrix(), T.matrix())
-    found = bn.Localizer(scene)(unseen())
+    found = bn.Localizer(scene, warm_up=False)(unseen())
     assert found.converged, found.reason
     assert error_of(found, UNSEEN) < 0.01
 
@@ -183,7 +183,7 @@ def test_a_database_replaces_the_photos(model: Model, tmp_path: Path) -> None:
     for photo in (model.folder / "images").iterdir():
         photo.unlink()
     scene = bn.import_map(model.folder / "sparse", None, {"keypoints": str(tmp_path / "keypoints.db")})
-    assert error_of(bn.Localizer(scene)(unseen()), UNSEEN) < 0.01
+    assert error_of(bn.Localizer(scene, warm_up=False)(unseen()), UNSEEN) < 0.01
     assert {camera.file for camera in scene.info.cameras} == {None}
 
 
@@ -222,7 +222,7 @@ def test_features_of_hloc_are_read_with_their_detector(
     fake = types.SimpleNamespace(File=lambda path, mode: contextlib.nullcontext(groups))
     monkeypatch.setitem(sys.modules, "h5py", fake)
     scene = bn.import_map(model.folder, None, {"keypoints": str(file)})
-    assert error_of(bn.Localizer(scene)(unseen()), UNSEEN) < 0.01
+    assert error_of(bn.Localizer(scene, warm_up=False)(unseen()), UNSEEN) < 0.01
     for group in groups.values():
         group["descriptors"] = group["descriptors"][:64]
     with refused(found="its descriptors have 64 channels, those of 'sift' 128"):
@@ -245,7 +245,7 @@ def test_a_model_is_scaled_and_placed(model: Model) -> None:
     place = SE3.exp(torch.tensor([5.0, -3.0, 1.0, 0.4, 0.2, -0.7], dtype=torch.float64))
     model.write_database(model.folder / "database.db")
     scene = bn.import_map(model.folder, options=bn.ImportOptions(scale=2.0, T_world_file=place))
-    found = bn.Localizer(scene)(unseen())
+    found = bn.Localizer(scene, warm_up=False)(unseen())
     assert found.converged
     assert scene.unit == "metres"
     expected = place.apply(2 * UNSEEN.translation)

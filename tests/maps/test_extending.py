@@ -30,7 +30,7 @@ BAKE = BakeConfig(rays=10_000, measured=30_000, cells=10_000)
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A map of seven of ten images of the textured ground."""
     folder = tmp_path_factory.mktemp("extend") / "map"
-    bn.train(list(training_views()[:7]), out=folder, config=tiny.config(25), bake=BAKE)
+    bn.train(list(training_views()[:7]), out=folder, config=tiny.config(), bake=BAKE)
     return folder
 
 

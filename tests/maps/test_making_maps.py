@@ -155,11 +155,11 @@ def test_what_was_finished_is_kept_when_a_stage_is_cancelled_and_finish_ends_it(
         bn.train(views, out=out, config=tiny.config(), bake=BAKE, **stopping_at(stage))
     half = bn.load_map(out)
     assert half.landmarks is not None
-    assert bn.Localizer(half)(unseen().frame).converged
     if stage == "baking":
         assert "the map has its landmarks and field so far" in str(stopped.value)
     else:
         assert 0 < half.info.step < tiny.STEPS
+        assert bn.Localizer(half, warm_up=False)(unseen().frame).converged
     done = bn.resume(out, views, bake=BAKE, finish=True)
     assert (done.info.complete, done.info.step) == (True, half.info.step)
     assert done.landmarks is not None

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
@@ -41,6 +41,7 @@ def names(folder: Path) -> set[str]:
     return {file.name for file in folder.iterdir()}
 
 
+@settings(max_examples=20)
 @given(
     anchor=record(
         Anchor, latitude=st.floats(-89, 89), longitude=st.floats(-180, 180), metres_per_unit=st.floats(1e-3, 1e3),

@@ -575,15 +575,15 @@ def test_more_layers_than_there_are_weights_for_are_refused_at_once(tmp_path: Pa
         load_map(tmp_path)
 
 
-def test_a_map_of_thousands_of_cameras_is_described_without_a_loop_of_tensors(
+def test_a_map_of_hundreds_of_cameras_is_described_without_a_loop_of_tensors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     many = tuple(
-        replace(CAMERAS[0], name=f"{i}", given_T_world_camera=CAMERAS[1].T_world_camera) for i in range(3000)
+        replace(CAMERAS[0], name=f"{i}", given_T_world_camera=CAMERAS[1].T_world_camera) for i in range(500)
     )
     write_parts(tmp_path, replace(info(complete=True), cameras=many), state())
     counted = []
     usual = SE3.from_matrix
     monkeypatch.setattr(SE3, "from_matrix", lambda rows: counted.append(len(rows)) or usual(rows))
-    assert len(load_map(tmp_path).describe().plain()["moved"]) == 3000
+    assert len(load_map(tmp_path).describe().plain()["moved"]) == 500
     assert len(counted) < 10
