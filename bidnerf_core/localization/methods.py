@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Generator
@@ -48,7 +48,6 @@ from bidnerf_core.localization.settings import (
     DescentSettings,
     ReachSettings,
     RefinementSettings,
-    SpreadSettings,
     objective_of,
     rendered_depth_scale,
 )
@@ -56,7 +55,7 @@ from bidnerf_core.localization.terms.images import ColourScales, field_renderer
 from bidnerf_core.localization.terms.sampled import SampledLoss
 from bidnerf_core.registry import USUAL_METHOD as USUAL_METHOD
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
-from bidnerf_core.settings import Settings, from_flat
+from bidnerf_core.settings import Range, Settings, from_flat
 
 RAYS = 1024
 """Number of rays on which the pose that a first-order method found is judged."""
@@ -211,8 +210,7 @@ def descended(
     middle = middle_of_view(problem, T if bool(T.matrix().isfinite().all()) else None)
     measures = support(lambda T: rays.costs(states_at(T)), T, middle, rays.plain_costs())
     most = config.adam.converged_loss
-    limits = {"mean_loss": most, "explained": 1 - config.adam.plain_share}
-    found = Support(measures | {"mean_loss": mean}, limits)
+    found = Support(measures | {"mean_loss": mean}, {"mean_loss": most})
     verdict = found.verdict(f"mean loss {mean:.3g}, must be below {most:.3g}")
     verdict = replace(verdict, reason=f"{ending}; {verdict.reason}")
     if not finite or not math.isfinite(mean):
@@ -260,7 +258,7 @@ IMAGE_STAGES = ((16, 0, 24), (16, 8, 6), (24, 6, 2), (48, 4, 2))
 class BidLmConfig(Settings):
     """Settings of method ``bid-lm``."""
 
-    spread: SpreadSettings = SpreadSettings()
+    poses: Annotated[int, Range(1, 10**5)] = 32  # number of poses tried near the start, including the start
     steps: RefinementSettings = RefinementSettings(fine_steps=6)
     depth: DepthLossSettings = DepthLossSettings()
     exposure: bool = False  # estimate a gain and an offset for each colour channel
@@ -270,14 +268,14 @@ class BidLmConfig(Settings):
 class InerfLmConfig(Settings):
     """Settings of method ``inerf-lm``."""
 
-    spread: SpreadSettings = SpreadSettings(256, spread_rotation=0.25)
+    poses: Annotated[int, Range(1, 10**5)] = 256  # number of poses tried near the start, including the start
     steps: RefinementSettings = RefinementSettings()
     exposure: bool = False  # estimate a gain and an offset for each colour channel
 
 
 def bid_lm(problem: Problem, config: BidLmConfig, seed: int = 0) -> Localization:
     """Refine poses around ``problem.start``; poses and pixels are drawn from ``seed``."""
-    return _halved(problem, config, config.depth, 0.1, seed, "bid-lm")
+    return _halved(problem, config, config.depth, (0.1, 0.12), seed, "bid-lm")
 
 
 def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localization:
@@ -285,21 +283,19 @@ def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localiza
 
     The method needs only the field; it uses neither measured depth nor a baked surface.
     """
-    return _halved(problem.without_depth(), config, None, 0.04, seed, "inerf-lm")
+    return _halved(problem.without_depth(), config, None, (0.04, 0.25), seed, "inerf-lm")
 
 
 def _halved(
-    problem: Problem, config: BidLmConfig | InerfLmConfig, depth: DepthLossSettings | None, share: float, seed: int, method: str
+    problem: Problem, config: BidLmConfig | InerfLmConfig, depth: DepthLossSettings | None, spread: tuple[float, float], seed: int, method: str
 ) -> Localization:  # fmt: skip
-    """Refine poses around the start; ``share`` is the default spread of the poses relative to the distance of the scene.
+    """Refine poses around the start; ``spread`` holds their standard deviations: relative to the distance of the scene, and radians.
 
     Colours alone have a narrow basin of convergence, so images without depth are first compared with small renderings.
     """
     began, start = time.perf_counter(), problem.start_for(method)
-    middle, spread, steps = middle_of_view(problem, start), config.spread, config.steps
-    along = spread.spread_translation
-    along = share * float(middle.norm()) if along is None else along
-    poses = neighbours(start, spread.poses, along, spread.spread_rotation, seed)
+    middle, steps = middle_of_view(problem, start), config.steps
+    poses = neighbours(start, config.poses, spread[0] * float(middle.norm()), spread[1], seed)
     terms, rays = RayTerms(steps.colour, depth, config.exposure), steps.fine_rays
     if depth is not None and problem.has_depth:
         poses = SE3.cat([poses, centred(problem, poses, middle)])

@@ -108,20 +108,6 @@ class AdamSettings(Settings):
     # stop once the mean loss of 20 steps is below this (epsilon of Alg. 1); 0: never
     stop_loss: NotNegative = 0.0
     converged_loss: NotNegative = 0.02  # mean loss of 20 steps below which the answer counts as converged
-    # maximum cost of an accepted pose as a fraction of the cost of the image's mean colour, if only colours are compared
-    plain_share: Annotated[float, Range(0.0), EXPERT] = 0.5
-
-
-@dataclass(frozen=True)
-class SpreadSettings(Settings):
-    """Settings of the additional poses tried near the start."""
-
-    # number of poses tried, including the start; 1: the start alone
-    poses: Annotated[int, Range(1, 10**5)] = 32
-    # standard deviation of the poses along each axis of the camera, metres; None: a fraction of the distance to the scene, 0.1 for
-    # ``bid-lm`` and 0.04 for ``inerf-lm``
-    spread_translation: NotNegative | None = None
-    spread_rotation: NotNegative = 0.12  # standard deviation of the poses about each axis, radians
 
 
 @dataclass(frozen=True)
@@ -182,8 +168,5 @@ class AutoConfig(Settings):
 class TrackerConfig(Settings):
     """Settings of a tracker."""
 
-    # maximum number of landmarks tracked from image to image
-    points: Annotated[int, Range(20, 10**4)] = 400
-    depth_points: Annotated[int, Range(50, 10**6)] = 400  # maximum number of measured pixels that are aligned
     # interval between frames without time stamps, seconds
     frame_seconds: Annotated[float, Above(0.0, 1e4)] = 1 / 30

@@ -52,6 +52,12 @@ def photograph(T_world_camera: SE3 = TRUTH) -> Frame:
     return Frame("frame", image.rgb, CAMERA, image.depth)
 
 
+@pytest.fixture(autouse=True)
+def judged_on_fewer_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Judging a descent takes longer than most of these descents."""
+    monkeypatch.setattr("bidnerf_core.localization.methods.RAYS", 256)
+
+
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     return single(FIELD, BOUNDS, photograph(), perturb(TRUTH, 0.2, 4.0, seed=3))
@@ -66,16 +72,19 @@ def test_pixels_are_drawn_where_the_config_says(problem: Problem) -> None:
     assert len(set(losses)) == 3
 
 
-@pytest.mark.parametrize(("share", "outcome"), [(0.5, Outcome.CONVERGED), (1e-6, Outcome.RENDERING_MISMATCH)])
 def test_colours_have_to_be_explained_better_than_by_a_single_one(
-    problem: Problem, share: float, outcome: Outcome
+    problem: Problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = {"rays": 128, "max_steps": 100, "plain_share": share}
-    assert localize(problem, "inerf", settings, seed=0).outcome is outcome
+    monkeypatch.setattr("bidnerf_core.localization.methods.RAYS", 1024)
+    found = localize(problem, "inerf", {"rays": 128, "max_steps": 100}, seed=0)
+    assert found.outcome is Outcome.CONVERGED
+    assert isinstance(found.diagnostics, Support)
+    strict = replace(found.diagnostics, limits=found.diagnostics.limits | {"explained": 1 - 1e-6})
+    assert strict.verdict("").outcome is Outcome.RENDERING_MISMATCH
 
 
 def test_the_loss_of_depth_is_not_compared_with_that_of_a_colour(problem: Problem) -> None:
-    found = localize(problem, "bid", {"rays": 64, "max_steps": 80, "converged_loss": 10.0})
+    found = localize(problem, "bid", {"rays": 64, "max_steps": 20, "converged_loss": 10.0})
     assert isinstance(found.diagnostics, Support)
     assert "plain" not in found.diagnostics.measures
     assert "contrast" not in found.reason
@@ -156,12 +165,12 @@ def test_updates_are_those_of_torch() -> None:
 
 def test_each_step_of_a_descent_follows_from_the_one_before(problem: Problem) -> None:
     """No step is longer than Adam allows, also from one block of steps to the next."""
-    settings = {"rays": 64, "max_steps": 3 * WINDOW, "learning_rate": 0.01, "decay": 1.0}
+    settings = {"rays": 64, "max_steps": 2 * WINDOW, "learning_rate": 0.01, "decay": 1.0}
     found = localize(problem, "bid", settings)
     steps = (found.poses[:-1].inverse() @ found.poses[1:]).log()
     assert float(steps[:, 3:].norm(dim=-1).max()) < 0.05
     assert float(steps[:, :3].norm(dim=-1).max()) < 0.3
-    assert len(torch.unique(found.poses.translation, dim=0)) == 3 * WINDOW + 1
+    assert len(torch.unique(found.poses.translation, dim=0)) == 2 * WINDOW + 1
 
 
 def test_a_step_that_is_not_finite_leaves_the_pose() -> None:

@@ -28,12 +28,19 @@ from bidnerf_core.progress import Progress, job_context
 from bidnerf_core.testing import DEVICE, Elsewhere, textured_map, training_views, unseen
 from bidnerf_hashgrid import backend as hashgrid
 from blob_images import BOUNDS, FIELD, FRAME, POSES, TRUTH, photograph
+from conditions import NOT_RENDERED
 from problems import FieldMap
 from refusals import refused
 
 MAP = FieldMap(FIELD, BOUNDS)
 START = perturb(TRUTH, 0.1, 3.0, seed=2)
 FEW = settings_of("bid", {"rays": 64, "max_steps": 3, "level": None})
+
+
+@pytest.fixture(autouse=True)
+def judged_on_few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether a descent is accepted plays no part here, and judging it takes far longer than a few steps."""
+    monkeypatch.setattr("bidnerf_core.localization.methods.RAYS", 16)
 
 
 @functools.cache
@@ -201,7 +208,7 @@ def test_warming_up_changes_no_answer_and_no_random_state() -> None:
 
 def test_many_queries_have_the_answers_of_each_alone_in_order() -> None:
     """A bad query gives its error, and queries are drawn a few at a time."""
-    made, drawn, stages = Localizer(textured_map()), list[int](), list[Progress]()
+    made, drawn, stages = Localizer(textured_map(), config=NOT_RENDERED), list[int](), list[Progress]()
     frames = [unseen().frame, *(view.frame for view in training_views()[:4])]
     queries: list[Any] = [*frames[:3], Path("missing.png"), *frames[3:]]
 

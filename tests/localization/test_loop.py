@@ -111,11 +111,8 @@ def assert_as_expected(found: Localization, truth: SE3, expected: Expected, true
 
 POINTS: dict[str, tuple[dict[str, Any], Expected]] = {
     "as stated, 0": ({}, Right()),
-    "as stated, 1": ({"pose": 1}, Right()),
     "as stated, 2": ({"pose": 2}, Right(metres=0.011, degrees=0.19)),
-    "focal 0.9": ({"stated": scaled(0.9)}, MAP),
     "focal 0.95": ({"pose": 1, "stated": scaled(0.95)}, MAP),
-    "focal 1.05": ({"stated": scaled(1.05)}, MAP),
     "focal 1.05, indistinguishable": ({"stated": scaled(1.05), "scatter": 0.1}, REJECTED),
     "principal point 12, -12": ({"pose": 1, "stated": shifted(12, -12)}, MAP),
     "lower left corner": (
@@ -129,8 +126,6 @@ POINTS: dict[str, tuple[dict[str, Any], Expected]] = {
         Right("estimated", metres=0.03, degrees=1.5),
     ),
     "middle": ({"true": part(120, 90)}, Right(metres=0.01, degrees=0.18)),
-    "middle, 120 rows fewer": ({"true": part(0, 120)}, Right(metres=0.01, degrees=0.2)),
-    "resized 0.95": ({"pose": 1, "stated": resized(0.95)}, MAP),
     "resized 1.33": ({"pose": 1, "stated": resized(1.33)}, MAP),
     "resized 1.33, unknown cameras": ({"stated": resized(1.33), "known": False}, REJECTED),
     "resized 0.95, moving rows": (
@@ -161,11 +156,7 @@ POINTS: dict[str, tuple[dict[str, Any], Expected]] = {
     ),
     "moving rows": ({"motion": MOTION}, MOVED),
     "moving rows, focal 0.95": ({"motion": MOTION, "stated": scaled(0.95)}, MOVED._replace(camera="map")),
-    "moving rows, focal 1.05": (
-        {"pose": 1, "motion": MOTION, "stated": scaled(1.05)}, MOVED._replace(camera="map", metres=0.012),
-    ),
     "two rooms": ({"repeated": 1.0}, Outcome.AMBIGUOUS),
-    "two rooms, rig": ({"repeated": 1.0, "others": POSES[1:2]}, Outcome.AMBIGUOUS),
     "two rooms, start": ({"pose": 1, "repeated": 1.0, "start": near(POSES[1])}, Right()),
     "two rooms, start in the other": (
         {"pose": 1, "repeated": 1.0, "start": near(COPY @ POSES[1]), "elsewhere": True}, Right(),
@@ -176,7 +167,6 @@ POINTS: dict[str, tuple[dict[str, Any], Expected]] = {
     "hidden but for the left third": ({"pose": 1, "visible": 0.33}, MAY_BE_REJECTED),
     "12 keypoints": ({"most": 12}, REJECTED),
     "30 keypoints": ({"pose": 1, "most": 30}, Right(metres=0.014, degrees=0.27)),
-    "30 keypoints, focal 0.95": ({"pose": 1, "most": 30, "stated": scaled(0.95)}, MAY_BE_REJECTED),
     "rig": ({"others": POSES[1:2]}, Right()),
     "rig, focal 0.95": ({"pose": 1, "others": POSES[:1], "stated": scaled(0.95)}, MAP),
     "poster from near": ({"flat": True, "at": looking_in(0.5)}, MAY_BE_REJECTED),
@@ -254,9 +244,7 @@ SHARP = AutoConfig(fused_rays=1024)
 GROUND: dict[str, tuple[Any, Expected]] = {
     "as stated, RGB": (lambda: noisy("none"), Right(metres=0.0075, degrees=0.18)),
     "as stated, RGB-D": (lambda: noisy("none", True), Right(metres=0.0075, degrees=0.18)),
-    "focal 0.95, RGB": (lambda: noisy("focal:0.95"), MAP._replace(degrees=0.18)),
     "focal 0.95, RGB-D": (lambda: noisy("focal:0.95", True), MAP._replace(degrees=0.18)),
-    "occluder, RGB": (lambda: noisy("occluder:0.25"), Right(metres=0.0085, degrees=0.18)),
     "occluder, RGB-D": (lambda: noisy("occluder:0.25", True), Right(metres=0.0085, degrees=0.18)),
     "principal point": (lambda: noisy("principal-point:5", False, 2), Right("map", False, 0.012, 0.32)),
     "stretched": (lambda: noisy("stretch:1.33"), MAP._replace(degrees=0.18)),
@@ -269,10 +257,6 @@ GROUND: dict[str, tuple[Any, Expected]] = {
     "depth 5 % too long": (lambda: noisy("depth-scale:1.05", True), Right(metres=0.0077, degrees=0.18)),
     "focal 0.5, not rendered": (
         lambda: {"views": stated(unseen(), 0.5), "config": NOT_RENDERED, "landmarks": own_correlation()},
-        MAP._replace(metres=0.03, degrees=1.0),
-    ),
-    "focal 2, not rendered": (
-        lambda: {"views": stated(unseen(), 2.0), "config": NOT_RENDERED, "landmarks": own_correlation()},
         MAP._replace(metres=0.03, degrees=1.0),
     ),
     "focal 1.02, not rendered": (
@@ -494,12 +478,12 @@ def test_degenerate_input_has_a_finite_answer_that_is_not_accepted_or_none(
 
 def test_the_same_seed_gives_the_same_answer_in_any_thread() -> None:
     localize = Localizer(with_landmarks(ground_landmarks()), config=QUICK, warm_up=False)
-    views = [ground_views("none", depth=True), ground_views("occluder:0.25"), ground_views("focal:0.95")]
+    views = [ground_views("none", depth=True), ground_views("focal:0.95")]
     expected = [localize(view, seed=3) for view in views]
     torch.manual_seed(99)
-    with ThreadPoolExecutor(3) as pool:
-        again = list(pool.map(lambda view: localize(view, seed=3), views * 2))
-    for one, other in zip(expected * 2, again, strict=True):
+    with ThreadPoolExecutor(2) as pool:
+        again = list(pool.map(lambda view: localize(view, seed=3), views))
+    for one, other in zip(expected, again, strict=True):
         assert torch.equal(one.T_world_camera.matrix(), other.T_world_camera.matrix())
         assert one.covariance is not None
         assert other.covariance is not None

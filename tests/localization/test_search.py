@@ -73,7 +73,7 @@ def test_a_stage_may_compare_poses_by_another_score() -> None:
 
 
 @pytest.mark.parametrize("by_points", [True, False])
-@pytest.mark.parametrize("count", [2, 5, 33, 90])
+@pytest.mark.parametrize("count", [2, 33])
 def test_hypotheses_are_distinct_and_begin_at_a_start(count: int, by_points: bool) -> None:
     view, surface = baked.unseen()[0], baked.toy()
     middle = torch.tensor([0.0, 0.0, 3.5])
@@ -120,7 +120,7 @@ def test_points_find_the_pose_anywhere_in_the_scene() -> None:
     assert found.margin > 0.15
 
 
-@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("number", [1])
 def test_images_find_the_pose_without_depth(number: int) -> None:
     view = baked.unseen()[number]
     found, _ = by_images(baked.problem(view).without_depth(), baked.toy(), 64, 0)

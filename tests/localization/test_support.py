@@ -38,7 +38,7 @@ from problems import FieldMap, localize
 CAMERA = Intrinsics(70.0, 70.0, 40.0, 30.0, 80, 60)
 BOUNDS = SceneBounds((-2.0, -2.0, -0.2), (2.0, 2.0, 0.2), 0.1, 8.0)
 POSES = [look_at((x, y, 1.8), (x, y + 0.1, 0.0)) for x in (-0.8, -0.3, 0.3, 0.8) for y in (-0.6, 0.0, 0.5)]
-FEW_STEPS = {"rays": 512, "max_steps": 60}
+FEW_STEPS = {"rays": 256, "max_steps": 20}
 CONFIGS: dict[str, Any] = {"auto": AutoConfig(hypotheses=24, rounds=1), "bid": FEW_STEPS, "inerf": FEW_STEPS}
 """Settings where the default ones take long, by method."""
 MIDDLE = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)

@@ -17,7 +17,6 @@ import torch
 from safetensors.torch import save_file
 
 from bidnerf_core import Localizer, Outcome, Tracker
-from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import read_tensors_and_metadata
@@ -48,7 +47,6 @@ from refusals import refused
 Flight = list[tuple[float, Frame, SE3]]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("depth", [True, False], ids=["rgb-d", "rgb"])
 def test_a_sequence_is_tracked_with_honest_covariances(depth: bool) -> None:
     frames = [(t, frame if depth else without_depth(frame), T) for t, frame, T in flight()]
@@ -66,9 +64,7 @@ def test_a_sequence_is_tracked_with_honest_covariances(depth: bool) -> None:
 
 CHANGED: dict[str, Callable[[Flight], Flight]] = {
     "times that decrease": lambda frames: frames[::-1],
-    "neighbours exchanged": lambda frames: [
-        frames[n] for n in (0, 1, 2, 4, 3, 5, 6, 8, 7, 9, 11, 10, 12, 13)
-    ],
+    "neighbours exchanged": lambda frames: [frames[n] for n in (0, 1, 2, 4, 3, 5, 7, 6, 8, 9)],
     "depth that stops midway": lambda frames: [
         (t, f if n < 6 else without_depth(f), T) for n, (t, f, T) in enumerate(frames)
     ],
@@ -84,20 +80,18 @@ def test_a_sequence_is_tracked_in_any_order_and_with_depth_or_without(changed: s
 @pytest.mark.parametrize("depth", [True, False], ids=["rgb-d", "rgb"])
 def test_a_covered_camera_is_reported_at_once_and_the_way_is_found_again(depth: bool) -> None:
     frames = [(t, frame if depth else without_depth(frame), T) for t, frame, T in flight()]
-    dark = range(5, 9)
-    frames = [(t, covered(f) if i in dark else f, T) for i, (t, f, T) in enumerate(frames)]
+    frames = [(t, covered(f) if 2 <= i < 6 else f, T) for i, (t, f, T) in enumerate(frames)]
     tracker = Tracker(localizer())
-    answers = tracked(frames[:9], tracker)
-    assert [answer.converged for answer in answers] == [True] * 5 + [False] * 4
+    answers = tracked(frames[:6], tracker)
+    assert [answer.converged for answer in answers] == [True] * 2 + [False] * 4
     assert tracker.lost_frames == 4
     assert "lost for 4 frames" in answers[-1].reason
     sizes = [
-        float(answer.covariance.diagonal().sum()) for answer in answers[4:] if answer.covariance is not None
+        float(answer.covariance.diagonal().sum()) for answer in answers[1:] if answer.covariance is not None
     ]
     assert sizes == sorted(sizes)
     assert len(sizes) == 5
-    after = tracked(frames[9:], tracker)
-    assert_right(after[2:], frames[11:])
+    assert_right(tracked(frames[6:], tracker)[2:], frames[8:])
     assert tracker.tracking
 
 
@@ -109,7 +103,6 @@ def test_frames_that_show_nothing_do_not_delay_the_search(count: int) -> None:
     assert [answer.converged for answer in answers[3:]] == [False] * count + [True]
 
 
-@pytest.mark.slow
 def test_frames_that_come_slowly_are_all_searched() -> None:
     """Lost by images of another place."""
     count = 5
@@ -128,45 +121,48 @@ def test_a_camera_that_is_carried_elsewhere_is_lost_and_found() -> None:
     """The motion cannot be foreseen, so no answer may follow the prediction."""
     elsewhere = [
         (t, view(flight_pose(n + 30), f"far {n}").frame, flight_pose(n + 30))
-        for n, (t, _, _) in enumerate(flight()[6:10], 6)
+        for n, (t, _, _) in enumerate(flight()[3:6], 3)
     ]
-    frames = [*flight()[:6], *elsewhere]
+    frames = [*flight()[:3], *elsewhere]
     answers = tracked(frames)
     assert_honest(answers, frames)
-    assert_right(answers[8:], frames[8:])
+    assert_right(answers[5:], frames[5:])
 
 
-def test_a_foreign_scene_is_never_accepted() -> None:
-    answers = tracked(flight()[:3])
-    assert all(answer.converged for answer in answers)
+def test_in_a_foreign_scene_no_pose_is_accepted_and_odometry_continues() -> None:
+    """Over ground that the map does not show, the motion between frames is still measured."""
     tracker = Tracker(localizer())
-    tracked(flight()[:3], tracker)
-    foreign = [tracker(view(flight_pose(n), f"{n}", seed=9).frame, 0.1 * n) for n in range(3, 7)]
+    assert_right(tracked(flight()[:3], tracker), flight()[:3])
+    foreign = [tracker(view(flight_pose(n), f"{n}", seed=9).frame, INTERVAL * n) for n in range(3, 8)]
     assert not any(answer.converged for answer in foreign)
-    assert all(answer.T_world_camera.is_rigid() for answer in foreign)
+    for n in range(1, 5):
+        moved = foreign[n - 1].T_world_camera.inverse() @ foreign[n].T_world_camera
+        error = pose_error(moved, flight_pose(n + 2).inverse() @ flight_pose(n + 3))
+        assert "bridged by odometry" in foreign[n].reason
+        assert float(error.translation) < 0.02
+        assert float(error.rotation_deg) < 0.8
+    sizes = [float(a.covariance.diagonal().sum()) for a in foreign if a.covariance is not None]
+    assert sizes == sorted(sizes)
 
 
-def test_depth_of_another_unit_is_left_out_and_the_user_is_warned_once() -> None:
+def test_depth_of_another_unit_is_left_out() -> None:
     """Feet read as metres after the first frame: each frame is tracked by its colours, and says so."""
     frames = Flight(flight()[:1])
-    for t, frame, T in flight()[1:8]:
+    for t, frame, T in flight()[1:4]:
         assert frame.depth is not None
         frames.append((t, replace(frame, depth=3.28 * frame.depth), T))
-    with pytest.warns(InputWarning) as warned:
-        answers = tracked(frames)
+    answers = tracked(frames)
     assert_right(answers, frames)
     assert all("without depth: it is 3.2" in answer.reason for answer in answers[1:])
-    (warning,) = warned
-    assert "depth of 5 frames disagrees with the map by a factor of 3.2" in str(warning.message)
 
 
 def test_repeated_frames_do_not_make_it_more_certain() -> None:
     """The errors of the map are the same in each of them."""
     tracker = Tracker(localizer())
-    tracked(flight()[:5], tracker)
-    time, frame, truth = flight()[5]
-    answers = [tracker(frame, time) for _ in range(12)]
-    assert_right(answers, [(time, frame, truth)] * 12)
+    tracked(flight()[:3], tracker)
+    time, frame, truth = flight()[3]
+    answers = [tracker(frame, time) for _ in range(10)]
+    assert_right(answers, [(time, frame, truth)] * 10)
     first, last = (answers[i].covariance for i in (0, -1))
     assert first is not None
     assert last is not None
@@ -182,12 +178,13 @@ def test_time_stamps_may_be_missing(known: int) -> None:
 
 
 @pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize("time", [math.nan, math.inf, "5", 10**400, True, [1.0]])
-def test_a_time_that_is_no_number_is_refused_and_changes_nothing(time: Any) -> None:
+def test_a_time_that_is_no_number_is_refused_and_changes_nothing() -> None:
     tracker = Tracker(localizer())
     tracked(flight()[:2], tracker)
-    with refused(found=f"time of the frame is '{str(time)[:40]}'", expected="seconds or None"):
-        tracker(flight()[2][1], time)
+    wrong: list[Any] = [math.nan, math.inf, "5", 10**400, True, [1.0]]
+    for time in wrong:
+        with refused(found=f"time of the frame is '{str(time)[:40]}'", expected="seconds or None"):
+            tracker(flight()[2][1], time)
     assert_right(tracked(flight()[2:4], tracker), flight()[2:4])
 
 
@@ -206,11 +203,11 @@ def test_a_changed_image_size_is_no_obstacle() -> None:
 
 def test_a_saved_state_continues_bit_for_bit(tmp_path: Path) -> None:
     tracker = Tracker(localizer())
-    tracked(flight()[:6], tracker)
+    tracked(flight()[:3], tracker)
     tracker.save(tmp_path / "state")
     other = Tracker(localizer())
     other.restore(tmp_path / "state")
-    one, two = tracked(flight()[6:9], tracker), tracked(flight()[6:9], other)
+    one, two = tracked(flight()[3:5], tracker), tracked(flight()[3:5], other)
     for a, b in zip(one, two, strict=True):
         assert torch.equal(a.T_world_camera.matrix(), b.T_world_camera.matrix())
         assert a.covariance is not None
@@ -247,56 +244,52 @@ def test_a_state_with_damaged_numbers_or_tensors_is_refused_and_changes_nothing(
     tracker.save(path)
     tensors, metadata = read_tensors_and_metadata(path, "a state")
     content = json.loads(metadata["bidnerf"])
+    rotation, noise = "motion.T_world_camera.rotation", "motion.noise"
+    impossible = "the numbers are impossible"
+    numbers: list[tuple[str, Any, str, str]] = [
+        ("frames", "3", ": frames", "found '3'"),
+        ("age", -1, "", impossible),
+        ("interval", 0, "", "no field 'interval'"),
+        ("clock.interval", 0.0, "", impossible),
+        ("motion.reach", 0.0, "", impossible),
+        ("motion.reach", None, ": motion: reach", "found None"),
+        ("motion.noise", 1.0, ": motion: noise", "found 1.0"),
+    ]
+    changed: list[tuple[dict[str, torch.Tensor], str, str]] = [
+        ({noise: tensors[noise].float()}, "", "motion.noise is torch.float32"),
+        ({noise: -tensors[noise]}, "", impossible),
+        ({noise: tensors[noise] * torch.nan}, "", "motion.noise holds NaN"),
+        ({rotation: 2 * tensors[rotation]}, "", impossible),
+        ({"points.landmark": tensors["points.landmark"][1:].clone()}, "", "points.landmark is torch.int64"),
+        ({"points.deviations": -tensors["points.deviations"]}, "", "points.deviations is -"),
+    ]
+    for name, part in tensors.items():
+        if name.startswith(("points.", "motion.")) and "T_world" not in name:
+            place = ": ".join(["", *name.split(".")])
+            changed.append((
+                {name: part[None].contiguous()}, place, f"found {part.dtype} {[1, *part.shape]}",
+            ))  # fmt: skip
 
-    def changed(place: str, value: Any) -> dict[str, Any]:
-        """Return the numbers with the value at ``place``, such as ``motion.reach``, replaced."""
+    def refuses(tensors: dict[str, torch.Tensor], state: Any, field: str, found: str) -> None:
+        save_file(tensors, path, {"bidnerf": json.dumps(content | {"state": state})})
+        with refused(where=f"{path}{field}", found=found):
+            tracker.restore(path)
+        assert tracker.tracking
+
+    for place, value, field, found in numbers:
         state = json.loads(json.dumps(content["state"]))
         *parents, last = place.split(".")
         functools.reduce(dict.__getitem__, parents, state)[last] = value
-        return dict(state)
-
-    numbers = content["state"]
-    rotation, noise = "motion.T_world_camera.rotation", "motion.noise"
+        refuses(tensors, state, field, found)
+    for parts, field, found in changed:
+        refuses(tensors | parts, content["state"], field, found)
     without = {name: tensor for name, tensor in tensors.items() if name != "points.pixels"}
-    fewer = tensors | {"points.landmark": tensors["points.landmark"][1:].clone()}
-    wrong: list[tuple[dict[str, torch.Tensor], dict[str, Any], str, str, str | None]] = [
-        (tensors, changed("frames", "3"), ": frames", "found '3'", "int"),
-        (tensors, changed("age", -1), "", "a number of frames or landmarks is negative", None),
-        (tensors, numbers | {"interval": 0}, "", "no field 'interval'", "any of clock"),
-        (tensors, changed("motion.reach", 0.0), "", "the reach is not positive", None),
-        (tensors, changed("motion.reach", None), ": motion: reach", "found None", "float"),
-        (tensors, changed("motion.noise", 1.0), ": motion: noise", "found 1.0", None),
-        (tensors, changed("depth_factor", []), ": depth_factor", "found []", "float"),
-        (tensors | {noise: tensors[noise].float()}, numbers, "", "motion.noise", "torch.float64"),
-        (tensors | {noise: -tensors[noise]}, numbers, "", "a variance of the motion is negative", None),
-        (
-            tensors | {rotation: 2 * tensors[rotation]},
-            numbers,
-            "",
-            "the pose of the motion is not rigid",
-            None,
-        ),
-        (without, numbers, "", "no tensor 'points.pixels'", None),
-        (fewer, numbers, "", "the points have different numbers", None),
-    ]
-    for name, part in tensors.items():
-        if name.startswith(("points.", "motion.")):
-            place = ": ".join(["", *name.split(".")])
-            found = f"found {part.dtype} {[1, *part.shape]}"
-            batch = {name: part[None].contiguous()}
-            if "T_world" in name:  # a batch of poses
-                place, found = "", "the pose of the motion is not rigid"
-            wrong.append((tensors | batch, numbers, place, found, None))
-    for damaged, state, field, found, expected in wrong:
-        save_file(damaged, path, {"bidnerf": json.dumps(content | {"state": state})})
-        with refused(where=f"{path}{field}", found=found, expected=expected):
-            tracker.restore(path)
-        assert tracker.tracking
+    refuses(without, content["state"], "", "no tensor 'points.pixels'")
 
 
 def test_trackers_in_threads_share_a_localizer() -> None:
     """Each gives what it gives alone."""
-    ways = [flight()[:6], flight()[::-1][:6]]
+    ways = [flight()[:3], flight()[::-1][:3]]
     alone = [tracked(frames) for frames in ways]
     with ThreadPoolExecutor(2) as pool:
         together = list(pool.map(tracked, ways))
@@ -349,7 +342,7 @@ def test_a_wrong_start_is_replaced_by_a_search() -> None:
 
 def test_frames_without_colours_are_tracked_between_photos() -> None:
     """The ground determines the height and the tilts; where the rest is known well enough, a pose is accepted."""
-    frames = [(t, depth_only(f) if n % 3 else f, T) for n, (t, f, T) in enumerate(flight()[:10])]
+    frames = [(t, depth_only(f) if n % 3 else f, T) for n, (t, f, T) in enumerate(flight())]
     answers = tracked(frames, Tracker(localizer()))
     assert_right(answers[slice(0, None, 3)], frames[slice(0, None, 3)])
     assert_honest(answers, frames)
@@ -387,21 +380,6 @@ def test_a_frame_without_colours_and_depth_is_reported() -> None:
     answer = tracker(without_depth(depth_only(flight()[2][1])), flight()[2][0])
     assert answer.outcome is Outcome.TOO_FEW_MATCHES
     assert_right(tracked(flight()[3:5], tracker), flight()[3:5])
-
-
-def test_a_lost_tracker_continues_by_odometry() -> None:
-    """Over ground that the map does not show, the motion between frames is still measured."""
-    tracker = Tracker(localizer())
-    tracked(flight()[:3], tracker)
-    foreign = [tracker(view(flight_pose(n), f"{n}", seed=9).frame, INTERVAL * n) for n in range(3, 9)]
-    for n in range(1, 6):
-        moved = foreign[n - 1].T_world_camera.inverse() @ foreign[n].T_world_camera
-        error = pose_error(moved, flight_pose(n + 2).inverse() @ flight_pose(n + 3))
-        assert "bridged by odometry" in foreign[n].reason
-        assert float(error.translation) < 0.02
-        assert float(error.rotation_deg) < 0.8
-    sizes = [float(a.covariance.diagonal().sum()) for a in foreign if a.covariance is not None]
-    assert sizes == sorted(sizes)
 
 
 def test_flow_of_mere_noise_is_recognised() -> None:
@@ -447,7 +425,7 @@ def test_a_map_that_cannot_be_searched_asks_for_a_start() -> None:
 def test_the_state_does_not_grow(tmp_path: Path) -> None:
     """However long the sequence."""
     tracker, sizes = Tracker(localizer()), []
-    to_and_fro = [flight()[n] for n in (*range(8), *range(6, 0, -1))]
+    to_and_fro = [flight()[n] for n in (0, 1, 2, 3, 2, 1)]
     for lap in range(3):
         for place, (_, frame, _) in enumerate(to_and_fro):
             tracker(frame, INTERVAL * (lap * len(to_and_fro) + place))

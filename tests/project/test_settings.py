@@ -172,7 +172,7 @@ def test_every_number_of_every_method_is_limited(method: str) -> None:
             with refused(found=f"{name} is"):
                 settings_of(method, {name: type(value)(-1)})
             limited += 1
-    assert limited > 5
+    assert limited >= 5
 
 
 def test_a_method_that_is_unknown_is_named() -> None:

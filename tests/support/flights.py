@@ -15,7 +15,7 @@ from bidnerf_core.results import pose_error
 from bidnerf_core.testing import textured_map, view
 from localizations import without_depth as without_depth
 
-FRAMES = 14
+FRAMES = 10
 INTERVAL = 0.1  # seconds
 
 

@@ -29,11 +29,11 @@ from bidnerf_core.localization.posterior import TOLERANCE, Posterior, mass_withi
 from bidnerf_core.localization.problem import SceneMap
 from bidnerf_core.localization.propose import LEAST_AGREEING, consensus
 from bidnerf_core.localization.result import Outcome, Verdict
-from bidnerf_core.localization.settings import LEAST_POINTS, TrackerConfig
+from bidnerf_core.localization.settings import LEAST_POINTS
 from bidnerf_core.localization.terms.rays import ALONE, Rays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
-from bidnerf_core.localization.tracking.points import INLIER, Fit, Grey, Points, cells
+from bidnerf_core.localization.tracking.points import INLIER, POINTS, Fit, Grey, Points, cells
 from bidnerf_core.localization.tracking.state import TrackerState
 from bidnerf_core.mapping import (
     DEPTH,
@@ -108,7 +108,6 @@ class Measurer:
     landmarks: LandmarkMap | None
     features: Features | None  # the detector of the map's keypoints
     sensor: DepthSensorModel
-    config: TrackerConfig
 
     @torch.no_grad()
     def __call__(
@@ -250,8 +249,6 @@ class Measurer:
         shared = (1 - share) * covariance + landmarks.pose_covariance
         motion = predicted.updated(PoseEstimate(here.T[0], share * covariance, shared))
         state = replace(state, moves=bool(here.row), doubt=doubt)
-        if factor != 1:
-            state = replace(state, misread=state.misread + 1, depth_factor=factor)
         words = "" if depth is None else ", fused with depth"
         words = words if factor == 1 else f", without depth: it is {factor:.3g} times that of the landmarks"
         found = self._judged(landmarks, state, replace(fit, states=here), motion, distance)
@@ -273,7 +270,7 @@ class Measurer:
             if abs(scale - 1) > 5.0 * math.hypot(DEPTH_WIDTH * sensor.scale, 0.01):
                 return None, 1 / scale
         view = View(frame, SE3.identity())
-        return Surface.of([view], None, surface, state.frames, self.config.depth_points), 1.0
+        return Surface.of([view], None, surface, state.frames, POINTS), 1.0
 
     def _judged(
         self, landmarks: LandmarkMap, state: TrackerState, fit: Fit, motion: Motion, distance: float
@@ -297,7 +294,7 @@ class Measurer:
         # Prior log odds of 4 if no image was rejected before: one pose in fifty is wrong, far more than tracked sequences show.
         verdict = judge(evidence, 0.0 if state.searchable else 4.0)
         if fit.is_recognised:
-            inliers = inliers.well_spread(fit.camera, self.config.points)
+            inliers = inliers.well_spread(fit.camera, POINTS)
             state = replace(state, sought=len(inliers), age=0)
         elif verdict.accepted and not fit.is_accurate:
             verdict = Verdict(Outcome.AMBIGUOUS, f"{verdict.reason}, hardly better than by chance")
@@ -315,8 +312,7 @@ class Measurer:
         """
         surface, view = self.scene.surface, View(frame, SE3.identity())
         reach, covariance = predicted.reach, predicted.covariance
-        count = self.config.depth_points
-        points = None if surface is None else Surface.of([view], None, surface, state.frames, count)
+        points = None if surface is None else Surface.of([view], None, surface, state.frames, POINTS)
         if points is None and (image is None or not has_field(self.scene.field)):
             return None
         off = math.sqrt(float((covariance.diagonal() * torch.tensor([1.0] * 3 + [reach**2] * 3)).sum() / 3))

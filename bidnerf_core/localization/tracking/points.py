@@ -27,6 +27,8 @@ from bidnerf_core.localization.matching import THRESHOLD, log10_nfa
 from bidnerf_core.localization.propose import from_poselib, pinhole, to_poselib
 from bidnerf_core.mapping import FIRST_CENTRE, Landmarks, Sights, States, measured_depth, point_variance
 
+POINTS = 400
+"""Maximum number of landmarks, corners or measured pixels that are tracked or aligned."""
 FRESH = -1
 """Landmark number of points that are not landmarks."""
 INLIER = 3.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -17,6 +17,8 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields import LARGEST_LENGTH
 from bidnerf_core.frames import Frame
 from bidnerf_core.io import (
+    TensorKind,
+    check_tensors,
     from_plain,
     packed,
     parse_json,
@@ -29,7 +31,25 @@ from bidnerf_core.localization.tracking.motion import Clock, Motion
 from bidnerf_core.localization.tracking.points import Points
 from bidnerf_core.mapping import true_intrinsics
 
-STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 10
+STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 11
+STATE_KINDS = {
+    name: TensorKind(shape, dtype, least, LARGEST_LENGTH)
+    for name, shape, dtype, least in (
+        ("points.pixels", "m 2", torch.float32, -LARGEST_LENGTH),
+        ("points.positions", "m 3", torch.float64, -LARGEST_LENGTH),
+        ("points.deviations", "m 2", torch.float64, 0),
+        ("points.directions", "m 3", torch.float64, -LARGEST_LENGTH),
+        ("points.landmark", "m", torch.int64, -1),
+        ("motion.T_world_camera.rotation", "3 3", torch.float64, -LARGEST_LENGTH),
+        ("motion.T_world_camera.translation", "3", torch.float64, -LARGEST_LENGTH),
+        ("motion.velocity", "6", torch.float64, -LARGEST_LENGTH),
+        ("motion.noise", "12 12", torch.float64, -LARGEST_LENGTH),
+        ("motion.bias", "6 6", torch.float64, -LARGEST_LENGTH),
+        ("camera", "6", torch.float64, -LARGEST_LENGTH),
+        ("doubt", "6 6", torch.float64, -LARGEST_LENGTH),
+    )
+}
+"""The tensors of a state; without a motion, those of the motion are absent."""
 
 
 def _zeros(*shape: int) -> Tensor:
@@ -50,8 +70,6 @@ class TrackerState:
     sought: int = 0  # number of landmarks when they were last recognised
     age: int = 0  # frames since then
     moves: bool = False  # whether the camera moved during the readout of the last image
-    misread: int = 0  # frames whose depth disagreed with the landmarks
-    depth_factor: float = 1.0  # ratio of the measured depth to that of the landmarks in the last of them
     # Corrections of the stated camera (see ``NUISANCES``) that a search has found, for frames whose focal length is as approximate.
     camera: Float[Tensor, "6"] = _zeros(6)
     is_approximate: bool = False
@@ -94,33 +112,16 @@ def load_tracker_state(path: Path, key: str) -> TrackerState:
     if found.get("map") != key:
         raise InputError(f"belongs to map {found.get('map')!r}, the tracker's is {key!r}", where=path)
     state = from_plain(TrackerState, with_tensors(found.get("state"), tensors, str(path)), str(path))
-    for name, value in tensors.items():
-        kind = torch.float32 if name == "points.pixels" else torch.float64
-        # The comparison is false for what is not a number.
-        sound = value.dtype == kind and bool((value.abs() <= LARGEST_LENGTH).all())
-        if value.is_floating_point() and not sound:
-            largest = f"finite numbers up to {LARGEST_LENGTH:g}, {kind}"
-            raise InputError(f"{name} has others, or is {value.dtype}", where=path, expected=largest)
-    points, motion = state.points, state.motion
-    counts = state.frames, state.lost, state.searchable, state.sought, state.age, state.misread
-    faults = {
-        "a number of frames or landmarks is negative": min(counts) < 0,
-        "the interval is not positive": state.clock.interval <= 0,
-        "the points have different numbers of pixels, positions or landmarks": len(
-            {len(getattr(points, part.name)) for part in fields(points)}
-        )
-        > 1,
-        "a deviation of the points is negative": bool((points.deviations < 0).any()),
-    }
+    try:
+        check_tensors(tensors, {name: kind for name, kind in STATE_KINDS.items() if name in tensors})
+    except ValueError as error:
+        raise InputError(str(error), where=path, expected=expected) from error
+    motion, counts = state.motion, (state.frames, state.lost, state.searchable, state.sought, state.age)
+    is_sound = min(counts) >= 0 and state.clock.interval > 0
     if motion is not None:
-        T = motion.T_world_camera
-        is_one = T.rotation.dim() + T.translation.dim() == 3
         variances = torch.cat([motion.noise.diagonal(), motion.bias.diagonal()])
-        faults |= {
-            "the pose of the motion is not rigid": not (is_one and bool(T.is_rigid())),
-            "a variance of the motion is negative": bool((variances < 0).any()),
-            "the reach is not positive": not 0 < motion.reach <= LARGEST_LENGTH,
-        }
-    for what in (what for what, is_so in faults.items() if is_so):
-        raise InputError(what, where=path, expected=expected)
+        is_sound &= bool((variances >= 0).all() & motion.T_world_camera.is_rigid())
+        is_sound &= 0 < motion.reach <= LARGEST_LENGTH
+    if not is_sound:
+        raise InputError("the numbers are impossible", where=path, expected=expected)
     return state

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 import time as clocks
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from bidnerf_core.errors import InputError, InputWarning, amount
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.auto import localize_by_landmarks, within_risk
@@ -22,7 +21,7 @@ from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.settings import TrackerConfig
 from bidnerf_core.localization.tracking.measuring import Measurement, Measurer, search_radius, shows_shape
 from bidnerf_core.localization.tracking.motion import Clock, Motion, PoseEstimate
-from bidnerf_core.localization.tracking.points import Grey, Points
+from bidnerf_core.localization.tracking.points import POINTS, Grey, Points
 from bidnerf_core.localization.tracking.state import (
     TrackerState,
     correction_of,
@@ -33,8 +32,6 @@ from bidnerf_core.mapping import grey_image, strongest
 
 METHOD = "track"
 """Method name of a tracker's poses."""
-MISREAD = 5
-"""Number of frames with implausible depth of which the user is warned."""
 
 
 class Tracker:
@@ -55,19 +52,19 @@ class Tracker:
                 f"got a {type(localizer).__name__}", where="Tracker",
                 expected="a Localizer; Localizer(map) makes one" if isinstance(localizer, SceneMap) else "a Localizer",
             )  # fmt: skip
-        self.localizer, self.config = localizer, TrackerConfig() if config is None else config
+        self.localizer, config = localizer, TrackerConfig() if config is None else config
         self._scene = localizer.scene
         if not self._scene.has_distances:
             found = f"tracking needs positions, but {NO_DISTANCES};"
             raise InputError(found, expected="a map of photos from several places")
-        self._state = TrackerState(Clock(None, self.config.frame_seconds))
+        self._state = TrackerState(Clock(None, config.frame_seconds))
         self._origin = origin_of(self._scene)
         self._start = None if start is None else start_pose(start).translated(-self._origin)
         matcher = localizer.matcher if localizer.matches_landmarks else None
         self._landmarks = None if matcher is None else matcher.landmarks
         # The 600 strongest keypoints of an image are matched with landmarks.
         features = None if matcher is None else strongest(matcher.features, 600)
-        self._measure = Measurer(self._scene, self._landmarks, features, localizer.depth_sensor, self.config)
+        self._measure = Measurer(self._scene, self._landmarks, features, localizer.depth_sensor)
         surface, bounds = self._scene.surface, self._scene.bounds
         corners = torch.tensor([bounds.lower, bounds.upper])
         self._extent = float((corners[1] - corners[0]).norm()) if surface is None else surface.extent
@@ -88,7 +85,7 @@ class Tracker:
         ``time`` (seconds, from any origin) is its time stamp; without one, the last interval is assumed. If the pose is
         rejected, the answer has an ``outcome`` other than ``CONVERGED``, and its pose is the best estimate with a corresponding
         covariance. Raises ``InputError`` for a non-finite time, and if the map does not allow the first frame to be found
-        without a start. Warns with ``InputWarning`` if the depth of several frames disagrees with the map by a factor.
+        without a start.
         """
         began = clocks.perf_counter()
         clock, seconds = self._state.clock.step(time)
@@ -98,11 +95,6 @@ class Tracker:
         answer, state = self._step(frame, image, state, seconds)
         # Points are tracked from the last image, even across frames without one.
         state = state if image is None else replace(state, image=torch.from_numpy(image))
-        if state.misread == MISREAD > self._state.misread:
-            warnings.warn(
-                f"depth of {MISREAD} frames disagrees with the map by a factor of {state.depth_factor:.3g}, and is left out; check its unit",
-                InputWarning, stacklevel=2,
-            )  # fmt: skip
         self._state = state
         stated, taken = frame.intrinsics, state.corrected(frame).intrinsics
         return replace(
@@ -228,11 +220,11 @@ class Tracker:
 
     def _corners(self, frame: Frame, image: Grey | None, points: Points, T_world_camera: SE3) -> Points:
         """Return the corners among ``points``, or new corners at the pose of this frame if few are left."""
-        points, count = points.fresh, self.config.points
+        points = points.fresh
         # New corners are detected once fewer than half of them are left.
-        if image is None or not frame.has_depth or len(points) >= 0.5 * count:
+        if image is None or not frame.has_depth or len(points) >= 0.5 * POINTS:
             return points
-        return Points.measured(frame, image, T_world_camera, count, self.localizer.depth_sensor.noise)
+        return Points.measured(frame, image, T_world_camera, POINTS, self.localizer.depth_sensor.noise)
 
     def _relocalized(
         self, frame: Frame, image: Grey | None, state: TrackerState, predicted: Motion | None
