@@ -17,7 +17,7 @@ from torch import Tensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, chi_squared_quantile
-from bidnerf_core.localization import HEAVY_TAILS, Answer, LandmarkMatcher, Loop
+from bidnerf_core.localization import HEAVY_TAILS, LandmarkAnswer, LandmarkMatcher, Loop
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
     HeldOutTrial,
@@ -77,13 +77,13 @@ def _answers(
     held_out: Sequence[int],
     config: LandmarkConfig,
     landmarks: LandmarkMap,
-) -> tuple[list[Answer], Float[Tensor, "n 6"]]:
+) -> tuple[list[LandmarkAnswer], Float[Tensor, "n 6"]]:
     """Localize the held-out images with the landmarks of the others.
 
     Returns the accepted answers, and the right updates from the given poses to the answers. In a map of many images,
     ``landmarks`` that are not visible in the held-out images are not rebuilt.
     """
-    answers, updates = list[Answer](), [torch.zeros((0, 6), dtype=torch.float64)]
+    answers, updates = list[LandmarkAnswer](), [torch.zeros((0, 6), dtype=torch.float64)]
     if not held_out:
         return answers, updates[0]
     try:
@@ -113,7 +113,10 @@ def _answers(
 
 
 def _correlation(
-    answers: Sequence[Answer], updates: Float[Tensor, "n 6"], matches: Sequence[int], landmarks: LandmarkMap
+    answers: Sequence[LandmarkAnswer],
+    updates: Float[Tensor, "n 6"],
+    matches: Sequence[int],
+    landmarks: LandmarkMap,
 ) -> float:
     """Return the ``correlation`` at which the errors match the covariances predicted by the fits."""
     covariances = torch.stack([answer.covariance / HEAVY_TAILS for answer in answers])
@@ -144,7 +147,9 @@ def _factors(matches: Sequence[int], landmarks: LandmarkMap) -> Float[Tensor, "n
     return torch.tensor([landmarks.correlation_of(count) for count in matches], dtype=torch.float64)
 
 
-def _calibration_scatter(answers: Sequence[Answer], factors: Float[Tensor, "n"]) -> Float[Tensor, "4"]:
+def _calibration_scatter(
+    answers: Sequence[LandmarkAnswer], factors: Float[Tensor, "n"]
+) -> Float[Tensor, "4"]:
     """Return the standard deviations of the corrections estimated for intrinsics that are in fact correct.
 
     The part explained by the uncertainty of each fit is subtracted.

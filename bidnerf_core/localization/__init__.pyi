@@ -24,7 +24,7 @@ from .localizer import picture_at as picture_at
 from .localizer import start_pose as start_pose
 from .loop import HEAVY_TAILS as HEAVY_TAILS
 from .loop import MIRROR as MIRROR
-from .loop import Answer as Answer
+from .loop import LandmarkAnswer as LandmarkAnswer
 from .loop import Loop as Loop
 from .matching import LandmarkMatcher as LandmarkMatcher
 from .methods import METHODS as METHODS
@@ -69,7 +69,7 @@ from .settings import TrackerConfig as TrackerConfig
 from .settings import objective_of as objective_of
 from .terms.images import Images as Images
 from .terms.images import surface_renderer as surface_renderer
-from .terms.rays import Rays as Rays
+from .terms.rays import RenderedRays as RenderedRays
 from .terms.sampled import SampledLoss as SampledLoss
 from .terms.surface import Surface as Surface
 from .tracking.tracker import Tracker as Tracker

@@ -19,7 +19,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Evidence, least_confidence
 from bidnerf_core.localization.by_surface import localize_by_depth, localize_by_images, nearest_piece
 from bidnerf_core.localization.explanations import CAMERAS, MOVING
-from bidnerf_core.localization.loop import Answer, Loop
+from bidnerf_core.localization.loop import LandmarkAnswer, Loop
 from bidnerf_core.localization.methods import BidConfig, Method, SharedSettings, bid
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict, current_record
@@ -111,7 +111,7 @@ def _uncertain_camera(found: Localization, problem: Problem) -> Localization:
     return found.rejected(Verdict(Outcome.IMPRECISE, why))
 
 
-def localization_of(problem: Problem, answer: Answer, began: float) -> Localization:
+def localization_of(problem: Problem, answer: LandmarkAnswer, began: float) -> Localization:
     """Convert an answer of the landmark loop to a ``Localization``."""
     T, noise = answer.T_world_rig, float(answer.posterior.states.noise[answer.posterior.best])
     stated, camera = problem.views[-1].frame.intrinsics, answer.camera

@@ -14,7 +14,7 @@ from bidnerf_core.geometry import SE3, Robust
 from bidnerf_core.localization.accept import Support, support
 from bidnerf_core.localization.problem import Problem, rendered_middle
 from bidnerf_core.localization.result import Localization
-from bidnerf_core.localization.search import Proposals, Stage, states_at
+from bidnerf_core.localization.search import SearchResult, Stage, states_at
 from bidnerf_core.localization.settings import (
     ColourSettings,
     DepthLossSettings,
@@ -22,7 +22,7 @@ from bidnerf_core.localization.settings import (
     mean_side,
     rendered_depth_scale,
 )
-from bidnerf_core.localization.terms.rays import ALONE, Rays
+from bidnerf_core.localization.terms.rays import ALONE, RenderedRays
 from bidnerf_core.mapping import States, damped_solution
 
 SHAPE_SIGMA = 0.012
@@ -42,7 +42,7 @@ class RayTerms:
     def term(
         self, problem: Problem, count: int, seed: int, level: int | None = None, blur: int = 1,
         wide: float = 1.0, sigma: float = 0.0,
-    ) -> Rays:  # fmt: skip
+    ) -> RenderedRays:  # fmt: skip
         """Draw ``count`` rays and return their residual term at a level of the field (0 is the coarsest, None the field itself).
 
         Observed colours are averaged over squares of ``blur`` pixels. ``wide`` multiplies the scales of the losses, and ``sigma``
@@ -52,7 +52,7 @@ class RayTerms:
         if depth is not None and (depth.depth_weight == 0 or not problem.has_depth):
             depth = None
         own = None if depth is None else problem.depth_rays
-        drawn = Rays.of(problem.views, problem.level(level), bounds, max(7, count), seed, blur, own)
+        drawn = RenderedRays.of(problem.views, problem.level(level), bounds, max(7, count), seed, blur, own)
         loss = Robust(self.colour.colour_loss, wide * self.colour.colour_scale)
         found = replace(drawn, loss=loss, exposure=self.exposure, sigma=sigma * mean_side(bounds))
         if depth is None:
@@ -84,7 +84,7 @@ def centred(problem: Problem, T: SE3, middle: Float[Tensor, "3"]) -> SE3:
 
 
 def localization_by_rays(
-    problem: Problem, found: Proposals, fresh: Rays, middle: Float[Tensor, "3"], least_inliers: float,
+    problem: Problem, found: SearchResult, fresh: RenderedRays, middle: Float[Tensor, "3"], least_inliers: float,
     method: str, began: float,
 ) -> Localization:  # fmt: skip
     """Accept or reject the best pose of a search, using rays to which the pose was not fitted.

@@ -30,7 +30,7 @@ from bidnerf_core.localization.by_rays import (
 )
 from bidnerf_core.localization.problem import Pivot, Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.search import Proposals, Stage, halve, image_stages, states_at
+from bidnerf_core.localization.search import SearchResult, Stage, halve, image_stages, states_at
 from bidnerf_core.localization.settings import LEAST_POINTS, AutoConfig, ColourSettings, DepthLossSettings
 from bidnerf_core.localization.terms.images import ColourScales, Thumbnail, surface_renderer
 from bidnerf_core.localization.terms.surface import Surface
@@ -68,7 +68,7 @@ def localize_by_depth(
     if points is None:
         return None
     middle = points.points.median(0).values.cpu()
-    found: Proposals
+    found: SearchResult
     for number in range(config.rounds):
         again = by_depth(problem, points, config.hypotheses, seed + number)
         found = again if number == 0 or again.scores[0] < found.scores[0] else found
@@ -136,7 +136,7 @@ def localize_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig
     return min(answers, key=lambda answer: answer.loss)
 
 
-def by_depth(problem: Problem, points: Surface, count: int, seed: int) -> Proposals:
+def by_depth(problem: Problem, points: Surface, count: int, seed: int) -> SearchResult:
     """Align measured points with the surface from ``count`` hypotheses throughout the scene; return the poses, best first.
 
     Scores are mean costs per point, from 0 to 2.
@@ -155,7 +155,7 @@ def by_depth(problem: Problem, points: Surface, count: int, seed: int) -> Propos
 
 def by_images(
     problem: Problem, surface: SurfaceMap, count: int, seed: int, detailed: bool = False, later: Iterable[Stage] = ()
-) -> tuple[Proposals, Float[Tensor, "3"]]:  # fmt: skip
+) -> tuple[SearchResult, Float[Tensor, "3"]]:  # fmt: skip
     """Compare the images with renderings of the surface from ``count`` hypotheses throughout the scene, then run ``later`` stages.
 
     Returns the best poses and the middle of the visible scene (metres, last camera's frame). Rays cast from the keyframes

@@ -1,6 +1,6 @@
 """Hypotheses about a query's camera and the camera's motion, each with a prior probability.
 
-An explanation is a Gaussian prior on the nuisances of ``states``; a seed is a pose from which all explanations are refined. Other places,
+An explanation is a Gaussian prior on the nuisances of ``states``; a proposal is a pose from which all explanations are refined. Other places,
 and other images such as the mirror image, are modes of the ``loop``, each with all explanations.
 """
 
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics, cameras_at_size
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.matching import Query
+from bidnerf_core.localization.matching import QueryKeypoints
 from bidnerf_core.mapping import LandmarkMap, N, States
 
 # fmt: off
@@ -73,7 +73,7 @@ MOVE, TURN = 0.005, 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Seed:
+class Proposal:
     """A pose from which refinement starts, and the camera with which the pose was found."""
 
     name: str
@@ -105,7 +105,7 @@ class Explanations:
         """The index of the static explanation that leaves the camera the most freedom."""
         return int((self.deviation[:, :6].sum(-1) - self.deviation[:, 6:12].sum(-1)).argmax())
 
-    def first(self, seed: Seed, mode: int, noise: float) -> States:
+    def first(self, proposal: Proposal, mode: int, noise: float) -> States:
         """Return the initial states of the search: one for each kind of camera, and one with the stated camera in motion.
 
         If the focal length or the principal point changes, the camera is moved along its axis and turned to see about the same view.
@@ -122,13 +122,13 @@ class Explanations:
         k, mean, deviation = len(row), self.mean[row], self.deviation[row]
         z = torch.zeros((k, N), dtype=torch.float64)
         # A deviation of 0 holds a nuisance at its mean.
-        off = (seed.camera - mean[:, :6]) / deviation[:, :6].clamp(min=1e-12)
+        off = (proposal.camera - mean[:, :6]) / deviation[:, :6].clamp(min=1e-12)
         z[:, :6] = torch.where(off.abs() <= 3, off, 0)
-        change = (mean + deviation * z)[:, :6] - seed.camera
+        change = (mean + deviation * z)[:, :6] - proposal.camera
         none = torch.zeros(k, dtype=torch.float64)
-        along = seed.distance * (1 - change[:, 0].exp())
+        along = proposal.distance * (1 - change[:, 0].exp())
         update = torch.stack([none, none, along, -change[:, 2], change[:, 1], none], -1)
-        T = SE3(seed.T.rotation.expand(k, 3, 3), seed.T.translation.expand(k, 3)).retract(update)
+        T = SE3(proposal.T.rotation.expand(k, 3, 3), proposal.T.translation.expand(k, 3)).retract(update)
         return States(
             T, z, mean, deviation, self.log_prior[row], none + noise, torch.full_like(row, mode), row
         )
@@ -144,7 +144,7 @@ class Explanations:
 
 
 def explanations(
-    query: Query, landmarks: LandmarkMap, distance: float, depth_scale: float, moving: bool = True
+    query: QueryKeypoints, landmarks: LandmarkMap, distance: float, depth_scale: float, moving: bool = True
 ) -> Explanations:
     """Return all explanations of the images.
 
@@ -192,7 +192,7 @@ def explanations(
     return Explanations(names, mean, deviation, prior.log(), torch.tensor(right))
 
 
-def cameras_of_map(query: Query, landmarks: LandmarkMap) -> list[Float[Tensor, "6"]]:
+def cameras_of_map(query: QueryKeypoints, landmarks: LandmarkMap) -> list[Float[Tensor, "6"]]:
     """Return the corrections that turn the stated camera into cameras of the map's images; empty for images from several cameras.
 
     Among the map's cameras with images of one shape, a camera that agrees with the stated intrinsics is chosen or, if none does, the

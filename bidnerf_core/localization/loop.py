@@ -2,7 +2,7 @@
 
 ``docs/methods.md#code`` says which module does which step. A further measurement becomes a term in ``Loop._fused``; it decides between
 places only through the log odds in ``Loop._posterior``. Anything else that the image may be, such as a mirror image of the scene,
-becomes a rival in ``Loop._rivals``.
+becomes a mode in ``Loop._other_modes``.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from bidnerf_core.fields import has_field
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import LANDMARK_BOUNDS, Evidence, judge
-from bidnerf_core.localization.explanations import MOVING, USUAL, Explanations, Seed, explanations
+from bidnerf_core.localization.explanations import MOVING, USUAL, Explanations, Proposal, explanations
 from bidnerf_core.localization.matching import (
     STRONGEST,
     LandmarkMatcher,
     Matches,
     Nearest,
     Projected,
-    Query,
+    QueryKeypoints,
     log10_nfa,
 )
 from bidnerf_core.localization.posterior import (
@@ -46,15 +46,15 @@ from bidnerf_core.localization.posterior import (
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.propose import CONVINCING, LEAST_AGREEING, best_consensus, consensus, inliers
 from bidnerf_core.localization.result import Outcome, Verdict, current_record
-from bidnerf_core.localization.terms.rays import Rays
+from bidnerf_core.localization.terms.rays import RenderedRays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.mapping import (
+    CostTerm,
     Features,
     LandmarkMap,
     Landmarks,
     Sights,
     States,
-    Term,
     point_variance,
     project,
 )
@@ -76,13 +76,13 @@ class Mode:
     """A place or a mirror image that may explain the query, with the matches that agree with this hypothesis."""
 
     name: str
-    query: Query
+    query: QueryKeypoints
     matches: Matches
     by_descriptors: Matches  # alone
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class LandmarkAnswer:
     """A landmark-based pose with everything that was fused into it, the explanations of the images, and the verdict."""
 
     modes: Sequence[Mode]
@@ -134,7 +134,7 @@ class Loop:
         """
         self.matcher, self.problem, self.seed, self.moving = matcher, problem, seed, moving
         self.landmarks: LandmarkMap = matcher.landmarks
-        self.query = Query.of(views, features or matcher.features)
+        self.query = QueryKeypoints.of(views, features or matcher.features)
         noise = None if problem is None else problem.colour_noise
         # The rays of a field with more colour noise on its training images add nothing to the landmarks.
         shows = problem is not None and has_field(problem.field) and (noise is None or noise <= 0.04)
@@ -144,11 +144,11 @@ class Loop:
         self._nearest: dict[int, Nearest] = {}
 
     @torch.no_grad()
-    def __call__(self) -> Answer | None:
+    def __call__(self) -> LandmarkAnswer | None:
         """Return the best answer; None if no pose agrees with any landmarks."""
-        answer: Answer | None = None
-        for seed, nearest, nfa in self._proposals():
-            found = self.answer(seed, nearest, nfa)
+        answer: LandmarkAnswer | None = None
+        for proposal, nearest, nfa in self._proposals():
+            found = self.answer(proposal, nearest, nfa)
             if found is not None and found.verdict.accepted:
                 return found
             if found is not None and (answer is None or found.evidence.log10_nfa < answer.evidence.log10_nfa):
@@ -156,17 +156,19 @@ class Loop:
         return answer
 
     @torch.no_grad()
-    def at(self, T_world_rig: SE3) -> Answer | None:
+    def at(self, T_world_rig: SE3) -> LandmarkAnswer | None:
         """Return the answer at a pose found by other means; None if no landmarks match there."""
         distance = self._distance(T_world_rig)
-        seed = Seed("elsewhere", T_world_rig, torch.zeros(6, dtype=torch.float64), distance)
-        return self.answer(seed, self.nearest(STRONGEST), 0.0, searched=False)
+        proposal = Proposal("elsewhere", T_world_rig, torch.zeros(6, dtype=torch.float64), distance)
+        return self.answer(proposal, self.nearest(STRONGEST), 0.0, searched=False)
 
-    def answer(self, seed: Seed, nearest: Nearest, nfa: float, searched: bool = True) -> Answer | None:
-        """Refine a seed under all explanations of the images, fuse all measurements, and judge the result."""
+    def answer(
+        self, proposal: Proposal, nearest: Nearest, nfa: float, searched: bool = True
+    ) -> LandmarkAnswer | None:
+        """Refine a proposal under all explanations of the images, fuse all measurements, and judge the result."""
         scale = 0.0 if self.problem is None else DEPTH_WIDTH * self.problem.sensor.scale
-        given = explanations(self.query, self.landmarks, seed.distance, scale, self.moving)
-        modes, states = self._modes(nearest, seed, given, nfa, searched)
+        given = explanations(self.query, self.landmarks, proposal.distance, scale, self.moving)
+        modes, states = self._modes(nearest, proposal, given, nfa, searched)
         if not modes:
             return None
         term = self._term(modes, states)
@@ -180,7 +182,7 @@ class Loop:
             self._nearest[count] = Nearest.of(self.query, self.matcher, count)
         return self._nearest[count]
 
-    def _proposals(self) -> Iterator[tuple[Seed, Nearest, float]]:
+    def _proposals(self) -> Iterator[tuple[Proposal, Nearest, float]]:
         """Yield poses to refine, cheapest first: by sample consensus on the strongest keypoints, then on all keypoints; then the start."""
         most = max(len(image.keypoints) for image in self.query.images)
         nearest, record = self.nearest(STRONGEST), current_record()
@@ -195,7 +197,7 @@ class Loop:
             if found[1] < CONVINCING:
                 break
         if self.problem is not None and (T := self.problem.start) is not None:
-            yield Seed("start", T, torch.zeros(6, dtype=torch.float64), self._distance(T)), nearest, 0.0
+            yield Proposal("start", T, torch.zeros(6, dtype=torch.float64), self._distance(T)), nearest, 0.0
 
     def _distance(self, T_world_rig: SE3) -> float:
         """Return the median distance of the landmarks in front of the camera, or of all landmarks if none is in front."""
@@ -230,16 +232,16 @@ class Loop:
         )  # fmt: skip
 
     def _modes(
-        self, nearest: Nearest, seed: Seed, given: Explanations, nfa: float, searched: bool
+        self, nearest: Nearest, proposal: Proposal, given: Explanations, nfa: float, searched: bool
     ) -> tuple[list[Mode], States]:
         """Return the modes and the most probable state of each mode, refined on matches by projection."""
-        first = self._mode(seed.name, self.query, nearest.best, seed, given, searched)
+        first = self._mode(proposal.name, self.query, nearest.best, proposal, given, searched)
         if first is None:
-            return [], States.known(seed.T, seed.camera)
+            return [], States.known(proposal.T, proposal.camera)
         if searched:
-            first = first[0], self._warped(first[0], seed, given, first[1])
-        rivals = (self._mode(*rival, given, True) for rival in self._rivals(nearest, nfa, first[1]))
-        both = [first, *(rival for rival in rivals if rival is not None)]
+            first = first[0], self._warped(first[0], proposal, given, first[1])
+        others = (self._mode(*other, given, True) for other in self._other_modes(nearest, nfa, first[1]))
+        both = [first, *(other for other in others if other is not None)]
         modes, best = [mode for mode, _ in both], [state for _, state in both]
         seen: list[Projected | None] = [None] * len(modes)
         for radius in RADII:
@@ -252,7 +254,7 @@ class Loop:
                 if radius == RADII[0]:
                     points = self.landmarks.positions[mode.matches.landmark].double()
                     distance = float(best[g].T.inverse().apply(points).norm(dim=-1).median())
-                    again = Seed(mode.name, best[g].T[0], best[g].nuisances[0, :6], distance)
+                    again = Proposal(mode.name, best[g].T[0], best[g].nuisances[0, :6], distance)
                     best[g] = self._compared(mode, again, given, float(best[g].noise))
                 term = self._term([mode], best[g])
                 best[g] = run_on(self.device, refine, best[g], term)
@@ -260,14 +262,20 @@ class Loop:
         return modes, States.cat(numbered)
 
     def _mode(
-        self, name: str, query: Query, found: Matches, seed: Seed, given: Explanations, searched: bool
+        self,
+        name: str,
+        query: QueryKeypoints,
+        found: Matches,
+        proposal: Proposal,
+        given: Explanations,
+        searched: bool,
     ) -> tuple[Mode, States] | None:
-        """Return the mode at a seed and its most probable state; None if too few matches agree.
+        """Return the mode at a proposal and its most probable state; None if too few matches agree.
 
-        If the seed was ``searched`` for among the matches ``found``, those that agree with it are kept; otherwise, landmarks are
+        If the proposal was ``searched`` for among the matches ``found``, those that agree with it are kept; otherwise, landmarks are
         matched by projection.
         """
-        known, within = States.known(seed.T, seed.camera), RADII[0] * query.threshold
+        known, within = States.known(proposal.T, proposal.camera), RADII[0] * query.threshold
         if searched:
             near = found[inliers(query, self.landmarks, found, known, RADII[0])]
         else:
@@ -275,19 +283,19 @@ class Loop:
         if len(near) < LEAST_AGREEING:
             return None
         mode = Mode(name, query, near, found)
-        return mode, self._compared(mode, seed, given, query.threshold / 2)
+        return mode, self._compared(mode, proposal, given, query.threshold / 2)
 
-    def _compared(self, mode: Mode, seed: Seed, given: Explanations, noise: float) -> States:
+    def _compared(self, mode: Mode, proposal: Proposal, given: Explanations, noise: float) -> States:
         """Return the most probable state of a mode among the kinds of cameras, each with its own noise, using a subset of the matches."""
         count = len(mode.matches)
         # At most a hundred matches are compared, evenly spread.
         some = torch.linspace(0, count - 1, min(count, 100)).long()
-        states = given.first(seed, 0, noise)
+        states = given.first(proposal, 0, noise)
         term = self._term([replace(mode, matches=mode.matches[some])], states[:1])
         term = replace(term, share=term.share * (count / len(some)))
         return run_on(self.device, most_probable, states, term)
 
-    def _warped(self, mode: Mode, seed: Seed, given: Explanations, best: States) -> States:
+    def _warped(self, mode: Mode, proposal: Proposal, given: Explanations, best: States) -> States:
         """Return the fit of a camera that explains any warp of the image if many more matches agree with that fit, else ``best``.
 
         In a sheared image, or a photo of a picture, consensus finds only the matches that happen to agree with a usual camera. From
@@ -297,23 +305,23 @@ class Loop:
         agreeing = int(inliers(query, self.landmarks, found, best).sum())
         if agreeing >= 0.7 * len(found):
             return best
-        states = given.first(seed, 0, query.threshold / 2)
+        states = given.first(proposal, 0, query.threshold / 2)
         state = states[(states.row == given.widest).nonzero()[:, 0]]
         term = self._term([replace(mode, matches=found)], best)
         state = run_on(self.device, graduate, state, term)
         more = int(inliers(query, self.landmarks, found, state).sum())
         return state if more > 1.3 * agreeing else best
 
-    def _rivals(
+    def _other_modes(
         self, nearest: Nearest, nfa: float, best: States
-    ) -> Iterator[tuple[str, Query, Matches, Seed]]:
+    ) -> Iterator[tuple[str, QueryKeypoints, Matches, Proposal]]:
         """Yield the hypotheses that compete with the place of the state ``best``.
 
         A scene may be repetitive, such as two rooms with the same furniture: keypoints that agree with the state may agree as well
         with similar landmarks elsewhere. The image may also be mirrored.
         """
         query = self.query
-        rivals: list[tuple[str, Query, Matches]] = []
+        modes: list[tuple[str, QueryKeypoints, Matches]] = []
         q, k = nearest.landmark.shape
         own = nearest.keypoint.repeat_interleave(k)
         points = self.landmarks.positions[nearest.landmark.flatten()].double()[None]
@@ -326,21 +334,21 @@ class Loop:
         others = others[agreeing[others.keypoint]]
         # Another place has at least three tenths as many inliers as the first.
         if len(others.keypoint.unique()) >= max(LEAST_AGREEING, 0.3 * int(agreeing.sum())):
-            rivals.append(("another place", query, others))
+            modes.append(("another place", query, others))
         # A pose with fewer false alarms than 1e-150 is unmistakable, so that no mirror image is tried.
         if nfa > -150.0 and self.landmarks.features == "sift" and len(query.images) == 1:
             mirrored = query.mirrored
-            rivals.append((MIRROR, mirrored, Nearest.of(mirrored, self.matcher, STRONGEST).best))
-        for name, there, found in rivals:
+            modes.append((MIRROR, mirrored, Nearest.of(mirrored, self.matcher, STRONGEST).best))
+        for name, there, found in modes:
             other = consensus(there, self.landmarks, found, best.nuisances[0, :6], name)
             if other is not None:
                 yield name, there, found, other[0]
 
     def _fused(
         self, modes: list[Mode], best: States, landmarks: Landmarks, given: Explanations, searched: bool
-    ) -> Answer:
+    ) -> LandmarkAnswer:
         """Fuse all measurements under all explanations, and judge the result."""
-        problem, terms = self.problem, list[Term]([landmarks])
+        problem, terms = self.problem, list[CostTerm]([landmarks])
         # Up to three fits, until the explanation that a mode is linearized about is its most probable one.
         for _ in range(3):
             row = best.row
@@ -374,7 +382,9 @@ class Loop:
         by_chance = searched and self._log10_nfa(modes[0], found.chosen) > LANDMARK_BOUNDS[0].limit
         if problem is not None and self.rays and found.mode == 0 and blurred and not by_chance:
             where = "cpu" if problem.device == self.device else None
-            rays = Rays.of(problem.views, problem.field, problem.bounds, self.rays, self.seed, device=where)
+            rays = RenderedRays.of(
+                problem.views, problem.field, problem.bounds, self.rays, self.seed, device=where
+            )
             fused.append("rendering")
             best = States.cat([found.chosen, best[1:]])
             minima, by_rays = run_on(self.device, fit_with_rays, best, terms, rays, given)
@@ -416,7 +426,7 @@ class Loop:
     def _judged(
         self, found: Posterior, mass: float, modes: list[Mode], term: Landmarks, given: Explanations, searched: bool,
         others: dict[str, float | None],
-    ) -> Answer:  # fmt: skip
+    ) -> LandmarkAnswer:  # fmt: skip
         """Judge the most probable pose; ``others`` is the evidence from measurements other than landmarks."""
         mode, state = modes[found.mode], found.chosen
         query = mode.query
@@ -451,4 +461,6 @@ class Loop:
         contradicted = seen.visible >= 200 and count < 1.5 * chance + LEAST_AGREEING
         if (record := current_record()) is not None:
             record.add(f"refined on {count} landmarks", found.pose())
-        return Answer(modes, found, given, term, covariance, distance, evidence, verdict, contradicted)
+        return LandmarkAnswer(
+            modes, found, given, term, covariance, distance, evidence, verdict, contradicted
+        )

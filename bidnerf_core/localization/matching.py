@@ -46,7 +46,7 @@ THRESHOLD = 0.005
 
 
 @dataclass(frozen=True, eq=False)
-class Query:
+class QueryKeypoints:
     """The keypoints of all images, view by view, the strongest of each view first."""
 
     images: tuple[ImageKeypoints, ...]
@@ -57,13 +57,13 @@ class Query:
     approximate: bool  # whether the focal length was only assumed or read from EXIF
 
     @staticmethod
-    def of(views: Sequence[View], features: Features) -> Query:
+    def of(views: Sequence[View], features: Features) -> QueryKeypoints:
         """Detect the keypoints of ``views``, whose ``T_ref_camera`` are relative to the last view."""
         images = tuple(image_keypoints(view, features) for view in views)  # host
-        return Query.seen(images, any(view.frame.focal_is_approximate for view in views))
+        return QueryKeypoints.seen(images, any(view.frame.focal_is_approximate for view in views))
 
     @staticmethod
-    def seen(images: tuple[ImageKeypoints, ...], approximate: bool) -> Query:
+    def seen(images: tuple[ImageKeypoints, ...], approximate: bool) -> QueryKeypoints:
         counts = [len(image.keypoints) for image in images]
         view = torch.arange(len(images)).repeat_interleave(torch.tensor(counts))
         T = SE3.stack([image.T_ref_camera.inverse() for image in images])[view]
@@ -75,10 +75,10 @@ class Query:
         last = images[-1].T_ref_camera.matrix()
         single = len(images) == 1 and torch.allclose(last, torch.eye(4, dtype=last.dtype), rtol=0, atol=1e-9)
         sights = Sights(rays, times, T.rotation, T.translation, single)
-        return Query(images, Keypoints(*joined), view, sights, focal, approximate)
+        return QueryKeypoints(images, Keypoints(*joined), view, sights, focal, approximate)
 
     @cached_property
-    def mirrored(self) -> Query:
+    def mirrored(self) -> QueryKeypoints:
         """The keypoints of the mirror image (left and right swapped): SIFT's descriptors are permuted, not computed anew."""
         image = self.images[-1]
         k, c = image.keypoints, image.intrinsics
@@ -93,7 +93,7 @@ class Query:
             hidden=None if image.hidden is None else image.hidden.flip(1),
             T_ref_camera=SE3.identity(),
         )
-        return Query.seen((swapped,), self.approximate)
+        return QueryKeypoints.seen((swapped,), self.approximate)
 
     @property
     def camera(self) -> Intrinsics:
@@ -127,6 +127,8 @@ def mirrored_sift() -> Int[Tensor, "128"]:
     return (((3 - row) * 4 + column) * 8 + (-angle) % 8).flatten()
 
 
+SAMPLE = 3
+"""Number of matches from which the solver of sample consensus (P3P) determines a pose."""
 STRONGEST = 700
 """Number of an image's keypoints that are matched by descriptors alone at first."""
 AMBIGUITY = 0.9
@@ -309,7 +311,7 @@ class Nearest:
     ]  # ratio of the distances of the best landmark and the best one at another place
 
     @staticmethod
-    def of(query: Query, matcher: LandmarkMatcher, strongest: int) -> Nearest:
+    def of(query: QueryKeypoints, matcher: LandmarkMatcher, strongest: int) -> Nearest:
         landmarks = matcher.landmarks
         first = torch.searchsorted(query.view, query.view)
         strongest = strongest if len(landmarks) else 0
@@ -347,7 +349,7 @@ class Projected:
 
     def __init__(
         self,
-        query: Query,
+        query: QueryKeypoints,
         landmarks: LandmarkMap,
         state: States,
         margin: float,
@@ -425,19 +427,19 @@ class Projected:
         return Matches(keypoint[once], landmark[once])
 
 
-def log10_nfa(matches: int, agreeing: int, probability: float, sample: int = 3) -> float:
+def log10_nfa(matches: int, agreeing: int, probability: float) -> float:
     """Return log10 of the number of false alarms (Moisan and Stival 2004, eq. 10).
 
     This is the expected number of poses with ``agreeing`` inliers if all ``matches`` are wrong and each is an inlier with
-    ``probability``; ``sample`` matches determine a pose.
+    ``probability``; ``SAMPLE`` matches determine a pose.
     """
-    if agreeing <= sample:
+    if agreeing <= SAMPLE:
         return 0.0
 
     def log_binomial(n: int, k: int) -> float:
         return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
 
     log = (
-        math.log(max(1, matches - sample)) + log_binomial(matches, agreeing) + log_binomial(agreeing, sample)
+        math.log(max(1, matches - SAMPLE)) + log_binomial(matches, agreeing) + log_binomial(agreeing, SAMPLE)
     )
-    return (log + (agreeing - sample) * math.log(probability)) / math.log(10)
+    return (log + (agreeing - SAMPLE) * math.log(probability)) / math.log(10)

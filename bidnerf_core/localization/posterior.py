@@ -16,17 +16,17 @@ from torch import Tensor
 from bidnerf_core.devices import run_on
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.explanations import Explanations
-from bidnerf_core.localization.terms.rays import Rays
+from bidnerf_core.localization.terms.rays import RenderedRays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.mapping import (
     CAMERA,
+    CostTerm,
     Landmarks,
     N,
     Normal,
     P,
     Quadratic,
     States,
-    Term,
     descend,
     log_evidence,
     prior,
@@ -248,14 +248,14 @@ Minima = tuple[Quadratic, States, Normal]
 """The model of all terms about the state of each mode, and its minimum under each explanation of the mode."""
 
 
-def fit(best: States, terms: Sequence[Term], given: Explanations, steps: int) -> tuple[States, Minima]:
+def fit(best: States, terms: Sequence[CostTerm], given: Explanations, steps: int) -> tuple[States, Minima]:
     """Return the refined state of each mode (g), and the minima about these states."""
     best, _ = descend(best, terms, steps)
     quadratic = linearize(best, terms, given)
     return best, (quadratic, *quadratic.minimum(given.about(quadratic.here)))
 
 
-def linearize(best: States, terms: Sequence[Term], given: Explanations) -> Quadratic:
+def linearize(best: States, terms: Sequence[CostTerm], given: Explanations) -> Quadratic:
     # The prior fixes nothing that any explanation frees.
     free = best.under(given.deviation.new_zeros(N), given.deviation.amax(0))
     return Quadratic.of(total(free, terms) - prior(free), free)
@@ -270,7 +270,7 @@ def settle(best: States, term: Landmarks, given: Explanations) -> tuple[States, 
 
 
 def fit_with_rays(
-    best: States, terms: Sequence[Term], rays: Rays, given: Explanations
+    best: States, terms: Sequence[CostTerm], rays: RenderedRays, given: Explanations
 ) -> tuple[Minima, Quadratic]:
     """Refine the first state with rays; return the minima, and the quadratic model of the rays about this state alone.
 

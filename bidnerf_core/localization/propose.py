@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.explanations import Seed, cameras_of_map
-from bidnerf_core.localization.matching import Matches, Query, log10_nfa
+from bidnerf_core.localization.explanations import Proposal, cameras_of_map
+from bidnerf_core.localization.matching import SAMPLE, Matches, QueryKeypoints, log10_nfa
 from bidnerf_core.mapping import LandmarkMap, States, project, rays_through
 
 CONVINCING = -20.0
@@ -22,8 +22,10 @@ LEAST_AGREEING = 6
 """Least number of matches that agree on a pose."""
 
 
-def best_consensus(query: Query, landmarks: LandmarkMap, matches: Matches) -> tuple[Seed, float] | None:
-    """Return the seed with the fewest false alarms, over the stated camera, the map's cameras and a ladder of focal lengths."""
+def best_consensus(
+    query: QueryKeypoints, landmarks: LandmarkMap, matches: Matches
+) -> tuple[Proposal, float] | None:
+    """Return the proposal with the fewest false alarms, over the stated camera, the map's cameras and a ladder of focal lengths."""
     best = None
     for camera in cameras(query, landmarks):
         found = consensus(query, landmarks, matches, camera)
@@ -34,7 +36,7 @@ def best_consensus(query: Query, landmarks: LandmarkMap, matches: Matches) -> tu
     return best
 
 
-def cameras(query: Query, landmarks: LandmarkMap) -> Iterator[Float[Tensor, "6"]]:
+def cameras(query: QueryKeypoints, landmarks: LandmarkMap) -> Iterator[Float[Tensor, "6"]]:
     """Yield the cameras to try: the stated one, the map's, and others with the principal point in the middle."""
     yield torch.zeros(6, dtype=torch.float64)
     yield from cameras_of_map(query, landmarks)
@@ -48,12 +50,12 @@ def cameras(query: Query, landmarks: LandmarkMap) -> Iterator[Float[Tensor, "6"]
 
 
 def consensus(
-    query: Query,
+    query: QueryKeypoints,
     landmarks: LandmarkMap,
     matches: Matches,
     camera: Float[Tensor, "6"],
     name: str = "landmarks",
-) -> tuple[Seed, float] | None:
+) -> tuple[Proposal, float] | None:
     """Return the pose with the most inliers under a given camera, and log10 of its false alarms; None if too few matches agree.
 
     The solvers are poselib's in LO-RANSAC with progressive sampling: P3P for each image (Persson and Nordberg 2018) and, for a rig,
@@ -65,7 +67,7 @@ def consensus(
     focal = query.focal[matches.keypoint] * math.exp(float(camera[0]))
     points, view = landmarks.positions[matches.landmark].double(), query.view[matches.keypoint]
     parts = [
-        part for part in ((view == v).nonzero()[:, 0] for v in range(len(query.images))) if len(part) >= 4
+        part for part in ((view == v).nonzero()[:, 0] for v in range(len(query.images))) if len(part) > SAMPLE
     ]
     options = {
         "max_reproj_error": query.threshold, "seed": 0,  "progressive_sampling": True,
@@ -97,11 +99,11 @@ def consensus(
         return None
     distance = float(T.inverse().apply(points[agreeing]).norm(dim=-1).median())
     nfa = log10_nfa(len(matches), int(agreeing.sum()), query.by_chance)
-    return Seed(name, T, camera, distance), nfa
+    return Proposal(name, T, camera, distance), nfa
 
 
 def inliers(
-    query: Query, landmarks: LandmarkMap, matches: Matches, state: States, radius: float = 1.0
+    query: QueryKeypoints, landmarks: LandmarkMap, matches: Matches, state: States, radius: float = 1.0
 ) -> Bool[Tensor, "m"]:
     """Return a mask of the matches that agree with a state; ``radius`` is in units of the inlier threshold."""
     keypoint = matches.keypoint

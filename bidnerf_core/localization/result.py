@@ -37,7 +37,7 @@ from bidnerf_core.geometry import (
 from bidnerf_core.io import from_plain, read_record, to_plain, write_file
 
 if TYPE_CHECKING:
-    from bidnerf_core.localization.loop import Answer
+    from bidnerf_core.localization.loop import LandmarkAnswer
 
 
 class Outcome(StrEnum):
@@ -249,7 +249,7 @@ class SearchRecord:
     """The steps of a search and the landmark-based answers, in order."""
 
     steps: list[RecordedStep] = field(default_factory=list)
-    answers: list[Answer] = field(default_factory=list)
+    answers: list[LandmarkAnswer] = field(default_factory=list)
 
     def add(self, caption: str, T: SE3, scores: Float[Tensor, "h"] | None = None, kept: int = 1) -> None:
         """Record poses T (h) or a single pose; without scores, the poses must be sorted, best first."""

@@ -17,7 +17,7 @@ from bidnerf_core.localization.accept import DISPLACEMENT, same_pose
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import current_record
 from bidnerf_core.localization.terms.images import ColourScales, Images, Renderer, Thumbnail
-from bidnerf_core.mapping import States, Term, descend
+from bidnerf_core.mapping import CostTerm, States, descend
 from bidnerf_core.progress import check_cancelled
 
 
@@ -25,14 +25,14 @@ from bidnerf_core.progress import check_cancelled
 class Stage:
     """One stage of a search: steps from all remaining poses; the best ``keep`` poses pass to the next stage."""
 
-    terms: Sequence[Term]
+    terms: Sequence[CostTerm]
     steps: int
     keep: int
     score: Callable[[States], Float[Tensor, "h"]] | None = None  # by which poses are compared; None: the cost
 
 
 @dataclass(frozen=True, eq=False)
-class Proposals:
+class SearchResult:
     """The remaining poses of a search, and how much better the best one is than any different one; on the CPU."""
 
     states: States  # (h), best first
@@ -46,7 +46,7 @@ class Proposals:
 
 def halve(
     start: States, stages: Iterable[Stage], middle: Float[Tensor, "3"], device: torch.device | str = "cpu"
-) -> Proposals:
+) -> SearchResult:
     """Run the stages on the hypotheses ``start`` (h) and return the poses that remain.
 
     ``middle`` is the middle of the visible scene (metres, last camera's frame). If the best poses of a stage are all the same
@@ -83,7 +83,7 @@ def halve(
         states, scores = states[passing], scores[passing]
     path_losses = torch.stack([values[0] for values in losses]) if losses else scores[:0]
     path_poses = SE3.cat([T[:, 0] for T in poses])
-    return moved(Proposals(states, scores, margin, rivals, before, path_poses, path_losses), "cpu")
+    return moved(SearchResult(states, scores, margin, rivals, before, path_poses, path_losses), "cpu")
 
 
 def image_stages(

@@ -49,9 +49,9 @@ from .landmarks.vocabulary import Vocabulary as Vocabulary
 from .landmarks.vocabulary import k_means as k_means
 from .landmarks.vocabulary import nearest_centre as nearest_centre
 from .landmarks.vocabulary import pooled_views as pooled_views
+from .resection.descend import CostTerm as CostTerm
 from .resection.descend import Normal as Normal
 from .resection.descend import Quadratic as Quadratic
-from .resection.descend import Term as Term
 from .resection.descend import damped_solution as damped_solution
 from .resection.descend import descend as descend
 from .resection.descend import log_det as log_det

@@ -19,7 +19,7 @@ from bidnerf_core.localization import (
     ADVICE,
     METHODS,
     MIRROR,
-    Answer,
+    LandmarkAnswer,
     Localization,
     SceneMap,
     SearchRecord,
@@ -225,7 +225,7 @@ def _finite(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
 
 
-def _matches(scene: SceneMap, found: Localization, answer: Answer) -> Json | None:
+def _matches(scene: SceneMap, found: Localization, answer: LandmarkAnswer) -> Json | None:
     """Return the last image's matches at the last pose from landmarks: matches by projection, then further ones by descriptor.
 
     ``keypoints`` and the ``projections`` of their landmarks (NaN behind the camera) are fractions of the image size,

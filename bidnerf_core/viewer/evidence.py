@@ -14,8 +14,8 @@ from bidnerf_core.localization import (
     LANDMARK_BOUNDS,
     MIRROR,
     MOVING,
-    Answer,
     Evidence,
+    LandmarkAnswer,
     Localization,
     SearchRecord,
     Support,
@@ -30,7 +30,7 @@ APART, TURNED_DEG = 0.1, 10.0
 """Distance (fraction of that to the scene) and angle beyond which two poses are different answers."""
 
 
-def last_answer(record: SearchRecord | None) -> Answer | None:
+def last_answer(record: SearchRecord | None) -> LandmarkAnswer | None:
     """Return the last pose from landmarks in the record of a search, or None if there is none."""
     return None if record is None or not record.answers else record.answers[-1]
 
@@ -47,14 +47,14 @@ def contests(found: Localization, record: SearchRecord | None) -> tuple[Json, ..
     return tuple(shown)
 
 
-def earlier(found: Localization, answer: Answer) -> str:
+def earlier(found: Localization, answer: LandmarkAnswer) -> str:
     """Return ``EARLIER`` if the pose from landmarks differs from the pose found, else an empty string."""
     off = pose_error(answer.T_world_rig.to("cpu"), found.T_world_camera.to("cpu"))
     near = float(off.translation) <= APART * answer.distance and float(off.rotation_deg) <= TURNED_DEG
     return "" if near else EARLIER
 
 
-def probable_poses(answer: Answer) -> list[tuple[int, SE3, float]]:
+def probable_poses(answer: LandmarkAnswer) -> list[tuple[int, SE3, float]]:
     """Return the index, the most probable pose and the probability of each mode, in order of decreasing probability."""
     posterior, found = answer.posterior, list[tuple[int, SE3, float]]()
     for mode in range(len(answer.modes)):
@@ -76,7 +76,7 @@ def _contest(
     return {"question": question, "answers": shown, "remark": remark, "of_pose": of_pose}
 
 
-def _of_modes(found: Localization, answer: Answer) -> Json:
+def _of_modes(found: Localization, answer: LandmarkAnswer) -> Json:
     shown, here, best = [], answer.T_world_rig.to("cpu"), answer.posterior.mode
     for mode, T, probability in probable_poses(answer):
         apart = float((T.translation - here.translation).norm())
@@ -90,7 +90,7 @@ def _of_modes(found: Localization, answer: Answer) -> Json:
     return _contest("This pose, another, or the mirror image?" if len(others) > 1 else question, shown)
 
 
-def _of_cameras(found: Localization, answer: Answer) -> Json:
+def _of_cameras(found: Localization, answer: LandmarkAnswer) -> Json:
     posterior, names = answer.posterior, answer.explanations.names
     own = posterior.probability * (posterior.states.mode == posterior.mode)
     shown = dict[str, float]()

@@ -14,12 +14,12 @@ from bidnerf_core.localization import MOVING
 # Inside: the prior of each explanation, of which answers show the most probable one
 from bidnerf_core.localization.explanations import (
     Explanations,
-    Seed,
+    Proposal,
     cameras_of_map,
     correction_between,
     explanations,
 )
-from bidnerf_core.localization.matching import Query
+from bidnerf_core.localization.matching import QueryKeypoints
 from bidnerf_core.mapping import (
     NUISANCES,
     Keypoints,
@@ -37,7 +37,7 @@ BENT = replace(PINHOLE, distortion=(-0.02, 0.0, 0.0, 0.0))
 LANDSCAPE = Intrinsics(520.0, 521.0, 310.0, 245.0, 640, 480, (0.05, -0.01, 0.001, 0.002))
 
 
-def query(*cameras: Intrinsics, approximate: bool = False) -> Query:
+def query(*cameras: Intrinsics, approximate: bool = False) -> QueryKeypoints:
     """Return images of these cameras that show nothing."""
     blank = Keypoints(torch.zeros((0, 2)), torch.zeros(0), torch.zeros((0, 64), dtype=torch.uint8))
     views = [
@@ -47,7 +47,7 @@ def query(*cameras: Intrinsics, approximate: bool = False) -> Query:
         )
         for c in cameras
     ]
-    return Query.of(views, lambda rgb: blank)
+    return QueryKeypoints.of(views, lambda rgb: blank)
 
 
 def landmarks(*cameras: Intrinsics, moving: float = 0.0) -> LandmarkMap:
@@ -221,8 +221,10 @@ def test_states_of_another_camera_begin_where_they_see_about_the_same(stated: In
     """A longer focal length is farther away, and a shifted principal point looks aside."""
     found = given(stated, of_map=(PINHOLE,))
     points = torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.1, 0.0], [-0.2, 0.2, 0.1]], dtype=torch.float64)
-    seed = Seed("s", POSES[0], torch.zeros(6, dtype=torch.float64), float(POSES[0].translation.norm()))
-    first = found.first(seed, 0, 1.0)
+    proposal = Proposal(
+        "s", POSES[0], torch.zeros(6, dtype=torch.float64), float(POSES[0].translation.norm())
+    )
+    first = found.first(proposal, 0, 1.0)
     assert len(first) == len(set(first.row.tolist()))
     eye, zero = torch.eye(3, dtype=torch.float64).expand(3, 3, 3), torch.zeros((3, 3), dtype=torch.float64)
     image = project(first, points[None], Sights(zero[:, :2], zero[:, 0], eye, zero)).image

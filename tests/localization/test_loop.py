@@ -19,7 +19,7 @@ import torch
 from bidnerf_core import SE3, Intrinsics, Localization, Localizer, Outcome, View
 from bidnerf_core.evaluation import faulty
 from bidnerf_core.fields import FieldValues
-from bidnerf_core.localization import Answer, AutoConfig, LandmarkMatcher, LogisticModel, Loop, rig
+from bidnerf_core.localization import AutoConfig, LandmarkAnswer, LandmarkMatcher, LogisticModel, Loop, rig
 from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.registry import registered
 from bidnerf_core.results import pose_error
@@ -292,7 +292,9 @@ def matcher() -> LandmarkMatcher:
     return LandmarkMatcher(replace(ground_landmarks(), cameras=()))
 
 
-def solved(*views: View, rays: int = 0, matching: LandmarkMatcher | None = None, **changes: Any) -> Answer:
+def solved(
+    *views: View, rays: int = 0, matching: LandmarkMatcher | None = None, **changes: Any
+) -> LandmarkAnswer:
     scene = replace(textured_map(surface=True), **changes)
     matching = (matching or matcher()).for_query()
     problem = rig(scene, views, None, matcher=matching)
@@ -302,7 +304,7 @@ def solved(*views: View, rays: int = 0, matching: LandmarkMatcher | None = None,
 
 
 @functools.cache
-def alone() -> Answer:
+def alone() -> LandmarkAnswer:
     return solved(colour_only(unseen()))
 
 

@@ -12,7 +12,14 @@ from bidnerf_core.devices import moved
 from bidnerf_core.localization import LandmarkMatcher
 
 # Inside: the matches, of which answers show only the number
-from bidnerf_core.localization.matching import STRONGEST, Matches, Nearest, Projected, Query, log10_nfa
+from bidnerf_core.localization.matching import (
+    STRONGEST,
+    Matches,
+    Nearest,
+    Projected,
+    QueryKeypoints,
+    log10_nfa,
+)
 from bidnerf_core.mapping import LandmarkMap, Sift, States, build_landmarks, squared_distances
 from bidnerf_core.testing import DEVICE, Elsewhere, unseen
 from conditions import COPY, PINHOLE, point_landmarks, point_view, points, twice
@@ -23,16 +30,16 @@ TRUE = looking_in(0.43, 0.45, 3.6)
 NO_CORRECTION = torch.zeros(6, dtype=torch.float64)
 
 
-def query(*views: View, seen: Points) -> Query:
+def query(*views: View, seen: Points) -> QueryKeypoints:
     last = views[-1].T_ref_camera.inverse()
-    return Query.of([replace(view, T_ref_camera=last @ view.T_ref_camera) for view in views], seen)
+    return QueryKeypoints.of([replace(view, T_ref_camera=last @ view.T_ref_camera) for view in views], seen)
 
 
 def pairs(found: Matches) -> set[tuple[int, int]]:
     return set(zip(found.keypoint.tolist(), found.landmark.tolist(), strict=True))
 
 
-def errors(query: Query, landmarks: LandmarkMap, found: Matches, T: SE3) -> torch.Tensor:
+def errors(query: QueryKeypoints, landmarks: LandmarkMap, found: Matches, T: SE3) -> torch.Tensor:
     """Return the distances (pixels) of keypoints from their landmarks' projections in the only image."""
     seen = PINHOLE.project(T.inverse().apply(landmarks.positions[found.landmark].double()))
     return (seen - query.keypoints.pixels[found.keypoint]).norm(dim=-1)
@@ -140,7 +147,9 @@ def test_landmarks_of_another_place_that_look_the_same_are_the_other_matches() -
 # By projection
 
 
-def projected(image: Query, landmarks: LandmarkMap, T: SE3 = TRUE, margin: float = 10.0) -> Projected:
+def projected(
+    image: QueryKeypoints, landmarks: LandmarkMap, T: SE3 = TRUE, margin: float = 10.0
+) -> Projected:
     return Projected(image, landmarks, States.known(T, NO_CORRECTION), margin)
 
 
@@ -225,9 +234,9 @@ def test_descriptors_of_a_mirrored_image_are_permuted_ones() -> None:
     frame = unseen().frame
     height, width, _ = frame.rgb.shape
     camera = Intrinsics(120.0, 118.0, 60.0, 50.0, width, height)
-    image = Query.of([View(replace(frame, intrinsics=camera), SE3.identity())], Sift())
+    image = QueryKeypoints.of([View(replace(frame, intrinsics=camera), SE3.identity())], Sift())
     flipped = Frame("flipped", frame.rgb.flip(1), replace(camera, cx=camera.width - camera.cx))
-    expected = Query.of([View(flipped, SE3.identity())], Sift())
+    expected = QueryKeypoints.of([View(flipped, SE3.identity())], Sift())
     found = image.mirrored
     assert found.camera == expected.camera
     distance = torch.cdist(found.keypoints.pixels, expected.keypoints.pixels)

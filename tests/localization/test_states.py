@@ -15,7 +15,7 @@ import blob_images
 from bidnerf_core import SE3, Intrinsics, View
 
 # Inside: the terms of the loop one by one
-from bidnerf_core.localization.terms.rays import Rays
+from bidnerf_core.localization.terms.rays import RenderedRays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.mapping import (
     MOTION,
@@ -183,11 +183,11 @@ def term_of_the_surface(rig: bool) -> tuple[Surface, States]:
     return term, replace(at, z=0.1 * at.z)
 
 
-def term_of_rays(depth: bool, rig: bool) -> tuple[Rays, States]:
+def term_of_rays(depth: bool, rig: bool) -> tuple[RenderedRays, States]:
     truth = blob_images.TRUTH
     others = (blob_images.POSES[0],) if rig else ()
     views = [View(blob_images.photograph(T), truth.inverse() @ T) for T in (*others, truth)]
-    term = Rays.of(views, blob_images.FIELD, blob_images.BOUNDS, 200, 0)
+    term = RenderedRays.of(views, blob_images.FIELD, blob_images.BOUNDS, 200, 0)
     loss = replace(term.loss, scale=0.2) if depth else None
     at = drawn(2, moving=False, about=truth)
     return replace(term, exposure=False, depth_loss=loss), replace(at, z=0.1 * at.z)

@@ -21,7 +21,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import ColourSettings, DepthLossSettings, Images, RayTerms, rig, states_at
 from bidnerf_core.localization.terms.images import Thumbnail, surface_renderer
-from bidnerf_core.mapping import SurfaceMap, Surfels, Term, cast, descend, trace
+from bidnerf_core.mapping import CostTerm, SurfaceMap, Surfels, cast, descend, trace
 from bidnerf_core.testing import DEVICE, DeviceFault, Elsewhere
 from problems import FieldMap
 
@@ -45,7 +45,7 @@ class Place:
         found.warm_up()
         return found
 
-    def descended(self, terms: list[Term], T: SE3) -> list[Tensor]:
+    def descended(self, terms: list[CostTerm], T: SE3) -> list[Tensor]:
         """Take a step, which fills caches, and two more that are checked, and return all that these lead to."""
         start, about = moved(states_at(T), self.device), torch.tensor([0.0, 0.0, 3.5]).to(self.device)
         first, _ = descend(start, terms, 1, about)

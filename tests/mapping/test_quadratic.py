@@ -16,7 +16,7 @@ from bidnerf_core import SE3
 from bidnerf_core.mapping import NUISANCES, Normal, Quadratic, States, descend, log_det, log_evidence, total
 
 P = 6 + len(NUISANCES)
-Term = Callable[[States], Normal]
+CostTerm = Callable[[States], Normal]
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
@@ -41,7 +41,7 @@ def unknowns(at: States) -> Tensor:
     return torch.cat([at.T.log(), at.nuisances], -1)
 
 
-def least_squares(A: Tensor, b: Tensor) -> Term:
+def least_squares(A: Tensor, b: Tensor) -> CostTerm:
     """Return half of the squared norm of ``A x - b``, with x linearized about each state."""
 
     def term(at: States) -> Normal:

@@ -27,7 +27,7 @@ OUTLIER = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Rays:
+class RenderedRays:
     """Residuals of the colours of rendered rays and, with a ``depth_loss``, of their distances.
 
     A gain and an offset of the exposure are eliminated per channel (variable projection). All tensors are on the field's device when
@@ -62,7 +62,7 @@ class Rays:
         blur: int = 1,
         depth_rays: Observations | None = None,
         device: torch.device | str | None = None,
-    ) -> Rays:
+    ) -> RenderedRays:
         """Draw ``count`` visible pixels of ``views``, and at most as many of ``depth_rays``.
 
         The poses of ``views`` are relative to the last view; another sensor measured ``depth_rays`` in the last camera's frame.
@@ -95,7 +95,7 @@ class Rays:
         image, times, R, t, rgb, coloured, depth = (torch.cat(part) for part in zip(*parts, strict=True))
         seen = Sights(image, times, R, t, single=len(views) == 1 and depth_rays is None)
         measured = moved((seen, rgb, coloured, depth), device or device_of(field))
-        return Rays(field, bounds, *measured)
+        return RenderedRays(field, bounds, *measured)
 
     def __len__(self) -> int:
         return len(self.rgb)
@@ -134,7 +134,7 @@ class Rays:
         value = (offset - self.rgb) * self.coloured[:, None]
         return (self._robust(value)[0] / self.noise**2)[0].cpu()
 
-    def fitted(self, states: States) -> Rays:
+    def fitted(self, states: States) -> RenderedRays:
         """Return the term with the noise that follows from the scatter of the rays' gradients at the first state."""
         return replace(self, noise=self.at(moved(states[:1], self.rgb.device)).fitted_noise())
 
@@ -251,7 +251,7 @@ class Rays:
 class ComparedRays:
     """Rendered minus measured values of n rays from each of h poses."""
 
-    term: Rays
+    term: RenderedRays
     value: Float[Tensor, "h n c"]
     rows: Float[Tensor, "h n c P"]  # derivatives
     steepness: Float[Tensor, "h n c"]  # norm of the gradient by the ray's origin, per metre

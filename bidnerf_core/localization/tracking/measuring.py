@@ -22,7 +22,7 @@ from bidnerf_core.localization.matching import (
     Matches,
     Nearest,
     Projected,
-    Query,
+    QueryKeypoints,
     log10_nfa,
 )
 from bidnerf_core.localization.posterior import TOLERANCE, Posterior, mass_within
@@ -30,7 +30,7 @@ from bidnerf_core.localization.problem import SceneMap
 from bidnerf_core.localization.propose import LEAST_AGREEING, consensus
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.settings import LEAST_POINTS
-from bidnerf_core.localization.terms.rays import ALONE, Rays
+from bidnerf_core.localization.terms.rays import ALONE, RenderedRays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
 from bidnerf_core.localization.tracking.points import INLIER, POINTS, Fit, Grey, Points, cells
@@ -38,6 +38,7 @@ from bidnerf_core.localization.tracking.state import TrackerState
 from bidnerf_core.mapping import (
     DEPTH,
     MOTION,
+    CostTerm,
     Features,
     LandmarkMap,
     N,
@@ -45,7 +46,6 @@ from bidnerf_core.mapping import (
     P,
     Quadratic,
     States,
-    Term,
     damped_solution,
     descend,
     log_evidence,
@@ -156,7 +156,7 @@ class Measurer:
         if len(number) > MOST_IN_VIEW:
             order = known.views[number].argsort(descending=True, stable=True)
             number = number[order[:MOST_IN_VIEW].sort().values]
-        query, landmarks = Query.of([View(frame, SE3.identity())], self.features), known[number]
+        query, landmarks = QueryKeypoints.of([View(frame, SE3.identity())], self.features), known[number]
         still = torch.zeros(6, dtype=torch.float64)
 
         def points_of(matches: Matches) -> Points:
@@ -216,7 +216,7 @@ class Measurer:
         states = replace(fit.states[0 * rows], deviation=deviation[rows], row=rows, log_prior=log_prior[rows])
         depth, factor = self._depth(frame, state, points, fit.states)
         term = fit.term.weighted_for(fit.states)
-        terms: list[Term] = [term] if depth is None else [term, depth.fitted_noise(fit.states)]
+        terms: list[CostTerm] = [term] if depth is None else [term, depth.fitted_noise(fit.states)]
         # Gauss-Newton steps, of which each is right but for the robust weights.
         # Depth hardly changes them, but few landmarks may be far off without it.
         rounds = [terms] if not bool(rows.any()) else [terms if fit.is_recognised else [term], terms]
@@ -326,7 +326,7 @@ class Measurer:
         prediction = Quadratic(states, zero[:, 0], zero, hessian)
         if points is None:
             # In a map without landmarks, 256 rays are rendered for a frame. The start is close, so that few steps suffice.
-            rays = Rays.of([view], self.scene.field, self.scene.bounds, 256, state.frames)
+            rays = RenderedRays.of([view], self.scene.field, self.scene.bounds, 256, state.frames)
             rays = replace(rays, independent=ALONE)
             for _ in range(2):
                 states, normal = descend(states, [prediction, rays.fitted(states)], 2)

@@ -42,7 +42,7 @@ class Normal:
         )  # fmt: skip
 
 
-Term = Callable[[States], Normal]
+CostTerm = Callable[[States], Normal]
 """Evaluates one kind of measurement at h states."""
 
 
@@ -53,13 +53,13 @@ def prior(states: States) -> Normal:
     return Normal(0.5 * z.square().sum(-1), pad(z, (6, 0)), free.expand(len(z), P, P))
 
 
-def total(states: States, terms: Sequence[Term]) -> Normal:
+def total(states: States, terms: Sequence[CostTerm]) -> Normal:
     return sum((term(states) for term in terms), start=prior(states))
 
 
 def descend(
     states: States,
-    terms: Sequence[Term],
+    terms: Sequence[CostTerm],
     steps: int,
     pivot: Float[Tensor, "3"] | None = None,
     path: list[tuple[SE3, Float[Tensor, "h"]]] | None = None,
