@@ -69,19 +69,6 @@ class Anchor:
         return replace(self, metres_per_unit=self.metres_per_unit / factor)
 
 
-def load_anchor(folder: Path, newer: str = "") -> Anchor | None:
-    """Load the anchor from a separate file in a map's folder; None if there is no such file.
-
-    The file is ``newer``, as earlier versions named it, if that exists, else ``anchor.json``. Raises
-    ``InputError`` if the file is damaged.
-    """
-    path = folder / newer if newer and (folder / newer).exists() else folder / ANCHOR
-    if not path.exists():
-        return None
-    found = read_json(path, "the anchor of a map")
-    return None if found is None and newer else from_plain(Anchor, found, str(path))
-
-
 @dataclass(frozen=True)
 class FieldFrame:
     """The scale and bounds in which a map's field was trained, for a map that was scaled afterwards."""
@@ -187,14 +174,13 @@ def load_info(folder: Path) -> MapInfo:
         newer = isinstance(found.get("version"), int) and found["version"] > VERSION
         advice = "it was written by a newer bidnerf; upgrade bidnerf" if newer else "retrain the map"
         raise InputError(f"version {found.get('version')!r}", where=path, expected=f"{VERSION}; {advice}")
-    for part in (*PART_NAMES, "anchor"):
+    for part in PART_NAMES:
         name = found.get(part)
         if isinstance(name, str) and (not name or Path(name).name != name):
             raise InputError(f"names {name!r}", where=path, expected="the name of a file next to it")
-    named = found.get("anchor")  # earlier versions named a file
-    anchor = load_anchor(folder, named if isinstance(named, str) else "")
-    info = from_plain(MapInfo, found | {"anchor": None if isinstance(named, str) else named}, str(path))
-    if anchor is not None:
+    info = from_plain(MapInfo, found, str(path))
+    if (folder / ANCHOR).exists():
+        anchor = from_plain(Anchor, read_json(folder / ANCHOR, "the anchor of a map"), str(folder / ANCHOR))
         info = replace(info, anchor=anchor)
     for name in with_wrong_pose(info.cameras):
         raise InputError(f"pose of camera {name!r} is not a rigid transform", where=path, expected="4x4 rows")

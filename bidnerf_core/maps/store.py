@@ -56,7 +56,9 @@ log = logging.getLogger("bidnerf")
 NEEDED = "a safetensors file, without which the map is incomplete"
 BAKED = "a safetensors file, which 'bidnerf bake' can recreate"
 RECORDED = "a capture record, which 'bidnerf bake' with --data can recreate"
-_NAMES = r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|(capture|anchor)-\d{8,}-[0-9a-f]{8}\.json)"
+_NAMES = (
+    r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|capture-\d{8,}-[0-9a-f]{8}\.json)"
+)
 OURS = re.compile(rf"{_NAMES}|\.({_NAMES}|map\.json)\.[0-9a-f]{{8}}")
 """Names of the files that saving may leave behind, of earlier versions as well; other files are never removed."""
 
@@ -412,7 +414,7 @@ def _sweep(folder: Path) -> None:
     if os.path.lexists(folder / DESCRIPTION):
         try:
             found = read_json(folder / DESCRIPTION, "the description of a map")
-            kept = {name for part in (*PART_NAMES, "anchor") if isinstance(name := found.get(part), str)}
+            kept = {name for part in PART_NAMES if isinstance(name := found.get(part), str)}
         except (InputError, AttributeError):
             return
     for file in list(folder.iterdir()):

@@ -91,21 +91,6 @@ def test_a_save_that_stops_anywhere_leaves_a_map_with_its_own_anchor(
         assert load_map(folder).anchor == expected
 
 
-def test_an_anchor_as_earlier_versions_stored_it_counts(tmp_path: Path, trained: Map) -> None:
-    """In a file of its own, which a new one replaced under another name until it had been renamed."""
-    old, new, name = Anchor(47.0, 19.0, 100.0), Anchor(1.0, 2.0, 3.0), "anchor-00000005-0123abcd.json"
-    save(tmp_path, trained, 5)
-    tiny.write_anchor(tmp_path, old)
-    description = tmp_path / "map.json"
-    description.write_text(json.dumps(json.loads(description.read_text()) | {"anchor": name}))
-    assert load_map(tmp_path).anchor == old
-    (tmp_path / "anchor.json").rename(tmp_path / name)
-    tiny.write_anchor(tmp_path, new)
-    assert load_map(tmp_path).anchor == old
-    (tmp_path / name).write_text("null")
-    assert load_map(tmp_path).anchor is None
-
-
 def test_a_map_does_not_take_over_the_anchor_of_the_one_before(tmp_path: Path) -> None:
     trained = train(tiny.views(3), out=tmp_path / "a", config=tiny.config(3), bake=False)
     tiny.write_anchor(tmp_path / "a", anchor := Anchor(47.0, 19.0, 100.0))
