@@ -48,29 +48,15 @@ status is 143 and 129."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return the exit status."""
+    """Run one command and return the exit status; a user error is reported in one line instead of a traceback."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     _open_streams()
     name = " ".join(["bidnerf", *[word for word in given[:1] if word in COMMANDS]])
     try:
-        status = _guarded(name, given)
-        sys.stdout.flush()  # flush here, where a full disk can still be reported
-    except BrokenPipeError:
-        _discard(sys.stdout)
-        return READER_GONE
-    except OSError as error:
-        _discard(sys.stdout)
-        return _failed(name, error.strerror or str(error), BAD_INPUT)
-    return status
-
-
-def _guarded(name: str, given: list[str]) -> int:
-    """Run a command and return its exit status; a user error is reported in one line instead of a traceback."""
-    try:
         with interruptions(), _warnings_as_lines(name), _remarks_as_lines():
-            return _dispatch(given)
-    except SystemExit as stopped:  # the parser has already printed the reason
-        return stopped.code if isinstance(stopped.code, int) else DONE if stopped.code is None else BAD_INPUT
+            status = _dispatch(given)
+            sys.stdout.flush()  # here, where a full disk can still be reported
+            return status
     except KeyboardInterrupt as stopped:
         return _failed(
             name, "interrupted", 128 + stopped.number if isinstance(stopped, Interrupted) else INTERRUPTED
@@ -78,7 +64,7 @@ def _guarded(name: str, given: list[str]) -> int:
     except Cancelled as stopped:
         return _failed(name, str(stopped), INTERRUPTED)
     except BrokenPipeError:
-        raise
+        return READER_GONE
     except OSError as error:  # a full disk, a folder without write permission
         where = f"{error.filename}: " if error.filename else ""
         return _failed(name, f"{where}{error.strerror or error}", BAD_INPUT)
@@ -88,6 +74,11 @@ def _guarded(name: str, given: list[str]) -> int:
         if type(error).__name__ != "OutOfMemoryError":  # it is torch's, whose import --help does not wait for
             raise
         return _failed(name, f"the GPU's memory is full, try --device cpu ({error})", BAD_INPUT)
+    finally:
+        try:
+            sys.stdout.flush()
+        except (OSError, ValueError):
+            _discard(sys.stdout)
 
 
 def _dispatch(given: list[str]) -> int:
@@ -110,7 +101,8 @@ def _dispatch(given: list[str]) -> int:
     from bidnerf_core.cli.parser import parse  # imported here for the sake of a quick --version
 
     module = importlib.import_module(f"bidnerf_core.cli.{MODULES.get(given[0], given[0])}")
-    parse(given[0], getattr(module, f"run_{given[0]}"), given[1:])
+    with contextlib.suppress(SystemExit):
+        parse(given[0], getattr(module, f"run_{given[0]}"), given[1:])
     return DONE
 
 

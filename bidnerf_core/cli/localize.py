@@ -142,7 +142,9 @@ def run_localize(
     count = next((n for n, path in enumerate(query) if not _holds_maps(path)), len(query))
     maps, paths = [map, *query[:count]], query[count:]
     if not paths:
-        raise _no_query(maps)
+        named = enumeration([repr(str(path)) for path in maps])
+        expected = "MAP first, then image files, folders of photos, or a folder of a dataset"
+        raise UsageError(f"no QUERY after {named};", expected=expected)
     start_of = start.of_queries(seed)
     require_start(method.method, start.start is not None or start.perturb is not None)
     if queries.depth_points is not None:
@@ -182,21 +184,6 @@ def _holds_maps(path: Path) -> bool:
         return bool(found)
     images = any(file.suffix.lower() in IMAGE_SUFFIXES for file in path.iterdir())
     return not images and find_reader(path) is None
-
-
-def _no_query(maps: Sequence[Path]) -> UsageError:
-    """Return the error to raise if no QUERY follows the maps."""
-    from bidnerf_core.maps import maps_in
-
-    expected = "image files, folders of photos, or a folder of a dataset"
-    if len(maps) == 1:
-        return UsageError("no QUERY", expected=expected)
-    if maps[0].exists() and not maps_in(maps[0]):
-        return UsageError(
-            f"{str(maps[0])!r} is not a map, but {str(maps[1])!r} is: MAP comes first, then QUERY"
-        )
-    named = enumeration([repr(str(path)) for path in maps])
-    return UsageError(f"{named} are maps, and no QUERY follows them;", expected=expected)
 
 
 def _check_for_several(output: OutputOptions, queries: QueryOptions, start: StartOptions) -> None:
@@ -257,28 +244,27 @@ class Run:
         from bidnerf_core.results import pose_format
 
         answers, out, total = self.answers, self.output.out, self.total
-        takes_all = out is not None and pose_format(out) == ".json"
+        takes_all, is_whole = out is not None and pose_format(out) == ".json", False
         try:
             yield
-        except BaseException:  # whatever ended it: Ctrl-C, SIGTERM, a closed pipe, a full disk
+            is_whole = True
+        finally:  # whatever ended it: also Ctrl-C, SIGTERM, a closed pipe, a full disk
             with uninterrupted():
-                if out is not None and (answers.accepted or (answers.given and takes_all)):
+                if is_whole and total > 1:
+                    scene = answers.scene
+                    more = f" in {len(scene)} maps" if isinstance(scene, MapCollection) else ""
+                    say(f"{len(answers.accepted)} of {total} converged{more}")
+                if is_whole and answers.remark is not None:
+                    say(answers.remark)
+                is_written = out is not None and bool(answers.given if takes_all else answers.accepted)
+                if out is not None and is_written:
                     answers.save(out)
-                    say(f"{out}: written after {len(answers)} of {total} images")
-            raise
-        with uninterrupted():
-            if total > 1:
-                scene = answers.scene
-                more = f" in {len(scene)} maps" if isinstance(scene, MapCollection) else ""
-                say(f"{len(answers.accepted)} of {total} converged{more}")
-            if answers.remark is not None:
-                say(answers.remark)
-            if out is not None and not takes_all and not answers.accepted:
-                raise InputError(
-                    "not written, since no pose converged; a .json file takes all of them", where=out
-                )
-            if out is not None:
-                answers.save(out)
+                    if not is_whole:
+                        say(f"{out}: written after {len(answers)} of {total} images")
+        if out is not None and not is_written:
+            raise InputError(
+                "not written, since no pose converged; a .json file takes all of them", where=out
+            )
         if failed := len(answers) - len(answers.answers):
             raise InputError(f"{failed} of {total} queries could not be read or localized, see above")
 

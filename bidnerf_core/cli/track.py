@@ -6,7 +6,7 @@ import sys
 import time as clocks
 from collections.abc import Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,7 +22,7 @@ from bidnerf_core.settings import WholeNumbers
 
 if TYPE_CHECKING:
     from bidnerf_core.depth import DepthCamera
-    from bidnerf_core.frames import Frame, MaskFile
+    from bidnerf_core.frames import Frame
     from bidnerf_core.localization import Tracker
     from bidnerf_core.results import Answers, TrackingVideo
 
@@ -196,7 +196,7 @@ def _follow(
         try:
             if isinstance(request, InputError):
                 raise request
-            name = request.image.stem
+            name = Path(request.image).stem
             frame = request.read(images, sensor)
             found = tracker(frame if depth else frame.replace(depth=None), request.time)
             answer = path.add(frame, found, request.time)
@@ -224,40 +224,27 @@ def _summarize(path: Answers, seconds: float, frame_seconds: float) -> None:
 class FrameRequest:
     """A frame to read."""
 
-    image: Path
-    depth: Path | None = None
+    image: str  # a file, as the depth and the mask
+    depth: str | None = None
     time: float | None = None  # seconds
     depth_unit: float | None = None  # metres per step
-    mask: MaskFile | None = None
+    mask: str | None = None  # black is ignored
 
     @staticmethod
     def parse(line: str) -> FrameRequest:
         """Parse a line such as ``{"image": path, "depth": path, "time": s}``; only the image is required."""
-        from bidnerf_core.io import parse_record
+        from bidnerf_core.io import from_plain, parse_json
 
-        request = parse_record("request", line, '{"image": path, "depth": path, "time": seconds}')
-        image, depth = request.text("image"), request.text("depth")
-        if image is None:
-            raise request.error(f'no "image" in {line.strip()[:80]!r}')
-        keys = {field.name for field in fields(FrameRequest)}
-        if unknown := sorted(request.values.keys() - keys):
-            raise request.error(f"unknown key {unknown[0]!r}", expected=f"any of {', '.join(sorted(keys))}")
-        mask = request.text("mask")
-        return FrameRequest(
-            Path(image),
-            None if depth is None else Path(depth),
-            request.number("time"),
-            request.number("depth_unit"),
-            None if mask is None else MaskFile(Path(mask)),
-        )
+        return from_plain(FrameRequest, parse_json(line.encode(), "request", "a JSON object"), "request")
 
     def read(self, images: DatasetOptions, sensor: DepthCamera | None) -> Frame:
         """Read the image and its depth. Raises ``InputError`` if they cannot be read or the camera is unknown."""
-        from bidnerf_core.frames import Frame
+        from bidnerf_core.frames import Frame, MaskFile
 
+        mask = None if self.mask is None else MaskFile(Path(self.mask))
         return Frame.read(
             self.image, images.camera_source, depth=self.depth, depth_unit=self.depth_unit, sensor=sensor,
-            background=images.background, mask=self.mask,
+            background=images.background, mask=mask,
         )  # fmt: skip
 
 
@@ -300,7 +287,7 @@ def _arriving(folder: Path) -> Iterator[FrameRequest]:
             if not all(_is_steady(file, sizes) for file in (photo, *depths[:1])):
                 break  # later names have to wait, to keep the name order
             given.add(photo)
-            yield FrameRequest(photo, depths[0] if depths else None)
+            yield FrameRequest(str(photo), str(depths[0]) if depths else None)
         clocks.sleep(POLL)
 
 

@@ -42,7 +42,7 @@ def sharp(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tiny, "SIZE", 64)
         patch.setattr(tiny, "CAMERA", Intrinsics(85.0, 85.0, 32.0, 32.0, 64, 64))
-        tiny.write_dataset(folder / "data", train=24)
+        tiny.write_dataset(folder / "data", train=16)
     assert main(["train", str(folder / "data"), "--out", str(folder / "map"), *tiny.options(4)]) == 0
     return folder
 
@@ -98,7 +98,7 @@ def test_a_baked_map_needs_no_start(sharp: Path, baked: Path, once: CommandResul
     unbaked = bidnerf("info", sharp / "map", "--draw", folder.parent / "capture.png")
     assert_refused(unbaked, 1, "no record of its photos")
     assert once.out == ""
-    assert "from 24 measured views" in err
+    assert "from 16 measured views" in err
     facts = json.loads(bidnerf("info", folder, "--json").out)
     assert facts["surfels"] > 1000
     stored = load_map(folder)
@@ -122,8 +122,8 @@ def test_a_baked_map_needs_no_start(sharp: Path, baked: Path, once: CommandResul
     with_points = json.loads(bidnerf(*place, "--depth-points", points, "--json").out)
     assert with_points["loss"] != found["loss"]  # they are used beside the image's own depth
     # Baking the photos has left a record of them.
-    (line,) = [line for line in err.splitlines() if "24 photos, " in line and "horizon" in line]
-    assert len(facts["capture"]["photos"]) == 24
+    (line,) = [line for line in err.splitlines() if "16 photos, " in line and "horizon" in line]
+    assert len(facts["capture"]["photos"]) == 16
     status, out, err = bidnerf("info", folder, "--draw", folder.parent / "capture.png")
     assert (status, line in out) == (0, True)
     assert "capture.png: written" in err
@@ -156,12 +156,12 @@ def test_a_map_is_baked_from_what_it_renders_and_anew_if_its_surface_is_damaged(
     for again in (False, True):
         status, out, err = bidnerf(*bake)
         assert (status, out) == (0, "")
-        assert "from 24 rendered views" in err
+        assert "from 16 rendered views" in err
         surface = load_map(folder).surface
         assert surface is not None
         height = torch.linalg.vector_norm(surface.surfels.positions, dim=-1) - 0.5
         assert height.abs().max() < surface.cell
-        assert len(surface.keyframes) == 24
+        assert len(surface.keyframes) == 16
         if not again:
             damaged = folder / str(load_info(folder).surface)
             damaged.write_bytes(b"")
@@ -272,10 +272,10 @@ def test_landmarks_of_photos_are_built_once_for_training_and_baking(
     stored = train(
         photos, config=tiny.config(4), options=TrainOptions(images=DatasetOptions(background=tiny.BACKGROUND))
     )
-    assert built == [24]
+    assert built == [16]
     assert seen[0] > 100
     assert stored.landmarks is not None
-    assert stored.landmarks.trial.images == 8
+    assert stored.landmarks.trial.images == len(photos) // 3
     assert stored.bounds.contracted
 
 

@@ -133,8 +133,8 @@ def test_what_is_no_query_is_refused_in_a_line(
     other = shutil.copytree(known, tmp_path / "other")
     assert_refused(bidnerf(*place, photos / "t_0001.png"), 1, "no focal length in EXIF")
     assert_refused(bidnerf(*place, tmp_path / "empty"), 1, tmp_path / "empty", "empty")
-    assert_refused(bidnerf("localize", photos, known), 2, f"'{photos}'", f"'{known}'", "MAP comes first")
-    assert_refused(bidnerf("localize", known, other), 2, f"'{known}' and '{other}' are maps", "QUERY")
+    assert_refused(bidnerf("localize", photos, known), 2, f"'{photos}'", f"'{known}'", "MAP first")
+    assert_refused(bidnerf("localize", known, other), 2, f"'{known}' and '{other}'", "QUERY")
     assert_refused(bidnerf(*place, data / "transforms.json"), 1, data / "transforms.json", f"folder, {data}")
 
 

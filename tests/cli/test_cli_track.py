@@ -218,7 +218,7 @@ def test_lines_of_stdin_are_answered_one_by_one(
     ("line", "message"),
     [
         ("{", "not JSON"),
-        ("[1]", "image"),
+        ("[1]", "dictionary"),
         ('{"image": 3}', "image"),
         ('{"image": "a", "depth": 1}', "depth"),
         ('{"image": "a", "time": "now"}', "time"),
@@ -244,7 +244,9 @@ def test_a_folder_is_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     found = [next(arriving) for _ in range(2)]
     iio.imwrite(tmp_path / "11.png", image)
     found.append(next(arriving))
-    pairs = [(r.image.name, r.depth and r.depth.name) for r in found if isinstance(r, FrameRequest)]
+    pairs = [
+        (Path(r.image).name, r.depth and Path(r.depth).name) for r in found if isinstance(r, FrameRequest)
+    ]
     assert pairs == [("2.png", "2.depth.png"), ("10.png", "10.npy"), ("11.png", None)]
 
 

@@ -55,10 +55,10 @@ LIMITS = ServiceLimits(
 FORM = "multipart/form-data; boundary=xyz"
 ECHO = '''"""A protocol that answers the JSON of a photo with its name."""
 import base64
-from pydantic import BaseModel
+from pydantic import Base64Bytes, BaseModel
 
 class Question(BaseModel):
-    photo: str
+    photo: Base64Bytes
     start: str
 
 class Answer(BaseModel):
@@ -684,7 +684,10 @@ def test_strangers_who_read_the_description_find_it_true(
     pytest.importorskip("schemathesis", reason="Schemathesis is not installed")
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
     openapi = importlib.import_module("_openapi")
-    found = openapi.tried(f"http://{address[0]}:{address[1]}", "map", [place.photo], 1)
+    # The protocols share the code of echo, and one map that of all: without these, a third of the requests is left.
+    found = openapi.tried(
+        f"http://{address[0]}:{address[1]}", "map", [place.photo], 1, without="geopose|maps/.*/localize"
+    )
     assert (found["failures"], found["errors"]) == ({}, {}), found["output"]
     assert found["operations"] >= 8
     assert found["requests"] > 100

@@ -207,6 +207,7 @@ def test_a_saved_page_works_from_disk_without_a_network(browser: Any, saved: Pat
 
 def test_a_refused_photo_tells_why_and_names_stay_text(browser: Any, saved: Path) -> None:
     with opened(browser, f"{saved.as_uri()}#frame={quote(viewed.HOSTILE)}", LAPTOP, offline=True) as page:
+        assert_first_view_holds_everything(page)
         assert page.title().startswith("map")  # no script of a name has run
         assert page.text_content("#verdict .name") == viewed.HOSTILE
         assert page.text_content(".outcome b").startswith("Refused")
@@ -245,25 +246,6 @@ def test_a_refused_photo_tells_why_and_names_stay_text(browser: Any, saved: Path
         assert not page.is_visible("#words")
 
 
-def test_two_points_measure_the_scale(browser: Any, saved: Path) -> None:
-    with opened(browser, saved.as_uri(), LAPTOP, offline=True) as page:
-        page.click("#measure")
-        for x in (300, 420):
-            page.mouse.click(x, 420)
-        ends = page.evaluate("page.measured")
-        assert len(ends) == 2
-        seen = page.evaluate(
-            "page.measured.map((place) => { const v = new THREE.Vector3(...place).project(page.space.camera);"
-            " return [(v.x + 1) / 2 * page.space.canvas.clientWidth, (1 - v.y) / 2 * page.space.canvas.clientHeight + 44]; })"
-        )
-        assert all(abs(x - at) < 7 and abs(y - 420) < 8 for (x, y), at in zip(seen, (300, 420), strict=True))
-        length = sum((a - b) ** 2 for a, b in zip(*ends, strict=True)) ** 0.5
-        page.fill("#note input", f"{2.5 * length}")
-        assert page.text_content("#note code") == "bidnerf scale MAP --factor 2.5"
-        page.keyboard.press("Escape")  # from the input
-        assert page.evaluate("page.measured") is None
-
-
 def test_a_descent_can_be_replayed(browser: Any, room: Map, tmp_path: Path) -> None:
     found = Localizer(room)(viewed.query().views)
     poses, losses = SE3.stack([*viewed.walk(30), found.T_world_camera]), torch.linspace(0.5, 0.1, 30)
@@ -282,8 +264,23 @@ def test_a_descent_can_be_replayed(browser: Any, room: Map, tmp_path: Path) -> N
         assert page.text_content("#caption") == "the pose found"
 
 
-def test_rows_are_filtered_and_lead_to_their_frames(browser: Any, saved: Path) -> None:
+def test_two_points_measure_the_scale_and_rows_lead_to_their_frames(browser: Any, saved: Path) -> None:
     with opened(browser, saved.as_uri(), LAPTOP, offline=True) as page:
+        page.click("#measure")
+        for x in (300, 420):
+            page.mouse.click(x, 420)
+        ends = page.evaluate("page.measured")
+        assert len(ends) == 2
+        seen = page.evaluate(
+            "page.measured.map((place) => { const v = new THREE.Vector3(...place).project(page.space.camera);"
+            " return [(v.x + 1) / 2 * page.space.canvas.clientWidth, (1 - v.y) / 2 * page.space.canvas.clientHeight + 44]; })"
+        )
+        assert all(abs(x - at) < 7 and abs(y - 420) < 8 for (x, y), at in zip(seen, (300, 420), strict=True))
+        length = sum((a - b) ** 2 for a, b in zip(*ends, strict=True)) ** 0.5
+        page.fill("#note input", f"{2.5 * length}")
+        assert page.text_content("#note code") == "bidnerf scale MAP --factor 2.5"
+        page.keyboard.press("Escape")  # from the input
+        assert page.evaluate("page.measured") is None
         assert page.locator("#rows tbody tr").count() == 3
         page.fill("#filter", "elsewhere")
         assert page.locator("#rows tbody tr").count() == 1
@@ -297,22 +294,27 @@ def test_rows_are_filtered_and_lead_to_their_frames(browser: Any, saved: Path) -
         assert page.text_content("#place").startswith("8 of 12 · 0.70 s · t7 · converged")
 
 
-@pytest.mark.parametrize("size", [LAPTOP, {"width": 1280, "height": 1600}])
-def test_the_first_view_holds_the_map_and_the_poses(browser: Any, saved: Path, size: dict[str, int]) -> None:
-    with opened(browser, f"{saved.as_uri()}#frame={quote(viewed.HOSTILE)}", size, offline=True) as page:
-        seen = page.evaluate(FARTHEST)
-        assert 0.4 < max(seen["cameras"]) < 1.1
-        assert max(seen["poses"]) < 1
+def assert_first_view_holds_everything(page: Any) -> None:
+    seen = page.evaluate(FARTHEST)
+    assert 0.4 < max(seen["cameras"]) < 1.1
+    assert max(seen["poses"]) < 1
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_a_phone_shows_everything_in_its_width(browser: Any, saved: Path, scheme: str) -> None:
-    with opened(browser, saved.as_uri(), PHONE, offline=True, color_scheme=scheme, has_touch=True) as page:
+def test_the_first_view_of_a_tall_window_holds_the_map_and_the_poses(browser: Any, saved: Path) -> None:
+    tall = {"width": 1280, "height": 1600}
+    with opened(browser, f"{saved.as_uri()}#frame={quote(viewed.HOSTILE)}", tall, offline=True) as page:
+        assert_first_view_holds_everything(page)
+
+
+def test_a_phone_shows_everything_in_its_width(browser: Any, saved: Path) -> None:
+    with opened(browser, saved.as_uri(), PHONE, offline=True, has_touch=True) as page:
         assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
         verdict, stage = (page.evaluate(f"document.querySelector('{name}').getBoundingClientRect().top") for name in ("#verdict", "#stage"))  # fmt: skip
         assert verdict < 100 < stage
-        paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
-        assert (int(paper[4:].split(",")[0]) > 127) == (scheme == "light")
+        for scheme in ("light", "dark"):
+            page.emulate_media(color_scheme=scheme, reduced_motion="reduce")
+            paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
+            assert (int(paper[4:].split(",")[0]) > 127) == (scheme == "light")
 
 
 def test_a_notebook_shows_the_page(browser: Any, saved: Path) -> None:
