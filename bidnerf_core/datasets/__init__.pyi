@@ -17,9 +17,7 @@ from .colmap_files import stored_keypoints as stored_keypoints
 from .formats.colmap import colmap_models as colmap_models
 from .formats.colmap import colmap_project as colmap_project
 from .formats.colmap import shot_of as shot_of
-from .formats.transforms_json import frame_entry as frame_entry
 from .formats.transforms_json import read_frames as read_frames
-from .formats.transforms_json import write_transforms as write_transforms
 from .lidar import LidarDepth as LidarDepth
 from .options import DatasetOptions as DatasetOptions
 from .options import DepthRegistration as DepthRegistration
@@ -44,3 +42,5 @@ from .trajectories import read_trajectory as read_trajectory
 from .video import VIDEO_SUFFIXES as VIDEO_SUFFIXES
 from .video import Video as Video
 from .video import is_video as is_video
+from .writing import frame_entry as frame_entry
+from .writing import write_transforms as write_transforms

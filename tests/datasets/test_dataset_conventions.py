@@ -95,6 +95,11 @@ def right(view: View) -> View:
     return view
 
 
+@cache
+def of_right(folder: Path) -> Agreement:
+    return agreement(pairs_of(folder), right, right)
+
+
 def shifted(pixels: float) -> Mistake:
     def shift(view: View) -> View:
         camera = view.frame.intrinsics
@@ -125,7 +130,7 @@ SCENES = {  # least surface, most depth, most colour; 8-bit depth, a real sensor
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_views_agree(data_dir: Path, scene: str) -> None:
-    found = agreement(pairs_of(data_dir / scene), right, right)
+    found = of_right(data_dir / scene)
     surface, depth, colour = SCENES[scene]
     assert found.surface > surface
     assert found.depth < depth
@@ -137,7 +142,7 @@ def test_views_agree(data_dir: Path, scene: str) -> None:
 )
 @pytest.mark.parametrize("scene", SCENES)
 def test_other_axes_are_worse(data_dir: Path, scene: str, mistake: Mistake) -> None:
-    good = agreement(pairs_of(data_dir / scene), right, right)
+    good = of_right(data_dir / scene)
     bad = agreement(pairs_of(data_dir / scene), mistake, mistake)
     assert bad.surface < good.surface - 0.15
 
@@ -145,7 +150,7 @@ def test_other_axes_are_worse(data_dir: Path, scene: str, mistake: Mistake) -> N
 @pytest.mark.parametrize("scene", SCENES)
 def test_half_a_pixel_in_one_view_is_worse(data_dir: Path, scene: str) -> None:
     """Pixel centres at whole numbers in one place, at halves in another."""
-    good = agreement(pairs_of(data_dir / scene), right, right)
+    good = of_right(data_dir / scene)
     bad = agreement(pairs_of(data_dir / scene), shifted(0.5), right)
     assert bad.colour > 1.02 * good.colour
 
@@ -153,5 +158,5 @@ def test_half_a_pixel_in_one_view_is_worse(data_dir: Path, scene: str) -> None:
 @pytest.mark.parametrize("shift", [shifted(0.5), shifted(-0.5)], ids=["right", "left"])
 def test_half_a_pixel_in_all_views_is_worse(data_dir: Path, shift: Mistake) -> None:
     """Intrinsics meant for other pixel centres: much of that cancels, and only exact depth tells."""
-    pairs = pairs_of(data_dir / "room_living")
-    assert agreement(pairs, shift, shift).depth > 2 * agreement(pairs, right, right).depth
+    room = data_dir / "room_living"
+    assert agreement(pairs_of(room), shift, shift).depth > 2 * of_right(room).depth

@@ -62,7 +62,7 @@ def test_point_clouds(scene: Map, tmp_path: Path) -> None:
 def test_transforms_json_is_read_again(scene: Map, tmp_path: Path) -> None:
     bn.export_map(scene, tmp_path / "out", "transforms.json")
     frames = read_frames(read_record(tmp_path / "out" / "transforms.json"))
-    assert {frame.unit for frame in frames} == {scene.unit}
+    assert {frame.record.value("unit") for frame in frames} == {scene.unit}
     for frame, camera in zip(frames, scene.info.cameras, strict=True):
         assert frame.stem == camera.name
         torch.testing.assert_close(frame.T_world_camera.matrix(), camera.pose.matrix(), atol=1e-9, rtol=0)

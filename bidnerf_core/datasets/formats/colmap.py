@@ -50,10 +50,8 @@ def _read(path: Path, models: list[Path], options: DatasetOptions) -> Capture:
     """Read the project. Raises ``InputError`` if its model is damaged or has no registered image."""
     model, folder, images, cameras, files = colmap_project(path)
     if options.masks is None and any((place / "masks").is_dir() for place in (path, folder.parent)):
-        remark(
-            path,
-            "masks lies beside the images and is not used; name it (--masks, masks= in Python) to use it",
-        )
+        text = "masks lies beside the images and is not used; name it (--masks, masks= in Python) to use it"
+        remark(path, text)
     if folder != path:
         photos = [file for file in folder.rglob("[!.]*") if file.suffix.lower() in IMAGE_ENDINGS[1:]]
         others = sorted(set(photos) - set(files.values()), key=lambda file: natural_order(str(file)))
@@ -109,10 +107,8 @@ def _largest(path: Path, models: Sequence[Path]) -> tuple[Path, list[ModelImage]
     read = {model: read_posed_images(model) for model in models}
     chosen = max(models, key=lambda model: len(read[model][0]))
     if len(models) > 1:
-        sizes = {
-            model: f"{model.relative_to(path)} with {amount(len(read[model][0]), 'image')}"
-            for model in models
-        }
+        count = {model: amount(len(images), "image") for model, (images, _) in read.items()}
+        sizes = {model: f"{model.relative_to(path)} with {count[model]}" for model in models}
         used = sizes.pop(chosen)
         text = f"has {len(models)} models, of which {used} is used, not {', '.join(sizes.values())}"
         remark(path, f"{text}; each model has its own world frame")
@@ -144,14 +140,11 @@ def shot_of(model: Path, image: ModelImage, file: Path | None, cameras: dict[int
         found = f"image {image.name!r} has the camera {image.camera}, which is missing from cameras"
         raise InputError(found, where=model)
     name, depth = posix_name(image.name), depth_map_of(model, image.name)
+    read = None if depth is None else DepthFile(depth, partial(read_colmap_depth, depth))
     return Shot(
-        image=file,
-        camera=cameras[image.camera],
-        T_world_camera=image.T_camera_model.inverse(),
-        depth=None if depth is None else DepthFile(depth, partial(read_colmap_depth, depth)),
-        stem=name.stem,
-        folders=name.parts[:-1],
-    )
+        image=file, camera=cameras[image.camera], T_world_camera=image.T_camera_model.inverse(), depth=read,
+        stem=name.stem, folders=name.parts[:-1],
+    )  # fmt: skip
 
 
 reader = Format("images with a sparse model in sparse/0 (COLMAP)", colmap_models, _read)

@@ -48,8 +48,8 @@ class Recording:
 
     def file(self, name: str) -> ImageSource:
         """Return a file of the recording: an archive member, read when opened, or the path where it is expected in the folder."""
-        is_packed = self._archive is not None and name in self._archive
-        return self._archive.file(name) if self._archive is not None and is_packed else self.path / name
+        packed = self._archive is not None and name in self._archive
+        return self._archive.file(name) if self._archive is not None and packed else self.path / name
 
     def depth(self, number: int, size: tuple[int, int]) -> DepthImage:
         """Read the depth of a frame of ``size`` (width, height). Raises ``InputError`` if the number of bytes does not match."""
@@ -61,20 +61,14 @@ class Recording:
         return self._lidar.sure(measured, sure, f"{self.path}/{confidence}")
 
     def _unpacked(self, name: str, kind: str, size: tuple[int, int]) -> np.ndarray:
-        where, packed, count = (
-            f"{self.path}/{name}",
-            self.read(name),
-            np.dtype(kind).itemsize * math.prod(size),
-        )
+        where, packed = f"{self.path}/{name}", self.read(name)
+        decompress = _lzfse(self.path)
         try:
-            found = _lzfse(self.path)(packed)
-        except InputError:
-            raise
+            found = decompress(packed)
         except Exception as error:  # a C library raises it
-            raise InputError(
-                f"not readable as LZFSE ({error})", where=where, expected="a complete file"
-            ) from error
-        if len(found) != count:
+            why = f"not readable as LZFSE ({error})"
+            raise InputError(why, where=where, expected="a complete file") from error
+        if len(found) != (count := np.dtype(kind).itemsize * math.prod(size)):
             expected = f"{count} according to metadata (dw, dh)"
             raise InputError(f"unpacks to {len(found)} bytes", where=where, expected=expected)
         return np.frombuffer(found, kind).reshape(size[::-1])
@@ -86,9 +80,8 @@ def _read(path: Path, metadata_file: Path, options: DatasetOptions) -> Capture:
     metadata = parse_record(str(metadata_file), files.read("metadata"), "the metadata of Record3D")
     poses = metadata.items("poses") or []
     if not poses:
-        raise metadata.error(
-            "no poses", expected="a list of qx qy qz qw tx ty tz; record with poses switched on"
-        )
+        expected = "a list of qx qy qz qw tx ty tz; record with poses switched on"
+        raise metadata.error("no poses", expected=expected)
     width, height = metadata.size("w"), metadata.size("h")
     if width is None or height is None:
         raise metadata.error("no w and h", expected="the size of the photos")
@@ -101,18 +94,12 @@ def _read(path: Path, metadata_file: Path, options: DatasetOptions) -> Capture:
         if not isinstance(pose, list) or len(pose) != 7 or not all(type(x) in (int, float) for x in pose):
             raise InputError("is not 7 numbers", where=where, expected="qx qy qz qw tx ty tz")
         file = f"{path / depth}" if depth in files else path / depth
-        shots.append(
-            Shot(
-                image=files.file(f"rgbd/{number}.jpg"),
-                camera=camera_of(metadata.where, cameras[number], (width, height)),
-                T_world_camera=pose_of_numbers(where, [*pose[4:], *pose[:4]], opengl=True),
-                time=times[number],
-                depth=DepthFile(file, partial(files.depth, number, size)) if has_depth else None,
-                stem=str(number),
-                folders=(),
-                usual_side=lidar.LARGEST_SIDE,
-            )
-        )
+        shots.append(Shot(
+            image=files.file(f"rgbd/{number}.jpg"), camera=camera_of(metadata.where, cameras[number], (width, height)),
+            T_world_camera=pose_of_numbers(where, [*pose[4:], *pose[:4]], opengl=True), time=times[number],
+            depth=DepthFile(file, partial(files.depth, number, size)) if has_depth else None,
+            stem=str(number), folders=(), usual_side=lidar.LARGEST_SIDE,
+        ))  # fmt: skip
     return Capture(
         path, shots, options.colour, unit="metres", pose_file=metadata.where, rate=lidar.FRAMES_PER_SECOND,
         poses_expected="finite qx qy qz qw tx ty tz of each frame",
@@ -148,14 +135,14 @@ def _times(metadata: Record, count: int) -> list[float | None]:
 def _cameras(metadata: Record, count: int) -> list[list[float]]:
     """Return fx, fy, cx and cy of each frame: per-frame values if recorded, else the same values for all."""
     rows, shared = metadata.items("perFrameIntrinsicCoeffs") or [], metadata.items("K") or []
+    if len(rows) > count:
+        raise metadata.error(f"perFrameIntrinsicCoeffs has {len(rows)} rows", expected=f"{count}, as poses")
     if len(rows) < count:
         rows = [[shared[i] for i in (0, 4, 6, 7)]] * count if len(shared) == 9 else []  # column by column
     if not rows or not all(isinstance(row, list) and len(row) >= 4 for row in rows):
         found = "no K with 9 numbers, and no perFrameIntrinsicCoeffs with 4 for each frame"
         raise metadata.error(found, expected="the intrinsics")
-    return [
-        [metadata.checked_number(value, "an entry of the intrinsics") for value in row[:4]] for row in rows
-    ]
+    return [[metadata.checked_number(value, "an intrinsic") for value in row[:4]] for row in rows]
 
 
 reader = Format("a .r3d file, or metadata with rgbd/0.jpg ... (Record3D)", _find, _read, suffixes=(".r3d",))

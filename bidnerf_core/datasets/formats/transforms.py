@@ -27,6 +27,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 from bidnerf_core.camera import Camera, CameraSource, PanoramaFace, same_aspect
 from bidnerf_core.datasets.capture import SPLITS, Capture, DepthFile, Shot, remark
@@ -36,6 +37,7 @@ from bidnerf_core.datasets.reader import DatasetOptions, Format
 from bidnerf_core.depth import DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import MaskFile
+from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import background_colour, is_file, read_header
 
 
@@ -45,7 +47,7 @@ def _read(path: Path, found: list[Path], options: DatasetOptions) -> Capture:
     images = [names.path(frame.file_path, IMAGE_ENDINGS, moved=True) for frame, _ in listed]
     _check_images(path, [frame for frame, _ in listed], images)
     steps = {frame.depth_unit for frame, _ in listed if frame.depth_path}
-    units = {frame.unit for frame, _ in listed}
+    units = {frame.record.value("unit") for frame, _ in listed}  # which bidnerf's own files state
     read_depth, size = DepthReader(), _first_size([frame for frame, _ in listed], images)
     shots, first = list[Shot](), dict[tuple[str, ...], Path]()
     for (frame, splits), image in zip(listed, images, strict=True):
@@ -76,7 +78,7 @@ def _read(path: Path, found: list[Path], options: DatasetOptions) -> Capture:
     white = options.background is None and any(has_alpha for _, has_alpha in map(_header, first.values()))
     return Capture(
         path, shots, background_colour("white") if white else options.colour,
-        unit=units.pop() if len(units) == 1 else None,
+        unit=next((unit for unit in get_args(LengthUnit) if units == {unit}), None),
         depth_unit=options.depth_unit or (steps.pop() if len(steps) == 1 else None),
     )  # fmt: skip
 
