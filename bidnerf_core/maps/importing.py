@@ -143,16 +143,13 @@ def import_map(
             gravity_up=None if read is None else read.gravity_up,
         )  # fmt: skip
         scene = Map(info, frozen_field(info, found.tensors, None)).to(device)
-        if read is not None:
-            cameras = read.with_files(stored_cameras(views))
-        elif found.cameras:
-            cameras = found.cameras
-            count = amount(len(cameras), "camera")
-            log.info(f"{where}: {count} of its training images found next to it")
-        else:
+        cameras = found.cameras if read is None else read.with_files(stored_cameras(views))
+        if read is None and cameras:
+            log.info(f"{where}: {amount(len(cameras), 'camera')} of its training images found next to it")
+        elif read is None:
             cameras = viewpoints(scene.field, bounds, found.up, found.is_solid)
-            place_of = "around it" if found.is_solid else "found in free space"
-            log.info(f"{where}: no photos; viewed from {amount(len(cameras), 'viewpoint')} {place_of}")
+            around = "around it" if found.is_solid else "found in free space"
+            log.info(f"{where}: no photos; viewed from {amount(len(cameras), 'viewpoint')} {around}")
         scene = replace(scene, info=replace(info, cameras=cameras))
         if views:
             scene.check_alike(views, where)
@@ -178,10 +175,11 @@ def _of_structure(
     origin = chosen_origin(T_world_camera.translation)
     offset = -torch.tensor(origin, dtype=torch.float64)
     unit: LengthUnit = "metres" if options.scale != 1 else "units"
+    tracked = None
     if structure.keypoints:
         read, tracked = _described(structure, features, origin)
     else:
-        read, tracked = read_views(capture, replace(options.images, split="all")).about(origin), None
+        read = read_views(capture, replace(options.images, split="all")).about(origin)
     bounds = bounds_about(structure.positions[structure.positions.isfinite().all(-1)] + offset)
     _report_extent(found, str(capture.path), unit)
     info = MapInfo(
@@ -211,7 +209,7 @@ def _described(structure: Structure, features: str, origin: Origin) -> tuple[Rea
 
     Raises ``InputError`` if the descriptors are not those of the detector ``features``.
     """
-    capture, blank = structure.capture, dict[tuple[int, int], Tensor]()
+    capture, offset = structure.capture, -torch.tensor(origin, dtype=torch.float64)
     probe = detected(
         find_features(features), torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0))
     )
@@ -222,45 +220,31 @@ def _described(structure: Structure, features: str, origin: Origin) -> tuple[Rea
             where=capture.path, expected="the detector that made them (--landmark-features)",
         )  # fmt: skip
     views, images, labels = list[View](), list[ImageKeypoints](), list[Tensor]()
-    free = len(structure.positions)
     for shot, keypoints, observed in zip(capture.shots, structure.keypoints, structure.observed, strict=True):
         stored, T = shot.camera, shot.T_world_camera
         assert isinstance(stored, Intrinsics)  # as the importer promises
         assert T is not None
-        camera = stored.at_most(USEFUL_SIDE)
-        size = camera.height, camera.width
-        blank.setdefault(size, torch.zeros((*size, 3), dtype=torch.uint8))
+        camera, T = stored.at_most(USEFUL_SIDE), T.translated(offset)
         order = (observed < 0).long().argsort(stable=True)
         # As many keypoints are used as SIFT finds in a query; if more observe a point, all of these.
         order = order[: max(int((observed >= 0).sum()), 2000)]
-        scale = torch.tensor([camera.width / stored.width, camera.height / stored.height])
+        size = torch.tensor([camera.width, camera.height])
+        scale = size / torch.tensor([stored.width, stored.height])
         chosen = Keypoints(
-            (keypoints.pixels[order] * scale).clamp(
-                torch.zeros(2), torch.tensor([camera.width, camera.height])
-            ),
+            (keypoints.pixels[order] * scale).clamp(torch.zeros(2), size),
             keypoints.sizes[order] * scale.mean(),
             keypoints.descriptors[order],
         )
-        there = observed[order]
-        labels.append(torch.where(there >= 0, there, free + torch.arange(len(order))))
-        free += len(order)
-        views.append(View(Frame(shot.name, blank[size], camera), T))
-        images.append(
-            ImageKeypoints(
-                chosen,
-                camera.unproject(chosen.pixels.double()),
-                torch.zeros(len(order), dtype=torch.float64),
-                camera,
-                T,
-            )
-        )
+        labels.append(observed[order])
+        blank = torch.zeros((1, 1, 3), dtype=torch.uint8).expand(camera.height, camera.width, 3)
+        views.append(View(Frame(shot.name, blank, camera), T))
+        rays, depth = camera.unproject(chosen.pixels.double()), torch.zeros(len(order), dtype=torch.float64)
+        images.append(ImageKeypoints(chosen, rays, depth, camera, T))
     files = {shot.name: os.path.relpath(shot.file, capture.path) for shot in capture.shots if shot.file}
-    read = ReadViews(views, capture.path.name, str(capture.path), BLACK, files=files).about(origin)
-    images = [
-        replace(image, T_ref_camera=view.T_ref_camera) for image, view in zip(images, read.views, strict=True)
-    ]
-    label = torch.cat(labels)
-    points = structure.positions - torch.tensor(origin, dtype=torch.float64)
+    read = ReadViews(views, capture.path.name, str(capture.path), BLACK, files=files)
+    label, points = torch.cat(labels), structure.positions + offset
+    # A keypoint that observes no point is a track of its own.
+    label = torch.where(label >= 0, label, len(points) + torch.arange(len(label)))
     return read, TrackedViews(TrackedKeypoints(images, label, torch.arange(len(label))), features, points)
 
 
@@ -271,15 +255,15 @@ def _report_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
         lower, upper = robust_box(found.points, margin=0.0)
         size = (upper - lower).tolist()
     extent = " x ".join(f"{side:.3g}" for side in size)
-    log.info(
-        f"{where}: extent {extent}"
-        + (" metres" if unit == "metres" else "; its unit is not stored (--scale gives its length in metres)")
-    )
+    known = " metres" if unit == "metres" else "; its unit is not stored (--scale gives its length in metres)"
+    log.info(f"{where}: extent {extent}{known}")
     # The longest side of a plausible scene is between 5 cm and 500 m; other lengths are probably in another unit.
-    doubt = "tiny in metres; are its lengths kilometres or an arbitrary unit?"
-    if max(size) > 500:
-        doubt = "very large in metres; are its lengths millimetres?"
     if not 0.05 <= max(size) <= 500:
+        doubt = (
+            "very large in metres; are its lengths millimetres?"
+            if max(size) > 500
+            else "tiny in metres; are its lengths kilometres or an arbitrary unit?"
+        )
         warnings.warn(f"{where}: {extent} would be {doubt} --scale changes them", InputWarning, stacklevel=3)
 
 
@@ -372,25 +356,20 @@ def _within(
     a, b = directions @ first, -directions @ second
     sectors = a > b.abs(), b >= a.abs(), -a > b.abs(), -b >= a.abs()
     poses = []
-    for number in _spread(places, VIEWS // 4):
+    # Farthest-point sampling, which begins near the middle of the positions
+    number = int((places - places.mean(0)).norm(dim=-1).argmin())
+    away = torch.full_like(places[:, 0], torch.inf)
+    for _ in range(min(VIEWS // 4, len(places))):
+        eye = places[number]
         # In each of four sectors about the vertical, the direction with the farthest matter: it shows most.
         for sector in sectors:
             allowed = sector & level & (distance[number] > 0)
             if bool(allowed.any()):
                 ray = int(torch.where(allowed, distance[number], -1).argmax())
-                eye = places[number].double()
-                poses.append(look_at(eye, eye + directions[ray], up))
+                poses.append(look_at(eye.double(), eye.double() + directions[ray], up))
+        away = torch.minimum(away, (places - eye).norm(dim=-1))
+        number = int(away.argmax())
     return poses
-
-
-def _spread(places: Float[Tensor, "p 3"], count: int) -> list[int]:
-    """Return the indices of positions far from each other (farthest-point sampling)."""
-    chosen = [int((places - places.mean(0)).norm(dim=-1).argmin())]
-    away = (places - places[chosen[0]]).norm(dim=-1)
-    while len(chosen) < min(count, len(places)):
-        chosen.append(int(away.argmax()))
-        away = torch.minimum(away, (places - places[chosen[-1]]).norm(dim=-1))
-    return chosen
 
 
 def sphere(count: int) -> Float[Tensor, "n 3"]:
