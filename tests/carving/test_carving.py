@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -50,24 +51,26 @@ def ball_distance(view_from: SE3, rays: Float[Tensor, "h w 3"], radius: float) -
     return (b - (b * b - a * (middle @ middle - radius**2)).sqrt()) / a
 
 
+@functools.cache
+def ball_depth(place: tuple[float, ...], camera: Intrinsics, radius: float) -> Tensor:
+    """The depth image of the ball from a place; 0 beside it."""
+    rays = camera.unproject(camera.pixel_centres(torch.float64))
+    return ball_distance(looking_at(place, (0, 0, 0)), rays, radius).nan_to_num(0).float()
+
+
 def ball_view(
-    place: Sequence[float],
+    place: tuple[float, ...],
     camera: Intrinsics = CAMERA,
     depth: bool = True,
     alpha: bool = True,
     radius: float = RADIUS,
 ) -> View:
-    pose = looking_at(place, (0, 0, 0))
-    z = (
-        ball_distance(pose, camera.unproject(camera.pixel_centres(torch.float64)), radius)
-        .nan_to_num(0)
-        .float()
-    )
+    z = ball_depth(place, camera, radius).clone()
     hit = (z > 0).float()
     frame = Frame(
         "ball", hit[..., None].expand(*hit.shape, 3), camera, z if depth else None, hit if alpha else None
     )
-    return View(frame, pose)
+    return View(frame, looking_at(place, (0, 0, 0)))
 
 
 def around(count: int = 10, distance: float = 4.0) -> list[tuple[float, float, float]]:

@@ -32,7 +32,7 @@ from bidnerf_core.maps import load_info, load_map, write_parts
 from bidnerf_core.results import Answer, Answers, PosedImage, new_figure, save_gif, write_figure
 from bidnerf_core.results.pose_files import POSE_WRITERS
 from interruptions import FULL, Stopped, outcomes
-from test_storage import CAMERAS, PARTS, info, names, state
+from test_storage import CAMERAS, PARTS, info, names, plain, save_part, state
 from trial_results import trial_result
 
 CAMERA = bn.Intrinsics(8.0, 8.0, 4.0, 3.0, 8, 6)
@@ -55,14 +55,12 @@ def file(
 
 
 def part_of_a_map(name: str) -> Saver:
-    part = PARTS[name]
-
     def save(folder: Path, number: int) -> None:
-        part.save(folder, load_info(folder), part.contents()[number - 1])
+        save_part(folder, load_info(folder), name, number - 1)
 
     def read(folder: Path) -> object:
-        found = part.read(load_map(folder))
-        return None if found is None else part.plain(found)
+        found = getattr(load_map(folder), name)
+        return None if found is None else plain(found)
 
     return save, read
 
