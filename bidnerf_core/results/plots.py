@@ -71,16 +71,12 @@ def new_figure(width: float, height: float) -> Any:
 def save_figure(figure: Any, folder: Path, name: str) -> Path:
     """Save a figure as SVG, and as PNG next to it; return the path of the SVG."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_figure(figure, folder / f"{name}.png", dpi=160)
-    figure.set_layout_engine(
-        "none"
-    )  # what is laid out stays so, and laying it out again takes as long as drawing it
-    write_figure(figure, folder / f"{name}.svg", metadata={"Date": None})
+    write_figure(figure, folder / f"{name}.png", folder / f"{name}.svg", dpi=160)
     return folder / f"{name}.svg"
 
 
-def write_figure(figure: Any, path: Path, **options: Any) -> None:
-    """Write a figure atomically in the format of the path's suffix.
+def write_figure(figure: Any, *paths: Path, dpi: int = 150) -> None:
+    """Write a figure atomically to each path, in the format of its suffix.
 
     Its text, which includes names of files, frames and settings, is made printable and truncated to a
     drawable length.
@@ -96,9 +92,11 @@ def write_figure(figure: Any, path: Path, **options: Any) -> None:
     ):
         if isinstance(formatter, FuncFormatter):  # its labels are set again whenever a figure is drawn
             formatter.func = lambda *place, labels=formatter.func: _drawable(str(labels(*place)))
-    file = io.BytesIO()
-    figure.savefig(file, format=path.suffix.lstrip(".") or "png", **options)
-    write_file(path, file.getvalue())
+    for path in paths:
+        file, suffix = io.BytesIO(), path.suffix.lstrip(".") or "png"
+        figure.savefig(file, format=suffix, dpi=dpi, metadata={"Date": None} if suffix == "svg" else {})
+        write_file(path, file.getvalue())
+        figure.set_layout_engine("none")  # to lay it out again would take as long as to draw it
 
 
 def _drawable(text: str) -> str:
@@ -155,7 +153,7 @@ def draw_capture(
         figure.legend(loc="outside lower center", ncols=4)
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
-            write_figure(figure, out, dpi=150)
+            write_figure(figure, out)
         except OSError as error:
             raise InputError(f"cannot be written ({error.strerror})", where=out) from error
 
@@ -210,4 +208,4 @@ def draw_path(
         label = f"standard deviation of the position ({fine})"
         figure.colorbar(marks, ax=list(panels), label=label, shrink=0.85)
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-        write_figure(figure, out, dpi=150)
+        write_figure(figure, out)
