@@ -179,18 +179,10 @@ def write_poses(path: str | Path, images: Sequence[PosedImage]) -> None:
     Raises ``InputError`` for an unknown ending, and for images that are not ``PosedImage``.
     """
     path = Path(path)
-    strange = (
-        [image for image in images if not isinstance(image, PosedImage)]
-        if isinstance(images, Sequence)
-        else [images]
-    )
-    if strange:
-        found = type(strange[0]).__name__
-        raise InputError(
-            f"got a {found}",
-            where=path,
-            expected="a list of PosedImage(name, number, intrinsics, T_world_camera)",
-        )
+    is_list = isinstance(images, Sequence)
+    if odd := [image for image in images if not isinstance(image, PosedImage)] if is_list else [images]:
+        expected = "a list of PosedImage(name, number, intrinsics, T_world_camera)"
+        raise InputError(f"got a {type(odd[0]).__name__}", where=path, expected=expected)
     POSE_WRITERS[pose_format(path)](path, images)
 
 
@@ -242,17 +234,16 @@ def read_positions(path: str | Path) -> dict[str, Float[Tensor, "3"]]:
     path = Path(path)
     try:
         entries = pose_entries(path, read_file(path, "a pose file"))
-        if len(entries) != 1 or not isinstance(entries[0], dict) or "T_world_camera" in entries[0]:
+        given = entries[0] if len(entries) == 1 and isinstance(entries[0], dict) else {}
+        if not given or "T_world_camera" in given:
             return {name: pose.translation for name, pose in read_poses(path).items()}
-        found = dict[str, Float[Tensor, "3"]]()
-        for name, value in entries[0].items():
-            numbers = _numbers(str(path), value, EXPECTED_POSITIONS)
-            if numbers.shape != (3,):
-                numbers = pose_from_matrix(numbers, repr(name), path).translation
-            found[name] = numbers
+        numbers = {name: _numbers(str(path), value, EXPECTED_POSITIONS) for name, value in given.items()}
+        return {
+            name: x if x.shape == (3,) else pose_from_matrix(x, repr(name), path).translation
+            for name, x in numbers.items()
+        }
     except InputError as error:
         raise InputError(error, expected=EXPECTED_POSITIONS) from error
-    return found
 
 
 def _numbers(where: str, values: Any, expected: str) -> Tensor:

@@ -16,7 +16,7 @@ from bidnerf_core.fields import RadianceField, levels
 from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.testing import field_checks, recipes
 from bidnerf_core.testing.device import check_steps
-from bidnerf_core.testing.faults import calling, is_one_line, query, require
+from bidnerf_core.testing.faults import calling, is_one_line, once, query, require
 from bidnerf_core.testing.scene import SCENE_BOUNDS, awkward_rays, joined, points, rgb_views, rgbd_views
 
 
@@ -232,12 +232,14 @@ class BackendContract:
 
     def _trained(self) -> Any:
         """Return a field trained on RGB-D views (once per test class) and frozen like the field of a loaded map."""
-        if "_kept" not in vars(type(self)):
+
+        def train() -> Any:
             field = self._build()
             with calling(f"{type(self._backend()).__name__}.train"):
                 self._backend().train(field, rgbd_views(), self._config(), recipes.Recorder())
-            type(self)._kept = frozen(field)  # type: ignore[attr-defined]
-        return vars(type(self))["_kept"]
+            return frozen(field)
+
+        return once(self, train)
 
     def _fields(self) -> Iterator[Any]:
         yield frozen(self._build())

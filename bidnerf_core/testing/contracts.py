@@ -21,7 +21,16 @@ from bidnerf_core.mapping import (
     squared_distances,
 )
 from bidnerf_core.registry import interface_defects
-from bidnerf_core.testing.faults import Named, are_colours, calling, equal, is_depth, is_one_line, require
+from bidnerf_core.testing.faults import (
+    Named,
+    are_colours,
+    calling,
+    equal,
+    is_depth,
+    is_one_line,
+    once,
+    require,
+)
 from bidnerf_core.testing.textured_field import (
     CAMERA,
     POSES,
@@ -137,10 +146,8 @@ class MethodContract(Named):
 
     def _first(self) -> Localization:
         """Return the answer for an image of the map's scene, found once per test class."""
-        if "_kept" not in vars(type(self)):
-            found = self._localized(textured_map(surface=True), unseen().frame, unseen().T_ref_camera)
-            type(self)._kept = found  # type: ignore[attr-defined]
-        return vars(type(self))["_kept"]
+        scene, view = textured_map(surface=True), unseen()
+        return once(self, lambda: self._localized(scene, view.frame, view.T_ref_camera))
 
     def _localized(self, scene: MapWithLandmarks, frame: Frame, truth: SE3) -> Localization:
         # A tangent vector (metres, radians) from the true pose to the start of methods that need one.

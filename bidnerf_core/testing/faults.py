@@ -58,6 +58,14 @@ def is_depth(depth: Tensor | None) -> bool:
     return depth is None or bool(depth.isfinite().all() and (depth >= 0).all())
 
 
+def once(subject: object, make: Callable[[], T]) -> T:
+    """Return what ``make`` makes, once per test class: ``subject`` is one of its instances."""
+    if "_made" not in vars(type(subject)):
+        type(subject)._made = make()  # type: ignore[attr-defined]
+    found: T = vars(type(subject))["_made"]
+    return found
+
+
 class Named:
     """Base class of the contracts of plugins that are registered under ``name``."""
 

@@ -20,7 +20,7 @@ from bidnerf_core.mapping import (
     depth_ratio,
     tracked_views,
 )
-from bidnerf_core.testing.faults import Named, are_colours, calling, equal, is_depth, require
+from bidnerf_core.testing.faults import Named, are_colours, calling, equal, is_depth, once, require
 
 ENOUGH_POINTS = 30
 """Smallest number of points that several images must agree on for their poses to be judged."""
@@ -152,6 +152,4 @@ class ReaderContract(Named):
 
     def _tracked(self) -> TrackedViews:
         """Return the keypoints of the images, joined into tracks; computed once per test class."""
-        if "_kept" not in vars(type(self)):
-            type(self)._kept = tracked_views(self._views())  # type: ignore[attr-defined]
-        return vars(type(self))["_kept"]
+        return once(self, lambda: tracked_views(self._views()))

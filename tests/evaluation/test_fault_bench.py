@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import json
 import math
 from pathlib import Path
 from types import ModuleType
@@ -71,23 +70,6 @@ def test_the_method_gets_the_faulty_views() -> None:
     (blind,) = trial_views(dataclasses.replace(trial("occluder:0.2"), depth=False), data)
     assert blind.frame.depth is None
     assert torch.equal(blind.frame.rgb, faulty(clean, "occluder:0.2", 0).frame.rgb)
-
-
-@pytest.mark.slow
-def test_evaluate_writes_the_fault_and_resumes_by_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "r.jsonl"
-    words = ["evaluate", "demo:blobs", "--out", str(out), *QUICK, "--trials", "2"]
-    assert main([*words, "--fault", "depth-noise:0.01,0.02"]) == 0
-    assert main([*words, "--fault", "none", "--fault", "depth-noise:0.01", "exposure:0.7"]) == 0
-    assert "2 of 6 trials are already there" in capsys.readouterr().err
-    faults = [json.loads(line)["trial"]["fault"] for line in out.read_text().splitlines()]
-    noise = [f"depth-noise:{size}" for size in (0.02, 0.01)]
-    assert faults == [noise[0]] * 2 + ["none"] * 2 + [noise[1]] * 2 + ["exposure:0.7"] * 2
-    assert main([*words, "--fault", "exposur:0.7"]) == 2
-    assert main([*words, "--fault", "depth-scale:1.02", "--no-depth"]) == 1
-    assert "did you mean 'exposure'" in capsys.readouterr().err
 
 
 def test_results_notice_when_a_fault_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
