@@ -6,6 +6,7 @@ import json
 import shutil
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ from bidnerf_core.evaluation import (
     trial,
 )
 from bidnerf_core.evaluation.comparison import MapRow, map_bytes, measured, named_maps
-from bidnerf_core.evaluation.run import InThisProcess, own_processes
+from bidnerf_core.evaluation.run import InThisProcess, ended_on_failure, own_processes
 from bidnerf_core.evaluation.summary import success_of
 from bidnerf_core.io import from_plain
 from refusals import refused
@@ -195,6 +196,22 @@ def test_a_process_that_ends_is_told_in_one_line(
     monkeypatch.setattr("bidnerf_core.evaluation.comparison.own_processes", lambda count: Ending())
     with refused(where=maps[0], found="frame t_0002 ended", expected="memory"):
         compare([maps[0]], data, plan)
+
+
+def test_a_failure_ends_the_processes_with_their_trials() -> None:
+    class Process:
+        ended = False
+
+        def terminate(self) -> None:
+            self.ended = True
+
+    for failure in (LookupError, None):
+        pool, process = InThisProcess(), Process()
+        vars(pool)["_processes"] = {7: process}
+        with suppress(LookupError), ended_on_failure(pool):
+            if failure is not None:
+                raise failure
+        assert process.ended == (failure is not None)
 
 
 def test_the_picture_is_written(compared: Comparison, tmp_path: Path) -> None:
