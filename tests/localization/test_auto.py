@@ -71,7 +71,10 @@ def test_measured_points_do_not_tell_an_approximate_focal_length() -> None:
     assert "the focal length is approximate" in found.reason
     colour = approximate(colour_only(view))
     lidar = rig(FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), [colour], None, in_camera(view))
-    assert found_for(lidar).converged
+    found = found_for(lidar)
+    assert_right(found, view.T_ref_camera)
+    assert found.converged, found.reason
+    assert found.covariance is not None
 
 
 def test_a_start_helps_where_the_map_has_no_view_alike() -> None:
@@ -110,19 +113,6 @@ def test_a_field_that_does_not_show_the_surface_hardly_moves_the_pose() -> None:
 def in_camera(view: View) -> Observations:
     """Return the depth image of a view as rays in the frame of its camera."""
     return depth_rays_of([View(view.frame, SE3.identity())])
-
-
-@pytest.mark.parametrize("number", range(2))
-def test_depth_rays_stand_in_for_a_depth_image(number: int) -> None:
-    """A colour image beside a lidar, without a start."""
-    view = baked.unseen()[number]
-    problem = rig(
-        FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), [colour_only(view)], None, in_camera(view)
-    )
-    found = found_for(problem)
-    assert_right(found, view.T_ref_camera)
-    assert found.converged, found.reason
-    assert found.covariance is not None
 
 
 def test_depth_rays_of_a_wide_lidar_are_matched_without_colour_where_no_image_sees_them() -> None:
@@ -212,13 +202,3 @@ def test_what_looks_the_same_from_two_sides_is_ambiguous() -> None:
     surface, (view,) = baked.baked(scene), baked.images(scene, 1, seed=5)
     found = found_for(baked.problem(view, surface=surface))
     assert found.outcome is Outcome.AMBIGUOUS, found.reason
-
-
-def test_the_same_seed_gives_the_same_answer() -> None:
-    problem = baked.problem(baked.unseen()[1])
-    first = found_for(problem, 3)
-    torch.manual_seed(99)
-    again = found_for(problem, 3)
-    assert torch.equal(first.T_world_camera.matrix(), again.T_world_camera.matrix())
-    assert torch.equal(first.losses, again.losses)
-    assert not torch.equal(first.T_world_camera.matrix(), found_for(problem, 4).T_world_camera.matrix())

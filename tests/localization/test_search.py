@@ -14,7 +14,7 @@ from bidnerf_core.localization import states_at
 
 # Inside: the distribution of proposals and the margin over other poses, of which an answer keeps one
 from bidnerf_core.localization.by_rays import centred
-from bidnerf_core.localization.by_surface import by_depth, by_images, hypotheses
+from bidnerf_core.localization.by_surface import by_images, hypotheses
 from bidnerf_core.localization.problem import middle_of_view
 from bidnerf_core.localization.search import Stage, halve, neighbours
 from bidnerf_core.mapping import Normal, P, States
@@ -111,18 +111,8 @@ def test_centring_takes_back_most_of_a_shift_and_leaves_a_view_of_nothing() -> N
     assert torch.equal(centred(problem, away, middle).matrix(), away.matrix())
 
 
-def test_points_find_the_pose_anywhere_in_the_scene() -> None:
-    view = baked.unseen()[0]
-    found = by_depth(baked.problem(view), baked.points(view), 128, 0)
-    error = pose_error(found.states.T[0], view.T_ref_camera)
-    assert float(error.translation) < 0.03
-    assert float(error.rotation_deg) < 0.5
-    assert found.margin > 0.15
-
-
-@pytest.mark.parametrize("number", [1])
-def test_images_find_the_pose_without_depth(number: int) -> None:
-    view = baked.unseen()[number]
+def test_images_find_the_pose_without_depth() -> None:
+    view = baked.unseen()[1]
     found, _ = by_images(baked.problem(view).without_depth(), baked.toy(), 64, 0)
     error = pose_error(found.states.T[0], view.T_ref_camera)
     # Of 3.5 m and with pixels and surfels that are 4 cm wide: what is left is the field's to take.
@@ -130,15 +120,9 @@ def test_images_find_the_pose_without_depth(number: int) -> None:
     assert float(error.rotation_deg) < 3
 
 
-@pytest.mark.parametrize("depth", [True, False])
-def test_what_looks_the_same_from_two_sides_has_no_margin(depth: bool) -> None:
+def test_what_looks_the_same_from_two_sides_has_no_margin() -> None:
     """A box that half a turn maps onto itself."""
     scene = baked.even_box()
     surface, (view,) = baked.baked(scene), baked.images(scene, 1, seed=5)
-    problem = baked.problem(view, surface=surface)
-    if depth:
-        found = by_depth(problem, baked.points(view, surface=surface), 128, 0)
-        assert found.margin < 0.15
-    else:
-        found, _ = by_images(problem.without_depth(), surface, 64, 0)
-        assert found.margin < 0.15 * float(found.scores[0])
+    found, _ = by_images(baked.problem(view, surface=surface).without_depth(), surface, 64, 0)
+    assert found.margin < 0.15 * float(found.scores[0])

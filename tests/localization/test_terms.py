@@ -104,15 +104,12 @@ def numerical(cost, states: States, step: float) -> Tensor:  # type: ignore[no-u
 
 @pytest.mark.parametrize("field", [BLOBS, Sheets()], ids=["density", "hits"])
 @pytest.mark.parametrize("depth", [False, True], ids=["RGB", "RGB-D"])
-@pytest.mark.parametrize("exposure", [False, True])
 def test_the_gradient_by_rays_is_the_numerical_one(
-    monkeypatch: pytest.MonkeyPatch, field: RadianceField, depth: bool, exposure: bool
+    monkeypatch: pytest.MonkeyPatch, field: RadianceField, depth: bool
 ) -> None:
     """Fields are float32, and the intervals that are sampled, which have no derivative, move with the rays."""
     monkeypatch.setattr(rendering, "LEAST_WEIGHT", 0.0)
-    terms = RayTerms(
-        ColourSettings("cauchy"), DepthLossSettings(depth_loss="cauchy") if depth else None, exposure
-    )
+    terms = RayTerms(ColourSettings("cauchy"), DepthLossSettings(depth_loss="cauchy") if depth else None)
     rays = terms.term(problem(field), 100, 0)
     normal = rays(near())
     expected = numerical(lambda states: rays(states).cost, near(), 2e-3)
