@@ -66,10 +66,6 @@ USUAL = ("exact", "right", "inexact", "nominal", "map", "map, about")
 """Explanations by which the stated camera or one of the map's is at least approximately right."""
 MOVING = " moving"
 """Ending of the names of explanations in motion."""
-SHARE_MOVING, SHARE_AS_MAP = 1 / 30, 0.8
-"""Prior probability of a motion during the readout, and the same if the map's images move."""
-MOVE, TURN = 0.005, 0.01
-"""Motion from the first row to the last: relative to the scene's distance, and radians."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,10 +169,10 @@ def explanations(
     else:
         rows.append(("exact", [0.0] * 6, [0.0] * 6, 1.0, True))
     single = moving and len(query.images) == 1  # views of a rig may be from different times
-    share_moving = max(SHARE_MOVING, SHARE_AS_MAP * landmarks.moving) if single else 0.0
-    kinds = [("", [0.0] * 6, 1 - share_moving)]
+    share_moving, motion = motion_prior(landmarks, distance)
+    kinds = [("", [0.0] * 6, 1 - share_moving * single)]
     if single:
-        kinds.append((MOVING, [MOVE * distance] * 3 + [TURN] * 3, share_moving))
+        kinds.append((MOVING, motion, share_moving))
     every = [
         (name + ending, [*c, *[0.0] * 7], [*deviation, *motion, depth_scale], share * of_kind, credible)
         for ending, motion, of_kind in kinds
@@ -190,6 +186,14 @@ def explanations(
     if query.has_one_camera:
         deviation[:, :4] = torch.hypot(deviation[:, :4], landmarks.calibration_scatter.double())
     return Explanations(names, mean, deviation, prior.log(), torch.tensor(right))
+
+
+def motion_prior(landmarks: LandmarkMap, distance: float) -> tuple[float, list[float]]:
+    """Return the prior probability that the camera moved during the readout, and the standard deviations of that motion.
+
+    The motion is from the first row to the last, and relative to the ``distance`` (metres) of the scene.
+    """
+    return max(1 / 30, 0.8 * landmarks.moving), [0.005 * distance] * 3 + [0.01] * 3
 
 
 def cameras_of_map(query: QueryKeypoints, landmarks: LandmarkMap) -> list[Float[Tensor, "6"]]:

@@ -22,12 +22,14 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import LANDMARK_BOUNDS, Evidence, judge
 from bidnerf_core.localization.explanations import MOVING, USUAL, Explanations, Proposal, explanations
 from bidnerf_core.localization.matching import (
+    CELLS,
     STRONGEST,
     LandmarkMatcher,
     Matches,
     Nearest,
     Projected,
     QueryKeypoints,
+    cells,
     log10_nfa,
 )
 from bidnerf_core.localization.posterior import (
@@ -63,8 +65,6 @@ MIRROR = "mirror image"
 """Name of the mode of an image whose mirror image fits."""
 DEPTH_WIDTH = 2.0
 """Ratio of the prior's deviation of the depth scale to that of the sensor's model, since some sensors are off by far more."""
-CELLS = 10
-"""Number of rows and columns of the grid whose occupied cells measure how far matches spread over an image."""
 RADII = (3.0, 1.5)
 """Radii of the rounds of matching by projection, in units of the inlier threshold."""
 HEAVY_TAILS = 1.7
@@ -436,16 +436,14 @@ class Loop:
         seen = Projected(query, self.landmarks, state, within)
         chance = sum(len(seen.matches(within, shift * within)) for shift in (4, -4)) / 2
         pixels = query.keypoints.pixels[mode.matches.keypoint]
-        size = torch.tensor([query.camera.width, query.camera.height])
-        cells = ((pixels / size * CELLS).long().clamp(0, CELLS - 1) * torch.tensor([1, CELLS])).sum(-1)
-        cells = cells + CELLS**2 * query.view[mode.matches.keypoint]
+        occupied = cells(pixels, query.camera) + CELLS**2 * query.view[mode.matches.keypoint]
         covariance = HEAVY_TAILS * (found.mixture() + self.landmarks.pose_covariance)
         position = float(covariance[:3, :3].trace().sqrt().nan_to_num(math.inf, math.inf))
         row = found.states.row
         evidence = Evidence(
             log10_nfa=self._log10_nfa(mode, state) if searched else 0.0,
             inliers=count, by_chance=chance, recall=count / max(1, min(seen.visible, len(query.view))),
-            spread=len(cells.unique()) / CELLS**2 / len(query.images),
+            spread=len(occupied.unique()) / CELLS**2 / len(query.images),
             noise_ratio=float(state.noise) / self.landmarks.noise,
             other_place=float(found.probability[found.states.mode != found.mode].sum()),
             credible=float(found.probability[given.credible[row]].sum()),

@@ -41,8 +41,8 @@ from bidnerf_core.mapping import (
     squared_distances,
 )
 
-THRESHOLD = 0.005
-"""Largest reprojection error of an inlier as a fraction of the image's diagonal; at least two pixels."""
+CELLS = 10
+"""Number of rows and columns of the grid whose occupied cells measure how far matches spread over an image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ class QueryKeypoints:
     @property
     def threshold(self) -> float:
         """The largest reprojection error of an inlier, pixels."""
-        return max(2.0, THRESHOLD * math.hypot(self.camera.width, self.camera.height))
+        return inlier_threshold(self.camera)
 
     @property
     def area(self) -> float:
@@ -118,6 +118,18 @@ class QueryKeypoints:
     def by_chance(self) -> float:
         """The probability that a wrong match, uniform in the image, is an inlier of a given pose."""
         return min(0.5, math.pi * self.threshold**2 / self.area)
+
+
+def inlier_threshold(camera: Intrinsics) -> float:
+    """Return the largest reprojection error of an inlier: 0.5 % of the image's diagonal, but at least two pixels."""
+    return max(2.0, 0.005 * math.hypot(camera.width, camera.height))
+
+
+def cells(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Int[Tensor, "m"]:
+    """Return the index of the image cell that contains each pixel (u, v)."""
+    size = torch.tensor([camera.width, camera.height])
+    column, row = (pixels / size * CELLS).long().clamp(0, CELLS - 1).unbind(-1)
+    return row * CELLS + column
 
 
 @lru_cache(maxsize=1)

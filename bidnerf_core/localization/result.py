@@ -241,7 +241,7 @@ class RecordedStep:
     T: SE3  # T_world_camera (h), best first, on the CPU
     scores: Float[Tensor, "h"]  # lower is better; only those of one step can be compared
     kept: int  # number of poses passed on to the next step
-    compared: bool = True  # whether they are scored rivals, instead of a step towards one pose
+    compared: bool  # whether they are scored rivals, instead of a step towards one pose
 
 
 @dataclass(eq=False)

@@ -111,10 +111,10 @@ def field_renderer(field: RadianceField, bounds: SceneBounds) -> Renderer:
 class ColourScales:
     """Scales for comparing colours and for fitting an image's exposure relative to the map."""
 
+    # The offset's prior about 0 has a standard deviation of 0.1.
     # norm of a pixel's colour difference (three channels) at which its inlier weight is 1/2
     colour: float = 0.2
     gain: float = 0.2  # standard deviation of the prior about 1
-    offset: float = 0.1  # standard deviation of the prior about 0
     rounds: int = 2  # of reweighting for the exposure
 
 
@@ -156,7 +156,7 @@ class Images:
 
         gain, offset = fit_exposure(
             seen, measured, lambda off: inlier(off).square().expand_as(off), sure,
-            ((scales.colour / scales.gain) ** 2, (scales.colour / scales.offset) ** 2), scales.rounds,
+            ((scales.colour / scales.gain) ** 2, (scales.colour / 0.1) ** 2), scales.rounds,
         )  # fmt: skip
         corrected = gain * seen + offset
         error = corrected.clamp(0, 1) - measured

@@ -14,15 +14,17 @@ from bidnerf_core.fields import has_field
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import CORNERS_PER_INDEPENDENT, SE3, skew, update_between
 from bidnerf_core.localization.accept import Evidence, Support, judge
-from bidnerf_core.localization.explanations import MOVE, SHARE_AS_MAP, SHARE_MOVING, STATED, TURN
-from bidnerf_core.localization.loop import CELLS, DEPTH_WIDTH
+from bidnerf_core.localization.explanations import STATED, motion_prior
+from bidnerf_core.localization.loop import DEPTH_WIDTH
 from bidnerf_core.localization.matching import (
+    CELLS,
     OBLIQUE,
     LandmarkMatcher,
     Matches,
     Nearest,
     Projected,
     QueryKeypoints,
+    cells,
     log10_nfa,
 )
 from bidnerf_core.localization.posterior import TOLERANCE, Posterior, mass_within
@@ -33,7 +35,7 @@ from bidnerf_core.localization.settings import LEAST_POINTS
 from bidnerf_core.localization.terms.rays import ALONE, RenderedRays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
-from bidnerf_core.localization.tracking.points import INLIER, POINTS, Fit, Grey, Points, cells
+from bidnerf_core.localization.tracking.points import INLIER, POINTS, Fit, Grey, Points
 from bidnerf_core.localization.tracking.state import TrackerState
 from bidnerf_core.mapping import (
     DEPTH,
@@ -56,8 +58,6 @@ from bidnerf_core.mapping import (
 
 ENOUGH_LANDMARKS = 40
 """Number of tracked inliers below which landmarks are recognised anew; fewer are not accepted unless the image confirms them."""
-MOST_IN_VIEW = 4_000
-"""Number of landmarks in view, those in most images, that are compared with keypoints regardless of where they project."""
 LEAST_CORNERS, SIGNIFICANT_NFA = 20, -6.0
 """Minimum number of the corners that agree on a motion, at least half of them, and maximum log10 of its number of false alarms."""
 
@@ -153,9 +153,9 @@ class Measurer:
         # Slopes of 0.5 times the size would have no margin.
         size = torch.tensor([camera.width / camera.fx, camera.height / camera.fy])
         number, _ = known.in_view(T, 0.6 * size, OBLIQUE)
-        if len(number) > MOST_IN_VIEW:
-            order = known.views[number].argsort(descending=True, stable=True)
-            number = number[order[:MOST_IN_VIEW].sort().values]
+        # Of the landmarks in view, the 4,000 that most images show are compared, regardless of where they project.
+        order = known.views[number].argsort(descending=True, stable=True)
+        number = number[order[:4_000].sort().values]
         query, landmarks = QueryKeypoints.of([View(frame, SE3.identity())], self.features), known[number]
         still = torch.zeros(6, dtype=torch.float64)
 
@@ -207,10 +207,10 @@ class Measurer:
         points = fit.points
         distance = float((points.positions - fit.states.T.translation).norm(dim=-1).median())
         scatter = landmarks.calibration_scatter.double()
-        moving = max(SHARE_MOVING, SHARE_AS_MAP * landmarks.moving)
+        moving, motion_deviation = motion_prior(landmarks, distance)
         log_prior = torch.tensor([1 - moving, moving], dtype=torch.float64).log()
         deviation = torch.zeros((2, N), dtype=torch.float64)
-        deviation[1, MOTION] = torch.tensor([MOVE * distance] * 3 + [TURN] * 3, dtype=torch.float64)
+        deviation[1, MOTION] = torch.tensor(motion_deviation, dtype=torch.float64)
         deviation[:, DEPTH] = DEPTH_WIDTH * self.sensor.scale
         rows = torch.tensor([0, 1] if fit.is_recognised else [int(state.moves)])
         states = replace(fit.states[0 * rows], deviation=deviation[rows], row=rows, log_prior=log_prior[rows])

@@ -47,16 +47,8 @@ class Clock:
         return Clock(time, seconds if seconds > 0 else self.interval), seconds
 
 
-SPEED = 1.0
-"""Standard deviation of an unknown velocity, per second: in reaches (distances to the visible scene), and in radians."""
-ACCELERATION, TURN_ACCELERATION = 2.0, 4.0
-"""Standard deviations of the acceleration, per second squared: reaches, and radians. They suit a hand-held camera that is moved
-briskly.
-"""
 LONGEST_GAP = 0.6
 """Interval without frames, in seconds, after which the velocity is no longer used."""
-UNSTAMPED = 0.5
-"""Relative standard deviation of an interval between frames without time stamps, as frames may be missing."""
 LEAST_SECONDS = 1e-3
 """Minimum interval for which process noise is added, in seconds; frames may be repeated or lack distinct times."""
 
@@ -91,7 +83,8 @@ class Motion:
         """Return the motion of a camera at a known pose with an unknown velocity."""
         noise = torch.zeros((12, 12), dtype=torch.float64)
         noise[:6, :6] = pose.noise
-        noise[6:, 6:] = _scaled(reach * SPEED, SPEED)
+        # An unknown velocity has a standard deviation of one reach, and of one radian, per second.
+        noise[6:, 6:] = _scaled(reach, 1.0)
         return Motion(pose.T_world_camera, torch.zeros(6, dtype=torch.float64), noise, pose.bias, reach)
 
     @property
@@ -115,12 +108,13 @@ class Motion:
         transition[:6, :6] = back
         transition[:6, 6:] = seconds * torch.eye(6, dtype=torch.float64)
         elapsed = max(abs(seconds), LEAST_SECONDS)
-        spread = _scaled(self.agility * self.reach * ACCELERATION, TURN_ACCELERATION)
+        spread = self._acceleration(self.agility)
         pairs = torch.tensor([[elapsed**4 / 4, elapsed**3 / 2], [elapsed**3 / 2, elapsed**2]])
         noise = transition @ motion.noise @ transition.T + torch.kron(pairs.double(), spread)
         if not stamped:
-            way, turn = (float(torch.linalg.vector_norm(part)) for part in step.split(3))
-            noise[:6, :6] += _scaled(UNSTAMPED * way, UNSTAMPED * turn)
+            # As frames may be missing, the interval is uncertain by half of it.
+            way, turn = (0.5 * float(torch.linalg.vector_norm(part)) for part in step.split(3))
+            noise[:6, :6] += _scaled(way, turn)
         return replace(motion, T_world_camera=T, noise=_symmetric(noise), bias=back @ self.bias @ back.T)
 
     def corrected(self, measured: PoseEstimate) -> Motion:
@@ -173,13 +167,17 @@ class Motion:
             return Motion.at(measured, self.reach)
         return replace(self.corrected(measured), agility=self._observed_agility(off[:3], spread[:3, :3]))
 
+    def _acceleration(self, agility: float = 1.0) -> Float[Tensor, "6 6"]:
+        """Return the covariance of the acceleration, per second squared, which suits a hand-held camera that is moved briskly."""
+        return _scaled(agility * self.reach * 2.0, 4.0)
+
     def _observed_agility(self, off: Float[Tensor, "3"], spread: Float[Tensor, "3 3"]) -> float:
         """Return the agility after a position innovation ``off`` with covariance ``spread`` (Mehra 1970).
 
         While the velocity is still unknown, the agility is unchanged. Rotations are ignored: they change more abruptly than the
         translation of a walking person, and measurements determine them well.
         """
-        velocity = float(self.noise.diagonal()[6:9].mean()) / (self.reach * SPEED) ** 2
+        velocity = float(self.noise.diagonal()[6:9].mean()) / self.reach**2
         # Innovations update the agility only once the variance of the velocity is less than half that of an unknown one.
         if velocity > 0.5:
             return self.agility
@@ -197,8 +195,7 @@ class Motion:
         seconds = max(abs(seconds), LEAST_SECONDS) * (-1 if seconds < 0 else 1)
         noise = torch.zeros((12, 12), dtype=torch.float64)
         noise[:6, :6] = back @ self.noise[:6, :6] @ back.T + relative
-        spread = _scaled(self.reach * ACCELERATION, TURN_ACCELERATION)
-        noise[6:, 6:] = 2 * relative / seconds**2 + spread * seconds**2
+        noise[6:, 6:] = 2 * relative / seconds**2 + self._acceleration() * seconds**2
         bias = back @ self.bias @ back.T
         return replace(
             self, T_world_camera=T_world_camera, velocity=step / seconds, noise=_symmetric(noise), bias=bias

@@ -22,8 +22,7 @@ from bidnerf_core.camera import Intrinsics, exposure_times
 from bidnerf_core.depth import DepthNoise
 from bidnerf_core.frames import Frame, visible_at
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.loop import CELLS
-from bidnerf_core.localization.matching import THRESHOLD, log10_nfa
+from bidnerf_core.localization.matching import cells, inlier_threshold, log10_nfa
 from bidnerf_core.localization.propose import from_poselib, pinhole, to_poselib
 from bidnerf_core.mapping import FIRST_CENTRE, Landmarks, Sights, States, measured_depth, point_variance
 
@@ -42,8 +41,6 @@ FLOW: dict[str, Any] = {
     "minEigThreshold": 1e-3,
 }
 """Options of the optical flow."""
-PATCH = 4
-"""Half size (pixels) of the patches that ``alike`` compares."""
 
 Grey = UInt8[np.ndarray, "h w"]
 
@@ -119,13 +116,6 @@ class Points:
         return self[rank.argsort(stable=True)[:most].sort().values]
 
 
-def cells(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Int[Tensor, "m"]:
-    """Return the index of the image cell that contains each pixel (u, v)."""
-    size = torch.tensor([camera.width, camera.height])
-    column, row = (pixels / size * CELLS).long().clamp(0, CELLS - 1).unbind(-1)
-    return row * CELLS + column
-
-
 @dataclass(frozen=True, eq=False)
 class Fit:
     """The pose of a static camera that observes points."""
@@ -141,7 +131,7 @@ class Fit:
     def of(points: Points, camera: Intrinsics, start: SE3, correlation: float) -> Fit:
         """Fit a pose near ``start`` to points, of which every ``correlation`` points count as one independent point."""
         focal, count = (camera.fx * camera.fy) ** 0.5, len(points)
-        threshold = max(2.0, THRESHOLD * math.hypot(camera.width, camera.height))
+        threshold = inlier_threshold(camera)
         image = camera.unproject(points.pixels.double())[:, :2]
         options = {"loss_type": "CAUCHY", "loss_scale": threshold / 2}
         known = points.positions.numpy(), to_poselib(start.inverse()), pinhole(focal)
@@ -234,8 +224,8 @@ def alike(
 
 
 def _patches(image: Grey, pixels: Float[Tensor, "m 2"]) -> Float[np.ndarray, "m p"]:
-    """Return the grey values around pixels, minus their mean."""
-    steps = np.arange(-PATCH, PATCH + 1)
+    """Return the grey values around pixels, in patches of 9 pixels a side, minus their mean."""
+    steps = np.arange(-4, 5)
     column, row = np.moveaxis(pixels.floor().long().numpy(), -1, 0)
     rows = (row[:, None] + steps).clip(0, image.shape[0] - 1)
     columns = (column[:, None] + steps).clip(0, image.shape[1] - 1)

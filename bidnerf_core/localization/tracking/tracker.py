@@ -30,9 +30,6 @@ from bidnerf_core.localization.tracking.state import (
 )
 from bidnerf_core.mapping import grey_image, strongest
 
-METHOD = "track"
-"""Method name of a tracker's poses."""
-
 
 class Tracker:
     """Estimates the pose of each frame of a sequence from the frames before it.
@@ -98,7 +95,7 @@ class Tracker:
         self._state = state
         stated, taken = frame.intrinsics, state.corrected(frame).intrinsics
         return replace(
-            answer, method=METHOD, seconds=clocks.perf_counter() - began, unit=unit_of(self._scene),
+            answer, method="track", seconds=clocks.perf_counter() - began, unit=unit_of(self._scene),
             focal_factor=math.sqrt(taken.fx * taken.fy / (stated.fx * stated.fy)),
             intrinsics=None if taken == stated else taken,
         ).translated(self._origin)  # fmt: skip
@@ -152,7 +149,7 @@ class Tracker:
                 deviation = torch.tensor([self._extent] * 3 + [math.pi] * 3, dtype=torch.float64)
                 path, losses = SE3.stack([T, T]), torch.ones(1, dtype=torch.float64)
                 found = Localization.of(
-                    why, path, losses, METHOD, clocks.perf_counter(), 1.0, deviation.square().diag()
+                    why, path, losses, "track", clocks.perf_counter(), 1.0, deviation.square().diag()
                 )
             return found, state
         # With each lost frame, 0.6 of the velocity is kept.
@@ -183,7 +180,7 @@ class Tracker:
             measured.verdict,
             path,
             losses,
-            METHOD,
+            "track",
             clocks.perf_counter(),
             measured.loss,
             measured.motion.covariance,
