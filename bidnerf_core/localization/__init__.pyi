@@ -11,7 +11,6 @@ from .accept import judge as judge
 from .accept import odds as odds
 from .adam import AdamSteps as AdamSteps
 from .auto import localize_by_landmarks as localize_by_landmarks
-from .by_rays import RayTerms as RayTerms
 from .by_surface import is_blank as is_blank
 from .corrector import Corrector as Corrector
 from .explanations import CAMERAS as CAMERAS
@@ -57,6 +56,7 @@ from .result import Outcome as Outcome
 from .result import SearchRecord as SearchRecord
 from .result import Verdict as Verdict
 from .result import recorded as recorded
+from .search import RayTerms as RayTerms
 from .search import states_at as states_at
 from .settings import AdamSettings as AdamSettings
 from .settings import AutoConfig as AutoConfig

@@ -21,16 +21,20 @@ from bidnerf_core.devices import moved
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Support, support
-from bidnerf_core.localization.by_rays import (
+from bidnerf_core.localization.problem import Pivot, Problem
+from bidnerf_core.localization.result import Localization, Outcome, Verdict
+from bidnerf_core.localization.search import (
     COLOUR_SIGMA,
     SHAPE_SIGMA,
     RayTerms,
+    SearchResult,
+    Stage,
     colour_stages,
+    halve,
+    image_stages,
     localization_by_rays,
+    states_at,
 )
-from bidnerf_core.localization.problem import Pivot, Problem
-from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.search import SearchResult, Stage, halve, image_stages, states_at
 from bidnerf_core.localization.settings import LEAST_POINTS, AutoConfig, ColourSettings, DepthLossSettings
 from bidnerf_core.localization.terms.images import ColourScales, Thumbnail, surface_renderer
 from bidnerf_core.localization.terms.surface import Surface

@@ -29,17 +29,21 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Support, support
 from bidnerf_core.localization.adam import follow_gradient, recent_loss
-from bidnerf_core.localization.by_rays import (
+from bidnerf_core.localization.problem import Problem, middle_of_view, pivot
+from bidnerf_core.localization.result import Localization, Outcome, Verdict
+from bidnerf_core.localization.search import (
     COLOUR_SIGMA,
     SHAPE_SIGMA,
     RayTerms,
+    Stage,
     centred,
     colour_stages,
+    halve,
+    image_stages,
     localization_by_rays,
+    neighbours,
+    states_at,
 )
-from bidnerf_core.localization.problem import Problem, middle_of_view, pivot
-from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.search import Stage, halve, image_stages, neighbours, states_at
 from bidnerf_core.localization.settings import (
     AdamSettings,
     ColourSettings,
