@@ -22,7 +22,7 @@ from refusals import refused
 from tiny import depth_rays_of
 
 FEW: dict[str, dict[str, Any]] = {
-    "auto": {"points": 500, "hypotheses": 24, "rounds": 1, "refine_steps": 2, "fine_rays": 128},
+    "auto": {"points": 800, "hypotheses": 24, "rounds": 1, "refine_steps": 2, "fine_rays": 128},
     "bid": {"rays": 256, "max_steps": 60, "learning_rate": 0.08, "decay": 0.5, "decay_steps": 20,
             "depth_weight": 0.3, "level": None},
     "bid-lm": {"poses": 8, "fine_rays": 512},
