@@ -109,6 +109,16 @@ class Intrinsics:
         question_focal(fx, width, height)
         return camera
 
+    @property
+    def pinhole(self) -> Intrinsics:
+        """The camera itself: its images are not resampled."""
+        return self
+
+    @property
+    def sentence(self) -> str:
+        """A few words on the camera, for messages."""
+        return f"fx {self.fx:.0f} px at {self.width}x{self.height}"
+
     def matrix(self, dtype: torch.dtype = torch.float64) -> Float[Tensor, "3 3"]:
         return torch.tensor([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=dtype)
 

@@ -24,28 +24,24 @@ WAYS_OF_PHOTO = "--camera FILE, --focal PX or --hfov DEG (in Python camera=, foc
 
 @dataclass(frozen=True)
 class FoundCamera:
-    """The camera of an upright image, and a one-line description of its source."""
+    """The camera of an upright image (the lens, if the image is resampled), and a one-line description of its source."""
 
-    intrinsics: Intrinsics
+    camera: Camera
     description: str
     approximate: bool = False  # whether the focal length is only nominal, as in EXIF
-    lens: Lens | None = None  # the lens whose images are resampled to ``intrinsics``
 
     @property
-    def camera(self) -> Camera:
-        """The camera of the image as read: the lens, or the intrinsics."""
-        return self.lens or self.intrinsics
+    def intrinsics(self) -> Intrinsics:
+        """The camera of the image as it is used."""
+        return self.camera.pinhole
 
     def at_most(self, largest: int | None) -> FoundCamera:
         """Return the camera of the image reduced to ``largest`` pixels along its longer side. Raises ``InputError``."""
-        camera, side = self.camera, checked_side(largest)
-        if side is None or max(camera.width, camera.height) <= side:
+        side = checked_side(largest)
+        if side is None or max(self.camera.width, self.camera.height) <= side:
             return self
-        size = reduced_size(camera.width, camera.height, side)
-        if self.lens is not None:
-            lens = self.lens.resized(*size)
-            return replace(self, intrinsics=lens.pinhole, lens=lens)
-        return replace(self, intrinsics=self.intrinsics.resized(*size))
+        size = reduced_size(self.camera.width, self.camera.height, side)
+        return replace(self, camera=self.camera.resized(*size))
 
 
 def checked_side(largest: int | None) -> int | None:
@@ -187,9 +183,8 @@ def folder_camera(
 
 
 def _described(camera: Intrinsics, origin: str) -> FoundCamera:
-    return FoundCamera(
-        camera, f"{origin}: {_focal(camera)} (the principal point is assumed to be the image centre)"
-    )
+    centred = "(the principal point is assumed to be the image centre)"
+    return FoundCamera(camera, f"{origin}: {camera.sentence} {centred}")
 
 
 def _fitted(where: str, raster: Raster, given: Camera, origin: str) -> FoundCamera:
@@ -201,13 +196,7 @@ def _fitted(where: str, raster: Raster, given: Camera, origin: str) -> FoundCame
             expected = "images that are not turned by a quarter against their cameras: export them as stored"
         found = f"image is {size}, but its camera is for {given.width}x{given.height}"
         raise InputError(found, where=where, expected=expected)
-    if isinstance(fitted, Lens):
-        return FoundCamera(fitted.pinhole, f"{origin}: {fitted.sentence}", lens=fitted)
-    return FoundCamera(fitted, f"{origin}: {_focal(fitted)}")
-
-
-def _focal(camera: Intrinsics) -> str:
-    return f"fx {camera.fx:.0f} px at {camera.width}x{camera.height}"
+    return FoundCamera(fitted, f"{origin}: {fitted.sentence}")
 
 
 def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: bool = False) -> FoundCamera:
@@ -264,5 +253,5 @@ def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> FoundCamera | Non
     likely, *others = (sorted(group, key=lambda c: c.fx)[(len(group) - 1) // 2] for group in groups)
     origin = f"camera unknown, assumed to be that of {'' if whole else 'centre crops of '}the map's images"
     if not others:
-        return FoundCamera(likely, f"{origin}: {_focal(likely)}")
+        return FoundCamera(likely, f"{origin}: {likely.sentence}")
     return _described(Intrinsics.from_focal(math.sqrt(likely.fx * likely.fy), *size), origin)

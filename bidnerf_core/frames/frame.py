@@ -241,9 +241,8 @@ class Frame:
         is taken from the nearest pixel, and pixels that the lens did not see are hidden. ``about`` holds further
         attributes of the frame, as for its constructor.
         """
-        intrinsics = camera
         if isinstance(camera, Lens):
-            intrinsics, about = camera.pinhole, {"camera_source": camera.sentence} | about | {"lens": camera}
+            about = {"camera_source": camera.sentence} | about | {"lens": camera}
             unseen = torch.from_numpy(camera.unseen())
             if hidden is not None:
                 unseen |= torch.from_numpy(camera.resampled(hidden.byte().numpy(), nearest=True)) > 0
@@ -252,7 +251,7 @@ class Frame:
                 depth = torch.from_numpy(camera.resampled(depth.numpy(), nearest=True))
             if alpha is not None:
                 alpha = torch.from_numpy(camera.resampled(alpha.numpy()))
-        return Frame(name, rgb, intrinsics, depth, alpha, hidden=hidden, **about)  # type: ignore[arg-type]
+        return Frame(name, rgb, camera.pinhole, depth, alpha, hidden=hidden, **about)
 
     def over(self, background: tuple[float, float, float]) -> Frame:
         """Composite the frame over ``background`` (rgb in [0, 1]) if it awaits one; otherwise, return the frame itself."""

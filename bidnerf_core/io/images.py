@@ -79,8 +79,10 @@ def read_image(
     rgb, alpha = list[Tensor](), list[Tensor]()
     with open_image(path) as image:
         width, height = image.size if size is None else size
+        if image.mode == "F":  # such as depth
+            raise InputError("image holds floats", where=path, expected="8 or 16 bits per channel")
         for strip, white in _strips(path, image):
-            colour, cover = channels(strip, f"{path}: image decodes to", white)
+            colour, cover = split_alpha(pixel_array(strip, f"{path}: image", white))
             rgb.append(reduced(over(colour, cover, background), width, len(strip)))
             if cover is not None:
                 alpha.append(reduced(cover, width, len(strip)))
@@ -110,23 +112,6 @@ def read_compact_image(
     return rgb if size is None else (rgb * FULL_SCALE["uint8"]).round_().to(torch.uint8), alpha
 
 
-def channels(
-    raw: np.ndarray, finding: str, full: int | None = None
-) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
-    """Scale an array (h, w) or (h, w, 1 to 4) of unsigned integers to colour in [0, 1] and alpha.
-
-    ``full`` is the value of white, by default the maximum of the array's type. Other arrays raise
-    ``InputError``, whose message begins with ``finding``.
-    """
-    count = raw.shape[2] if raw.ndim == 3 else 1
-    if raw.ndim not in (2, 3) or not 1 <= count <= 4 or raw.dtype.name not in FULL_SCALE:
-        found = f"{'x'.join(map(str, raw.shape))} of {raw.dtype.name}"
-        raise InputError(f"{finding} {found}", expected="grey, RGB or RGBA with 8 or 16 bits per channel")
-    scaled = raw.reshape(*raw.shape[:2], count).astype(np.float32)
-    scaled /= full or FULL_SCALE[raw.dtype.name]
-    return split_alpha(torch.from_numpy(scaled))
-
-
 def split_alpha(values: Float[Tensor, "h w c"]) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
     """Split grey, grey with alpha, RGB or RGBA (1 to 4 channels) into colour and alpha."""
     count = values.shape[-1]
@@ -135,11 +120,12 @@ def split_alpha(values: Float[Tensor, "h w c"]) -> tuple[Float[Tensor, "h w 3"],
     return colour.expand(*colour.shape[:2], 3).contiguous(), alpha
 
 
-def pixel_array(pixels: np.ndarray | Tensor, what: str) -> Float[Tensor, "h w c"]:
+def pixel_array(pixels: np.ndarray | Tensor, what: str, white: int | None = None) -> Float[Tensor, "h w c"]:
     """Scale a pixel array, grey (h, w) or with 1 to 4 channels in the last axis, to [0, 1].
 
-    Accepts uint8 in [0, 255], uint16 in [0, 65535], bool, and floats in [0, 1]. Raises ``InputError``, whose
-    message begins with ``what``, for other types and shapes, for NaN, and for floats outside [0, 1].
+    Accepts uint8 in [0, 255], uint16 in [0, 65535], bool, and floats in [0, 1]; ``white`` is the value of white in integers, by
+    default the largest of the type. Raises ``InputError``, whose message begins with ``what``, for other types and shapes, for
+    NaN, and for floats outside [0, 1].
     """
     raw = to_numpy(pixels)
     is_float = raw.dtype.kind == "f"
@@ -154,8 +140,9 @@ def pixel_array(pixels: np.ndarray | Tensor, what: str) -> Float[Tensor, "h w c"
         found, expected = f"floats from {raw.min():g} to {raw.max():g}", f"[0, 1]{hint}"
     if found:
         raise InputError(f"{what} has {found}", expected=expected)
-    scaled = raw.reshape(*raw.shape[:2], -1).astype(np.float32) / FULL_SCALE.get(raw.dtype.name, 1)
-    return torch.from_numpy(scaled).clamp(0, 1)
+    scaled = raw.reshape(*raw.shape[:2], -1).astype(np.float32)
+    scaled /= white or FULL_SCALE.get(raw.dtype.name, 1)
+    return torch.from_numpy(scaled).clamp_(0, 1)
 
 
 def to_numpy(array: np.ndarray | Tensor) -> np.ndarray:
@@ -240,11 +227,8 @@ def _strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[np.ndarray,
 
 def _is_deep(image: Image.Image) -> bool:
     """Return whether an open image has 16 bits per channel; Pillow reduces images with several such channels to 8 bits."""
-    return (
-        image.mode.startswith("I;16")
-        or (image.format == "PNG" and image.mode == "I")
-        or _is_deep_colour(image)
-    )
+    is_grey = image.mode.startswith("I;16") or (image.format == "PNG" and image.mode == "I")
+    return is_grey or _is_deep_colour(image)
 
 
 def _is_deep_colour(image: Image.Image) -> bool:
