@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 
@@ -18,6 +17,7 @@ from bidnerf_core.fields import RadianceField, SceneBounds, scaled_field
 from bidnerf_core.geometry import SE3, LengthUnit, multiplied, pose_from_matrix
 from bidnerf_core.io import from_plain, read_json
 from bidnerf_core.mapping import USUAL_FEATURES
+from bidnerf_core.settings import Above, NotNegative, Range, Settings
 
 VERSION = 1
 DESCRIPTION = "map.json"
@@ -28,33 +28,26 @@ LandmarkSource = Literal["photos", "rendered images"]
 
 
 @dataclass(frozen=True)
-class Anchor:
+class Anchor(Settings):
     """The location of a map on earth: a geodetic point, and the map's pose in the east-north-up frame at that point.
 
     Users may write an ``anchor.json`` next to ``map.json``; it overrides the key ``anchor`` until the map is
     saved.
     """
 
-    latitude: float  # degrees
-    longitude: float
-    height: float  # metres above the WGS 84 ellipsoid
+    latitude: Annotated[float, Range(-90, 90)]  # degrees
+    longitude: Annotated[float, Range(-180, 180)]
+    height: Annotated[float, Range(-1e6, 1e6)]  # metres above the WGS 84 ellipsoid
     # rows of the 4x4 matrix that maps the map's coordinates, times ``metres_per_unit``, to the east-north-up frame
     T_enu_world: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))  # fmt: skip
-    metres_per_unit: float = 1.0
-    position_sigma: float = 0.0  # of the anchor itself, along each axis; metres
-    orientation_sigma: float = 0.0  # about each axis; degrees
+    metres_per_unit: Annotated[float, Above(0)] = 1.0
+    position_sigma: NotNegative = 0.0  # of the anchor itself, along each axis; metres
+    orientation_sigma: NotNegative = 0.0  # about each axis; degrees
 
     def __post_init__(self) -> None:
         """Raise ``InputError`` for a value out of range, or a matrix that is not a rigid transform."""
-        # The height is in metres above or below the ellipsoid.
-        for name, most in (("latitude", 90.0), ("longitude", 180.0), ("height", 1e6)):
-            if not abs(getattr(self, name)) <= most:
-                raise InputError(f"{name} is {getattr(self, name)}", expected=f"{-most:g} to {most:g}")
+        super().__post_init__()
         self.pose  # noqa: B018 (it checks the matrix)
-        if not 0 < self.metres_per_unit < math.inf:
-            raise InputError(f"metres_per_unit is {self.metres_per_unit}", expected="a positive number")
-        if not (0 <= self.position_sigma < math.inf and 0 <= self.orientation_sigma < math.inf):
-            raise InputError(where="position_sigma and orientation_sigma", expected="0 or more")
 
     @cached_property
     def pose(self) -> SE3:
@@ -70,15 +63,11 @@ class Anchor:
 
 
 @dataclass(frozen=True)
-class FieldFrame:
+class FieldFrame(Settings):
     """The scale and bounds in which a map's field was trained, for a map that was scaled afterwards."""
 
-    scale: float  # units of the map per unit of the field
+    scale: Annotated[float, Above(0)]  # units of the map per unit of the field
     bounds: SceneBounds  # of the field, in its own unit
-
-    def __post_init__(self) -> None:
-        if not 0 < self.scale < math.inf:
-            raise InputError(f"scale is {self.scale}", expected="a positive number")
 
 
 @dataclass(frozen=True)

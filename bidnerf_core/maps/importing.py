@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
@@ -24,7 +24,7 @@ from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.fields import NoField, RadianceField, Rays, SceneBounds, device_of, render
 from bidnerf_core.frames import BLACK, Frame, View, draw, uniform
 from bidnerf_core.geometry import SE3, LengthUnit, Similarity, look_at
-from bidnerf_core.io import from_plain, to_plain
+from bidnerf_core.io import to_plain
 from bidnerf_core.mapping import (
     BakeConfig,
     ImageKeypoints,
@@ -41,9 +41,10 @@ from bidnerf_core.maps.description import MapInfo, cameras_of
 from bidnerf_core.maps.importers import ImportedField, Structure, bounds_about, importer_of, robust_box
 from bidnerf_core.maps.map import Map
 from bidnerf_core.maps.store import frozen_field, map_folder, write_parts
-from bidnerf_core.maps.training import MapOptions, bake_settings, baked_if_possible
+from bidnerf_core.maps.training import MapOptions, bake_settings, baked_if_possible, given_settings
 from bidnerf_core.maps.views import USEFUL_SIDE, Images, Origin, ReadViews, chosen_origin, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, job_context
+from bidnerf_core.settings import Above
 from bidnerf_core.training import TrainingState
 
 log = logging.getLogger("bidnerf")
@@ -62,7 +63,7 @@ class ImportOptions(MapOptions):
     importer: str | None = None
     """name of an installed importer, by default the one that recognizes the file"""
 
-    scale: float = 1.0
+    scale: Annotated[float, Above(0)] = 1.0
     """factor of all lengths: metres per unit of the file"""
 
     T_world_file: SE3 | None = None
@@ -100,12 +101,8 @@ def import_map(
     do not show the scene of the field; the folder must be empty unless ``options.overwrite`` is set.
     """
     path, scale = Path(path), options.scale
-    if not (math.isfinite(scale) and scale > 0):
-        raise InputError(f"scale is {scale}", expected="a number above 0")
     name, chosen = importer_of(path, options.importer)
-    settings, baking = config, bake_settings(bake)
-    if config is None or isinstance(config, dict):
-        settings = from_plain(chosen.config_type, config or {}, f"settings of importer {name!r}")
+    settings, baking = given_settings(config, chosen.config_type, f"importer {name!r}"), bake_settings(bake)
     T = SE3.identity() if options.T_world_file is None else options.T_world_file
     origin = chosen_origin(T.translation[None])
     if any(origin):

@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -61,6 +61,7 @@ from bidnerf_core.progress import (
     job_context,
 )
 from bidnerf_core.registry import USUAL_BACKEND, PluginError
+from bidnerf_core.settings import NotNegative, Settings
 from bidnerf_core.structure import lacks_poses
 from bidnerf_core.training import TrainingState, TrainingStopped
 
@@ -68,7 +69,7 @@ log = logging.getLogger("bidnerf")
 
 
 @dataclass(frozen=True)
-class MapOptions:
+class MapOptions(Settings):
     """What training and importing have in common: which images are used, and where the map goes."""
 
     images: DatasetOptions = DatasetOptions()
@@ -84,6 +85,7 @@ class MapOptions:
     """whether a folder that is not empty is replaced"""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         find_features(self.features)
 
 
@@ -104,16 +106,8 @@ class TrainOptions(MapOptions):
     point_choice: SparseChoice = SparseChoice()
     """which of these points are used"""
 
-    checkpoint_seconds: float = USUAL_SECONDS
+    checkpoint_seconds: NotNegative = USUAL_SECONDS
     """time between checkpoints: the most work lost if the program is killed"""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.refine_poses not in get_args(RefinementChoice):
-            choices = ", ".join(get_args(RefinementChoice))
-            raise InputError(f"refine_poses is {self.refine_poses!r}", expected=f"one of {choices}")
-        if not self.checkpoint_seconds >= 0:
-            raise InputError(f"checkpoint_seconds is {self.checkpoint_seconds}", expected="0 or more")
 
 
 USUAL = TrainOptions()
@@ -157,16 +151,10 @@ def train(
     Raises ``InputError`` if data, settings or folder cannot be used, and if the poses contradict most pairs of
     images unless ``options.trust_poses`` is set; the folder must be empty unless ``options.overwrite`` is set.
     """
-    chosen, settings = load_backend(backend), config
-    if config == "quick":
-        settings = quick_config(chosen)
-    elif config is None or isinstance(config, dict):
-        settings = from_plain(chosen.config_type, config or {}, f"settings of backend {backend!r}")
-    elif not isinstance(config, chosen.config_type):
-        found, expected = type(config).__name__, chosen.config_type.__name__
-        raise InputError(
-            f"config is a {found}", expected=f"a {expected} or a dict of its settings, or 'quick'"
-        )
+    chosen = load_backend(backend)
+    settings = given_settings(
+        quick_config(chosen) if config == "quick" else config, chosen.config_type, f"backend {backend!r}"
+    )
     baking = bake_settings(bake)
     working_device(options.device)  # an invalid one is rejected before anything is read
     place, known = None if out is None else Path(out), None
@@ -220,6 +208,19 @@ def train(
         if baking is not None and place is not None and not (place / DESCRIPTION).exists():
             scene = replace(scene, info=write_parts(place, info, TrainingState(0, {}, {})), folder=place)
         return _completed(scene, taken.views, taken.tracked, options, baking, out=place)
+
+
+def given_settings(config: Any, kind: type, what: str) -> Any:
+    """Return the settings of a backend or an importer: ``config`` itself, or its dict of those that differ from the defaults.
+
+    Raises ``InputError`` if ``config`` is neither, and for unknown settings or values out of range.
+    """
+    if config is None or isinstance(config, dict):
+        return from_plain(kind, config or {}, f"settings of {what}")
+    if not isinstance(config, kind):
+        found = f"config is a {type(config).__name__}"
+        raise InputError(found, expected=f"a {kind.__name__} or a dict of its settings")
+    return config
 
 
 def _with_field(

@@ -129,7 +129,7 @@ def test_damaged_anchors_are_refused(tmp_path: Path) -> None:
         ({"T_enu_world": [[1.0]]}, "4 rows"),
         ({"T_enu_world": [[2.0, 0.0, 0.0, 0.0], *[[0.0] * 4] * 3]}, "T_enu_world"),
         ({"metres_per_unit": 0.0}, "metres_per_unit is 0"),
-        ({"position_sigma": -1.0}, "expected 0 or more"),
+        ({"position_sigma": -1.0}, "position_sigma is -1"),
         ({"lattitude": 1.0}, "lattitude"),
     ):
         (tmp_path / "anchor.json").write_text(json.dumps(good | change))
