@@ -201,10 +201,10 @@ class BackendContract:
         recipes.check_exposure(self._backend(), self._config())
 
     def test_training_reports_and_saves(self) -> None:
-        recipes.check_reports(self._backend(), self._build(), self._config())
+        recipes.check_reports(self._backend(), self._config().steps, self._training())
 
     def test_training_stops_and_resumes(self) -> None:
-        recipes.check_resuming(self._backend(), self._build, self._config())
+        recipes.check_resuming(self._backend(), self._build, self._config(), self._training())
 
     # The fields that the tests build and train follow.
 
@@ -230,16 +230,21 @@ class BackendContract:
         with calling(f"{type(self._backend()).__name__}.build"):
             return self._backend().build(self._config() if config is None else config, SCENE_BOUNDS)
 
-    def _trained(self) -> Any:
-        """Return a field trained on RGB-D views (once per test class) and frozen like the field of a loaded map."""
+    def _training(self) -> recipes.Training:
+        """Return a training on RGB-D views (once per test class), whose field is frozen like that of a loaded map."""
 
-        def train() -> Any:
-            field = self._build()
+        def train() -> recipes.Training:
+            field, total = self._build(), self._config().steps
+            before = recipes.copied(field)
+            report = recipes.Recorder(due={1, total // 2, total})
             with calling(f"{type(self._backend()).__name__}.train"):
-                self._backend().train(field, rgbd_views(), self._config(), recipes.Recorder())
-            return frozen(field)
+                self._backend().train(field, rgbd_views(), self._config(), report)
+            return recipes.Training(frozen(field), before, recipes.copied(field), report)
 
         return once(self, train)
+
+    def _trained(self) -> Any:
+        return self._training().field
 
     def _fields(self) -> Iterator[Any]:
         yield frozen(self._build())

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from safetensors.torch import load as tensors_from_bytes
 from safetensors.torch import save as tensors_to_bytes
-from torch import Tensor
+from torch import Tensor, nn
 
 from bidnerf_core.backend import Backend
 from bidnerf_core.fields import RadianceField, SceneBounds, render
@@ -28,7 +28,7 @@ class Recorder:
     """A ``Report`` that records progress, and keeps states as bytes, as a map on disk does."""
 
     def __init__(
-        self, due: Sequence[int] = (), stop: int | None = None, state: TrainingState | None = None
+        self, due: Collection[int] = (), stop: int | None = None, state: TrainingState | None = None
     ) -> None:
         self.steps: list[TrainingStep] = []
         self.saved: list[TrainingState] = []
@@ -56,6 +56,21 @@ def stored(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     with calling("writing the tensors of a state to safetensors"):
         packed = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
         return tensors_from_bytes(tensors_to_bytes(packed))
+
+
+class Training(NamedTuple):
+    """A training of ``config.steps`` steps on RGB-D views, which was to save its state after the first, middle and last one."""
+
+    field: Any
+    before: dict[str, Tensor]  # the field's state
+    after: dict[str, Tensor]
+    report: Recorder
+
+
+def copied(field: Any) -> dict[str, Tensor]:
+    """Return a copy of the state of a field, empty for one that is no module, as another test reports."""
+    state = field.state_dict() if isinstance(field, nn.Module) else {}
+    return {name: value.detach().clone() for name, value in state.items()}
 
 
 def check_learning(
@@ -110,13 +125,9 @@ def check_exposure(backend: Backend, config: Any) -> None:
     )
 
 
-def check_reports(backend: Backend, field: Any, config: Any) -> None:
-    """Check that all steps are reported in order, and that states, which hold the field, are saved exactly when due."""
-    total = config.steps
-    due = sorted({1, total // 2, total})
-    report = Recorder(due)
-    _train(backend, field, rgbd_views(), config, report, "")
-    who = f"{type(backend).__name__}.train"
+def check_reports(backend: Backend, total: int, training: Training) -> None:
+    """Check that all ``total`` steps were reported in order, and that states, which hold the field, were saved exactly when due."""
+    due, report, who = sorted({1, total // 2, total}), training.report, f"{type(backend).__name__}.train"
     steps = [(progress.step, progress.total) for progress in report.steps]
     odd = [p for p in report.steps if not (math.isfinite(p.loss) and math.isfinite(p.psnr))]
     saved = [state.step for state in report.saved]
@@ -134,20 +145,18 @@ def check_reports(backend: Backend, field: Any, config: Any) -> None:
     )
     _require_same(
         report.saved[-1].field,
-        field.state_dict(),
+        training.after,
         who,
         "the state saved after the last step is not that of the trained field",
     )
 
 
-def check_resuming(backend: Backend, make: Callable[[], Any], config: Any) -> None:
+def check_resuming(backend: Backend, make: Callable[[], Any], config: Any, whole: Training) -> None:
     """Check that training that stops midway with ``TrainingStopped`` and is resumed gives a bitwise identical result."""
     who, middle = f"{type(backend).__name__}.train", config.steps // 2
-    first, second, third = make(), make(), make()
-    beginning = stored(first.state_dict())
-    _train(backend, first, rgbd_views(), config, Recorder(), "")
+    second, third = make(), make()
     for field in (second, third):  # another test checks whether builds differ
-        field.load_state_dict(beginning)
+        field.load_state_dict(whole.before)
     report = Recorder(stop=middle)
     stop = f"report.stopping was set after step {middle}"
     try:
@@ -173,7 +182,7 @@ def check_resuming(backend: Backend, make: Callable[[], Any], config: Any) -> No
     )
     _require_same(
         third.state_dict(),
-        first.state_dict(),
+        whole.after,
         who,
         "a resumed training arrives elsewhere than an uninterrupted one, expected the same bits; is all state in"
         " state_dict, and all randomness from the saved generator?",

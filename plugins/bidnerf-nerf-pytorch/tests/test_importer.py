@@ -18,7 +18,8 @@ from checkpoints import SMALL, Writer, contents
 
 def test_a_checkpoint_is_recognised_and_imported(write: Writer) -> None:
     assert importer_of(write())[0] == "nerf-pytorch"
-    scene = import_map(write(), config={"near": 1.0, "background": "black"}, bake=False)
+    few = {"coarse_samples": 8, "fine_samples": 7}
+    scene = import_map(write(), config={"near": 1.0, "background": "black", **few}, bake=False)
     assert scene.info.backend == "nerf-pytorch"
     assert (scene.bounds.near, scene.bounds.background) == (1.0, (0.0, 0.0, 0.0))
     assert scene.info.cameras
@@ -26,7 +27,9 @@ def test_a_checkpoint_is_recognised_and_imported(write: Writer) -> None:
 
 def test_the_map_holds_the_networks_and_the_options(write: Writer) -> None:
     box = (-1.0, -2.0, -3.0, 1.0, 2.0, 3.5)
-    scene = import_map(write(), config={"far": 9.0, "fine_samples": 7, "box": box}, bake=False)
+    scene = import_map(
+        write(), config={"far": 9.0, "coarse_samples": 8, "fine_samples": 7, "box": box}, bake=False
+    )
     assert (scene.info.step, scene.info.complete) == (100, True)
     assert scene.bounds == SceneBounds(box[:3], box[3:], 2.0, 9.0, (1.0, 1.0, 1.0))
     assert (scene.info.config["fine_samples"], scene.info.config["width"]) == (7, SMALL.width)

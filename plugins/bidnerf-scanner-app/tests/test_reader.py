@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -84,14 +85,19 @@ def write_frame(folder: Path, number: int, name: str, photo: bool = True) -> Non
     iio.imwrite(folder / f"conf_{name}.png", sure)
 
 
-@pytest.fixture
-def scan(tmp_path: Path) -> Path:
+@pytest.fixture(scope="session")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five frames, of which the third has no photo, with numbers that sort otherwise as text."""
-    folder = tmp_path / "scan"
-    folder.mkdir()
+    folder = tmp_path_factory.mktemp("scan")
     for number, name in enumerate(("0", "2", "5", "10", "11")):
         write_frame(folder, number, name, photo=name != "5")
     return folder
+
+
+@pytest.fixture
+def scan(written: Path, tmp_path: Path) -> Path:
+    """A copy of these frames."""
+    return Path(shutil.copytree(written, tmp_path / "scan"))
 
 
 def every_view(dataset: Capture) -> dict[str, View]:
