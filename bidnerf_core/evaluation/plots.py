@@ -10,7 +10,6 @@ import math
 import textwrap
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -83,12 +82,8 @@ Panel = tuple[str, Callable[[Any], None]]
 """The title of a panel, and the function that draws it."""
 
 
-@dataclass(frozen=True)
-class Figure:
-    """A figure with its caption; ``file`` is an SVG, next to which the same figure lies as PNG."""
-
-    file: Path
-    caption: str
+Figure = tuple[Path, str]
+"""An SVG, next to which the same figure lies as PNG, and its caption."""
 
 
 class Figures:
@@ -217,7 +212,7 @@ class Figures:
                 panel.set_axis_off()
             handles = [Line2D([], [], **look) for look in looks.values()]
             figure.legend(handles, labels, loc="outside lower left", ncols=beside)
-            return Figure(save_figure(figure, self.folder, name), caption)
+            return save_figure(figure, self.folder, name), caption
 
 
 def _set_logarithmic(axes: Any, name: str) -> None:
@@ -274,4 +269,4 @@ def comparison_figure(folder: Path, comparison: Comparison) -> Path:
     panels += [(name, partial(bars, values=values)) for name, values in costs.items() if any(values)]
     drawn = figures._figure("compare", panels, figures.looks, "")
     assert drawn is not None  # there are panels
-    return drawn.file
+    return drawn[0]

@@ -126,7 +126,7 @@ def page(
         ],
         pooled=any(g.situation.size is None for g in groups),
         stepwise=any(are_stepwise(group.results) for group in groups),
-        figures=[(f.caption, base64.b64encode(f.file.read_bytes()).decode()) for f in figures],
+        figures=[(caption, base64.b64encode(file.read_bytes()).decode()) for file, caption in figures],
         relative=RELATIVE,
         absolute=ABSOLUTE,
         view=view,

@@ -64,7 +64,7 @@ def unit_of(scene: SceneMap) -> LengthUnit:
     return getattr(scene, "unit", "units")
 
 
-def origin_of(scene: SceneMap) -> Float[Tensor, "3"]:
+def origin_of(scene: object) -> Float[Tensor, "3"]:
     """Return the origin of a map's own coordinates in its world frame (float64), see ``Map.origin``; 0 for maps that state no origin."""
     return torch.tensor(getattr(scene, "origin", (0.0, 0.0, 0.0)), dtype=torch.float64)
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import UpDirection, as_given
@@ -25,6 +24,7 @@ from bidnerf_core.localization import (
     Localization,
     Localizer,
     SceneMap,
+    origin_of,
     unit_of,
 )
 from bidnerf_core.mapping import SurfaceMap
@@ -297,10 +297,6 @@ class Answers:
         found, true = (SE3.stack(list(poses)) for poses in zip(*known, strict=True))
         return found, true
 
-    @property
-    def _origin(self) -> Tensor:
-        return torch.tensor(getattr(self.scene, "origin", (0.0, 0.0, 0.0)), dtype=torch.float64)
-
     def plot(
         self, file: str | Path, surface: SurfaceMap | None = None, up: UpDirection | None = None
     ) -> None:
@@ -309,16 +305,16 @@ class Answers:
         ``up`` is the up direction of the scene (``Map.up``), by default estimated from the surface and the
         cameras. Raises ``InputError`` without matplotlib or without any finite pose.
         """
-        drawn = [answer for answer in self.answers if answer.is_finite]
+        drawn, origin = [answer for answer in self.answers if answer.is_finite], origin_of(self.scene)
         if not drawn:
             raise InputError("not drawn, since no frame was tracked", where=file)
         covariances = [answer.found.covariance for answer in drawn]
         deviations = [math.nan if c is None else standard_deviations(c)[0] for c in covariances]
         draw_path(
-            SE3.stack([answer.found.T_world_camera for answer in drawn]).translated(-self._origin),
+            SE3.stack([answer.found.T_world_camera for answer in drawn]).translated(-origin),
             torch.tensor([answer.accepted for answer in drawn]),
             torch.tensor(deviations, dtype=torch.float64),
-            [None if answer.truth is None else answer.truth.translated(-self._origin) for answer in drawn],
+            [None if answer.truth is None else answer.truth.translated(-origin) for answer in drawn],
             Path(file),
             surface,
             up,
@@ -354,7 +350,7 @@ class Answers:
         # Frames are training images of the map if their names and true poses are the same, up to rounding in files.
         info = getattr(self.scene, "info", None)
         cameras = () if info is None else as_given(info.cameras)
-        given = {camera.name: camera.pose.translated(self._origin).matrix() for camera in cameras}
+        given = {camera.name: camera.pose.translated(origin_of(self.scene)).matrix() for camera in cameras}
         seen = sum(
             answer.truth is not None
             and answer.name in given
