@@ -80,8 +80,6 @@ def may_wait(device: torch.device) -> bool:
 
 _capturing = Lock()
 """Allows one capture at a time: a capture begins by waiting for the device, which is forbidden during another."""
-_ALIGNMENT = 16
-"""Bytes to whose multiples tensors of any dtype are aligned in a common buffer."""
 _sharing = Lock()
 _free: dict[torch.device, list[_Lane]] = {}
 """The lanes of each device that no thread uses now, the last used at the end."""
@@ -196,7 +194,8 @@ class _Remote:
         self, function: Callable[..., Any], values: Any, tensors: Sequence[Tensor], lane: _Lane
     ) -> None:
         self._lane, self._calls, device = lane, 0, lane.device
-        sizes = [-(-t.nbytes // _ALIGNMENT) * _ALIGNMENT if t.device.type == "cpu" else 0 for t in tensors]
+        # Tensors of any dtype begin at multiples of 16 bytes in the common buffer.
+        sizes = [-(-t.nbytes // 16) * 16 if t.device.type == "cpu" else 0 for t in tensors]
         self._sent = torch.empty(sum(sizes), dtype=torch.uint8, pin_memory=device.type == "cuda")
         self._received = torch.empty_like(self._sent, device=device)
         self._sources, self._arguments, first = list[Tensor](), list[Tensor](), 0

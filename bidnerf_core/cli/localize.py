@@ -16,6 +16,7 @@ from bidnerf_core.cli.options import (
     MethodOptions,
     QueryOptions,
     Seed,
+    refuse,
     require_one,
 )
 from bidnerf_core.cli.output import check_folder, check_output, print_json, say, show
@@ -193,9 +194,7 @@ def _check_for_several(output: OutputOptions, queries: QueryOptions, start: Star
     given = {
         "--start": start.start, "--perturb": start.perturb, "--draw": output.draw, "--depth-points": queries.depth_points
     }  # fmt: skip
-    for option, value in given.items():
-        if value is not None:
-            raise UsageError(f"{option} applies to one map, but several are given")
+    refuse(given, "applies to one map, but several are given")
     if output.out is not None and pose_format(output.out) != ".json":
         raise UsageError(
             "poses in several maps have different worlds", where=output.out, expected="a .json file"

@@ -16,6 +16,7 @@ from bidnerf_core.cli.options import (
     MapFolder,
     MapOptions,
     Names,
+    refuse,
     require_one,
     wrong_usage,
 )
@@ -253,12 +254,14 @@ def run_bake(
     from bidnerf_core.mapping import find_features
     from bidnerf_core.maps import load_map
 
-    if rendered_landmarks and data is not None:
-        raise UsageError(
-            "--rendered-landmarks uses no photos, but --data gives some;", expected="only one of them"
+    if rendered_landmarks:
+        refuse(
+            {"--data": data}, "gives photos, but --rendered-landmarks uses none;", expected="only one of them"
         )
-    if images.masks is not None and data is None:
-        raise UsageError("--masks was given without --data", expected="the dataset that they belong to")
+    if data is None:
+        refuse(
+            {"--masks": images.masks}, "was given without --data", expected="the dataset that they belong to"
+        )
     if landmark_features is not None:
         find_features(landmark_features)
     # The parts that are baked may be damaged, and are replaced anyway.
@@ -305,11 +308,11 @@ def run_extend(
     given = {
         "--camera": images.camera, "--register-depth": images.register_depth, "--depth-unit": images.depth_unit
     }  # fmt: skip
-    stated = [name for name, value in given.items() if value is not None]
+    is_stated = any(value is not None for value in given.values())
     paths = [new] if data is None else [new, data]
-    datasets = [path for path in paths if stated and find_reader(path) is not None]
-    if stated and not datasets:
-        raise UsageError(f"{stated[0]} is for a dataset, but {new} is none; leave it out")
+    datasets = [path for path in paths if is_stated and find_reader(path) is not None]
+    if not datasets:
+        refuse(given, f"is for a dataset, but {new} is none; leave it out")
     options = replace(images, background=info.bounds.background)
     opened: dict[Path, Path | Capture] = {path: options.open(path) for path in datasets}
     known = None if data is None else opened.get(data, data)

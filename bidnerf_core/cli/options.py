@@ -89,6 +89,13 @@ def require_one(values: Mapping[str, object], required: bool = False) -> None:
         raise UsageError(f"one of {', '.join(values)} is missing")
 
 
+def refuse(options: Mapping[str, object], reason: str, expected: str | None = None) -> None:
+    """Raise ``UsageError``, which begins with the option and the ``reason``, if one of ``options`` has a value."""
+    for option, value in options.items():
+        if value is not None and value != ():
+            raise UsageError(f"{option} {reason}", expected=expected)
+
+
 @contextlib.contextmanager
 def wrong_usage() -> Iterator[None]:
     """Convert ``InputError`` to ``UsageError``, for arguments that are wrong regardless of the contents of files."""
@@ -193,15 +200,10 @@ class QueryOptions:
         if self.frame or any(is_dataset):
             if len(paths) > 1:
                 raise UsageError(f"{len(paths)} queries including a dataset", expected="only the dataset")
-            given = {
-                "--depth": self.depth or None, "--focal": self.camera.focal, "--hfov": self.camera.hfov
-            }  # fmt: skip
-            for option, value in given.items():
-                if value is not None:
-                    raise UsageError(
-                        f"{option} is for photos, but {paths[0]} is a dataset, which has its own; to use its images as"
-                        " photos, name the files"
-                    )
+            refuse(
+                {"--depth": self.depth, "--focal": self.camera.focal, "--hfov": self.camera.hfov},
+                f"is for photos, but {paths[0]} is a dataset, which has its own; to use its images as photos, name the files",
+            )
             dataset = replace(images, background=background).open(paths[0])
             source: QuerySource = DatasetFrames(dataset, images.split, self.frame, self.window, points)
             kind = "frames; name one by --frame"
@@ -209,12 +211,12 @@ class QueryOptions:
             if self.window > 1:
                 raise UsageError(f"--window {self.window} needs known relative poses", expected="a dataset")
             files = photo_files(paths, self.depth)
-            of_depth = {"--depth-unit": images.depth_unit, "--register-depth": images.registration}
-            for option, setting in of_depth.items():
-                if setting and not self.depth:
-                    raise UsageError(
-                        f"{option} was given without --depth", expected="the depth image that it belongs to"
-                    )
+            if not self.depth:
+                of_depth = {
+                    "--depth-unit": images.depth_unit,
+                    "--register-depth": images.registration or None,
+                }
+                refuse(of_depth, "was given without --depth", expected="the depth image that it belongs to")
             options = replace(images, camera=self.camera.source(images, assumed), background=background)
             source = Photos(files, options, depth_files(files, self.depth), points)
             kind = "photos; expected one photo"

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from bidnerf_core import localization  # its parts are loaded when they are used
-from bidnerf_core.cli.options import CameraOptions, MapFolder
+from bidnerf_core.cli.options import CameraOptions, MapFolder, refuse
 from bidnerf_core.cli.output import check_output, print_json, print_table, say
 from bidnerf_core.cli.parser import Flag, Option, Settings, Without
 from bidnerf_core.cli.running import displayed, uninterrupted
@@ -133,14 +133,9 @@ def run_track(
     from bidnerf_core.maps import load_map
     from bidnerf_core.results import Answers, TrackingVideo, read_pose, track
 
-    if frames.follow and frames.split is not None:
-        raise UsageError("--split is for datasets, leave it out with --follow")
-    if frames.follow and images.depth_unit is not None:
-        raise UsageError("--depth-unit does not work with --follow", expected="depth_unit in each request")
-    if frames.follow and images.masks is not None:
-        raise UsageError(
-            '--masks needs the images in advance; with --follow, lines of stdin may name a "mask"'
-        )
+    if frames.follow:
+        given = {"--split": frames.split, "--depth-unit": images.depth_unit, "--masks": images.masks}
+        refuse(given, "is for recordings; with --follow, a line of stdin may state the depth unit and a mask")
     if output.out is None and not frames.follow:
         raise UsageError("no --out", expected="the name of a pose file")
     named = (sequence, images.camera, tracking.start, images.register_depth)

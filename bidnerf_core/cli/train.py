@@ -11,6 +11,7 @@ from bidnerf_core.cli.options import (
     Json,
     MapOptions,
     PointChoice,
+    refuse,
     wrong_usage,
 )
 from bidnerf_core.cli.output import check_folder, print_json
@@ -167,14 +168,11 @@ def run_train(
     check_folder(out, (data,), may_be_map=True)
     working_device(target.device)
     photos = lacks_poses(data)
-    if photos and (images.depth_unit is not None or images.register_depth is not None):
-        raise UsageError(
-            f"{data}: photos without poses have no depth; leave out --depth-unit and --register-depth"
-        )
-    if photos and images.masks is not None:
-        raise UsageError(
-            f"{data}: photos without poses; find them with 'bidnerf poses', then train with --masks"
-        )
+    if photos:
+        given = {
+            "--depth-unit": images.depth_unit, "--register-depth": images.register_depth, "--masks": images.masks
+        }  # fmt: skip
+        refuse(given, f"is for a dataset, but {data} has no poses; 'bidnerf poses' makes a dataset of photos")
     # A run that was interrupted during pose estimation resumes by itself.
     resumes = resumes and not (photos and not (out / DESCRIPTION).exists())
     if resumes:

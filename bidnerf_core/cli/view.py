@@ -24,12 +24,11 @@ from bidnerf_core.cli.parser import Option, Without
 from bidnerf_core.cli.running import displayed
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, spelling_hint
-from bidnerf_core.io import read_file, read_record
+from bidnerf_core.io import read_file
 from bidnerf_core.progress import counter
 from bidnerf_core.registry import USUAL_METHOD
 from bidnerf_core.service import LEAST_TOKEN, ServiceLimits
 from bidnerf_core.service import serve as serve_maps
-from bidnerf_core.settings import WholeNumbers
 
 if TYPE_CHECKING:
     from bidnerf_core.datasets import Query, QuerySource
@@ -43,9 +42,6 @@ class PageOptions:
     save: Annotated[
         Path | None, Option("PAGE.html", "write a page that opens without a server or a network, and exit")
     ] = None
-    most: Annotated[
-        int, WholeNumbers(1), Option("N", "largest number of images in a page of --save, spread over all")
-    ] = 24
     results: Annotated[
         Path | None, Option("FILE", "results of 'bidnerf evaluate', as a table with links to their frames")
     ] = None
@@ -118,7 +114,7 @@ def run_view(
             if name not in source.names:
                 hint = f"no frame {name!r}{spelling_hint(name, source.names)}"
                 raise InputError(in_other_split(name, splits) or hint)
-        step = -(-len(source.names) // page.most) if page.save else 1
+        step = -(-len(source.names) // 24) if page.save else 1  # a page of at most 24 images, spread over all
         places = [source.names.index(name) for name in frame] or range(0, len(source.names), step)
         source = Chosen(source, places)
     if page.save is None:
@@ -193,15 +189,6 @@ def run_serve(
         ),
     ] = None,
     method: Method = USUAL_METHOD,
-    config: Annotated[
-        Path | None,
-        Option(
-            "FILE",
-            "JSON object with settings of the method, as 'bidnerf localize --method NAME --help-all' lists them:"
-            ' {"refine_steps": 20}',
-            "the method's own",
-        ),
-    ] = None,
     device: Device = "cpu",
     *,
     limits: ServiceLimits,
@@ -234,5 +221,5 @@ def run_serve(
 
     serve_maps(
         maps, host=host, port=port, token=stated, method=method, device=device, limits=limits,
-        config=None if config is None else read_record(config).values, ready=announce,
+        ready=announce,
     )  # fmt: skip

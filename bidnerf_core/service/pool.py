@@ -37,10 +37,6 @@ PAUSE = 1.0
 """Seconds between two attempts to fork a worker."""
 LOST = (OSError, EOFError, ValueError, psutil.Error)
 """The exceptions that reading from a process raises if it has died or sends nonsense."""
-ATTEMPTS = 3
-"""Workers that may die of a request before it is refused."""
-SECONDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0)
-"""Upper bounds of the buckets of times."""
 
 
 class Worker:
@@ -81,10 +77,9 @@ class Pool:
         self._maps: tuple[subprocess.Popen[bytes], socket.socket] | None = None
         self._loading = asyncio.Lock()
         self.registry = CollectorRegistry()
-        count, times = (
-            partial(Counter, registry=self.registry),
-            partial(Histogram, registry=self.registry, buckets=SECONDS),
-        )
+        buckets = (0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0)  # seconds
+        count = partial(Counter, registry=self.registry)
+        times = partial(Histogram, registry=self.registry, buckets=buckets)
         self.requests = count("bidnerf_requests", "Requests answered.", ["path", "status"])
         self.outcomes = count("bidnerf_outcomes", "Localizations by their outcome.", ["map", "outcome"])
         self.restarts = count("bidnerf_worker_restarts", "Workers replaced.", ["reason"])
@@ -122,7 +117,7 @@ class Pool:
         """
         began = time.perf_counter()
         os.makedirs(tempfile.gettempdir(), exist_ok=True)  # something may have removed it
-        for attempt in range(1, ATTEMPTS + 1):
+        for attempt in (1, 2, 3):  # workers that may die of the request before it is refused
             facts["attempts"] = attempt
             self.waiting += 1
             try:

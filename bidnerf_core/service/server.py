@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
 
 PORT = 8000
-IDLE_SECONDS = 15
-"""Time for which a connection may be idle between two requests."""
 NEEDS = "the service needs the extra 'serve' (pip install 'bidnerf[serve]')"
 
 
@@ -138,7 +136,7 @@ def run_app(
 
     options = uvicorn.Config(
         app, http="h11", ws="none", loop="asyncio", lifespan="off", log_config=None, access_log=False,
-        server_header=False, proxy_headers=False, timeout_keep_alive=IDLE_SECONDS, timeout_graceful_shutdown=grace,
+        server_header=False, proxy_headers=False, timeout_keep_alive=15, timeout_graceful_shutdown=grace,
     )  # fmt: skip
     server, host = Server(options), host or "127.0.0.1"
     try:

@@ -41,8 +41,8 @@ from bidnerf_core.viewer.evidence import (
 from bidnerf_core.viewer.pictures import Json, drawing, packed, photograph, quick_image
 from bidnerf_core.viewer.scene import frustum, rows_of
 
-MOST_MATCHES, MOST_STEPS = 600, 200
-"""Maximum numbers of matches and of steps of a descent that are shown; more are subsampled at a regular stride."""
+MOST_STEPS = 200
+"""Maximum number of steps of a descent that are shown; more are subsampled at a regular stride."""
 
 
 def no_answer(name: str, outcome: str, reason: str) -> Json:
@@ -251,7 +251,7 @@ def _matches(scene: SceneMap, found: Localization, answer: LandmarkAnswer) -> Js
     shares = [query.keypoints.pixels[keypoint] / size, there / size]
     if mode.name == MIRROR:  # drawn on the image as it is
         shares = [torch.stack([1 - share[:, 0], share[:, 1]], dim=-1) for share in shares]
-    every = max(1, math.ceil(len(keypoint) / MOST_MATCHES))
+    every = max(1, math.ceil(len(keypoint) / 600))  # at most 600 are drawn
     return {
         "keypoints": packed(shares[0][::every].numpy()),
         "projections": packed(shares[1][::every].numpy()),

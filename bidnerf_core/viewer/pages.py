@@ -29,10 +29,6 @@ from bidnerf_core.viewer.scene import shown_map, shown_trajectory
 
 MODULES = ("data", "space", "compare", "panel", "table", "track", "live", "main")
 """The modules of the page, each after those that it imports. They share one scope, so their names must differ."""
-IMPORT = re.compile(r'^import \{[^}]*\} from "\./\w+\.js";\n', re.MULTILINE)
-
-ESCAPED = str.maketrans({c: f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"})
-"""JSON escapes of the characters that could end a script in a page or begin markup."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +57,8 @@ class MapView:
 
     def html(self) -> str:
         """Return the whole page, whose content security policy allows only its own scripts and, if live, its own server."""
+        # The characters that could end a script in a page or begin markup.
+        escapes = str.maketrans({c: f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"})
         library, scripts = _part("three.min.js"), _scripts()
         server = "'self'" if self.live else "'none'"
         policy = (
@@ -70,7 +68,7 @@ class MapView:
         parts = {
             "policy": f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
             "style": f"<style>{_part('style.css')}</style>",
-            "state": json.dumps(to_plain(self), allow_nan=False, separators=(",", ":")).translate(ESCAPED),
+            "state": json.dumps(to_plain(self), allow_nan=False, separators=(",", ":")).translate(escapes),
             "scripts": f'<script>{library}</script>\n<script type="module">{scripts}</script>',
         }
         return re.sub(r"<!-- (\w+) -->", lambda found: parts[found[1]], _part("index.html"))
@@ -95,8 +93,8 @@ def _part(name: str) -> str:
 @cache
 def _scripts() -> str:
     """Return the JavaScript modules of the page, joined into one script."""
-    texts = (IMPORT.sub("", _part(f"{name}.js")).replace("\nexport ", "\n") for name in MODULES)
-    return "\n".join(texts)
+    texts = "\n".join(_part(f"{name}.js") for name in MODULES).replace("\nexport ", "\n")
+    return re.sub(r'^import \{[^}]*\} from "\./\w+\.js";\n', "", texts, flags=re.MULTILINE)
 
 
 @cache

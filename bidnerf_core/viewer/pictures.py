@@ -20,9 +20,6 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import SceneMap, picture_at, surface_renderer
 from bidnerf_core.results import as_picture
 
-JPEG_QUALITY = 85
-
-
 Json: TypeAlias = dict[str, Any]
 """A part of the page's state, which its scripts read. The function that returns it says what it holds."""
 
@@ -49,16 +46,16 @@ def packed_colours(rgb: Float[Tensor, "n 3"]) -> Json:
     return packed((rgb.detach().cpu().float().clamp(0, 1).numpy() * 255 + 0.5).astype(np.uint8))
 
 
-def jpeg(image: Float[Tensor, "h w 3"] | UInt8[np.ndarray, "h w 3"], quality: int = JPEG_QUALITY) -> bytes:
+def jpeg(image: Float[Tensor, "h w 3"] | UInt8[np.ndarray, "h w 3"]) -> bytes:
     """Return an image as the bytes of a JPEG file."""
     file = io.BytesIO()
-    Image.fromarray(as_picture(image)).save(file, "JPEG", quality=quality)
+    Image.fromarray(as_picture(image)).save(file, "JPEG", quality=85)
     return file.getvalue()
 
 
-def photograph(image: Float[Tensor, "h w 3"], quality: int = JPEG_QUALITY) -> Json:
+def photograph(image: Float[Tensor, "h w 3"]) -> Json:
     """Return an image as the data ``url`` of a JPEG, with its ``width`` and ``height`` in pixels."""
-    url = "data:image/jpeg;base64," + base64.b64encode(jpeg(image, quality)).decode()
+    url = "data:image/jpeg;base64," + base64.b64encode(jpeg(image)).decode()
     return {"url": url, "width": int(image.shape[1]), "height": int(image.shape[0])}
 
 

@@ -36,15 +36,11 @@ from bidnerf_core.viewer.pictures import (
 
 log = logging.getLogger("bidnerf")
 
-MOST_SURFELS, MOST_LANDMARKS = 120_000, 20_000
-"""Maximum numbers of points in a page; larger sets are subsampled at random."""
-THUMBNAIL, THUMBNAIL_QUALITY = 80, 75
-"""Longer side of a thumbnail (pixels), and its JPEG quality."""
-MOST_THUMBNAILS = 60
-"""Maximum number of thumbnails in a saved page, since each has to be rendered."""
+MOST_POINTS = 120_000
+"""Maximum number of surfels or splats in a page; larger sets are subsampled at random."""
 
 
-def shown_map(scene: Map, thumbnails: int = MOST_THUMBNAILS) -> Json:
+def shown_map(scene: Map, thumbnails: int = 60) -> Json:
     """Return the JSON values of a map; ``thumbnails`` is the maximum number of cameras with a rendered thumbnail.
 
     ``unit`` is the symbol of the unit of length, ``up_source`` says how the upward direction was found, and
@@ -69,7 +65,7 @@ def shown_map(scene: Map, thumbnails: int = MOST_THUMBNAILS) -> Json:
                 "name": camera.name,
                 "pose": rows_of(camera.pose),
                 "shape": frustum(camera.intrinsics),
-                "thumbnail": photograph(_small_image(scene, camera), THUMBNAIL_QUALITY)
+                "thumbnail": photograph(_small_image(scene, camera))
                 if thumbnails and number % every == 0
                 else None,
             }
@@ -89,11 +85,11 @@ def frustum(camera: Intrinsics) -> Json:
 
 def thumbnail_jpeg(scene: Map, camera: StoredCamera) -> bytes:
     """Render a small image from a camera of the map, as a JPEG file."""
-    return jpeg(_small_image(scene, camera), THUMBNAIL_QUALITY)
+    return jpeg(_small_image(scene, camera))
 
 
 def _small_image(scene: Map, camera: StoredCamera) -> Float[Tensor, "h w 3"]:
-    return quick_image(scene, camera.intrinsics.at_most(THUMBNAIL), camera.pose)
+    return quick_image(scene, camera.intrinsics.at_most(80), camera.pose)  # pixels on the longer side
 
 
 def rows_of(T: SE3) -> tuple[float, ...]:
@@ -136,7 +132,7 @@ def _surface(scene: Map) -> Json | None:
     if scene.surface is None:
         return None
     surfels = scene.surface.surfels
-    some = _subset(len(surfels), MOST_SURFELS)  # in random order, so that the first ones show the whole
+    some = _subset(len(surfels), MOST_POINTS)  # in random order, so that the first ones show the whole
     radius = scene.surface.cell * max(1.0, (len(surfels) / max(len(some), 1)) ** 0.5) / 2
     positions, keyframes = surfels.positions[some].cpu(), scene.surface.keyframes[:, :3, 3].cpu()
     normals = towards(positions, surfels.normals[some].cpu(), keyframes)
@@ -160,7 +156,7 @@ def towards(
 def _landmarks(scene: Map) -> Json | None:
     if scene.landmarks is None:
         return None
-    some = _subset(len(scene.landmarks), MOST_LANDMARKS)
+    some = _subset(len(scene.landmarks), 20_000)
     return _points(scene.landmarks.positions[some], len(scene.landmarks), 0.0)
 
 
@@ -170,7 +166,7 @@ def _splats(scene: Map) -> Json | None:
         return None
     splats = moved(scene.field.splats(), "cpu")
     seen = (splats.opacity >= 0.2).nonzero()[:, 0]
-    some = seen[_subset(len(seen), MOST_SURFELS)]
+    some = seen[_subset(len(seen), MOST_POINTS)]
     return _points(
         splats.positions[some], len(splats.positions), 1.0, packed_colours(splats.rgb[some]),
         packed(splats.radius[some].float().numpy()),

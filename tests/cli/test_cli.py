@@ -25,6 +25,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 import tiny
+from bidnerf_core import Intrinsics, scenes
 from bidnerf_core.backend import load_backend
 from bidnerf_core.cli import COMMANDS, main
 
@@ -378,21 +379,13 @@ def test_a_disk_that_fills_up_keeps_the_last_whole_map(bidnerf: Run, shared: Pat
 # Wrong usage.
 
 WRONG_USAGE = """
-    frobnicate
-    train
-    train {data}
-    train {data} --out
-    train {data} --out {out} --steps many
     train {data} --out {out} --steps 0
     train {data} --out {out} --learning-rate nan
     train {data} --out {out} --checkpoint-every -1
     train {data} --out {out} --largest 0
-    train {data} --out {out} --frobnicate
     train {data} --out {out} --backend adanerf --threshold inf
     train {data} --out {out} --depth-weight inf
     train {data} --out {out} --points-error inf
-    info
-    info {map} {map}
     render {map} --out {out}
     render {map} {data} --out {out} --level 1.5
     localize {map}
@@ -403,17 +396,13 @@ WRONG_USAGE = """
     localize {map} x.png --focal 30 --perturb 1 2
     localize {map} x.png --focal 30 --depth a.png b.png
     localize {map} x.png --focal 30 --out poses.csv
-    localize {map} {data} --frame
     localize {map} {data} --frame t_0000 --method guess
     localize {map} {data} --frame t_0000 --start p.json --perturb 1 2
-    localize {map} {data} --frame t_0000 --perturb 1
     localize {map} {data} --frame t_0000 --perturb 1 2 --seed -1
     localize {map} {data} --frame t_0000 --perturb 1 2 --seed 999999999999999999999999999999
     localize {map} {data} --frame t_0000 --perturb 1 2 --method bid --wide nan
     demo --frames 0 --out {out}
     demo --steps 0 --out {out}
-    demo extra --out {out}
-    backends --jsn
     evaluate {map} {data} --out {out} --method guess
     evaluate {map} {data} --out {out} --protocol guess
     evaluate {map} {data} --out {out} --size -1
@@ -761,6 +750,10 @@ def whole(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_demo_leaves_a_map_and_the_data_that_it_was_made_from(
     bidnerf: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    small = Intrinsics(87.5, 87.5, 32.0, 32.0, 64, 64)
+    monkeypatch.setattr(
+        scenes, "views", lambda scene, camera, poses, seen=scenes.views: seen(scene, small, poses)
+    )
     for name, less in (("TRAINING_VIEWS", 12), ("ANIMATED", 2), ("DESCENT", {"rays": 64, "max_steps": 5})):
         monkeypatch.setattr(f"bidnerf_core.cli.demo.{name}", less)
     monkeypatch.setattr("bidnerf_core.maps.training.USUAL_BAKE", BakeConfig(cells=20_000))

@@ -84,12 +84,6 @@ def test_pages_fit_the_terminal(words: list[str], bidnerf: Run, monkeypatch: pyt
         assert option == "--help-all" or page.count("\n") < 80
 
 
-def test_arguments_are_named_as_in_the_manual(bidnerf: Run) -> None:
-    for command, named in (("train", "DATA"), ("info", "MAP"), ("render", "MAP DATA"), ("localize", "MAP")):
-        assert f" {named}" in bidnerf(command, "--help").out.splitlines()[0]
-    assert "QUERY..." in bidnerf("localize", "--help").out
-
-
 @pytest.mark.parametrize("columns", ["1", "39"])
 def test_help_ends_in_a_narrow_terminal(bidnerf: Run, monkeypatch: pytest.MonkeyPatch, columns: str) -> None:
     monkeypatch.setenv("COLUMNS", columns)

@@ -156,7 +156,7 @@ OPTIONS = """
 --out --seed --split --frame --size --trials --workers --shards --shard --images --angle --fault --device --protocol --method
 --steps --levels --log2-table-size --width --learning-rate --cells --rays --max-steps --hypotheses --start --perturb --window
 --depth --depth-unit --depth-points --camera --focal --hfov --draw --json --level --overwrite --resume --background --backend
---config --dask --criterion --title --no-depth --split= --plot --video --help --help-all --nothing
+--dask --criterion --title --no-depth --split= --plot --video --help --help-all --nothing
 """.split()  # noqa: SIM905
 VALUES = (
     *TEXTS, *NUMBERS, "test", "train", "none", "auto", "bid", "0.3", "1", "2", "1e9", "99999999", "{}", "{}/map", "{}/data",
