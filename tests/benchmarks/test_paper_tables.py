@@ -42,6 +42,7 @@ def test_the_cells_of_a_part_can_be_tried_from_the_same_starts(part: str, script
         assert len({(trial.frame, trial.size, trial.seed) for trial in same}) == 1
 
 
+@pytest.mark.usefixtures("small_images")
 def test_a_part_is_recorded(tmp_path: Path, script: Script, monkeypatch: pytest.MonkeyPatch) -> None:
     few = ["--trials", "1", "--rays", "8", "--steps", "1", "--workers", "1", "--part", "inerf"]
     monkeypatch.setattr("sys.argv", ["paper_tables.py", PLACE, "--map", PLACE, "--out", str(tmp_path), *few])

@@ -113,14 +113,17 @@ def test_only_the_inner_half_of_contracted_space_is_carved() -> None:
 
 @pytest.mark.slow
 def test_training_learns_what_lies_beyond_the_box() -> None:
-    """Photos of a toy before white, without alpha: rays past the box become white, though the background is black."""
-    config = tiny.config(steps=150, samples_per_step=8192, carve=False)
+    """Photos of a toy before white, without alpha: rays past the box become white, though the background is black.
+
+    Where space ends at the box, no step can change what they see.
+    """
+    config = tiny.config(samples_per_step=4096, carve=False)
     corners = torch.stack([_corner(view) for view in rgb_views()])
     places = torch.stack([view.T_ref_camera.translation for view in rgb_views()]).float()
     seen = []
-    for bounds in (OPEN, replace(OPEN, contracted=False)):
+    for bounds, steps in ((OPEN, 150), (replace(OPEN, contracted=False), 8)):
         field = hashgrid.build(config, bounds)
-        hashgrid.train(field, rgb_views(), config, Silent())
+        hashgrid.train(field, rgb_views(), replace(config, steps=steps), Silent())
         with torch.no_grad():
             seen.append(render(field, bounds.rays(places, corners), torch.zeros(3)).rgb)
     assert float(seen[0].min()) > 0.75
