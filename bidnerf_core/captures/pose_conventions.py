@@ -27,8 +27,6 @@ from bidnerf_core.mapping import LEAST_BASELINE, ImageKeypoints, likely_pairs, s
 MOST_PAIRS = 40
 """Largest number of examined pairs among those suggested by poses and order, and among those suggested by
 image similarity."""
-ENOUGH_PAIRS = 8
-"""Smallest number of pairs with matches from which poses are judged."""
 ENOUGH_MATCHES = 40
 """Smallest number of inlier matches to an essential matrix for a pair."""
 USUAL_FOCAL = 700.0
@@ -89,7 +87,7 @@ def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | 
     if len(pairs) < MOST_PAIRS / 2:
         others = [pair for pair in _similar(images) if pair not in proposed][:MOST_PAIRS]
         pairs += [pair for i, j in others if (pair := matched_pair(images, i, j)) is not None]
-    if len(pairs) < ENOUGH_PAIRS:
+    if len(pairs) < 8:  # too few to judge the poses
         return None
     poses = SE3.stack([image.T_ref_camera for image in images])
     agrees = [bool(pair.agreeing(poses[None])[0]) for pair in pairs]

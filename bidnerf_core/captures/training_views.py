@@ -66,8 +66,6 @@ ROUNDS = 3
 poses prevented."""
 MOST_EVIDENCE = 10.0
 """Largest contribution of an image to the log evidence for or against a motion, so that no few images decide."""
-UNUSUAL_RATIO = 0.05
-"""Smallest relative error of measured depth, compared with triangulated points, that is reported."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +174,7 @@ def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> 
     """
     seen, points = tracked.triangulated(DEFAULT_LANDMARKS)
     ratio = depth_ratio(seen, points)
-    if ratio is None or abs(ratio - 1) < UNUSUAL_RATIO:
+    if ratio is None or abs(ratio - 1) < 0.05:  # as sensors and triangulation may be off
         return
     remark = f"measured depth is {ratio:.3g} times the depth that the poses and photos imply"
     if 1 / 2 < ratio < 2:

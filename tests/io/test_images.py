@@ -333,7 +333,7 @@ def test_resampling_takes_the_nearest_and_invents_nothing() -> None:
 
 def test_threads_that_read_images_leave_warnings_as_they_were(tmp_path: Path) -> None:
     """Filters of warnings belong to the process: one that stays behind would silence all later warnings of an application."""
-    Image.fromarray(noise(300, 400)).save(tmp_path / "a.png")
+    Image.fromarray(noise(60, 80)).save(tmp_path / "a.png")
     before = list(warnings.filters)
     with ThreadPoolExecutor(4) as pool:
         for _ in pool.map(read_image, [tmp_path / "a.png"] * 400):
