@@ -62,8 +62,7 @@ def once(subject: object, make: Callable[[], T]) -> T:
     """Return what ``make`` makes, once per test class: ``subject`` is one of its instances."""
     if "_made" not in vars(type(subject)):
         type(subject)._made = make()  # type: ignore[attr-defined]
-    found: T = vars(type(subject))["_made"]
-    return found
+    return type(subject)._made  # type: ignore[attr-defined]
 
 
 class Named:
