@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from bidnerf_core.backend import load_backend
 from bidnerf_core.camera import CameraSource
-from bidnerf_core.captures import at_stored_poses, stored_cameras
+from bidnerf_core.captures import stored_cameras
 from bidnerf_core.datasets import (
     Capture,
     DatasetOptions,
@@ -46,7 +46,7 @@ from bidnerf_core.maps.description import load_info, longest_side
 from bidnerf_core.maps.map import USUAL_BAKE, Map, load_map
 from bidnerf_core.maps.store import with_tracks_in
 from bidnerf_core.maps.training import TrainOptions, train_field
-from bidnerf_core.maps.views import Images, read_views
+from bidnerf_core.maps.views import Images, views_again
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context
 
 log = logging.getLogger("bidnerf")
@@ -158,7 +158,7 @@ def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> li
 def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], list[LeftOut]]:
     """Read photos, downscaled to the size of the map's largest image; also return the photos that cannot be read."""
     side, background = longest_side(scene.info), scene.bounds.background
-    frames, unread = list[Frame](), list[LeftOut]()
+    frames, unread = list[Any](), list[LeftOut]()
     source: Sequence[Frame] | Sequence[View] | Capture
     if not isinstance(photos, str | Path):
         source = photos.split(split) if isinstance(photos, Capture) else photos
@@ -175,23 +175,20 @@ def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], lis
                 unread.append((name, str(error)))
     else:
         frames = [item.frame if isinstance(item, View) else item for item in source]
-    for frame in frames:
-        if not isinstance(frame, Frame):
-            raise InputError(f"photos holds a {type(frame).__name__}", expected="frames, views, or a path")
+    if odd := [type(frame).__name__ for frame in frames if not isinstance(frame, Frame)]:
+        raise InputError(f"photos holds a {odd[0]}", expected="frames, views, or a path")
     if not frames and unread:
         raise InputError(f"none of {amount(len(unread), 'photo')} can be read: {unread[0][1]}")
     if not frames:
         raise InputError("no photos to add", expected="at least one")
-    frames = [frame.over(background) for frame in frames]
-    return [frame if side is None else frame.at_most(side) for frame in frames], unread
+    seen = [frame.over(background) for frame in frames]
+    return [frame if side is None else frame.at_most(side) for frame in seen], unread
 
 
 def _old_views(scene: Map, data: Images | None, split: str) -> list[View]:
     """Return the images that the map was built from, or renderings at their cameras."""
     if data is not None:
-        background = scene.bounds.background if isinstance(data, str | Path) else None
-        read = read_views(data, DatasetOptions(split=split, background=background))
-        views = at_stored_poses(read.about(scene.origin).views, scene.info.cameras)
+        _, views = views_again(scene.info, data, DatasetOptions(split=split))
         own = {camera.name for camera in scene.info.cameras}
         if not any(view.frame.name in own for view in views):
             raise InputError(

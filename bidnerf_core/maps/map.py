@@ -17,7 +17,6 @@ from torch import nn
 from bidnerf_core.captures import (
     CaptureReport,
     UpDirection,
-    at_stored_poses,
     given_up,
     pose_updates,
     poses_of,
@@ -70,7 +69,7 @@ from bidnerf_core.maps.store import (
     write_parts,
 )
 from bidnerf_core.maps.summary import MapSummary
-from bidnerf_core.maps.views import AS_STORED, Images, read_views
+from bidnerf_core.maps.views import AS_STORED, Images, views_again
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context
 from bidnerf_core.training import TrainingState
 
@@ -282,10 +281,7 @@ class Map:
         ):
             views = list[View]()
             if data is not None:
-                if images.background is None and isinstance(data, str | Path):
-                    images = replace(images, background=self.bounds.background)
-                found = read_views(data, images, folder=self.folder)
-                views = at_stored_poses(found.about(self.origin).views, self.info.cameras)
+                _, views = views_again(self.info, data, images, folder=self.folder)
                 own = {(camera.name, camera.T_world_camera) for camera in self.info.cameras}
                 if own and not any((c.name, c.T_world_camera) in own for c in stored_cameras(views)):
                     # None of them was used to build the map: they may be of another scene.

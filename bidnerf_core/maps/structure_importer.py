@@ -59,20 +59,17 @@ class StructureImporter:
         observed = [_numbers(image.observed, points.ids, sound) for image in images]
         known: Mapping[str, Keypoints] = {}
         given = None if config.keypoints in ("", "photos") else Path(config.keypoints)
-        if config.keypoints != "photos":
-            beside = (folder / "database.db" for folder in (model, model.parent, model.parent.parent))
-            source = given or next((file for file in beside if file.is_file()), None)
-            known = {} if source is None else dict(stored_keypoints(source))
-            why = None
-            if source is not None:
-                why = _misfit(known, {i.name: len(i.observed) for i in images}, [s.camera for s in shots])
-                found.append(
-                    f"{source}: "
-                    + ("the keypoints and their descriptors" if why is None else f"not used: {why}")
-                )
-            if why is not None and given is not None:
+        beside = (folder / "database.db" for folder in (model, model.parent, model.parent.parent))
+        source = given or next((file for file in beside if file.is_file()), None)
+        if source is not None and config.keypoints != "photos":
+            stored = dict(stored_keypoints(source))
+            why = _misfit(stored, {i.name: len(i.observed) for i in images}, [s.camera for s in shots])
+            if why is None:
+                known = stored
+            elif given is not None:
                 raise InputError(why, where=given, expected=f"the keypoints of {model}")
-            known = {} if why is not None else known
+            used = "the keypoints and their descriptors" if why is None else f"not used: {why}"
+            found.append(f"{source}: {used}")
         left_out, kept = list[str](), list[int]()
         for number, image in enumerate(images):
             if known and image.name not in known:

@@ -21,7 +21,6 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import (
     RefinementChoice,
     as_given,
-    at_stored_poses,
     located,
     prepared,
     stored_cameras,
@@ -52,7 +51,7 @@ from bidnerf_core.maps.store import (
     read_part,
     write_parts,
 )
-from bidnerf_core.maps.views import Images, ReadViews, chosen_origin, read_views
+from bidnerf_core.maps.views import Images, ReadViews, chosen_origin, read_views, views_again
 from bidnerf_core.progress import (
     Cancel,
     ProgressCallback,
@@ -228,16 +227,12 @@ def _with_field(
 ) -> tuple[Map, list[View], TrackedViews | None]:
     """Prepare a landmark-only map for training a field; return it with its images at the stored poses, and their keypoints."""
     info, images = scene.info, replace(images, largest=longest_side(scene.info))
-    read = read_views(data, images, options.depth_points, options.point_choice, scene.folder).about(
-        info.origin
-    )
+    read, views = views_again(info, data, images, options.depth_points, options.point_choice, scene.folder)
     own = {camera.name for camera in info.cameras}
     if unknown := [view.frame.name for view in read.views if view.frame.name not in own]:
         found, expected = f"image {unknown[0]!r} is none of those of {scene.name}", "images of that map"
         raise InputError(found, where=read.place, expected=expected)
-    tracked, views = located(
-        at_stored_poses(read.views, info.cameras), info.landmark_features, True, read.depth_unit
-    )
+    tracked, views = located(views, info.landmark_features, True, read.depth_unit)
     bounds = estimate_bounds(views, read.background)
     info = replace(info, bounds=bounds, complete=False, hidden=read.hidden, sparse_depth=read.sparse_depth)
     return replace(scene, info=info), views, tracked
@@ -288,14 +283,10 @@ def resume(
     ):
         info = interrupted(out, baking is not None)  # another process may have finished meanwhile
         images = replace(images, largest=longest_side(info))
-        if images.background is None and isinstance(posed, str | Path):
-            images = replace(images, background=info.bounds.background)
-        read = read_views(posed, images, options.depth_points, options.point_choice, out).about(info.origin)
+        read, views = views_again(info, posed, images, options.depth_points, options.point_choice, out)
         _check_same_views(out, info, read, images.split)
         # These are the keypoints and views with which training began.
-        tracked, views = located(
-            at_stored_poses(read.views, info.cameras), info.landmark_features, True, read.depth_unit
-        )
+        tracked, views = located(views, info.landmark_features, True, read.depth_unit)
         if info.complete or finish:
             scene = load_map(out, device)
             if not info.complete:

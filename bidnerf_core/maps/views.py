@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera import UPRIGHT, checked_side
-from bidnerf_core.captures import StoredCamera
+from bidnerf_core.captures import StoredCamera, at_stored_poses
 from bidnerf_core.datasets import (
     Capture,
     DatasetOptions,
@@ -37,6 +37,7 @@ from bidnerf_core.frames import (
 )
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import available_memory, background_colour
+from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.progress import counter
 
 log = logging.getLogger("bidnerf")
@@ -143,12 +144,10 @@ def read_views(
     else:
         given: Sequence[object] = data if isinstance(data, Sequence) else [data]
         views = [view for view in given if isinstance(view, View)]
-        for other in given:
-            if not isinstance(other, View):
-                raise InputError(
-                    f"data is or holds a {type(other).__name__}",
-                    expected="a dataset, a path, or views with poses",
-                )
+        if odd := [type(other).__name__ for other in given if not isinstance(other, View)]:
+            raise InputError(
+                f"data is or holds a {odd[0]}", expected="a dataset, a path, or views with poses"
+            )
         if not views:
             raise InputError("data holds no views", expected="at least one")
         colour = BLACK if background is None else background_colour(background)
@@ -255,3 +254,22 @@ def _with_depth(read: ReadViews, model: Path, choice: SparseChoice, split: str) 
         )
     log.info(f"{sparse.summary}; depth at {count} pixels of {len(new)} of {len(read.views)} images")
     return replace(read, views=changed, sparse_depth=count)
+
+
+def views_again(
+    info: MapInfo,
+    data: Images,
+    options: DatasetOptions = AS_STORED,
+    depth_points: str | Path | None = None,
+    point_choice: SparseChoice | None = None,
+    folder: Path | None = None,
+) -> tuple[ReadViews, list[View]]:
+    """Read images of a map that ``info`` describes, as ``read_views`` does, with poses in the map's own coordinates.
+
+    The background is by default the one with which its field was begun. Also returns the views at the poses that
+    the map has for them, where training refined the given ones.
+    """
+    if options.background is None and isinstance(data, str | Path) and info.backend:
+        options = replace(options, background=info.bounds.background)
+    read = read_views(data, options, depth_points, point_choice, folder).about(info.origin)
+    return read, at_stored_poses(read.views, info.cameras)
