@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.geometry import SE3
 from bidnerf_gaussians.pieces import LEAST_ALPHA
-from bidnerf_gaussians.quaternions import product, quaternion_of
+from bidnerf_gaussians.quaternions import product
 from bidnerf_gaussians.spherical_harmonics import rotated
 
 COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}
@@ -52,7 +53,7 @@ class Gaussians:
         """Return the Gaussians transformed by ``x -> rotation @ (scale * x) + translation``; colours rotate with them."""
         R = rotation.double()
         means = (scale * self.means.double()) @ R.mT + translation.double()
-        turn = quaternion_of(R).to(self.quaternions)
+        turn = SE3(R, translation).quaternion("wxyz").to(self.quaternions)
         is_turned = bool((R - torch.eye(3, dtype=torch.float64)).abs().max() > 1e-9)
         return Gaussians(
             means.float(),

@@ -30,18 +30,3 @@ def product(a: Float[Tensor, "*p 4"], b: Float[Tensor, "*p 4"]) -> Float[Tensor,
     aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
     w = aw * bw - (av * bv).sum(-1, keepdim=True)
     return torch.cat([w, aw * bv + bw * av + torch.linalg.cross(av, bv)], dim=-1)
-
-
-def quaternion_of(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
-    """Return the unit quaternion of a rotation matrix, from the eigenvector of Bar-Itzhack (2000), stable for any angle."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation.double().tolist()
-    K = torch.tensor(
-        [
-            [a + e + i, h - f, c - g, d - b],
-            [h - f, a - e - i, b + d, c + g],
-            [c - g, b + d, e - a - i, f + h],
-            [d - b, c + g, f + h, i - a - e],
-        ],
-        dtype=torch.float64,
-    )
-    return torch.linalg.eigh(K).eigenvectors[:, -1]

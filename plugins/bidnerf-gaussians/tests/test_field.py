@@ -142,8 +142,6 @@ def test_quaternions_turn_as_their_matrices() -> None:
     R = quaternions.matrices(q)
     assert torch.allclose(quaternions.turned_back(q, v), (R.mT @ v[..., None])[..., 0])
     assert torch.allclose(quaternions.matrices(quaternions.product(q, q.flip(0))), R @ R.flip(0))
-    for each in R:
-        assert torch.allclose(quaternions.matrices(quaternions.quaternion_of(each)), each)
 
 
 def test_splats_are_the_gaussians_as_points(some: Callable[..., Gaussians]) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.geometry import SE3
 from bidnerf_core.io import parse_json, read_file
 from bidnerf_gaussians.formats.parts import LARGEST_FILE, gaussians_of, joined, logit
 from bidnerf_gaussians.gaussians import COEFFICIENTS, Gaussians
@@ -166,18 +167,9 @@ def _shown_meshes(scene: _Scene) -> list[tuple[int, np.ndarray]]:
 def _local(node: dict[str, Any]) -> np.ndarray:
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T  # column by column
-    x, y, z, w = node.get("rotation", (0, 0, 0, 1))
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)))
-    matrix[:3, 3] = node.get("translation", (0, 0, 0))
-    return matrix
+    turn, place = node.get("rotation", (0, 0, 0, 1)), node.get("translation", (0, 0, 0))
+    pose = SE3.from_quaternion(*(torch.tensor(part, dtype=torch.float64) for part in (turn, place)), "xyzw")
+    return np.asarray(pose.matrix()) * [*node.get("scale", (1, 1, 1)), 1.0]
 
 
 def _gaussians(scene: _Scene, primitive: dict[str, Any]) -> Gaussians:
