@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import base64
 import io
-import itertools
 import os
 from collections.abc import Sequence
 from importlib.resources import files
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +36,6 @@ from bidnerf_core.scenes import is_closed_form
 
 MARK = '<meta name="generator" content="bidnerf report">'
 """Marks a page as a report, which a later report may replace."""
-LISTED_FRAMES = 24
-"""Number of trials that a report lists."""
 
 
 def write_report(
@@ -62,20 +61,18 @@ def write_report(
     chosen = chosen_criterion(criterion, table.groups)
     require_matplotlib()
     path = folder / "index.html"
-    is_ours = (
-        path.is_file() and MARK.encode() in path.read_bytes()[:4096]
-    )  # bytes that contain the mark of a report
+    is_ours = path.is_file() and MARK.encode() in path.read_bytes()[:4096]  # the head of the page
     if folder.is_dir() and not is_ours and not all(is_temporary(file.name) for file in folder.iterdir()):
         raise InputError(
             "holds something other than a bidnerf report; name another --out or remove it", where=folder
         )
-    shown = thumbnails(worst(table.rows)[:LISTED_FRAMES], data)
+    frames = pictured(worst(table.rows)[:24], data)
     with output_folder(folder, overwrite=True):
         if not path.exists():  # so that an interrupted report is recognized as one
             text = "This report was interrupted; the same command rewrites it."
             write_file(path, f"<!doctype html>{MARK}<title>Unfinished report</title><p>{text}</p>\n".encode())
         figures = Figures(table.groups, folder, chosen).all()
-        write_file(path, page(title, table, figures, chosen, runs, view, shown).encode())
+        write_file(path, page(title, table, figures, runs, view, frames).encode())
     return path
 
 
@@ -100,12 +97,11 @@ def page(
     title: str,
     table: ResultTable,
     figures: Sequence[Figure],
-    criterion: str,
     runs: Sequence[tuple[str, Sequence[Provenance]]] = (),
     view: str | None = None,
-    pictures: Sequence[str | None] = (),
+    frames: Sequence[tuple[TrialResult, str | None]] = (),
 ) -> str:
-    """Return a report as HTML; ``pictures`` holds a JPEG (base64) or None for each of the worst trials."""
+    """Return a report as HTML; ``frames`` lists trials with their images, see ``pictured``."""
     environment = Environment(
         autoescape=True, finalize=_printed, undefined=StrictUndefined, keep_trailing_newline=True
     )
@@ -113,7 +109,6 @@ def page(
     source = files(__package__).joinpath("report.html.jinja").read_text(encoding="utf-8")
     template = environment.from_string(source.strip() + "\n")
     groups = table.groups
-    titles = {row.situation: row.start for row in table.summary}
     maps = (f"{s.map} ({s.weights.partition('.')[0]}) on {s.data}/{s.split}" for s in situations(groups))
     return template.render(
         mark=Markup(MARK),
@@ -121,16 +116,14 @@ def page(
         trials=len(table.rows),
         maps=list(dict.fromkeys(maps)),
         criteria={n: CRITERION_NAMES[n] for n in CRITERIA if any(applies(n, g.results) for g in groups)},
-        sections=[
-            (titles[s], list(rows)) for s, rows in itertools.groupby(table.summary, lambda row: row.situation)
-        ],
+        sections=[(start, list(rows)) for start, rows in groupby(table.summary, attrgetter("start"))],
         pooled=any(g.situation.size is None for g in groups),
         stepwise=any(are_stepwise(group.results) for group in groups),
         figures=[(caption, base64.b64encode(file.read_bytes()).decode()) for file, caption in figures],
         relative=RELATIVE,
         absolute=ABSOLUTE,
         view=view,
-        frames=list(itertools.zip_longest(worst(table.rows)[:LISTED_FRAMES], pictures)),
+        frames=frames,
         succeeded=succeeded,
         wrong=sum(row.converged and not succeeded(row) for row in table.rows),
         refused=sum(not row.converged for row in table.rows),
@@ -153,15 +146,16 @@ def worst(rows: Sequence[TrialResult]) -> list[TrialResult]:
     return sorted(rows, key=rank)
 
 
-def thumbnails(rows: Sequence[TrialResult], data: Sequence[str | Path]) -> list[str | None]:
-    """Return the image of each trial, with its faults, as a JPEG in base64; None if the trial's dataset is not in ``data``."""
+def pictured(rows: Sequence[TrialResult], data: Sequence[str | Path]) -> list[tuple[TrialResult, str | None]]:
+    """Return each trial with its image, with its faults, as a JPEG in base64; None if the trial's dataset is not in ``data``."""
     folders = {Path(os.path.realpath(folder)).name: str(folder) for folder in data}
     opened: dict[tuple[str, str], Capture] = {}
-    pictures: list[str | None] = []
-    for trial in (row.trial for row in rows):
+    found: list[tuple[TrialResult, str | None]] = []
+    for row in rows:
+        trial = row.trial
         name = trial.data if is_closed_form(trial.data) else folders.get(trial.data)
         if name is None:
-            pictures.append(None)
+            found.append((row, None))
             continue
         if (name, trial.split) not in opened:  # results hold names of other files, not paths
             options = DatasetOptions(split=trial.split, depth_unit=trial.depth_unit)
@@ -170,8 +164,8 @@ def thumbnails(rows: Sequence[TrialResult], data: Sequence[str | Path]) -> list[
         image = Image.fromarray(as_picture(view.frame.rgb))
         image.thumbnail((240, 240))
         image.save(content, "JPEG", quality=80)
-        pictures.append(base64.b64encode(content.getvalue()).decode())
-    return pictures
+        found.append((row, base64.b64encode(content.getvalue()).decode()))
+    return found
 
 
 def _printed(value: Any) -> Any:

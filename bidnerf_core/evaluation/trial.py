@@ -43,7 +43,6 @@ Opened: TypeAlias = tuple[Map, Capture]
 """A map, and a dataset of the same scene."""
 Data: TypeAlias = Capture | Sequence[View] | str | Path
 """A dataset in memory, posed images (T_world_camera), the folder of a dataset, or demo:NAME."""
-DIGEST_BYTES = 16  # enough that no two inputs coincide by chance
 
 
 @dataclass(frozen=True)
@@ -259,7 +258,7 @@ def places_of(info: MapInfo) -> list[tuple[str, SE3]]:
 
 def views_digest(views: Sequence[View]) -> str:
     """Return the digest of the images, depth, alpha, hidden pixels, intrinsics and poses of ``views``; it depends on their order."""
-    hashed = hashlib.blake2b(digest_size=DIGEST_BYTES)
+    hashed = hashlib.blake2b(digest_size=16)
     for view in views:
         frame = view.frame
         camera = json.dumps(to_plain(frame.intrinsics), sort_keys=True)
@@ -281,7 +280,7 @@ def folder_digest(folder: str) -> str:
 
     Raises ``InputError`` if one of them cannot be read.
     """
-    hashed = hashlib.blake2b(digest_size=DIGEST_BYTES)
+    hashed = hashlib.blake2b(digest_size=16)
     try:
         for path in sorted(path for path in Path(folder).iterdir() if path.is_file()):
             with path.open("rb") as file:
