@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -180,13 +181,11 @@ def run_compare(
         )
     *maps, data = folders
     plan = replace(starts, size=() if size is None else (size,)).plan(method, images)
-    if out is None:
-        with displayed():
-            found = compare(maps, data, plan)
-    else:
+    if out is not None:
         check_folder(out, folders)
-        with output_folder(out, overwrite), displayed():
-            found = compare(maps, data, plan)
+    with nullcontext() if out is None else output_folder(out, overwrite), displayed():
+        found = compare(maps, data, plan)
+        if out is not None:
             found.save(out / "compare.json")
             try:
                 say(f"look at {comparison_figure(out, found).with_suffix('.png')}")

@@ -205,28 +205,22 @@ def _interrupted(
     from bidnerf_core.settings import to_flat
 
     info = interrupted(out, not target.no_bake)
-    if backend not in (None, info.backend):
-        raise UsageError(f"{out}: uses backend {info.backend!r}, cannot resume it with {backend!r}")
+
+    def require_same(name: str, value: object, usual: object, before: object) -> None:
+        if value not in (usual, before):
+            raise UsageError(
+                f"{out}: was started with {name} {before}, got {value}; --resume keeps it, --overwrite starts again"
+            )
+
+    require_same("backend", backend, None, info.backend)
     kind: Any = load_backend(info.backend, str(out)).config_type
     stored, unchanged = to_flat(from_plain(kind, info.config, f"{out}: config")), to_flat(kind())
     for key, value in to_flat(config).items():
-        if value not in (unchanged[key], stored[key]):
-            raise UsageError(
-                f"{out}: was started with {key} {stored[key]}, got {value}; --resume keeps settings, --overwrite"
-                " starts again"
-            )
+        require_same(key, value, unchanged[key], stored[key])
     refinement = info.pose_refinement
     if refinement is not None:  # None: "never", or too few keypoints for any
-        refined = refinement.refined or bool(refinement.replaced)
-        if given_poses.refine_poses == ("never" if refined else "always"):
-            raise UsageError(
-                f"{out}: was started with {'refined' if refined else 'given'} poses, got --refine-poses"
-                f" {given_poses.refine_poses}; --resume keeps the poses"
-            )
-    for option, value, usual, before in (
-        ("--largest", images.largest, None, longest_side(info)),
-        ("--landmark-features", target.landmark_features, USUAL_FEATURES, info.landmark_features),
-    ):
-        if value not in (usual, before):
-            raise UsageError(f"{out}: was started with {option} {before}, got {value}; leave it out")
+        before = "always" if refinement.refined or refinement.replaced else "never"
+        require_same("refine_poses", given_poses.refine_poses, "auto", before)
+    require_same("largest", images.largest, None, longest_side(info))
+    require_same("landmark_features", target.landmark_features, USUAL_FEATURES, info.landmark_features)
     return info

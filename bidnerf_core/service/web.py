@@ -22,7 +22,7 @@ from starlette.datastructures import MutableHeaders, UploadFile
 from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import ClientDisconnect, HTTPConnection
-from starlette.responses import HTMLResponse, Response
+from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from bidnerf_core.errors import InputError
@@ -125,7 +125,10 @@ class Application(FastAPI):
 
 
 class Gate:
-    """ASGI middleware that checks access to each request, sets headers on each response, and reports its status and duration."""
+    """ASGI middleware that checks access to each request, sets headers on each response, and reports its status and duration.
+
+    With the name of a ``cookie``, a browser may bring the token once, in the address ``/?token=TOKEN``.
+    """
 
     def __init__(
         self, app: ASGIApp, token: str | None, cookie: str | None = None, report: Report | None = None
@@ -150,10 +153,13 @@ class Gate:
                 message = {**message, "headers": headers.raw}
             await send(message)
 
+        # Cookies are sent to all ports of a host.
         cookie = None if self.cookie is None else f"{self.cookie}_{scope['server'][1]}"
         refused = refusal(scope, self.token, cookie)
         try:
-            if refused is None:
+            if cookie is not None and self.token is not None and _brings_token(scope, self.token):
+                await _logged_in(scope, cookie, self.token)(scope, receive, answer)
+            elif refused is None:
                 await self.app(scope, receive, answer)
             else:
                 more = {"Connection": "close"} | ({"WWW-Authenticate": "Bearer"} if refused[0] == 401 else {})
@@ -217,6 +223,20 @@ def refusal(scope: Scope, token: str | None, cookie: str | None = None) -> tuple
     if not is_local:
         return 403, "without a token the service answers requests to localhost only"
     return None if is_own_page else (403, "requests from pages of other sites are rejected")
+
+
+def _brings_token(scope: Scope, token: str) -> bool:
+    """Return whether a request is for ``/?token=TOKEN``, the address that a browser is given."""
+    given = HTTPConnection(scope).query_params.get("token", "")
+    return scope["path"] == "/" and hmac.compare_digest(given.encode(), token.encode())
+
+
+def _logged_in(scope: Scope, cookie: str, token: str) -> Response:
+    """Return a response that stores the token in a browser as a cookie, which replaces the header, and leads to the page."""
+    secure = "https" in (scope["scheme"], HTTPConnection(scope).headers.get("x-forwarded-proto"))
+    away = RedirectResponse("/", 303, {"Referrer-Policy": "no-referrer"})
+    away.set_cookie(cookie, token, httponly=True, samesite="strict", secure=secure)
+    return away
 
 
 def is_loopback(host: str | None) -> bool:

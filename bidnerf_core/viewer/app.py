@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hmac
 import logging
 import math
 import re
@@ -16,14 +15,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
-from urllib.parse import parse_qs
 
 import torch
 from fastapi import FastAPI, Request
 from pydantic import BaseModel, ConfigDict, Field
-from starlette.datastructures import Headers
-from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.responses import HTMLResponse, JSONResponse, Response
 
 from bidnerf_core.camera import CameraSource, Intrinsics
 from bidnerf_core.datasets import Query, QuerySource
@@ -56,10 +52,8 @@ log = logging.getLogger("bidnerf.viewer")
 
 PLACES = 10
 """Maximum number of photos that are uploading, waiting or being localized."""
-COOKIE = "bidnerf_token"
 LARGEST_RENDERING = 1024
 """Longer side (pixels) of renderings from the virtual camera of the page."""
-PAGE_HEADERS = {"Content-Security-Policy": "frame-ancestors 'none'", "Referrer-Policy": "no-referrer"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,24 +174,6 @@ class VirtualCamera(BaseModel):
         return Intrinsics(focal, focal, self.width / 2, self.height / 2, self.width, self.height)
 
 
-class Login:
-    """Middleware that accepts the token from a browser: ``/?token=TOKEN`` stores it as a cookie, which replaces the header."""
-
-    def __init__(self, app: ASGIApp, token: str) -> None:
-        self.app, self.token = app, token
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        given = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [""])[0]
-        if scope.get("path") != "/" or not hmac.compare_digest(given.encode(), self.token.encode()):
-            await self.app(scope, receive, send)
-            return
-        secure = "https" in (scope["scheme"], Headers(scope=scope).get("x-forwarded-proto"))
-        away = RedirectResponse("/", 303, PAGE_HEADERS | {"Cache-Control": "no-store"})
-        name = f"{COOKIE}_{scope['server'][1]}"  # cookies are sent to all ports of a host
-        away.set_cookie(name, self.token, httponly=True, samesite="strict", secure=secure)
-        await away(scope, receive, send)
-
-
 def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits | None = None) -> FastAPI:
     """Return the viewer as an ASGI application; ``limits`` apply to uploads.
 
@@ -226,10 +202,12 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
             painter.shutdown(wait=False, cancel_futures=True)
 
     app = Application(
-        "bidnerf view", token, COOKIE, lifespan=lifespan, description="A map, and localizations in it."
+        "bidnerf view",
+        token,
+        "bidnerf_token",
+        lifespan=lifespan,
+        description="A map, and localizations in it.",
     )
-    if token is not None:
-        app.add_middleware(Login, token=token)
 
     def queued(job: ShownJob, read: Read) -> Response:
         jobs.put(job, read)
@@ -237,7 +215,9 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
 
     @app.get("/", response_class=HTMLResponse, summary="The page.")
     async def page() -> Response:
-        return HTMLResponse(state.html(), headers=PAGE_HEADERS)
+        # The page states a policy for its own scripts.
+        headers = {"Content-Security-Policy": "frame-ancestors 'none'", "Referrer-Policy": "no-referrer"}
+        return HTMLResponse(state.html(), headers=headers)
 
     @app.get("/health", summary="Whether the viewer is up; needs no token.")
     async def health() -> Response:
