@@ -80,7 +80,8 @@ def read_image(
     with open_image(path) as image:
         width, height = image.size if size is None else size
         if image.mode == "F":  # such as depth
-            raise InputError("image holds floats", where=path, expected="8 or 16 bits per channel")
+            expected = "grey, RGB or RGBA with 8 or 16 bits per channel"
+            raise InputError("image is of float32", where=path, expected=expected)
         for strip, white in _strips(path, image):
             colour, cover = split_alpha(pixel_array(strip, f"{path}: image", white))
             rgb.append(reduced(over(colour, cover, background), width, len(strip)))

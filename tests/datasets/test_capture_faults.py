@@ -114,6 +114,7 @@ FAULTS: dict[str, list[tuple[str, Edit, str | tuple[str, ...]]]] = {
         ("metadata", keys(poses=[[0] * 6] * COUNT), ("pose 0", "7 numbers")),
         ("metadata", keys(poses=[[1, 1, 0, 0, 0, 0, 0]] * COUNT), ("pose 0", "quaternion", "1.41")),
         ("metadata", keys(w=None), "no w and h"),
+        ("metadata", keys(perFrameIntrinsicCoeffs=[[20.0, 21.0, 8.0, 6.0]] * 7), ("has 7 rows", "6, as poses")),
         ("metadata", keys(K=None, perFrameIntrinsicCoeffs=None), ("no K", "9 numbers")),
         ("metadata", content("{"), "not JSON"),
         ("rgbd/0.depth", lambda file: file.write_bytes(file.read_bytes()[:50]), ""),
