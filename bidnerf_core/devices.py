@@ -135,8 +135,8 @@ def captured(
 
 def graph_memory(device: torch.device) -> tuple[Any, torch.cuda.Stream]:
     """Return a pool for the temporary memory of graphs, and the stream of their captures."""
-    # Torch hands out the same 32 streams of a priority in turn. Those of captures have another priority than usual
-    # ones, since what another thread launches on a stream would become part of the graph that is captured there.
+    # Torch hands out the same 32 streams of a priority in turn. Captures use a priority of their own, since whatever
+    # another thread launches on the stream of a capture would become part of the graph.
     return torch.cuda.graph_pool_handle(), torch.cuda.Stream(device, priority=-1)
 
 

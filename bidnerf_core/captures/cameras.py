@@ -68,7 +68,7 @@ class StoredCamera:
 
 @dataclass(frozen=True)
 class MovedCamera:
-    """How far refinement moved an image from its given pose."""
+    """How far refinement moved the camera of an image from its given pose."""
 
     name: str
     translation: float  # metres

@@ -225,7 +225,10 @@ def _level(up_axis: Float[Tensor, "v 3"], level_axis: Float[Tensor, "v 3"]) -> F
 
 
 def _planes(normals: Float[Tensor, "n 3"] | None) -> list[tuple[Tensor, float, UpSource]]:
-    """Return up to six directions that most normals agree with, and the fraction of agreeing normals in excess of chance."""
+    """Return up to six directions about which the normals cluster; the signs of normals are ignored.
+
+    Each direction comes with the fraction of the normals near it, less the fraction expected by chance, and with its source.
+    """
     if normals is None or not len(normals):
         return []
     some = normals.detach().cpu().double()[:: max(1, len(normals) // 20_000)]

@@ -128,7 +128,7 @@ class MatchedPair:
     second: int
     seen_by_first: Float[Tensor, "m 3"]
     seen_by_second: Float[Tensor, "m 3"]
-    pixel: float  # size on the plane z = 1
+    pixel: float  # size of a pixel on the plane z = 1, scaled up in large images (see ``USUAL_FOCAL``)
 
     def agreeing(self, T: SE3) -> Bool[Tensor, "h"]:
         """Return which pose hypotheses T_world_camera (h n) put matches near their epipolar lines and in front of both cameras.
@@ -209,7 +209,7 @@ def matched_pair(images: Sequence[ImageKeypoints], i: int, j: int) -> MatchedPai
     if len(rows) < ENOUGH_MATCHES:
         return None
     first, second, focal = a.rays[rows], b.rays[partner], min(a.focal, b.focal)
-    pixel = max(1.0, focal / USUAL_FOCAL) / focal
+    pixel = max(1.0, focal / USUAL_FOCAL) / focal  # one pixel on the plane z = 1, scaled up in large images
     cv2.setRNGSeed(0)
     found, mask = cv2.findEssentialMat(
         first[:, :2].numpy(), second[:, :2].numpy(), np.eye(3), cv2.RANSAC, prob=0.999, threshold=pixel

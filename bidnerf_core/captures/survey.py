@@ -184,7 +184,9 @@ class Relocation:
 
 
 def suspects(seen: TrackedKeypoints, links: csr_array) -> list[int]:
-    """Return the photos whose given poses the others do not support, 32 at most; ``links`` are those of ``linked``.
+    """Return the indices of the photos whose given poses the others do not support, 32 at most.
+
+    ``links`` are the pairs of photos that share landmarks, see ``linked``.
 
     A photo is suspect if it belongs to no group, or if the fraction of its keypoints that are landmarks is less than half of
     what is usual in its group, unless enough photos agree with its pose. Photos that agree among themselves are not
@@ -201,6 +203,7 @@ def suspects(seen: TrackedKeypoints, links: csr_array) -> list[int]:
         own = group == number
         doubtful |= own & (share < 0.5 * share[own].median())
     found = [i for i in doubtful.nonzero()[:, 0].tolist() if not _has_support(seen.images, links, i)]
+    # If there are more than 32, an evenly spread selection of them.
     return [found[int(i * max(1.0, len(found) / 32))] for i in range(min(len(found), 32))]
 
 
@@ -212,7 +215,8 @@ def _has_support(images: Sequence[ImageKeypoints], links: csr_array, number: int
     poses, needed = SE3.stack([image.T_ref_camera for image in images]), LEAST_GROUP - 1
     for other in links.indices[links.indptr[number] : links.indptr[number + 1]].tolist():
         pair = matched_pair(images, number, other)
-        needed -= pair is not None and bool(pair.agreeing(poses[None])[0])
+        if pair is not None and bool(pair.agreeing(poses[None])[0]):
+            needed -= 1
         if not needed:
             return True
     return False

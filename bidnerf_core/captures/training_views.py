@@ -85,9 +85,9 @@ def prepared(
 ) -> TrainingViews:  # fmt: skip
     """Refine the poses of the views if requested, and find the landmarks visible in the views.
 
-    ``features`` is the name of the keypoint detector. Raises ``InputError`` if the poses contradict most
-    pairs of images, unless ``trust_poses`` is set, and if depth is clearly in another unit than
-    ``depth_unit`` (metres per step of depth images, if another can be given), with which it was read.
+    ``features`` is the name of the keypoint detector. ``depth_unit`` is the unit with which depth images were read
+    (metres per step), or None if the user cannot set another. Raises ``InputError`` if the poses contradict most
+    pairs of images, unless ``trust_poses`` is set, and if measured depth is clearly in a different unit from the poses.
     """
     if refinement == "never":
         tracked, seeing = located(views, features, trust_poses, depth_unit)

@@ -50,7 +50,10 @@ class StartOptions:
         require_one({"--start": self.start, "--perturb": self.perturb})
 
     def of_queries(self, seed: int) -> Callable[[Query], SE3 | None]:
-        """Return a function that returns the start of a query, if any. Raises ``UsageError`` if the perturbation is out of range."""
+        """Return a function from a query to its start, or to None if it has none.
+
+        Raises ``UsageError`` if the perturbation is out of range.
+        """
         from bidnerf_core.evaluation import find_protocol, perturb
         from bidnerf_core.results import pose_of, read_poses
 

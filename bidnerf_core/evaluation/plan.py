@@ -244,10 +244,10 @@ class Setup:
 
     def __post_init__(self) -> None:
         for name in FOLDERS:
-            value = getattr(self, name, None)
+            value = getattr(self, name, None)  # some of these are fields of ``Trial`` alone
             if "\0" in str(value):
                 raise InputError(f"{name} holds a NUL character", expected="the name of a file or folder")
-            if isinstance(value, Path):
+            if isinstance(value, Path):  # stored as text, since trials are written as JSON
                 object.__setattr__(self, name, str(value))
 
     @property

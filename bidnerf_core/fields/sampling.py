@@ -202,16 +202,18 @@ class Concentrated:
         if rough.starts.shape[-1] <= self.count:
             return rough
         many = rough.valid.sum(-1) > self.count
-        first = [part[..., : self.count] for part in rough.parts]
-        if not may_wait(many.device):  # all rays are concentrated, including those that keep their intervals
+        # What the other rays keep: ``gathered`` puts the valid intervals first.
+        unchanged = [part[..., : self.count] for part in rough.parts]
+        # Selecting the rays in ``many`` makes the host wait for the device. Where it may not, all rays are concentrated.
+        if not may_wait(many.device):
             found = self._concentrated(rays, rough, jitter)
-            pairs = zip(found.parts, first, strict=True)
+            pairs = zip(found.parts, unchanged, strict=True)
             return RaySamples(*(torch.where(many[..., None], new, old) for new, old in pairs))
         index = many.reshape(-1).nonzero()[:, 0]
         found = self._concentrated(rows_of(rays, index), rows_of(rough, index), jitter)
         merged = (
             old.reshape(-1, self.count).index_copy(0, index, new)
-            for new, old in zip(found.parts, first, strict=True)
+            for new, old in zip(found.parts, unchanged, strict=True)
         )
         return RaySamples(*merged).unflattened(many.shape)
 

@@ -102,7 +102,7 @@ class ImagePixels:
     ) -> ImagePixels:
         """Store ``images`` on ``device``; for an image that is None, every pixel has the value ``default``.
 
-        On the CPU, images that share few blocks of memory are not copied.
+        On the CPU, images that share a few blocks of memory are not copied.
         """
         device, present = torch.device(device), {i: x.detach() for i, x in enumerate(images) if x is not None}
         block, start = torch.tensor([[-1], [0]]).repeat(1, len(images))

@@ -37,9 +37,9 @@ class SE3:
 
     @staticmethod
     def from_matrix(matrix: Float[Tensor, "*b 4 4"]) -> SE3:
-        """Convert a homogeneous matrix. Its entries are not checked; ``is_rigid`` does that.
+        """Convert homogeneous matrices to transforms, without checking that these are rigid (see ``is_rigid``).
 
-        Raises ``InputError`` unless it is a tensor of 4x4 matrices.
+        Raises ``InputError`` unless ``matrix`` is a tensor of 4x4 matrices.
         """
         if not isinstance(matrix, Tensor):
             raise InputError(

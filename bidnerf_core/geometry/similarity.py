@@ -64,7 +64,9 @@ def look_at(
     up: Sequence[float] = (0.0, 0.0, 1.0),
 ) -> SE3:
     """Return ``T_world_camera`` (float64) of a camera at ``eye`` that looks at ``target``, with ``up``
-    pointing upwards.
+    pointing upwards in the image.
+
+    Raises ``InputError`` if ``eye`` and ``target`` coincide.
     """
     position = torch.as_tensor(eye, dtype=torch.float64)
     forward = torch.as_tensor(target, dtype=torch.float64) - position

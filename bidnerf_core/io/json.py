@@ -171,10 +171,10 @@ def _is_tensor(value: Any) -> TypeGuard[Tensor]:
 
 
 def to_plain(value: Any, where: str = "", tensors: dict[str, Tensor] | None = None) -> Any:
-    """Convert dataclasses to dicts and tuples to lists. Raises ``InputError`` for values that strict JSON
-    cannot represent.
+    """Return a value with all dataclasses in it converted to dicts, and all tuples to lists.
 
-    Tensors are moved to ``tensors``, if given, under the names of their fields, such as ``motion.noise``;
+    Raises ``InputError`` for values that strict JSON cannot represent; the message names the value by its path, which begins
+    with ``where``. Tensors are moved to ``tensors``, if given, under the names of their fields, such as ``motion.noise``;
     ``with_tensors`` puts them back.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

@@ -175,7 +175,7 @@ SUPPORT_BOUNDS = (
     Bound("free_space_violations", 0.15, False, Outcome.FREE_SPACE_VIOLATED, "{0:.0%} of the lines of sight pass through the surface"),
     Bound("runner_up_margin", 0.15, True, Outcome.AMBIGUOUS, "another pose fits about as well"),
     Bound("rendered_inliers", 0.8, True, Outcome.RENDERING_MISMATCH, "only {0:.0%} of the rendered rays agree with the measurements"),
-    # Of the answers on record, 16 of 17 right ones were more precise, and 2 of 15 wrong ones, most of them by another camera than stated.
+    # Of the answers on record, 16 of the 17 right ones were more precise, and 2 of the 15 wrong ones, most of which had wrong intrinsics.
     Bound("precision", 0.015, False, Outcome.IMPRECISE, "the position is uncertain by {0:.1%} of the distance"),
     Bound("determined", 1.0, True, Outcome.UNDETERMINED, "the measurements do not determine the pose"),
     Bound("new_inliers", 0.93, True, Outcome.RENDERING_MISMATCH, "{0:.0%} of newly drawn rays agree with the measurements, expected {1:.0%}"),

@@ -163,7 +163,7 @@ def by_images(
     """Compare the images with renderings of the surface from ``count`` hypotheses throughout the scene, then run ``later`` stages.
 
     Returns the best poses and the middle of the visible scene (metres, last camera's frame). Rays cast from the keyframes
-    tell the typical distance of the scene, and whether the scene has a background. ``detailed`` is for partly occluded images: its
+    show how far the scene typically is, and whether it has a background. ``detailed`` is for partly occluded images: its
     colour scales are narrow, as wider ones favour poses that partly explain the occluders' colours, and the exposure stays close to
     that of the map.
     """

@@ -128,9 +128,9 @@ class Localizer:
         """Localize independent queries, each as ``__call__`` does, and yield the answers in the order of the queries.
 
         A query that cannot be localized at all yields its ``InputError`` in place of an answer. ``workers`` threads, each with its
-        own stream on a GPU, localize at the same time; by default as many as torch uses or, on a GPU, 8.
+        own stream on a GPU, localize at the same time: by default, as many as torch has threads or, on a GPU, 8.
         ``queries`` may be an iterator, from which a few queries are taken in advance, or a folder of photos. Raises ``InputError`` unless
-        ``workers`` is positive, and for a folder without photos, and ``Cancelled`` as usual.
+        ``workers`` is positive, and for a folder without photos, and ``Cancelled`` if the current job is cancelled.
         """
         if isinstance(queries, str | Path):
             photos, _ = photos_in(queries)
@@ -152,7 +152,7 @@ class Localizer:
         total, count = length_hint(queries), counter("localizing", "images")
 
         def begin() -> None:
-            set_threads_here(1)  # other queries are better for the other cores than parts of one
+            set_threads_here(1)  # the other cores are better used for other queries than for parts of one
             if device.type == "cuda":
                 torch.cuda.set_stream(torch.cuda.Stream(device))
 

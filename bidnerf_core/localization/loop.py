@@ -2,7 +2,8 @@
 
 ``docs/methods.md#code`` says which module does which step. A further measurement becomes a term in ``Loop._fused``; it decides between
 places only through the log odds in ``Loop._posterior``. Anything else that the image may be, such as a mirror image of the scene,
-becomes a mode in ``Loop._other_modes``.
+becomes a mode in ``Loop._other_modes``, and its outcome is chosen in ``Loop._judged``. The minimal solvers are called in
+``propose.consensus``.
 """
 
 from __future__ import annotations
@@ -129,7 +130,7 @@ class Loop:
         """Detect keypoints of ``views``, whose poses are relative to the last view.
 
         Without a ``problem``, only landmarks are used. ``rays`` is the maximum number of rays to render if the map has a field,
-        0 for none. ``features`` is the keypoint detector, by default the map's. ``moving`` tells whether the camera may have
+        0 for none. ``features`` is the keypoint detector, by default the map's. ``moving`` is true if the camera may have
         moved during the readout.
         """
         self.matcher, self.problem, self.seed, self.moving = matcher, problem, seed, moving
@@ -318,7 +319,8 @@ class Loop:
         """Yield the hypotheses that compete with the place of the state ``best``.
 
         A scene may be repetitive, such as two rooms with the same furniture: keypoints that agree with the state may agree as well
-        with similar landmarks elsewhere. The image may also be mirrored.
+        with similar landmarks elsewhere. The image may also be mirrored. No hypotheses are tried unless a first pose, be it a wrong
+        one, agrees with at least ``LEAST_AGREEING`` matches of the image as it is.
         """
         query = self.query
         modes: list[tuple[str, QueryKeypoints, Matches]] = []

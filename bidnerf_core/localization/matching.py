@@ -154,7 +154,7 @@ class LandmarkMatcher:
 
     Above some thousand landmarks, it uses an inverted file: k-means divides the landmarks into sqrt(n) cells (more in large
     maps), and only the cells nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). Threads may share
-    a matcher. The matcher also prepares ``LandmarkMap.cells`` for guided matching.
+    a matcher. The matcher also computes ``LandmarkMap.cells`` for matching by projection.
 
     Descriptors are compared on the device of the descriptors of ``landmarks``; all other computations with landmarks run on the CPU. On an
     accelerator the search is always exhaustive.
@@ -162,13 +162,13 @@ class LandmarkMatcher:
 
     def __init__(self, landmarks: LandmarkMap, seed: int = 0) -> None:
         self.landmarks = landmarks.to("cpu")
-        _ = self.landmarks.cells
+        _ = self.landmarks.cells  # computed now and cached, as threads may share the matcher
         self._descriptors = landmarks.descriptors
-        self._index: _Products | _Cells | None = None  # None: all are compared
-        self._found_once: FoundOnce | None = None
+        self._cached_features: FoundOnce | None = None  # see ``for_query``
+        # None: the search is exhaustive, as it is for up to 4,000 landmarks.
+        self._index: _Products | _Cells | None = None
         if self.device.type != "cpu":
             self._index = _Products(landmarks.descriptors)
-        # The search of up to 4,000 landmarks is exhaustive, without cells.
         elif len(landmarks) > 4_000:
             self._index = _Cells(landmarks.descriptors, seed)
 
@@ -183,14 +183,14 @@ class LandmarkMatcher:
 
         Raises ``PluginError`` (an ``InputError``) if its plugin is not installed.
         """
-        return self._found_once or find_features(
+        return self._cached_features or find_features(
             self.landmarks.features, "the detector of the map's landmarks"
         )
 
     def for_query(self) -> LandmarkMatcher:
         """Return a matcher for one query, whose ``features`` cache the keypoints of each image; everything else is shared."""
         found = copy.copy(self)
-        found._found_once = FoundOnce(lambda rgb: detected(self.features, rgb))
+        found._cached_features = FoundOnce(lambda rgb: detected(self.features, rgb))
         return found
 
     def nearest(

@@ -228,7 +228,7 @@ def most_probable(states: States, term: Landmarks) -> States:
 
 
 def graduate(states: States, term: Landmarks) -> States:
-    # The noise is decreased to that of usual fits.
+    """Refine the states in several fits, whose noise decreases to the largest noise of keypoints that match."""
     for factor in (16.0, 8.0, 4.0, 2.0, 1.0):
         states = replace(states, noise=torch.full_like(states.noise, factor * term.most_noise))
         states, _ = descend(states, [term], 4)
@@ -236,10 +236,12 @@ def graduate(states: States, term: Landmarks) -> States:
 
 
 def refine(states: States, term: Landmarks) -> States:
+    """Refine the states, each under its own estimated noise."""
     return descend(term.with_noise(states), [term], 3)[0]
 
 
 def weigh(states: States, term: Landmarks) -> tuple[States, Landmarks]:
+    """Return the states with their noise, and the term with its number of independent matches, estimated from the residuals."""
     states = term.with_noise(states)
     return states, term.weighted_for(states)
 
@@ -256,6 +258,7 @@ def fit(best: States, terms: Sequence[CostTerm], given: Explanations, steps: int
 
 
 def linearize(best: States, terms: Sequence[CostTerm], given: Explanations) -> Quadratic:
+    """Return the quadratic model of the terms, without priors, about the state of each mode."""
     # The prior fixes nothing that any explanation frees.
     free = best.under(given.deviation.new_zeros(N), given.deviation.amax(0))
     return Quadratic.of(total(free, terms) - prior(free), free)

@@ -143,7 +143,7 @@ def checked(model: type[Model], values: Any) -> Model:
         raise InputError(f"no {name!r}", expected="all that the description requires")
     text = first["msg"].removeprefix("Value error, ")
     text = EXPECTED[kind].format(**first.get("ctx", {})) if kind in EXPECTED else text
-    if kind == "cameras":
+    if kind == "cameras":  # concerns several fields, which the message names
         raise InputError(text)
     raise InputError(f"{name or 'the body'} is {short(first['input'])}", expected=text)
 

@@ -74,8 +74,8 @@ def serve(
 ) -> None:
     """Serve maps over HTTP until the process is interrupted, or ``stop`` is set.
 
-    ``scenes`` is the folder of a map, a list of folders (``NAME=MAP`` gives one another name than its folder's), or a mapping
-    from the names that clients use to folders.
+    ``scenes`` is the folder of a map, a list of folders (``NAME=MAP`` serves a map under a name other than its folder's), or
+    a mapping from the names that clients use to folders.
     Only programs on this machine are answered unless a ``host``, such as 0.0.0.0, is given: clients then need the
     ``token``, which is generated if none is given. With ``port`` 0, a free port is picked. ``options`` are
     ``method``, ``config``, ``device`` and ``limits`` of ``service_app``. ``ready`` is called with the address and the

@@ -246,21 +246,22 @@ def _waiting(name: str, args: Any, flat: list[Any], there: bool, wanted: str | N
 
 
 def _generator_of(kind: Any) -> Any:
-    """Return a subclass of ``torch.Generator`` whose instances can report ``DEVICE`` as their device."""
+    """Return a stand-in for the class of generators ``kind``, which PyTorch cannot create on ``DEVICE``.
 
-    class There(kind):
+    For ``DEVICE``, it creates a generator on the CPU that reports ``DEVICE`` as its device; for any other device, an instance
+    of ``kind`` itself.
+    """
+
+    class SimulatedGenerator(kind):
         def __new__(cls, device: Any = "cpu") -> Any:
-            elsewhere = torch.device(device).type == DEVICE.type
-            return super().__new__(cls) if elsewhere else kind(device)
-
-        def __init__(self, device: Any = "cpu") -> None:
-            pass
+            is_simulated = torch.device(device).type == DEVICE.type
+            return super().__new__(cls) if is_simulated else kind(device)
 
         @property
         def device(self) -> torch.device:
             return DEVICE
 
-    return There
+    return SimulatedGenerator
 
 
 # Steps.

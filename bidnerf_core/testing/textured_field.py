@@ -48,7 +48,7 @@ class TexturedGround:
 
 @dataclass(frozen=True, eq=False)
 class MapWithLandmarks:
-    """A map made of a field, with all of its baked parts."""
+    """A map in memory, made from a field and, where given, baked landmarks and a baked surface."""
 
     field: RadianceField
     bounds: SceneBounds

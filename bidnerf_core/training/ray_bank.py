@@ -45,12 +45,13 @@ class TrainingBatch:
 
 
 class RayBank:
-    """All pixels of the training views, from which batches are drawn; all tensors are on ``device``.
+    """The pixels of all training views, from which batches of rays are drawn. The batches are on ``device``.
 
-    Images that would take more than ``LARGEST_SHARE`` of a GPU's free memory stay in host memory, and each batch is copied.
-    If an image has an alpha channel, each batch replaces its background by random colours, so that a field
-    cannot explain the background by matter of one colour (as in the code of Mueller et al. 2022). On the CPU,
-    the views' images are not copied if they lie in few blocks of memory, as in a ``PixelStore``.
+    The images are on ``device`` as well, unless they would take more than ``LARGEST_SHARE`` of a GPU's free memory: they then
+    stay in host memory, and each batch is copied to the GPU. On the CPU, images that lie in a few blocks of memory, as in a
+    ``PixelStore``, are not copied.
+    The background of images with an alpha channel is replaced with random colours in each batch, so that a field cannot
+    explain the background as matter of one colour (as in the code of Mueller et al. 2022).
     """
 
     def __init__(
@@ -91,7 +92,7 @@ class RayBank:
     def draw(self, count: int, generator: Generator) -> TrainingBatch:
         """Return the rays of ``count`` pixels, drawn uniformly from all visible pixels of the views.
 
-        If only few pixels have depth, a fixed fraction is drawn from these; another fraction is drawn from
+        If only a few pixels have depth, a fixed fraction is drawn from these; another fraction is drawn from
         pixels with landmarks. Nothing is copied between devices if the generator is on the images' device.
         """
         index = self._visible_pixel(self._random(self._drawn, count, generator))

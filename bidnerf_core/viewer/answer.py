@@ -197,7 +197,7 @@ def _steps(found: Localization, record: SearchRecord | None) -> tuple[Json, ...]
     """Return the steps of the search (or else of the descent), then the pose together with its rivals, then the pose found."""
     last = found.T_world_camera.to("cpu", torch.float64)
     shown = [] if record is None else [_step(s.caption, s.T, s.scores.tolist(), s.kept) for s in record.steps]
-    if not shown:
+    if not shown:  # no search: the steps of the descent, evenly spread
         count = min(len(found.losses), len(found.poses.translation) - 1)
         for number in range(0, count, max(1, math.ceil(count / MOST_STEPS))):
             T, loss = found.poses[number : number + 1], float(found.losses[number])
@@ -206,7 +206,7 @@ def _steps(found: Localization, record: SearchRecord | None) -> tuple[Json, ...]
     if not bool(last.matrix().isfinite().all()):
         return tuple(shown)
     answer = last_answer(record)
-    if answer is not None and len(answer.modes) > 1:
+    if answer is not None and len(answer.modes) > 1:  # the pose and its rivals
         _, poses, probabilities = zip(*probable_poses(answer), strict=True)
         scores = (-torch.tensor(probabilities, dtype=torch.float64).log()).tolist()
         caption = "the pose and others that explain the image"

@@ -226,7 +226,7 @@ def turned(frame: Frame, on: float, generator: Generator, columns: bool = False,
 
 
 def covered_lens(frame: Frame, on: float, generator: Generator) -> Frame:
-    """Replace the image by one random colour, and remove any measured depth."""
+    """Replace the image with one random colour, and remove any measured depth."""
     colour = torch.rand(3, generator=generator).to(frame.rgb)
     depth = None if frame.depth is None else torch.zeros_like(frame.depth)
     alpha = None if frame.alpha is None else torch.ones_like(frame.alpha)

@@ -37,7 +37,8 @@ def sights_of(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the fields of ``Sights`` for some pixels of a view; rotation and translation are T_rig_camera.
 
-    ``may_move`` tells whether the camera may have moved during the readout: views of a rig may be from different times.
+    ``may_move`` is true if the camera may have moved during the readout, and false for a rig, whose views may be from
+    different times.
     """
     pixels, camera = torch.stack([column, row], -1).double() + 0.5, view.frame.intrinsics
     times = exposure_times(pixels, camera) if may_move else torch.zeros_like(pixels[:, 0])

@@ -71,10 +71,12 @@ def pose_updates(
 ) -> dict[int, Float[Tensor, "6"]]:
     """Return the right updates from the given to the resected poses, by image number, for images with enough points.
 
-    If ``most`` is given, at most that many images, at regular intervals, are resected.
+    Each update holds a translation (metres), then a rotation (radians). If ``most`` is given, at most that many images, at
+    regular intervals, are resected.
 
-    The points from which an image is resected were triangulated from it as well, so its pose scatters too little: with k views
-    of a point, by 1 - 1/k of the true variance, against 1 + 1/k for a new image. The updates are rescaled accordingly.
+    The points from which an image is resected were triangulated from that image as well, so the resected poses scatter too
+    little. With k views of each point, their variance is (1 - 1/k) times that for exactly known points; for a new image, it is
+    (1 + 1/k) times that. The updates are rescaled to the scatter of new images.
     """
     sightings, image = tracked.sightings, tracked.image
     count = torch.bincount(image)

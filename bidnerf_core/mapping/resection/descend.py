@@ -77,8 +77,8 @@ def descend(
             path.append((states.T, here.cost))
         step = damped_solution(here, damping, about)
         settled = ((step * here.gradient).sum(-1) < SETTLED).all()
-        if step.device.type == "cpu" and bool(settled):
-            break  # where the host need not wait for this
+        if step.device.type == "cpu" and bool(settled):  # elsewhere, the host would wait for the device
+            break
         moved = states.retract(-step)
         there = total(moved, terms)
         better = (there.cost < here.cost) & ~settled  # false for NaN
