@@ -241,7 +241,6 @@ class RecordedStep:
     T: SE3  # T_world_camera (h), best first, on the CPU
     scores: Float[Tensor, "h"]  # lower is better; only those of one step can be compared
     kept: int  # number of poses passed on to the next step
-    compared: bool  # whether they are scored rivals, instead of a step towards one pose
 
 
 @dataclass(eq=False)
@@ -254,12 +253,11 @@ class SearchRecord:
     def add(self, caption: str, T: SE3, scores: Float[Tensor, "h"] | None = None, kept: int = 1) -> None:
         """Record poses T (h) or a single pose; without scores, the poses must be sorted, best first."""
         T = T if T.translation.ndim == 2 else T[None]
-        compared = scores is not None
         if scores is None:
             scores = torch.arange(len(T.translation), dtype=torch.float64)
         best = scores.argsort()[:400]  # only the best poses of a step are kept
         T, scores = moved((T[best], scores[best]), "cpu")
-        self.steps.append(RecordedStep(caption, T, scores.double(), min(kept, len(best)), compared))
+        self.steps.append(RecordedStep(caption, T, scores.double(), min(kept, len(best))))
 
 
 _RECORD: ContextVar[SearchRecord | None] = ContextVar("record", default=None)

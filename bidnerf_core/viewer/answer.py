@@ -278,7 +278,7 @@ def _runner_up(
     T = found.T_world_camera.to("cpu", torch.float64)
     x, y, z = scene.bounds.centre
     reach = APART * float((T.translation - torch.tensor([x, y, z], dtype=torch.float64)).norm())
-    for step in reversed([step for step in record.steps if step.compared]):
+    for step in reversed([step for step in record.steps if len(step.scores) > 1]):
         off = pose_error(step.T, T)
         different = (off.translation > reach) | (off.rotation_deg > TURNED_DEG)
         if bool(different.any()):

@@ -63,6 +63,12 @@ def found_by(
     return localizer(query, start, lidar, seed)
 
 
+@pytest.fixture
+def hardly_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Judging a descent of three steps takes far longer than the steps."""
+    monkeypatch.setattr("bidnerf_core.localization.methods.RAYS", 16)
+
+
 def off(T: SE3, truth: SE3 = TRUTH) -> float:
     return float(pose_error(T, truth).translation)
 
@@ -107,6 +113,7 @@ def test_a_descent_from_a_start_leads_to_the_truth_and_tells_its_way(
         assert float(torch.linalg.eigvalsh(found.covariance)[0]) > 0
 
 
+@pytest.mark.usefixtures("hardly_judged")
 @pytest.mark.parametrize("method", METHODS)
 def test_all_random_choices_come_from_the_seed(method: str) -> None:
     start, poses = perturb(TRUTH, 0.1, 3.0, seed=3), []
@@ -118,6 +125,7 @@ def test_all_random_choices_come_from_the_seed(method: str) -> None:
     assert not torch.equal(one[-1], other[-1])
 
 
+@pytest.mark.usefixtures("hardly_judged")
 @pytest.mark.parametrize("method", ["inerf", "inerf-lm"])
 def test_methods_of_colour_alone_use_no_depth(method: str) -> None:
     start, wrong = perturb(TRUTH, 0.1, 3.0, seed=2), replace(FRAME, depth=torch.full((40, 48), 9.0))

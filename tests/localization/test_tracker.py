@@ -201,31 +201,25 @@ def test_a_changed_image_size_is_no_obstacle() -> None:
     assert_right(answers[:3] + answers[5:], frames[:3] + frames[5:])
 
 
-def test_a_saved_state_continues_bit_for_bit(tmp_path: Path) -> None:
-    tracker = Tracker(localizer())
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_saved_state_continues_bit_for_bit(tmp_path: Path, lost: bool) -> None:
+    tracker, other = Tracker(localizer()), Tracker(localizer())
     tracked(flight()[:3], tracker)
+    if lost:
+        tracker(covered(flight()[3][1]), 3 * INTERVAL)
     tracker.save(tmp_path / "state")
-    other = Tracker(localizer())
+    other.save(tmp_path / "fresh")
     other.restore(tmp_path / "state")
-    one, two = tracked(flight()[3:5], tracker), tracked(flight()[3:5], other)
+    assert other.lost_frames == lost
+    one, two = tracked(flight()[4:6], tracker), tracked(flight()[4:6], other)
     for a, b in zip(one, two, strict=True):
         assert torch.equal(a.T_world_camera.matrix(), b.T_world_camera.matrix())
         assert a.covariance is not None
         assert b.covariance is not None
         assert torch.equal(a.covariance, b.covariance)
-
-
-def test_the_state_of_a_lost_tracker_is_saved_too(tmp_path: Path) -> None:
-    tracker = Tracker(localizer())
-    tracker.save(tmp_path / "fresh")
-    tracked(flight()[:3], tracker)
-    tracker(covered(flight()[3][1]), 0.3)
-    tracker.save(tmp_path / "lost")
-    tracker.restore(tmp_path / "fresh")
-    assert not tracker.tracking
-    assert tracker.lost_frames == 0
-    tracker.restore(tmp_path / "lost")
-    assert tracker.lost_frames == 1
+    other.restore(tmp_path / "fresh")
+    assert not other.tracking
+    assert other.lost_frames == 0
 
 
 def test_files_that_hold_no_state_are_refused(tmp_path: Path) -> None:
