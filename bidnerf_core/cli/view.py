@@ -174,7 +174,7 @@ def run_serve(
         tuple[str, ...],
         Option(
             "MAP...",
-            "folders of maps; NAME=MAP serves one under another name than its folder's",
+            "folders of maps; NAME=MAP serves one under a name other than its folder's",
             positional=True,
         ),
     ] = (),

@@ -1,6 +1,6 @@
 """Acceptance of poses: the measures, a table of their bounds, and the confidence.
 
-A pose by landmarks has a logistic model of its evidence for a confidence. Without landmarks, agreement alone is weak evidence, as a plain
+The confidence of a landmark-based pose is from a logistic model of its evidence. Without landmarks, agreement alone is weak evidence, as a plain
 wall looks the same from everywhere: a pose must explain the measurements better than its rivals, which are poses displaced by more than
 the tolerated error, the best different pose of a search, and images rendered in their mean colour. One test serves colours,
 depths and points on the surface: the difference of each measurement's cost between the rival and the pose.
@@ -70,7 +70,7 @@ class Bound(NamedTuple):
     reason: str  # with the value as ``{0}``, and the limit as ``{1}``
 
     def keeps(self, value: float) -> bool:
-        """Return whether a value satisfies the limit; NaN never does."""
+        """Return whether a value satisfies the limit, which NaN never does."""
         return value >= self.limit if self.is_least else value <= self.limit
 
 

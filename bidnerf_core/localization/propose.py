@@ -1,4 +1,4 @@
-"""Proposals: poses from which to refine, the cheapest first."""
+"""Proposals: poses from which refinement starts, found by sample consensus with minimal solvers under several cameras."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Search without landmarks: successive halving of many poses, with finer terms as fewer poses remain, and its verdict.
 
-A search ends with steps on rendered rays, few of them at the coarsest level at first and many from one pose at last.
+A search ends with steps on rendered rays: at first few rays at the coarsest level, in the end many rays from a single pose.
 """
 
 from __future__ import annotations
