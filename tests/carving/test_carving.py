@@ -73,7 +73,7 @@ def ball_view(
     return View(frame, looking_at(place, (0, 0, 0)))
 
 
-def around(count: int = 10, distance: float = 4.0) -> list[tuple[float, float, float]]:
+def around(count: int = 8, distance: float = 4.0) -> list[tuple[float, float, float]]:
     """Places on a sphere, on both sides of the equator."""
     places = []
     for i in range(count):
