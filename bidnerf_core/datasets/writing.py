@@ -12,7 +12,7 @@ import torch
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.capture import SPLITS
-from bidnerf_core.datasets.formats.transforms_json import METRES_PER_DEPTH_UNIT, file_of
+from bidnerf_core.datasets.formats.transforms_json import METRES_PER_DEPTH_UNIT, SPLIT_FILES
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
@@ -43,7 +43,7 @@ def write_transforms(
             continue
         folder.mkdir(parents=True, exist_ok=True)
         write_file(
-            folder / file_of(split), json.dumps({"frames": frames}, indent=1, allow_nan=False).encode()
+            folder / SPLIT_FILES[split], json.dumps({"frames": frames}, indent=1, allow_nan=False).encode()
         )
 
 

@@ -160,14 +160,6 @@ def test_broken_split_files_name_the_line(
         open_dataset(scene)
 
 
-def test_depth_of_another_size_is_that_of_the_nearest_measurement(scene: Path) -> None:
-    iio.imwrite(scene / "seq-02" / "frame-000000.depth.png", np.full((6, 8), 1000, np.uint16))
-    depth = open_dataset(scene, register_depth=False, depth_unit=0.002).views("test")[0].frame.depth
-    assert depth is not None
-    assert depth.shape == (120, 160)
-    assert depth.unique().tolist() == [2]
-
-
 def test_another_calibration_moves_depth_and_poses(scene: Path) -> None:
     """A sensor at the colour camera's place: depth and poses are then those of the files."""
     same = DepthCamera(COLOUR_CAMERA, SE3.identity())

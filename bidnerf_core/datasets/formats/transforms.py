@@ -30,9 +30,9 @@ from pathlib import Path
 from typing import get_args
 
 from bidnerf_core.camera import Camera, CameraSource, PanoramaFace, same_aspect
-from bidnerf_core.datasets.capture import SPLITS, Capture, DepthFile, Shot, remark
+from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, remark
 from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames
-from bidnerf_core.datasets.formats.transforms_json import FrameRecord, file_of, read_splits
+from bidnerf_core.datasets.formats.transforms_json import SPLIT_FILES, FrameRecord, read_splits
 from bidnerf_core.datasets.reader import DatasetOptions, Format
 from bidnerf_core.depth import DepthReader
 from bidnerf_core.errors import InputError
@@ -84,7 +84,7 @@ def _read(path: Path, found: list[Path], options: DatasetOptions) -> Capture:
 
 
 def _find(path: Path) -> list[Path]:
-    return [path / name for name in ("transforms.json", *map(file_of, SPLITS)) if is_file(path / name)]
+    return [path / name for name in ("transforms.json", *SPLIT_FILES.values()) if is_file(path / name)]
 
 
 def _check_images(folder: Path, frames: Sequence[FrameRecord], images: Sequence[Path]) -> None:

@@ -19,6 +19,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import IMAGE_SUFFIXES, Record, read_record
 
 METRES_PER_DEPTH_UNIT = 0.001
+SPLIT_FILES = {split: f"transforms_{split}.json" for split in SPLITS}
 UNIT_KEYS = {"depth_file_path": "depth_unit_scale_factor", "depth_path": "integer_depth_scale"}
 """The keys of a depth image (nerfstudio's; instant-ngp's and NeRFCapture's), and those of the metres per step of its values."""
 
@@ -53,7 +54,7 @@ def read_splits(path: Path) -> list[tuple[FrameRecord, tuple[str, ...]]]:
 
     Raises ``InputError`` for an invalid ``transforms*.json``.
     """
-    if files := {split: path / file_of(split) for split in SPLITS if (path / file_of(split)).is_file()}:
+    if files := {split: path / name for split, name in SPLIT_FILES.items() if (path / name).is_file()}:
         return [(frame, (split,)) for split in files for frame in read_frames(read_record(files[split]))]
     record = read_record(path / "transforms.json")
     frames, lists = read_frames(record), {split: record.items(f"{split}_filenames") or [] for split in SPLITS}
@@ -122,11 +123,9 @@ def _frame(file: Record, number: int, entry: object) -> FrameRecord:
     if not path:
         raise own.error("no file_path", expected="the name of its image")
     record = Record(f"{where} ({path})", entry, file)
-    T_world_camera, scale = pose_and_scale(Record(record.where, entry))
-    return FrameRecord(
-        record, posix_name(path), camera_record(record), T_world_camera, scale, *_depth(record, own), _time(own),
-        posix_name(mask) if mask else None,
-    )  # fmt: skip
+    posed, masked = pose_and_scale(Record(record.where, entry)), posix_name(mask) if mask else None
+    camera, depth = camera_record(record), _depth(record, own)
+    return FrameRecord(record, posix_name(path), camera, *posed, *depth, _time(own), masked)
 
 
 def _depth(record: Record, own: Record) -> tuple[PurePosixPath | None, float]:
@@ -154,8 +153,3 @@ def _time(own: Record) -> float | None:
             return found / NANOSECONDS if found >= LEAST_NANOSECONDS else found
     source = own.value("source")
     return timestamp(PurePosixPath(source).stem) if isinstance(source, str) else None
-
-
-def file_of(split: str) -> str:
-    """Return the name of the file that describes a split."""
-    return f"transforms_{split}.json"
