@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -67,15 +68,20 @@ def trained(
     return field
 
 
+@functools.cache
+def on_device(name: str) -> tuple[Kept, int]:
+    """Return what a whole training on the device reported, and how many of its steps would be replayed."""
+    report = Kept()
+    with pytest.MonkeyPatch.context() as patch, elsewhere(patch) as replays:
+        trained(name, report, DEVICE)
+    return report, len(replays)
+
+
 @pytest.mark.parametrize("name", BACKENDS)
-def test_steps_on_a_device_do_not_wait_and_are_those_of_the_cpu(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    here, there = Kept(), Kept()
+def test_steps_on_a_device_do_not_wait_and_are_those_of_the_cpu(name: str) -> None:
+    here, (there, replays) = Kept(), on_device(name)
     trained(name, here)
-    with elsewhere(monkeypatch) as replays:
-        trained(name, there, DEVICE)
-    assert len(replays) > 20
+    assert replays > 20
     assert [step.step for step in there.told] == list(range(1, 41))
     for part in ("loss", "psnr", "samples_per_ray"):
         found, expected = (torch.tensor([getattr(s, part) for s in r.told]) for r in (there, here))
@@ -92,10 +98,10 @@ def test_masks_landmarks_motion_and_exposure_are_drawn_without_waiting(
         changed = replace(seen(view, 7), motion=torch.full((6,), 0.01, dtype=torch.float64))
         views.append(replace(changed, frame=replace(changed.frame, alpha=None, hidden=hidden)))
     here, there = Kept(), Kept()
-    trained("vanilla", here, "cpu", views, distortion_weight=0.1)
+    trained("vanilla", here, "cpu", views, distortion_weight=0.1, steps=20)
     with elsewhere(monkeypatch) as replays:
-        trained("vanilla", there, DEVICE, views, distortion_weight=0.1)
-    assert len(replays) == 38
+        trained("vanilla", there, DEVICE, views, distortion_weight=0.1, steps=20)
+    assert len(replays) == 18
     found, expected = (torch.tensor([step.loss for step in report.told]) for report in (there, here))
     torch.testing.assert_close(found, expected, rtol=2e-3, atol=1e-5)
 
@@ -120,9 +126,8 @@ def test_a_training_on_a_device_resumes_there_and_elsewhere(monkeypatch: pytest.
             trained("hashgrid", half, device)
         halves.append(half.saved[0])
     assert [half.step for half in halves] == [20, 32]  # where the host next reads from the device
-    whole = Kept()
+    whole, _ = on_device("hashgrid")
     with elsewhere(monkeypatch):
-        trained("hashgrid", whole, DEVICE)
         for half in halves:
             rest = Kept(begin=half)
             trained("hashgrid", rest, DEVICE)
@@ -136,7 +141,7 @@ def test_samples_that_do_not_fit_are_reported(
 ) -> None:
     monkeypatch.setattr(recipe, "SPARE", 0.01)
     with elsewhere(monkeypatch), caplog.at_level(logging.INFO, "bidnerf"):
-        trained("hashgrid", Kept(), DEVICE)
+        trained("hashgrid", Kept(), DEVICE, steps=8)
     assert "samples did not fit" in caplog.text
 
 
