@@ -115,7 +115,7 @@ def parse(command: str, target: Callable[..., T], arguments: Sequence[str]) -> T
     words = [re.sub("^--[^=]*", lambda name: name[0].replace("_", "-"), word) for word in arguments]
     if {"-h", HELP, HELP_ALL} & set(words):
         loaded = _loaded(command, target, words) if HELP_ALL in words else None
-        sys.stdout.write(_Parser(command, target, loaded, for_help=True).format_help())
+        sys.stdout.write(_Parser(command, target, loaded).format_help())
         raise SystemExit(0)
     loaded = _loaded(command, target, words)
     return _built(target, _Parser(command, target, loaded).values(words), loaded)
@@ -181,8 +181,8 @@ class _Parser(argparse.ArgumentParser):
     """
 
     def __init__(
-        self, command: str, target: Callable[..., Any], loaded: Mapping[str, Any] | None, *,
-        for_help: bool = False, options_only: bool = False,
+        self, command: str, target: Callable[..., Any], loaded: Mapping[str, Any] | None,
+        options_only: bool = False,
     ) -> None:  # fmt: skip
         self.width = max(40, shutil.get_terminal_size().columns)  # 40 columns even in narrower terminals
         super().__init__(
@@ -190,7 +190,7 @@ class _Parser(argparse.ArgumentParser):
             description=self._filled(inspect.getdoc(target) or ""),
             formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, 2, 24, self.width),
         )  # fmt: skip
-        self.names, self._short, self._options_only = set[str](), for_help and loaded is None, options_only
+        self._is_short, self._options_only = loaded is None, options_only
         self._positional, self._required = list[str](), list[str]()  # for the usage
         own = self.add_argument_group("options")
         announced, groups = list[str](), dict[str, Any]()  # group of each parameter
@@ -205,10 +205,9 @@ class _Parser(argparse.ArgumentParser):
                 announced.append(settings.summary)
             else:
                 self._add(parameter, groups.get(parameter.name, own))
-        if for_help:
-            own.add_argument("-h", HELP, action="store_true", help="show the usual options")
-            more = "show all options" + (f", also {' and '.join(announced)}" if announced else "")
-            own.add_argument(HELP_ALL, action="store_true", help=more)
+        own.add_argument("-h", HELP, action="store_true", help="show the usual options")
+        more = "show all options" + (f", also {' and '.join(announced)}" if announced else "")
+        own.add_argument(HELP_ALL, action="store_true", help=more)
         usage = " ".join([f"bidnerf {command} [OPTIONS]", *self._positional, *self._required])
         self.usage = textwrap.fill(usage, self.width - len("usage: "), subsequent_indent="  ").replace(
             "%", "%%"
@@ -224,7 +223,7 @@ class _Parser(argparse.ArgumentParser):
         option, default = parameter.option, parameter.default
         nargs, convert, metavar = conversion(parameter.hint)
         shown, is_required = option.metavar or metavar, default is MISSING
-        expert = any(isinstance(note, Expert) for note in parameter.notes) and self._short
+        expert = any(isinstance(note, Expert) for note in parameter.notes) and self._is_short
         common: dict[str, Any] = {
             "type": convert,
             "metavar": shown,
@@ -237,11 +236,8 @@ class _Parser(argparse.ArgumentParser):
                 self.add_argument(parameter.name, nargs=nargs, **common)
             return
         flag = parameter.flag
-        self.names.add(flag)
         if parameter.hint is bool:
-            pair = FLAG not in parameter.notes
-            self.names |= {f"--no-{flag[2:]}"} if pair else set()
-            action = argparse.BooleanOptionalAction if pair else "store_true"
+            action = "store_true" if FLAG in parameter.notes else argparse.BooleanOptionalAction
             group.add_argument(flag, action=action, dest=parameter.name, help=common["help"])
             return
         if is_required:
@@ -267,8 +263,8 @@ class _Parser(argparse.ArgumentParser):
         message = re.sub(r"^argument (\S+): ", r"\1 ", message)
         for word in getattr(self, "_words", ()):
             name = word.split("=")[0]
-            if name.startswith("--") and len(name) > 2 and name not in self.names:
-                message = f"no option {name!r}{spelling_hint(name, self.names)}"
+            if name.startswith("--") and len(name) > 2 and name not in self._option_string_actions:
+                message = f"no option {name!r}{spelling_hint(name, self._option_string_actions)}"
                 break
         raise UsageError(f"{message}; '{self.prog} {HELP}' describes all arguments")
 

@@ -206,15 +206,16 @@ def test_a_picture_that_cannot_be_written_ends_the_run_and_keeps_the_poses(
     assert len(read_trajectory(tmp_path / "poses.txt")) == 1
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_frame_that_is_not_finite_is_null_and_the_others_are_written(
-    bidnerf: Run, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: float
+    bidnerf: Run, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     odd = [
         FOUND,
-        replace(FOUND, T_world_camera=SE3(T.rotation, T.translation * value)),
-        replace(FOUND, covariance=torch.eye(6).double() * value),
-        replace(FOUND, loss=value, confidence=value, focal_factor=value),
+        replace(
+            FOUND, T_world_camera=SE3(T.rotation, T.translation * torch.tensor([1.0, math.nan, math.inf]))
+        ),
+        replace(FOUND, covariance=torch.eye(6).double() * math.inf),
+        replace(FOUND, loss=math.nan, confidence=math.inf, focal_factor=math.nan),
     ]
     for name, more in (
         ("poses.json", ["--plot", tmp_path / "p.png"]),
