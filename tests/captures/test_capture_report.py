@@ -142,9 +142,11 @@ def towards(eye: tuple[float, float, float], forward: tuple[float, float, float]
     return look_at(eye, [e + f for e, f in zip(eye, forward, strict=True)])
 
 
-def surroundings(poses: list[SE3], stretch: float, up: UpDirection | None = None) -> CaptureReport:
+def surroundings(
+    poses: list[SE3], stretch: float, up: UpDirection | None = None, count: int = 300
+) -> CaptureReport:
     """Survey photos of points in a box, which is long along x."""
-    points = Points(count=600)
+    points = Points(count)
     points.positions = points.positions * points.positions.new_tensor([stretch, 1, 1])
     views = [
         replace(view := points.view(T), frame=replace(view.frame, name=f"{i}")) for i, T in enumerate(poses)
@@ -159,7 +161,7 @@ def test_photos_from_inside_a_room_have_no_open_side() -> None:
         towards((0.4 * math.cos(3 * a), 0.4 * math.sin(3 * a), 0.2), (math.cos(a), math.sin(a), -0.4))
         for a in angles
     ]
-    report = surroundings(poses, 1)
+    report = surroundings(poses, 1, count=600)
     assert report.coverage.arrangement == "inside"
     assert (report.coverage.open_side, report.coverage.gaps) == (None, ())
     words = sentences(report)
