@@ -1,4 +1,4 @@
-"""Cameras: intrinsics, where they come from, orientation, and rolling shutters."""
+"""Cameras: intrinsics and their sources, image orientation, and rolling shutters."""
 
 from lazy_loader import attach_stub
 

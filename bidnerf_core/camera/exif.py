@@ -24,7 +24,7 @@ class Orientation:
 
     @staticmethod
     def from_exif(code: int) -> Orientation:
-        """Return the orientation of EXIF tag 0x0112 (CIPA DC-008, table 6); unknown codes mean an upright image."""
+        """Return the orientation for a code of EXIF tag 0x0112 (CIPA DC-008, table 6); unknown codes mean upright."""
         return Orientation(*CODES.get(code, (False, False, False)))
 
     def upright(self, image: Shaped[Tensor, "sh sw *channels"]) -> Shaped[Tensor, "h w *channels"]:
@@ -53,19 +53,19 @@ CODES = {
 
 @dataclass(frozen=True)
 class Exif:
-    """The tags that describe the camera; None for a tag that is missing or implausible."""
+    """The EXIF tags that describe the camera; None for a tag that is missing or implausible."""
 
     orientation: Orientation = UPRIGHT
     size: tuple[int, int] | None = None  # width and height of the stored image when the photo was taken
     equivalent_mm: float | None = None  # focal length with the same diagonal field of view on 35 mm film
     focal_mm: float | None = None
-    # on the sensor, along the columns and rows of the stored image
+    # on the sensor, horizontally and vertically in the stored image
     pixels_per_mm: tuple[float, float] | None = None
     digital_zoom: float = 1.0
 
     @property
     def has_focal_length(self) -> bool:
-        """Whether the tags give a focal length in pixels."""
+        """Whether the tags determine a focal length in pixels."""
         return self.equivalent_mm is not None or None not in (self.focal_mm, self.pixels_per_mm)
 
 

@@ -56,14 +56,14 @@ EXPECTED = "YAML from ROS (camera_info), OpenCV, ORB-SLAM or Kalibr with the int
 class CameraRecord:
     """Intrinsics before the image size is known.
 
-    A focal length is in pixels or, if ``True`` follows, a field of view in radians.
+    Each focal length is a number and a flag: pixels if the flag is ``False``, a field of view in radians if it is ``True``.
     """
 
     record: Record
     width: int | None
     height: int | None
     model: str  # from ``MODELS``, or ``PERSPECTIVE``
-    focals: tuple[tuple[float, bool] | None, ...]  # of x and y; None: that of x
+    focals: tuple[tuple[float, bool] | None, ...]  # along x and y; None for y: as along x
     centre: tuple[float | None, float | None]
     coefficients: tuple[float, ...]
 
@@ -142,10 +142,10 @@ def _focal(record: Record, axis: str) -> tuple[float, bool] | None:
 
 
 def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> Camera:
-    """Read the camera from a file in one of the formats above.
+    """Read the camera from a file in one of the formats that this module supports.
 
     Files without a size are taken to describe an image of ``size`` (width, height). If a file holds several
-    different cameras, the one of the image named ``photo`` is used. Raises ``InputError`` for other files,
+    different cameras, the camera of the image named ``photo`` is used. Raises ``InputError`` for other files,
     and if the camera is ambiguous.
     """
     content = read_file(path, "a camera file (JSON, YAML, COLMAP's cameras.txt or a list of images)")
@@ -208,7 +208,7 @@ def _chosen(path: Path, cameras: Mapping[str, Camera], photo: str | None) -> Cam
 
 
 def read_text_cameras(path: Path) -> dict[int, Camera]:
-    """Read COLMAP's ``cameras.txt`` and return its cameras by id. Raises ``InputError``."""
+    """Read the cameras in COLMAP's ``cameras.txt``, by id. Raises ``InputError`` if the file is malformed."""
     content = read_file(path, "COLMAP's cameras.txt")
     return {int(key): camera for key, camera in _text_cameras(path, content, named=False).items()}
 
@@ -234,15 +234,16 @@ def _text_cameras(path: Path, content: bytes, named: bool = True) -> dict[str, C
 
 
 def calibrated_camera(where: str, values: Mapping[str, Any], size: tuple[int, int]) -> Camera:
-    """Parse the camera in an object that a calibration tool or a robot wrote.
+    """Parse the camera in a mapping written by a calibration tool or a robot.
 
-    If it gives no image size, ``size`` (width, height) is assumed. Raises ``InputError``, whose message begins with ``where``.
+    Without an image size in it, ``size`` (width, height) is assumed. Raises ``InputError``, whose message begins with
+    ``where``, if the mapping does not describe a single camera.
     """
     inner = [value for key, value in values.items() if re.fullmatch(r"cam\d+", str(key))]  # in Kalibr
     if len(inner) > 1:
         expected = "one; keep only the lines of this photo's camera"
         raise InputError(f"holds {len(inner)} cameras", where=where, expected=expected)
-    for inside in (*inner, values.get("intrinsic")):  # the latter in a view in Open3D
+    for inside in (*inner, values.get("intrinsic")):  # Open3D nests the camera of a view
         values = inside if isinstance(inside, Mapping) else values
     if inner and (kind := values.get("camera_model", "pinhole")) != "pinhole":
         raise InputError(f"camera_model is {kind}", where=where, expected="pinhole")
@@ -296,7 +297,7 @@ def _first(values: Mapping[str, Any], what: str) -> Any:
 
 
 def _array(where: str, given: Any) -> np.ndarray:
-    """Return a list, or the data of an OpenCV or ROS matrix."""
+    """Convert a list, or the ``data`` of an OpenCV or ROS matrix, to an array."""
     found = given.get("data") if isinstance(given, Mapping) else given
     try:
         return np.asarray(found, dtype=float)  # YAML reads 1e-05 as text

@@ -29,8 +29,8 @@ LIMITS: dict[str, tuple[type, float, float, str]] = {
     "size": (Integral, 1, 1_000_000, "a whole number of pixels from 1 to 1000000"),
     "coefficient": (Real, -1e6, 1e6, "coefficients of a real lens"),
 }
-"""The types and limits of a camera's numbers. Beyond them, float32 overflows; coefficients of rational models reach
-some hundreds."""
+"""Type, limits and description of each number of a camera. Beyond these limits, float32 overflows; coefficients of
+rational models reach several hundred."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,9 @@ class Intrinsics:
 
     @staticmethod
     def from_focal(focal: float, width: int, height: int) -> Intrinsics:
-        """Return an undistorted camera; ``focal`` is in pixels, and the principal point is the image centre."""
+        """Return an undistorted camera with focal length ``focal`` (pixels) and its principal point at the image centre.
+
+        Raises ``InputError`` for a focal length that no lens has."""
         camera = Intrinsics(focal, focal, 0.0, 0.0, width, height)
         question_focal(focal, width, height)
         if focal > 1000 * max(width, height):  # a field of view of 0.06 degrees, as of a telescope
@@ -77,7 +79,7 @@ class Intrinsics:
 
     @staticmethod
     def from_hfov(degrees: float, width: int, height: int) -> Intrinsics:
-        """Return an undistorted camera with a horizontal field of view of ``degrees``."""
+        """Return an undistorted camera with a horizontal field of view of ``degrees``, as ``from_focal`` does."""
         expected = "degrees between 0 and 180 (both excluded)"
         check_number("horizontal field of view", degrees, Real, 1e-9, math.nextafter(180, 0), expected)
         check_number("width", width, *LIMITS["size"])
@@ -90,7 +92,7 @@ class Intrinsics:
         ``K`` (3 x 3) and ``distortion`` (4, 5, 8, 12 or 14 coefficients in any shape; None for an ideal lens)
         are arrays, tensors or lists, and ``size`` is (width, height) in pixels. OpenCV's first pixel has its
         centre at (0, 0), ours at (0.5, 0.5), so half a pixel is added to the principal point. Raises
-        ``InputError`` if they do not describe a camera.
+        ``InputError`` if these values do not describe a camera.
         """
         matrix = _numbers("K", K)
         lens = () if distortion is None else _numbers("distortion", distortion).ravel().tolist()
@@ -116,7 +118,7 @@ class Intrinsics:
 
     @property
     def sentence(self) -> str:
-        """A few words on the camera, for messages."""
+        """A short description of the camera, for messages."""
         return f"fx {self.fx:.0f} px at {self.width}x{self.height}"
 
     def matrix(self, dtype: torch.dtype = torch.float64) -> Float[Tensor, "3 3"]:
@@ -133,7 +135,7 @@ class Intrinsics:
         return torch.stack([x, y, torch.ones_like(x)], dim=-1)
 
     def rays(self, pixels: Float[Tensor, "*p 2"]) -> tuple[Float[Tensor, "*p 3"], Float[Tensor, "*p"]]:
-        """Return unit directions in the camera frame, and the distance along each at which z is 1."""
+        """Return the unit directions (camera frame) of the rays through ``pixels``, and the distance along each to z = 1."""
         ray = self.unproject(pixels)
         length = torch.linalg.vector_norm(ray, dim=-1)
         return ray / length[..., None], length
@@ -151,7 +153,7 @@ class Intrinsics:
         return torch.where(inside, row, 0).long(), torch.where(inside, column, 0).long(), inside
 
     def project(self, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 2"]:
-        """Project points in the camera frame to pixels (u, v); not finite for points at or behind the camera."""
+        """Project points (camera frame) to pixels (u, v), which are not finite for points with z <= 0."""
         z = torch.where(points[..., 2] > 0, points[..., 2], torch.nan)
         u = points[..., 0] / z * self.fx + self.cx
         v = points[..., 1] / z * self.fy + self.cy
@@ -219,7 +221,7 @@ class Intrinsics:
         return Intrinsics(fx, fy, cx, cy, width, height, k)
 
     def _distortion_at(self, points: Float[Tensor, "n 2"]) -> tuple[Tensor, Tensor]:
-        """Return the camera matrix (3 3) and the distortion coefficients, on the device of ``points``."""
+        """Return the camera matrix (3 3) and the distortion coefficients on the device of ``points``."""
         rows = (self.fx, 0.0, self.cx, 0.0, self.fy, self.cy, 0.0, 0.0, 1.0)
         return constant(rows, points).reshape(3, 3), constant(tuple(self.distortion), points)
 
@@ -290,7 +292,7 @@ def focal_length(pixels: int, angle: float) -> float:
 
 
 def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether two sizes (width, height) may belong to one image at two resolutions."""
+    """Return whether two sizes (width, height) may belong to one image at two resolutions."""
     ratio = size[0] * other[1] / (size[1] * other[0])
     return abs(ratio - 1) <= 0.005  # sizes are rounded when an image is resized
 
@@ -302,7 +304,7 @@ def reduced_size(width: int, height: int, largest: int) -> tuple[int, int]:
 
 
 CameraGroup = tuple[Intrinsics, ...]
-"""Cameras that were all rotated to the same side, if at all."""
+"""Cameras, some of which may have been rotated, all to the same side."""
 
 
 @lru_cache(maxsize=64)
@@ -311,8 +313,8 @@ def cameras_at_size(
 ) -> tuple[CameraGroup, ...]:
     """Return ``cameras`` resized to an image of another size, grouped by the turn applied to them.
 
-    By default, only those are returned whose images have its aspect ratio, or else those that match after a quarter turn, in
-    two groups: turned to one side, and to the other; possibly none. With another ``fit``, all are returned, centre-cropped to
+    By default, only cameras of that aspect ratio are returned. If there are none, cameras that match after a quarter turn are
+    returned in two groups, one for each side; there may be none. With another ``fit``, all are returned, centre-cropped to
     the aspect ratio or resized regardless of it; landscape cameras are turned to both sides for a portrait size, and vice versa.
     """
     size = (width, height)

@@ -24,8 +24,8 @@ from bidnerf_core.camera.intrinsics import LIMITS, Intrinsics, check_number, sam
 from bidnerf_core.errors import InputError
 
 WIDEST = math.radians(60)
-"""Largest angle between the optical axis and the middle of a side of an undistorted image: beyond it, pixels
-are stretched."""
+"""Largest angle (radians) between the optical axis and the middle of a side of an undistorted image: beyond this
+angle, pixels are stretched too much."""
 PERSPECTIVE, FISHEYE, DIVISION, PANORAMA = "PERSPECTIVE", "OPENCV_FISHEYE", "DIVISION", "EQUIRECTANGULAR"
 MODELS: dict[str, tuple[int, str, tuple[int, ...]]] = {
     # The id in ``cameras.bin``, our kind of model, and the indices of fx, fy, cx, cy and the coefficients (in OpenCV's
@@ -53,7 +53,7 @@ PANORAMA_FACES = {  # name: yaw to the right and pitch upwards, degrees
 
 
 class Lens(ABC):
-    """A camera whose images are resampled on reading to a ``pinhole`` camera at the same pose, or rotated from it.
+    """A camera whose images are resampled on reading to a ``pinhole`` camera at the same position, which may be rotated.
 
     Images are upright by the time they are resampled. The lens parameters refer to the stored image, which
     ``orientation`` turns upright.
@@ -78,7 +78,7 @@ class Lens(ABC):
 
     @abstractmethod
     def upright(self, orientation: Orientation) -> Lens:
-        """Return the lens of the upright image; this one describes the image as stored."""
+        """Return the lens of the upright image, where this lens describes the image as stored."""
 
     @property
     @abstractmethod
@@ -114,7 +114,7 @@ class Lens(ABC):
     @property
     @abstractmethod
     def sentence(self) -> str:
-        """Human-readable description of what is done with the image."""
+        """A description, for messages, of what is done with the image."""
 
 
 Camera: TypeAlias = Intrinsics | Lens
@@ -151,9 +151,9 @@ class CentralLens(Lens):
 
     @property
     def flat(self) -> Intrinsics:
-        """A camera of the same focal length.
+        """A pinhole camera of the same focal length.
 
-        It sees as far to each side as the lens does in the middle of that side, but at most 60 degrees from the axis.
+        Its view extends to each side as far as that of the lens in the middle of that side, but at most 60 degrees from the axis.
         """
         left, right, top, bottom = (math.tan(min(angle, WIDEST)) for angle in self._angles)
         fx, fy = self.stored.fx, self.stored.fy
@@ -208,7 +208,7 @@ class CentralLens(Lens):
 
 @dataclass(frozen=True)
 class PanoramaFace(Lens):
-    """One of the ``PANORAMA_FACES`` of an equirectangular image; the middle of that image is straight ahead of the camera."""
+    """One of the ``PANORAMA_FACES`` of an equirectangular image, whose middle is straight ahead of the panorama's camera."""
 
     face: str
     stored_size: tuple[int, int]
@@ -236,7 +236,7 @@ class PanoramaFace(Lens):
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
-        """The axes of the face in the panorama's camera: R_panorama_face, OpenCV axes."""
+        """The axes of the face in the frame of the panorama's camera: R_panorama_face, OpenCV axes."""
         yaw, pitch = map(math.radians, PANORAMA_FACES[self.face])
         turn = np.array([[math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)]])
         tilt = np.array(
@@ -253,7 +253,7 @@ class PanoramaFace(Lens):
         )
 
     def resampled(self, image: np.ndarray, nearest: bool = False) -> np.ndarray:
-        """Resample the face; the left and right edges of the panorama join."""
+        """Resample a panorama to this face; the panorama's left and right edges are joined."""
         u, v = _lookup(self)
         method = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
         wrapped = cv2.copyMakeBorder(image, 0, 0, 1, 1, cv2.BORDER_WRAP)

@@ -1,8 +1,8 @@
 """Rolling shutters: the rows of an image are exposed one after another, while the camera moves.
 
-The motion is the right update of the camera's pose from the first row to the last (translation first, in the camera's frame),
-at a constant velocity; the pose itself is that of the middle row (Hedborg et al., Rolling shutter bundle adjustment, CVPR
-2012).
+The motion is the right update (metres, then radians, in the camera's frame) of the camera's pose from the first row to the
+last, at a constant velocity; the pose itself is that of the middle row (Hedborg et al., Rolling shutter bundle adjustment,
+CVPR 2012).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bidnerf_core.geometry import SE3
 
 @dataclass(frozen=True)
 class MotionPrior:
-    """Standard deviations of the motion from the first row to the last."""
+    """Standard deviations of the camera's motion from the first row to the last, per axis."""
 
     move: float = 0.0  # metres
     turn: float = 0.0  # radians
@@ -32,13 +32,13 @@ class MotionPrior:
     def usual(distance: float) -> MotionPrior:
         """Return the prior for a hand-held camera at ``distance`` (metres) from the scene.
 
-        The readout takes a few hundredths of a second.
+        The readout is assumed to take a few hundredths of a second.
         """
         return MotionPrior(0.005 * distance, 0.01)
 
 
 AT_REST = torch.zeros(6, dtype=torch.float64)
-"""No motion."""
+"""The motion of a camera at rest."""
 STILL = MotionPrior()
 """The prior of a static camera or a global shutter."""
 
@@ -56,6 +56,6 @@ def exposure_times(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Te
 def poses_of_rows(times: Float[Tensor, "m"], motion: Float[Tensor, "*m 6"]) -> SE3:
     """Return T_middle_row: the camera's pose at each time, relative to the camera at the middle row.
 
-    ``motion`` belongs to a single image, or holds one row per time.
+    ``motion`` (metres, then radians) is that of a single image, or has one row per time.
     """
     return SE3.exp(times[:, None] * motion.to(times))

@@ -32,11 +32,11 @@ class FoundCamera:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """The camera of the image as it is used."""
+        """The pinhole camera of the image after any resampling."""
         return self.camera.pinhole
 
     def at_most(self, largest: int | None) -> FoundCamera:
-        """Return the camera of the image reduced to ``largest`` pixels along its longer side. Raises ``InputError``."""
+        """Return the camera of the image reduced to at most ``largest`` pixels along its longer side, see ``checked_side``."""
         side = checked_side(largest)
         if side is None or max(self.camera.width, self.camera.height) <= side:
             return self
@@ -70,7 +70,7 @@ class Raster:
         return self.orientation.upright_size(self.width, self.height)
 
     def upright(self, camera: CameraKind) -> CameraKind | None:
-        """Return a given camera for the upright image, or None if its aspect ratio fits neither orientation.
+        """Return ``camera`` adapted to the upright image, or None if its aspect ratio fits neither orientation.
 
         A camera that fits the stored image is assumed to describe that image (COLMAP ignores the EXIF
         orientation too).
@@ -83,7 +83,7 @@ class Raster:
     def turned(
         self, image: Shaped[Tensor, "mh mw"], what: str, where: object = None
     ) -> Shaped[Tensor, "h w"]:
-        """Return the image's mask or depth, at any resolution, upright; it is turned if its aspect ratio is the stored image's.
+        """Return the image's mask or depth upright, at its own resolution; it is turned if it has the stored image's aspect ratio.
 
         Raises ``InputError``, which names ``what`` and ``where``, if the aspect ratio fits neither orientation.
         """
@@ -101,8 +101,8 @@ class Raster:
 class CameraSource:
     """What is known about the camera of a set of images, apart from their EXIF.
 
-    At most one of these is given: intrinsics or a file with them, a focal length, a field of view.
-    ``assumed`` are candidate cameras for images whose focal length is unknown.
+    At most one of ``camera`` (intrinsics, or a file that holds them), ``focal`` and ``hfov`` may be given.
+    ``assumed`` holds candidate cameras for images whose focal length is unknown.
     """
 
     camera: Camera | str | Path | None = None
@@ -166,9 +166,9 @@ def folder_camera(
 ) -> CameraSource:
     """Return the single camera of a recording whose format stores none.
 
-    It is the ``given`` one (intrinsics or a file), the file ``camera.json`` or ``cameras.txt`` in ``folder``, or the
-    ``published`` one of the format. Raises ``InputError`` if there is none, with the reason ``unknown`` and
-    the ``ways`` to give one, and for a given file that does not exist.
+    In order of precedence, it is the ``given`` camera (intrinsics or a file), the file ``camera.json`` or ``cameras.txt``
+    in ``folder``, or the ``published`` camera of the format. Raises ``InputError`` if there is none, with the reason
+    ``unknown`` and the ``ways`` to give one, and for a given file that does not exist.
     """
     if isinstance(given, Path) and not given.exists():
         raise InputError("no such file", where=given, expected=f"the camera of {folder}: {ways}")

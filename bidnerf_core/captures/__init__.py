@@ -1,4 +1,4 @@
-"""Captures: what a map's images reveal about its poses, coverage and landmarks."""
+"""Capture analysis: poses, coverage and landmarks, checked against a map's images."""
 
 from lazy_loader import attach_stub
 

@@ -23,9 +23,9 @@ from bidnerf_core.io import parse_record, read_file, write_file
 MatrixRows = tuple[tuple[float, float, float, float], ...]
 """The rows of a 4x4 matrix."""
 RowMotion = tuple[float, float, float, float, float, float]
-"""A camera's motion during the readout of an image, see ``rolling_shutter``: metres, then radians."""
+"""A camera's motion while an image is read out (metres, then radians); see ``rolling_shutter``."""
 INRIA_CAMERAS = "cameras.json"
-"""The file that the original code of 3D Gaussian splatting writes beside its result."""
+"""Name of the file in which the original 3D Gaussian splatting code stores the training cameras."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class StoredCamera:
     T_world_camera: MatrixRows
     given_T_world_camera: MatrixRows | None = None  # the dataset's pose, if training refined it
     moved_pixels: float | None = None  # median shift (pixels) of the image's points due to the refinement
-    # of the camera from the first row to the last, if refinement estimated it
+    # camera motion from the first row to the last, if refinement estimated it
     motion: RowMotion | None = None
     file: str | None = None  # image file, relative to the folder of its dataset, if known
     orientation: Orientation | None = None  # how the image in the file was turned upright; None: not at all
@@ -48,11 +48,11 @@ class StoredCamera:
         return _pose(self.T_world_camera)
 
     def translated(self, offset: Float[Tensor, "3"]) -> StoredCamera:
-        """Return the camera in a parallel world frame, in which ``offset`` is added to all positions."""
+        """Return the camera with ``offset`` (metres, world) added to its position."""
         return self._mapped(lambda rows: _rows(_pose(rows).translated(offset)))
 
     def scaled(self, factor: float) -> StoredCamera:
-        """Return the camera in a world frame in which lengths are multiplied by ``factor``."""
+        """Return the camera with all lengths (positions and motion) multiplied by ``factor``."""
         motion = self.motion and (*multiplied(self.motion[:3], factor), *self.motion[3:])
         scaled = self._mapped(lambda rows: (*((a, b, c, t * factor) for a, b, c, t in rows[:3]), rows[3]))
         return replace(scaled, motion=motion)
@@ -74,7 +74,7 @@ class MovedCamera:
     translation: float  # metres
     rotation_deg: float
     pixels: float  # median shift of points in the image
-    motion: RowMotion | None = None  # of the camera from the first row of the image to the last
+    motion: RowMotion | None = None  # camera motion from the first row of the image to the last
 
     def __str__(self) -> str:
         return f"{self.name} by {self.translation:.3g} and {self.rotation_deg:.2g}° or {self.pixels:.1f} px"
@@ -101,7 +101,7 @@ class PoseRefinement:
 
 
 def poses_of(cameras: Sequence[StoredCamera]) -> SE3:
-    """Return T_world_camera of all n cameras, float64."""
+    """Return the poses T_world_camera of the cameras as a batch (n), float64."""
     return _pose([camera.T_world_camera for camera in cameras])
 
 
@@ -119,7 +119,7 @@ def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
 
 
 def as_given(cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
-    """Return the cameras with their poses as given in the dataset."""
+    """Return the cameras at the poses given in the dataset, with names and intrinsics only."""
     return tuple(
         StoredCamera(c.name, c.intrinsics, c.given_T_world_camera or c.T_world_camera) for c in cameras
     )
@@ -128,7 +128,7 @@ def as_given(cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
 def moved_from(
     given: Sequence[View], refined: Sequence[StoredCamera], pixels: Sequence[float]
 ) -> tuple[StoredCamera, ...]:
-    """Return the refined cameras; those whose pose changed also record the ``given`` view's pose."""
+    """Return the refined cameras, with the given pose and the shift ``pixels`` recorded where the pose changed."""
     return tuple(
         camera
         if camera.T_world_camera == (rows := _rows(view.T_ref_camera))
@@ -148,7 +148,7 @@ def with_wrong_pose(cameras: Sequence[StoredCamera]) -> list[str]:
 
 
 def pose_updates(cameras: Sequence[StoredCamera]) -> list[Float[Tensor, "6"] | None]:
-    """Return the right updates (translation in metres first) from given to refined poses; None for unchanged poses."""
+    """Return the right updates (metres, then radians) from given to refined poses; None for unrefined poses."""
     if not cameras:
         return []
     given = _pose([camera.given_T_world_camera or camera.T_world_camera for camera in cameras])
@@ -160,7 +160,7 @@ def pose_updates(cameras: Sequence[StoredCamera]) -> list[Float[Tensor, "6"] | N
 
 
 def moved_cameras(cameras: Sequence[StoredCamera]) -> list[MovedCamera]:
-    """Return how far refinement moved the cameras whose poses it changed."""
+    """Return how far refinement moved each camera whose pose it changed."""
     return [
         MovedCamera(c.name, float(u[:3].norm()), math.degrees(u[3:].norm()), c.moved_pixels or 0.0, c.motion)
         for c, u in zip(cameras, pose_updates(cameras), strict=True)
@@ -169,7 +169,7 @@ def moved_cameras(cameras: Sequence[StoredCamera]) -> list[MovedCamera]:
 
 
 def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> list[str]:
-    """Return a sentence or two on how consistent the given poses are and how far refinement moved them."""
+    """Return sentences on how consistent the given poses are and how far refinement moved them."""
     moved = sorted(moved_cameras(cameras), key=lambda m: m.pixels, reverse=True)
     wrong = [m for m in moved if m.name in found.replaced]
     motions = torch.tensor([camera.motion for camera in cameras if camera.motion], dtype=torch.float64)
@@ -197,7 +197,7 @@ def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> li
 
 
 def at_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -> list[View]:
-    """Return the views with the refined poses and motions in ``cameras``, matched by name and given pose.
+    """Return the views with the refined poses and motions from ``cameras``, matched by name and given pose.
 
     Views whose pose was not refined are returned unchanged.
     """
@@ -224,9 +224,9 @@ def _pose(rows: MatrixRows | Sequence[MatrixRows]) -> SE3:
 
 
 def write_inria_cameras(folder: Path, cameras: Sequence[StoredCamera]) -> list[Path]:
-    """Write a ``cameras.json``, unless there are no cameras, and return it.
+    """Write ``cameras.json`` to ``folder`` and return its path in a list; write nothing if there are no cameras.
 
-    Principal points become the image centres, since the format cannot store principal points.
+    The format stores no principal points; readers take the image centres instead.
     """
     if not cameras:
         return []
@@ -248,9 +248,9 @@ def write_inria_cameras(folder: Path, cameras: Sequence[StoredCamera]) -> list[P
 
 
 def cameras_beside(path: Path, placement: Similarity) -> tuple[StoredCamera, ...]:
-    """Return the cameras in the ``cameras.json`` beside a file or up to two folders above, transformed by ``placement``.
+    """Read the ``cameras.json`` next to ``path`` or up to two folders above it, and transform the cameras by ``placement``.
 
-    Returns no cameras if the file does not exist. A file that is damaged or written by another program is ignored with a warning.
+    Returns no cameras if there is no such file. A damaged file, or one in another layout, is ignored with an ``InputWarning``.
     """
     folders = [path.parent, *list(path.parent.parents)[:2]]
     file = next((folder / INRIA_CAMERAS for folder in folders if (folder / INRIA_CAMERAS).is_file()), None)

@@ -3,7 +3,7 @@
 People hold cameras level but point them down at desks and objects, so the mean of the cameras' upward axes is
 tilted as much as the cameras are. Two cues do not suffer from this tilt: the horizontal image axes of level
 cameras are perpendicular to the vertical, and floors, ceilings and tables are horizontal planes. The upward
-direction is opposite to gravity if the capture measured gravity, else the direction best supported by both cues.
+direction is opposite to gravity if the capture measured gravity; otherwise it is the direction best supported by both cues.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, TrackedKeypoints, TrackedViews
 
 UpSource = Literal["gravity", "planes", "cameras"]
-"""Where an upward direction comes from."""
+"""What an upward direction was derived from."""
 
 ROLL = math.sin(math.radians(6.0)) ** 2
-"""Variance (of the sine) of the roll of hand-held cameras relative to the horizon."""
+"""Variance of the sine of a hand-held camera's roll relative to the horizon."""
 INDEPENDENT = 8
-"""Largest number of cameras whose rolls count as independent, since many frames of a video share one."""
+"""Largest number of cameras whose rolls count as independent, since many frames of a video share the same roll."""
 ALIKE_DEG = 8.0
-"""Angle within which normals belong to one plane or to parallel ones."""
+"""Largest angle (degrees) between a plane's normal and the surfel normals that support it."""
 CHANCE = 1 - math.cos(math.radians(ALIKE_DEG))
-"""Fraction of randomly oriented surfels whose normals agree with a direction."""
+"""Fraction of randomly oriented surfels whose normals are within ``ALIKE_DEG`` of a direction or its opposite."""
 DIRECTIONS = 1500
-"""Number of directions tried."""
+"""Number of candidate directions for the normals of planes."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class UpDirection:
 
 
 def given_up(direction: Sequence[float]) -> UpDirection:
-    """Return the measured upward direction of a capture; the length of the vector does not matter."""
+    """Return a capture's measured upward ``direction`` (a vector of any length in the world frame), normalized."""
     unit = normalize(torch.tensor(tuple(direction), dtype=torch.float64), dim=0)
     return UpDirection((*unit.tolist(),), "gravity")
 
@@ -62,9 +62,9 @@ def coverage(
 ) -> CoverageRecord:  # fmt: skip
     """Measure how well the views cover their scene.
 
-    ``matched`` are all matched keypoints, ``seen`` those consistent with a triangulated point,
-    ``positions`` these points, and ``least_parallax`` is the angle (degrees) between rays below which a point cannot be
-    triangulated. ``up`` is the upward direction of the scene, estimated from the cameras by default.
+    ``matched`` holds all matched keypoints, ``seen`` those consistent with a triangulated point, and ``positions`` these
+    points (metres, world). ``least_parallax`` is the angle (degrees) between rays below which a point cannot be
+    triangulated. ``up`` is the upward direction of the scene; by default, it is estimated from the cameras.
     """
     angle = _median(_cones_deg(matched))
     centres = torch.stack([v.T_ref_camera.translation.cpu().double() for v in views])
@@ -76,8 +76,8 @@ def coverage(
     if not converge and len(positions):
         centre = positions.median(dim=0).values
         behind = [((positions - c) @ axis < 0).double().mean() for c, axis in zip(centres, axes, strict=True)]
-        # On average, up to 0.02 of the landmarks are behind a camera if things are seen from outside, and 0.08 to 0.5 in rooms
-        # and corridors.
+        # On average, at most 2 % of the landmarks lie behind a camera if an object is seen from outside, and 8 % to 50 % in
+        # rooms and corridors.
         surrounded = float(torch.stack(behind).mean()) > 0.05
     arrangement: Arrangement = "inside" if len(positions) else "unknown"
     open_side, gaps, heights = None, tuple[Gap, ...](), _range_deg(axes @ upward)
@@ -95,20 +95,20 @@ def coverage(
 def _around(
     views: Sequence[View], directions: Float[Tensor, "v 3"], up: Float[Tensor, "3"]
 ) -> tuple[Arrangement, Gap | None, tuple[Gap, ...], tuple[float, float]]:
-    """Return how the ``directions`` from the scene centre to the cameras are distributed about the vertical.
+    """Return how the cameras are arranged, from the ``directions`` in which they lie as seen from the scene centre.
 
-    Also returns the open side, the gaps and the range of elevations (degrees) for a ``CoverageRecord``.
+    Also returns the open side (None if there is none), the gaps and the range of elevations (degrees).
     """
     unit = normalize(directions, dim=-1)
     sines = unit @ up
     heights = _range_deg(sines)
-    flat = (sines.abs() < math.sin(math.radians(75))).nonzero()[:, 0]  # steeper ones have no azimuth
+    flat = (sines.abs() < math.sin(math.radians(75))).nonzero()[:, 0]  # steeper directions have no azimuth
     if len(flat) < 4:
         return "unknown", None, (), heights
     first, second = horizontal_axes(up)
     azimuths = torch.atan2(unit[flat] @ second, unit[flat] @ first).rad2deg()
     order = azimuths.argsort()
-    steps = torch.diff(azimuths[order], append=azimuths[order[:1]] + 360)  # from each to the next
+    steps = torch.diff(azimuths[order], append=azimuths[order[:1]] + 360)  # from each azimuth to the next
     names = [views[i].frame.name for i in flat[order].tolist()]
     named = [Gap(round(step, 1), *ends) for step, *ends in zip(steps.tolist(), names, names[1:] + names[:1], strict=True)]  # fmt: skip
     widest = steps.argsort(descending=True).tolist()
@@ -119,14 +119,14 @@ def _around(
 
 
 def _range_deg(sines: Float[Tensor, "v"]) -> tuple[float, float]:
-    """Return the 5th and 95th percentiles of the angles (degrees) with these sines."""
+    """Return the 5th and 95th percentiles of the angles (degrees) whose sines are ``sines``."""
     angles = sines.clamp(-1, 1).asin().rad2deg()
     low, high = angles.quantile(torch.tensor([0.05, 0.95], dtype=angles.dtype)).tolist()
     return low, high
 
 
 def horizontal_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Return two unit axes that form a right-handed frame with ``up``."""
+    """Return two horizontal unit axes that form a right-handed frame with ``up``."""
     helper = torch.eye(3, dtype=up.dtype)[int(up.abs().argmin())]
     first = normalize(helper - up * (helper @ up), dim=0)
     return first, torch.linalg.cross(up, first)
@@ -169,7 +169,7 @@ def shows_distances(views: Sequence[View], tracked: TrackedViews | None) -> bool
 
 
 def _cones_deg(seen: TrackedKeypoints) -> Float[Tensor, "n"]:
-    """Return twice the largest angle between the rays of each point and their mean."""
+    """Return, for each point, twice the largest angle (degrees) between one of its rays and their mean."""
     sightings, count = seen.sightings, seen.count
     rays = sightings.directions()
     mean = torch.zeros((count, 3), dtype=rays.dtype).index_add_(0, sightings.point, rays)
@@ -185,13 +185,13 @@ def _median(values: Float[Tensor, "n"]) -> float:
 def up_direction(poses: SE3, normals: Float[Tensor, "n 3"] | None = None) -> UpDirection:
     """Estimate the upward direction of a scene from its cameras and, if there is a surface, its surfels' normals.
 
-    ``poses`` are T_world_camera of the images (n), at least one; the signs of normals are ignored.
+    ``poses`` holds T_world_camera of one or more images. The signs of ``normals`` (world) do not matter.
     """
     rotations = poses.rotation.detach().cpu().double()
     planes = _planes(normals)
     weight = min(len(rotations), INDEPENDENT)
     tried = list[tuple[float, Tensor, UpSource]]()
-    # Log odds against sideways images, which phones store if they are held upright, mostly with the camera at the top.
+    # Prior log odds of images stored sideways, as by phones that are held upright, mostly with the camera at the top.
     for up_axis, level_axis, prior in (
         (-rotations[:, :, 1], rotations[:, :, 0], 0.0),
         (-rotations[:, :, 0], rotations[:, :, 1], -2.0),
@@ -202,21 +202,21 @@ def up_direction(poses: SE3, normals: Float[Tensor, "n 3"] | None = None) -> UpD
             looking_up = max(0.0, float((rotations[:, :, 2] @ direction).mean()))
             tilt = (level_axis @ direction).square().mean() / ROLL
             score = prior + math.log(CHANCE + support) - 0.5 * weight * float(tilt)
-            # Cameras rarely all look straight up; the log odds against it are proportional to the sine of the angle.
+            # Cameras rarely all look upwards; the log odds fall with the mean sine of their elevation.
             tried.append((score - 3 * looking_up, direction, source))
     _, up, source = max(tried, key=lambda one: one[0])
     near = [(share, axis) for axis, share, _ in planes if abs(float(axis @ up)) > 1 - CHANCE]
-    if source == "cameras" and near:  # snapped to the normal of a plane that is nearly perpendicular to it
+    if source == "cameras" and near:  # snap to the normal of a nearly horizontal plane
         axis = max(near, key=lambda one: one[0])[1]
         up, source = axis * torch.sign(axis @ up), "planes"
     return UpDirection((*up.tolist(),), source)
 
 
 def _level(up_axis: Float[Tensor, "v 3"], level_axis: Float[Tensor, "v 3"]) -> Float[Tensor, "3"]:
-    """Return the direction closest to perpendicular to all horizontal image axes, with a prior for the mean upward axis.
+    """Return the direction most nearly perpendicular to all level image axes, with a prior at the mean upward axis.
 
-    If all cameras face the same way, only the plane of such directions is known, and the direction in it nearest to the
-    mean is chosen; its tilt has a standard deviation of about 20 degrees.
+    If all cameras face the same way, their level axes determine only a plane of directions. The direction in that plane
+    nearest to the mean is then chosen, and its tilt has a standard deviation of about 20 degrees.
     """
     mean = normalize(up_axis.mean(0), dim=0)
     spread = level_axis.mT @ level_axis / len(level_axis)
@@ -239,7 +239,7 @@ def _planes(normals: Float[Tensor, "n 3"] | None) -> list[tuple[Tensor, float, U
     found = list[tuple[Tensor, float, UpSource]]()
     for _ in range(6):
         start = axis = tried[int(share.argmax())]
-        # Refined to the mean of the normals near it, in ever smaller cones.
+        # Refine the axis to the mean of the normals near it, in ever smaller cones.
         for degrees in (ALIKE_DEG, ALIKE_DEG, ALIKE_DEG / 2, ALIKE_DEG / 4):
             along = some @ axis
             near = along.abs() > math.cos(math.radians(degrees))

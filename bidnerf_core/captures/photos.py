@@ -17,18 +17,18 @@ from bidnerf_core.geometry import mad_deviation
 from bidnerf_core.mapping import TrackedKeypoints, likely_pairs
 
 LARGEST = 800
-"""Pixels along the longer side to which photos are downscaled: finer detail is of no use to a map."""
+"""Longer side (pixels) to which photos are downscaled to measure sharpness: finer detail is of no use to a map."""
 COARSE = 4
-"""Standard deviation (pixels) of the Gaussian for the coarser of the two scales whose energies are compared. That of the finer is
-one, which suppresses noise that would be mistaken for detail.
+"""Standard deviation (pixels) of the Gaussian at the coarser of the two scales whose energies are compared. At the finer scale
+it is one pixel, which suppresses noise that would be mistaken for detail.
 """
 
 
 def photo_measures(views: Sequence[View]) -> Float[Tensor, "3 v"]:
-    """Measure each photo on its own.
+    """Measure the sharpness and exposure of each photo, independently of the other photos.
 
-    Returns the sharpness (see ``sharpness``), and the fractions of the pixels that are overexposed and underexposed: with the
-    brightest channel at either end of its range.
+    The rows are the sharpness (see ``sharpness``) and the fractions of overexposed and underexposed pixels, whose brightest
+    channel is at the upper or lower end of its range.
     """
     return torch.tensor([_measured(view.frame) for view in views], dtype=torch.float64).reshape(-1, 3).mT
 
@@ -44,7 +44,7 @@ def detail_kept(views: Sequence[View]) -> Float[Tensor, "v"]:
 
 
 def blurred(lacking: Float[Tensor, "v"]) -> Bool[Tensor, "v"]:
-    """Return which photos lack more fine detail (energy in octaves, relative to nearby photos) than most others do."""
+    """Return which photos are outliers in ``lacking``, the fine detail (octaves of energy) that they lack compared with nearby photos."""
     return standing_out(lacking, 0.5)
 
 
@@ -65,7 +65,7 @@ def _measured(frame: Frame) -> tuple[float, float, float]:
 def sharpness(grey: np.ndarray, hidden: Bool[Tensor, "h w"] | None = None) -> float:
     """Return log2 of the ratio of fine-scale to coarse-scale energy, in which contrast cancels out.
 
-    The minimum over four directions is returned, as motion blur affects only one of them. Pixels affected by ``hidden``
+    The minimum over four directions is returned, since motion blur affects mainly one of them. Pixels affected by ``hidden``
     pixels are ignored, unless hardly any others remain.
     """
     size = reduced_size(grey.shape[1], grey.shape[0], LARGEST)
@@ -74,7 +74,9 @@ def sharpness(grey: np.ndarray, hidden: Bool[Tensor, "h w"] | None = None) -> fl
     counted = None
     if hidden is not None:
         shown = cv2.resize((~hidden.cpu().numpy()).astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        reach = np.ones((6 * COARSE + 1,) * 2, np.uint8)  # of the blur, to both sides, plus the differences
+        reach = np.ones(
+            (6 * COARSE + 1,) * 2, np.uint8
+        )  # reach of the blur and the differences to both sides
         away = cv2.erode((shown >= 1).astype(np.uint8), reach) > 0
         counted = away if away.mean() >= 0.02 else None
     fine, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1.0, COARSE))
@@ -86,7 +88,7 @@ def sharpness(grey: np.ndarray, hidden: Bool[Tensor, "h w"] | None = None) -> fl
 
 
 def _energy(image: np.ndarray, rows: int, columns: int, step: int, counted: np.ndarray | None) -> float:
-    """Return the mean squared second difference along a direction, over the ``counted`` pixels (None for all)."""
+    """Return the mean squared second difference along (``rows``, ``columns``) over the ``counted`` pixels (None for all)."""
     ahead = np.roll(image, (-rows * step, -columns * step), (0, 1))
     behind = np.roll(image, (rows * step, columns * step), (0, 1))
     inner = (ahead + behind - 2 * image)[step:-step, step:-step]
@@ -101,7 +103,7 @@ def _clean(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
 
 
 Nearby: TypeAlias = Int[Tensor, "p 2"]
-"""Pairs of photos, by index, that were taken from nearby places in similar directions; each in both orders."""
+"""Pairs (photo, other photo), by index, of photos taken from nearby positions in similar directions."""
 
 
 def nearby(views: Sequence[View], group: Int[Tensor, "v"] | None = None) -> Nearby:
@@ -128,8 +130,8 @@ def excess(values: Float[Tensor, "v"], near: Nearby) -> Float[Tensor, "v"]:
 def exposures(views: Sequence[View], seen: TrackedKeypoints) -> Float[Tensor, "v"]:
     """Return the exposure of each photo (stops) relative to the median of all; NaN if it shows fewer than ten landmarks.
 
-    The brightness of a landmark in a photo is the landmark's own brightness times the photo's exposure. Both
-    are estimated alternately, as medians.
+    The brightness of a landmark in a photo is modelled as a brightness of the landmark times the photo's exposure.
+    The two are estimated alternately, as medians.
     """
     image, point, count = seen.image, seen.point, len(views)
     light = torch.zeros(len(image), dtype=torch.float64)  # log2 of the linear light around each keypoint
@@ -138,7 +140,7 @@ def exposures(views: Sequence[View], seen: TrackedKeypoints) -> Float[Tensor, "v
         smooth = cv2.blur(_clean(views[index].frame.rgb).mean(-1), (5, 5))
         u, v = seen.pixels[own].floor().long().unbind(-1)
         rows, columns = v.clamp(0, smooth.shape[0] - 1).numpy(), u.clamp(0, smooth.shape[1] - 1).numpy()
-        # The exponent is approximately that of sRGB. Quantization makes the darkest pixels incomparable: they count as equal.
+        # The exponent is approximately that of sRGB. Quantization makes the darkest pixels incomparable, so they count as equal.
         linear = 2.2 * np.log2(np.maximum(smooth[rows, columns], 2 / 255))
         light[own] = torch.from_numpy(linear).double()
     enough = torch.bincount(image, minlength=count) >= 10

@@ -1,8 +1,8 @@
 """Detection of poses that contradict their images, and of pose conventions that would resolve the contradiction.
 
 Keypoint matches between two images are found from the images alone (RANSAC with an essential
-matrix, Nistér, PAMI 2004). Under correct poses these matches lie on their epipolar lines, and their points in
-front of both cameras; the lines alone do not determine the sign of a baseline (Hartley, Cheirality, IJCV
+matrix, Nistér, PAMI 2004). Under correct poses, these matches lie on their epipolar lines, and the triangulated points lie
+in front of both cameras; the lines alone do not determine the sign of a baseline (Hartley, Cheirality, IJCV
 1998). Poses are wrong if they disagree with most pairs of images. Each reading of the poses (another convention, or
 a common mistake undone) is a transformation of all poses of a capture, and is tested in the same way.
 """
@@ -25,16 +25,16 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import LEAST_BASELINE, ImageKeypoints, likely_pairs, squared_distances
 
 MOST_PAIRS = 40
-"""Largest number of examined pairs among those suggested by poses and order, and among those suggested by
-image similarity."""
+"""Largest number of image pairs examined from those suggested by poses and image order, and again from those
+suggested by image similarity."""
 ENOUGH_MATCHES = 40
-"""Smallest number of inlier matches to an essential matrix for a pair."""
+"""Smallest number of inliers of an essential matrix for two images to count as a matched pair."""
 USUAL_FOCAL = 700.0
 """Focal length (pixels) beyond which the pixel size is scaled up: keypoints of large images are detected in
-downscaled ones."""
+downscaled copies."""
 AGREED = 0.7
-"""Smallest fraction of a pair's matches near their epipolar lines, of those in front of both cameras, and of the pairs for a
-reading to be suggested."""
+"""Smallest fraction of a pair's matches that must lie near their epipolar lines, and in front of both cameras, for the pair to
+agree with poses; also the smallest fraction of pairs that must agree with a reading for it to be suggested."""
 
 
 AS_GIVEN = torch.eye(3, dtype=torch.float64)
@@ -57,7 +57,7 @@ class Reading:
 class PoseContradiction:
     """A contradiction between poses and images, and the reading of the poses that would resolve it, if any."""
 
-    pairs: int  # of images with matches
+    pairs: int  # number of image pairs with enough matches
     agreeing_as_given: int
     reading: Reading | None = None
     agreeing: int = 0  # pairs with which the reading agrees
@@ -147,7 +147,7 @@ class MatchedPair:
         still = torch.linalg.vector_norm(rays[..., :2] / rays[..., 2:] - seen[..., :2], dim=-1)
         at_rest = torch.linalg.vector_norm(moved[:, 0], dim=-1) < LEAST_BASELINE
         away = torch.where(at_rest[:, None], still, away)
-        # Matches may be off by two pixels, and small errors of correct poses may cause four in a usual image.
+        # Matches may be off by two pixels. In an image of usual size, small errors of correct poses may cause four.
         near = (away.abs() <= max(4 / USUAL_FOCAL, 2 * self.pixel)).double().mean(-1) >= AGREED
         normal = torch.linalg.cross(seen, rays)
         a = (torch.linalg.cross(moved, rays) * normal).sum(-1)
@@ -224,7 +224,7 @@ def matched_pair(images: Sequence[ImageKeypoints], i: int, j: int) -> MatchedPai
 
 @cache
 def readings(count: int) -> tuple[Reading, ...]:
-    """Return the readings of ``count`` poses, common ones first: among those that fit equally well, the first is preferred."""
+    """Return the readings to try for ``count`` poses, most common first: of readings that fit equally well, the first is preferred."""
     kinds = _of_axes(), _of_parts(), _of_quaternions(), _of_worlds(), _of_positions(), _of_orders(count)
     return tuple(itertools.chain(*kinds))
 
@@ -236,7 +236,7 @@ def changed(
     mirror: Float[Tensor, "3 3"] = AS_GIVEN,
     inverted: bool = False,
 ) -> SE3:
-    """Return poses with rotations ``mirror R axes`` and translations ``positions t``, after inverting them if ``inverted``.
+    """Return poses with rotations ``mirror R axes`` and translations ``positions t``; T = [R | t] is inverted first if ``inverted``.
 
     The columns of ``axes`` are the true camera's axes in the given camera's frame.
     """
@@ -245,7 +245,7 @@ def changed(
 
 
 def _of_axes() -> Iterator[Reading]:
-    """Yield readings with other camera axes, starting with y and z reversed; then the same readings of inverted matrices."""
+    """Yield readings with other camera axes, starting with y and z reversed, then readings of inverted matrices with any axes."""
     yield Reading(
         "their cameras' y and z axes are reversed (OpenCV's and COLMAP's axes where OpenGL's and Blender's are expected, or the"
         " other way round)",
@@ -280,7 +280,7 @@ PARTS: tuple[tuple[Part, str, str], ...] = (
     (lambda R, t: (R.mT, R @ t), "their rotations are transposed, and their translations rotated", "transpose each rotation R, and replace t by R t"),
     (lambda R, t: (R.mT, -R @ t), "their rotations are transposed, and their translations rotated and negated", "transpose each rotation R, and replace t by -R t"),
 )  # fmt: skip
-"""The true rotation and position (a column) as functions of the given ones, and what is wrong then."""
+"""For each mistake, the true rotation and position (a column) as functions of the given ones, what is wrong, and the remedy."""
 
 
 def _of_parts() -> Iterator[Reading]:
@@ -357,12 +357,12 @@ def _of_orders(count: int) -> Iterator[Reading]:
 
 
 def _in_file_axes(clause: str, remedy: str, understand: Callable[[SE3], SE3]) -> Iterator[Reading]:
-    """Yield a reading of the matrices as they are here, and as they were in a file with reversed y and z axes."""
+    """Yield the reading in our camera axes and in those of a file with y and z reversed, then with a reversal on one side only."""
 
     def whole(T: SE3, before: Tensor, after: Tensor) -> SE3:
         return changed(understand(changed(T, before)), after)
 
-    # A reader has reversed y and z of correct poses as well, so this needs no remedy; a reversal on one side only does.
+    # The reader also reverses y and z of correct poses, so a reversal on both sides needs no remedy; one on a single side does.
     both = (AS_GIVEN, Y_AND_Z_REVERSED)
     for axes in both:
         yield Reading(clause, remedy, partial(whole, before=axes, after=axes))
@@ -372,14 +372,14 @@ def _in_file_axes(clause: str, remedy: str, understand: Callable[[SE3], SE3]) ->
 
 
 def signed_permutations(determinant: int) -> list[Float[Tensor, "3 3"]]:
-    """Return the 24 signed permutation matrices with a determinant of 1 or -1, starting with the identity if included."""
+    """Return the 24 signed permutation matrices with a determinant of 1 or -1, starting with the identity if it is among them."""
     orders, signs = itertools.permutations(range(3)), list(itertools.product((1.0, -1.0), repeat=3))
     found = (AS_GIVEN[list(order)] * torch.tensor([s]).mT for order in orders for s in signs)
     return [A for A in found if round(float(torch.linalg.det(A))) == determinant]
 
 
 def _named(axes: Float[Tensor, "3 3"]) -> str:
-    """Describe where the true camera's axes point, in terms of the given camera's."""
+    """Describe where the true camera's axes point, in terms of the given camera's axes."""
     names = ("right", "down", "forward"), ("left", "up", "backward")
     words = [names[int(column.sum() < 0)][int(column.abs().argmax())] for column in axes.mT]
     return "right, down and forward are the given ones' {}, {} and {}".format(*words)

@@ -13,12 +13,12 @@ from bidnerf_core.geometry import multiplied
 from bidnerf_core.mapping import HeldOutTrial
 
 PhotoProblem = Literal["mirrored", "turned", "badly posed", "apart", "isolated", "blurred", "badly exposed"]
-"""Problems that a photo may have, most serious first. A photo that is "apart" is linked to only a few others,
-as are photos of a second place.
+"""Problems that a photo may have, most serious first. A photo is "apart" if it belongs to a smaller group of
+linked photos, such as photos of a second place.
 """
 Arrangement = Literal["around", "inside", "one side", "one place", "unknown"]
-"""How the cameras are arranged: around what they look at, inside it, all on one side of it, or all in one
-place."""
+"""How the cameras are arranged: around what they look at, inside it, all on one side of it, or all at about
+the same position."""
 
 SUMMARY_LINES = 5
 """Largest number of lines of a summary."""
@@ -47,7 +47,7 @@ PROBLEMS: dict[PhotoProblem, tuple[str, str]] = {
     "blurred": ("blurred compared with nearby photos", "retake such photos with more light or a steadier camera"),
     "badly exposed": ("exposed differently from the rest", "retake such photos with locked exposure"),
 }  # fmt: skip
-"""How each problem reads after "is" or "are", and what helps."""
+"""For each problem, the words that follow "is" or "are", and advice."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,10 @@ class PhotoRecord:
     overexposed: float  # fraction of the pixels
     underexposed: float
     keypoints: int
-    landmarks: int  # number of triangulated ones that it shows
+    landmarks: int  # number of triangulated landmarks that it shows
     linked: int  # number of photos with which it shares enough landmarks
-    group: int  # index of its group of linked photos; 0 is the largest, -1 is none
-    # Distance of its pose from the one given by the other photos' landmarks; None if there is no such pose.
+    group: int  # index of its group of linked photos; 0 for the largest, -1 for none
+    # Distance of its given pose from the pose estimated from landmarks; None if there is no estimate.
     pose_translation: float | None = None  # metres
     pose_rotation_deg: float | None = None
     pose_deviations: float | None = None  # in standard deviations of such differences in this capture
@@ -95,14 +95,14 @@ class CoverageRecord:
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # unit, world: the upward direction of the scene
     parallax_deg: float = 0.0  # median angle between the rays to a point
-    landmarks: int = 0  # triangulated
+    landmarks: int = 0  # number of triangulated landmarks
     seen_by: float = 0.0  # median number of photos that show a landmark
     seen_by_two: float = 0.0  # fraction of the landmarks that only two photos show
     seen_within_deg: float = 0.0  # median angle between the directions from which a landmark is seen
     # widest range of directions without a camera if the cameras do not go all the way around; ``gaps`` are the others
     open_side: Gap | None = None
     gaps: tuple[Gap, ...] = ()  # much wider than the capture's other steps, the widest first
-    # elevation of the cameras above the centre's horizon, or of the axes of cameras inside: 5th and 95th percentiles
+    # elevation of the cameras seen from the centre, or of the axes of cameras inside: 5th and 95th percentiles
     heights_deg: tuple[float, float] = (0.0, 0.0)
 
 
@@ -134,7 +134,7 @@ class CaptureReport:
 
 
 def summary(report: CaptureReport) -> list[str]:
-    """Return at most ``SUMMARY_LINES`` lines of the report; the last one says how many were left out, if any."""
+    """Return at most ``SUMMARY_LINES`` lines of the report; if some were left out, the last line gives their number."""
     lines = sentences(report)
     left = len(lines) - SUMMARY_LINES + 1
     more = f"{left} more remarks: 'bidnerf info' prints them all, and --draw plots the capture"

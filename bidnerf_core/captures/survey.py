@@ -48,11 +48,11 @@ def surveyed(
     trial: HeldOutTrial | None = None,
     up: UpDirection | None = None,
 ) -> CaptureReport:
-    """Return the report on a capture whose keypoints are matched in ``tracked``, in the order of ``views``.
+    """Return a report on the photos ``views``, whose keypoints are matched in ``tracked`` in the same order.
 
-    Photos whose poses the others do not support are localized with the landmarks of the others, both unchanged
+    If the other photos do not support the pose of a photo, their landmarks are used to localize it, both as it is
     and mirrored; this distinguishes a wrong pose from a photo of something else. ``trial``
-    holds the errors of held-out photos, and ``up`` is the upward direction of the scene if known.
+    holds the errors of held-out photos, and ``up`` is the upward direction of the scene, if known.
     """
     seen, positions = tracked.triangulated(config)
     links = linked(seen)
@@ -75,7 +75,7 @@ def surveyed(
     for i, (view, image) in enumerate(zip(views, seen.images, strict=True)):
         found, pose = posed.get(i), view.T_ref_camera.to("cpu", torch.float64)
         problem = found.problem if found else None
-        # A photo of another group fits its own landmarks; an isolated one may have been localized all the same.
+        # A photo of another group fits that group's landmarks; an isolated photo may still have been localized.
         if problem is None and grouped and (group[i] > 0 or (group[i] < 0 and not found)):
             problem = "apart" if group[i] > 0 else "isolated"
         known = found if found and not found.mirrored else None  # a mirrored photo's pose cannot be compared
@@ -112,7 +112,7 @@ def surveyed(
 def _by_own_landmarks(
     seen: TrackedKeypoints, positions: Float[Tensor, "n 3"], views: Sequence[View]
 ) -> dict[int, Relocation]:
-    """Compare the poses that best fit the photos' own landmarks with the given poses, relative to the scatter in this capture.
+    """Compare the given poses with the poses that best fit the photos' own landmarks, relative to the scatter in this capture.
 
     Poses from fewer landmarks scatter more: the variance is inversely proportional to their number.
     """
@@ -135,9 +135,9 @@ def _by_own_landmarks(
 def linked(seen: TrackedKeypoints) -> csr_array:
     """Return the pairs of images that share enough landmarks, in both directions, as a sparse matrix (v, v).
 
-    ``seen`` are the keypoints consistent with their points. Five landmarks link two photos: photos of different places share
-    one by chance, seldom two, as a match has to lie on the epipolar line, stand out from all others, and agree on a point
-    in front of both cameras.
+    ``seen`` holds the keypoints consistent with their triangulated points. Five shared landmarks link two images: images of
+    different places may share one by chance, but rarely two, since a match must lie on the epipolar line, stand out from
+    all others, and yield a point in front of both cameras.
     """
     shape = (len(seen.images), max(1, seen.count))
     ones = np.ones(len(seen.point), np.int32)
@@ -150,7 +150,7 @@ def linked(seen: TrackedKeypoints) -> csr_array:
 
 
 def groups(links: csr_array) -> Int[Tensor, "v"]:
-    """Return the group of each image, 0 for the largest; -1 if too few images are linked to form one."""
+    """Return the group index of each image, 0 for the largest group; -1 if too few images are linked to form a group."""
     label = torch.from_numpy(connected_components(links, directed=False)[1]).long()
     sizes = torch.bincount(label)
     rank = sizes.argsort(descending=True, stable=True).argsort()
@@ -159,7 +159,7 @@ def groups(links: csr_array) -> Int[Tensor, "v"]:
 
 @dataclass(frozen=True, eq=False)
 class Relocation:
-    """A photo's pose estimated from other photos' landmarks, compared with the given pose."""
+    """A photo's pose estimated from landmarks, compared with its given pose."""
 
     update: Float[Tensor, "6"]  # right update from the given pose, translation (metres) first
     deviations: float  # length of the update, in standard deviations
@@ -170,7 +170,7 @@ class Relocation:
     def problem(self) -> PhotoProblem | None:
         """What is wrong with the given pose, or None.
 
-        The given pose is right if the photo is not mirrored and the pose is off by less than six standard deviations or less
+        The given pose counts as right if the photo is not mirrored and the pose is off by less than six standard deviations or less
         than four pixels, which is twice the distance allowed between a match and its epipolar line.
         """
         angle = float(torch.linalg.vector_norm(self.update[3:]))
@@ -186,10 +186,10 @@ class Relocation:
 def suspects(seen: TrackedKeypoints, links: csr_array) -> list[int]:
     """Return the indices of the photos whose given poses the others do not support, 32 at most.
 
-    ``links`` are the pairs of photos that share landmarks, see ``linked``.
+    ``links`` holds the pairs of photos that share landmarks, see ``linked``.
 
     A photo is suspect if it belongs to no group, or if the fraction of its keypoints that are landmarks is less than half of
-    what is usual in its group, unless enough photos agree with its pose. Photos that agree among themselves are not
+    what is usual in its group, unless enough linked photos agree with its pose. Photos that agree among themselves are not
     suspect even if they are linked to none of the others: a place that looks like another is more likely than the
     same error in all of them.
     """
@@ -203,7 +203,7 @@ def suspects(seen: TrackedKeypoints, links: csr_array) -> list[int]:
         own = group == number
         doubtful |= own & (share < 0.5 * share[own].median())
     found = [i for i in doubtful.nonzero()[:, 0].tolist() if not _has_support(seen.images, links, i)]
-    # If there are more than 32, an evenly spread selection of them.
+    # Of more than 32, an evenly spread selection is returned.
     return [found[int(i * max(1.0, len(found) / 32))] for i in range(min(len(found), 32))]
 
 
@@ -225,10 +225,10 @@ def _has_support(images: Sequence[ImageKeypoints], links: csr_array, number: int
 def relocated(
     tracked: TrackedViews, views: Sequence[View], numbers: Sequence[int], config: LandmarkConfig
 ) -> dict[int, Relocation]:
-    """Localize the suspects with landmarks built without them.
+    """Localize the photos ``numbers`` with landmarks built without them; photos that cannot be localized are left out.
 
-    Of several poses that explain a photo, as in a building with identical rooms, the one nearest to the given
-    pose is taken.
+    If several poses explain a photo, as in a building with identical rooms, the pose nearest to the given
+    pose is returned.
     """
     if not numbers:
         return {}
@@ -240,7 +240,7 @@ def relocated(
     for number in numbers:
         view, features = views[number], tracked.detector_of(views[number], number)
         found = Loop([View(view.frame, SE3.identity())], matcher, features=features)()
-        # Only these outcomes tell the pose, or which poses look the same.
+        # Only these outcomes determine the pose, or the poses that look the same.
         telling = (Outcome.CONVERGED, Outcome.AMBIGUOUS, Outcome.MIRRORED)
         if found is None or found.verdict.outcome not in telling:
             continue
@@ -256,6 +256,6 @@ def relocated(
 
 
 def image_motion(update: Float[Tensor, "6"], view: View, distance: float) -> float:
-    """Return the maximum shift (pixels) that a pose update causes in the image of a point at ``distance`` (metres)."""
+    """Return roughly how far (pixels) a pose update (metres, then radians) moves the image of a point at ``distance`` (metres)."""
     translation, rotation = (float(torch.linalg.vector_norm(part)) for part in update.split(3))
     return view.frame.intrinsics.fx * (rotation + translation / max(distance, 1e-9))

@@ -58,14 +58,14 @@ RefinementChoice = Literal["auto", "always", "never"]
 """When to refine the given poses: ``auto`` refines them if they are inconsistent."""
 
 INCONSISTENT = 0.25
-"""Smallest deviation (pixels) added to the keypoints by errors of the given poses at which the poses are
-refined. Poses from structure from motion or a renderer add less than a tenth.
+"""Standard deviation (pixels) that errors of the given poses must add to the keypoint noise for the poses to be
+refined. Poses from structure from motion or a renderer add less than a tenth of a pixel.
 """
 ROUNDS = 3
-"""Largest number of adjustments. After each, the keypoints are rematched, which finds matches that wrong
-poses prevented."""
+"""Largest number of bundle adjustments. After each one, the keypoints are rematched, which finds matches that
+wrong poses prevented."""
 MOST_EVIDENCE = 10.0
-"""Largest contribution of an image to the log evidence for or against a motion, so that no few images decide."""
+"""Largest contribution of an image to the log evidence for or against a motion, so that a few images cannot decide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,8 +132,8 @@ def located(
 ) -> tuple[TrackedViews | None, list[View]]:
     """Track the keypoints of the views, unless all have dense depth or a silhouette.
 
-    Returns the tracks, from which baking builds the map's landmarks, and the views with the landmarks visible
-    in each, which provide distances for training.
+    Returns the tracks (None if none are needed), from which baking builds the map's landmarks, and the views with
+    the landmarks visible in each, which provide distances for training.
     """
     if not any(map(_lacks_distances, views)):
         return None, list(views)
@@ -142,16 +142,16 @@ def located(
 
 
 def _lacks_distances(view: View) -> bool:
-    """Return whether a view has neither dense depth nor a silhouette, so that training gets no cue about where the geometry is."""
+    """Return whether a view has neither dense depth nor a silhouette, so that training has no cue to where the surfaces are."""
     return not (view.frame.has_dense_depth or has_outline(view))
 
 
 def _tracked(
     views: Sequence[View], features: str, trust_poses: bool, depth_unit: float | None
 ) -> TrackedViews:
-    """Track the keypoints of the views. Raises ``InputError`` if poses contradict the images, or depth is in another unit.
+    """Track the keypoints of the views. Raises ``InputError`` if poses contradict the images or depth is in another unit.
 
-    The unit is checked last: under wrong poses, triangulated distances say nothing about it.
+    The unit is checked last, since triangulated distances are meaningless under wrong poses.
     """
     tracked = tracked_views(views, features)
     counter("checking poses", "stage")(0, 1)
@@ -174,7 +174,7 @@ def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> 
     """
     seen, points = tracked.triangulated(DEFAULT_LANDMARKS)
     ratio = depth_ratio(seen, points)
-    if ratio is None or abs(ratio - 1) < 0.05:  # as sensors and triangulation may be off
+    if ratio is None or abs(ratio - 1) < 0.05:  # within the errors of sensors and triangulation
         return
     remark = f"measured depth is {ratio:.3g} times the depth that the poses and photos imply"
     if 1 / 2 < ratio < 2:
@@ -207,7 +207,7 @@ def _with_landmarks(views: Sequence[View], tracked: TrackedViews) -> list[View]:
 class TrainingPoses:
     """The poses used for training, and how far they are from the given poses."""
 
-    tracked: TrackedViews  # with these poses
+    tracked: TrackedViews  # tracks at these poses
     pixels: Float[Tensor, "v"]  # median shift of the points in an image; 0 if its pose was kept
     replaced: list[int]  # images whose given pose was wrong, localized with the others' landmarks
     refined: bool  # whether all poses were refined
@@ -220,10 +220,10 @@ def training_poses(
     least: float = INCONSISTENT,
     config: LandmarkConfig = DEFAULT_LANDMARKS,
 ) -> TrainingPoses:
-    """Return the poses to train with, for ``views`` whose keypoints are ``tracked``.
+    """Return the poses with which to train on ``views``, whose keypoints are ``tracked``.
 
-    A photo whose given pose no group of photos supports gets the pose at which the landmarks of the others
-    localize it. All poses are refined if errors of the given poses add at least ``least`` pixels to the
+    If no group of photos supports the given pose of a photo, the pose is replaced with the one found from the
+    landmarks of the other photos. All poses are refined if errors of the given poses add at least ``least`` pixels to the
     standard deviation of the keypoints; otherwise they are kept.
     """
     seen, _ = tracked.triangulated(config)
@@ -284,7 +284,9 @@ def adjusted_poses(
         pixels = _image_motion(seen, fit.points, given, fit.T_world_camera)
         tracked, noticed = tracked.at(fit.T_world_camera, fit.motion), False
         seen, points = tracked.triangulated(config)
-        if motion == STILL and number < ROUNDS - 1:  # later ones could no longer be estimated
+        if (
+            motion == STILL and number < ROUNDS - 1
+        ):  # a motion found in the last round could not be estimated any more
             motion = common_motion(seen, points, KEYPOINTS_PER_INDEPENDENT)
             noticed = motion != STILL
         consistency = PoseRefinement(before, noise_of(seen, points))
@@ -299,7 +301,7 @@ def adjusted_poses(
 
 
 def _deviations(updates: Float[Tensor, "v 6"]) -> tuple[float, float]:
-    """Return robust standard deviations about zero (metres, radians) of pose updates, along and about each axis."""
+    """Return robust standard deviations about zero, per axis, of the translation (metres) and rotation (radians) of updates."""
     return max(1e-9, mad_deviation(updates[:, :3])), max(1e-9, mad_deviation(updates[:, 3:]))
 
 
@@ -318,7 +320,7 @@ def _image_motion(
 
 
 def common_motion(seen: TrackedKeypoints, points: Float[Tensor, "n 3"], correlation: float) -> MotionPrior:
-    """Return the prior of the camera motions if a rolling shutter is more probable than none, else ``STILL``.
+    """Return a prior for camera motions if a rolling shutter is more probable than none, otherwise ``STILL``.
 
     The hypotheses concern the capture as a whole: either all images have a rolling shutter, or none. Each of up to 60
     images is resected from ``points`` with and without motion. ``correlation`` is the number of keypoints

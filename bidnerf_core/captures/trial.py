@@ -47,8 +47,8 @@ def tried_landmarks(
     because many given poses are wrong. Raises ``InputError`` if there are no landmarks.
     """
     landmarks = tracked.landmarks(config, report)
-    # One in eight images is held out, evenly spread, but 24 at most. Of few images, one in three is, up to eight, since fewer would
-    # leave the scatter unknown.
+    # One in eight images is held out, evenly spread, but 24 at most. Of a small number of images, one in three is held out, up to
+    # eight, since fewer would leave the scatter unknown.
     wanted = max(min(len(views) // 8, 24), min(len(views) // 3, 8))
     held_out = [int((i + 0.5) * len(views) / wanted) for i in range(wanted)]
     answers, updates = _answers(tracked, views, held_out, config, landmarks)
@@ -87,7 +87,7 @@ def _answers(
     if not held_out:
         return answers, updates[0]
     try:
-        # In maps of more images, most landmarks are in none of the held-out ones.
+        # In larger maps, most landmarks are visible in none of the held-out images.
         if len(views) <= 200 or landmarks.tracks is None:
             landmarks = tracked.without(held_out).landmarks(config)
         else:
@@ -96,14 +96,14 @@ def _answers(
             others[landmarks.tracks.landmark[seen].long()] = False
             anew = tracked.of_points_in(held_out).without(held_out).landmarks(config)
             landmarks = concatenated([landmarks[others], anew])
-    except InputError:  # the rest has no overlap
+    except InputError:  # the remaining images do not overlap
         return answers, updates[0]
     plain = replace(landmarks, correlation=1.0, pose_covariance=torch.zeros_like(landmarks.pose_covariance))
     matcher = LandmarkMatcher(plain)
     for number in held_out:
         T = views[number].T_ref_camera.to("cpu", torch.float64)
         view = View(views[number].frame, SE3.identity())
-        # Poses found without a motion are compared with such poses.
+        # A given pose without a camera motion is compared with a pose found without one.
         features, moving = tracked.detector_of(view, number), views[number].motion is not None
         found = Loop([view], matcher, features=features, moving=moving)()
         if found is not None and found.verdict.accepted:

@@ -18,11 +18,11 @@ from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.io import decode, read_array, to_numpy
 
 FARTHEST = 1e9
-"""Metres. No sensor measures farther."""
+"""Largest depth (metres) that counts as measured: no sensor reaches farther."""
 NOTHING = 1e10
-"""Floating-point values from here on mean "nothing", whatever the unit: Blender's 1e10, the largest float."""
+"""Floating-point values from here on mean "not measured" in any unit, such as Blender's 1e10 and the largest float."""
 MILLIMETRE = 0.001
-"""Metres."""
+"""One millimetre in metres, the usual step of integer depth images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +57,9 @@ class DepthImage:
 
 
 def read_depth_image(path: Path, unit: float | None) -> DepthImage:
-    """Read a grey image of integer or floating-point numbers, or the ``.npy`` file of an array; see ``depth_image``.
+    """Read depth from a grey image (integers or floats), or from an array in a ``.npy`` file; see ``depth_image``.
 
-    Raises ``InputError`` for anything else.
+    Raises ``InputError`` if the file holds neither.
     """
     raw = read_array(path, "a .npy file") if path.suffix.lower() == ".npy" else decode(path)
     return depth_image(raw, unit, f"{path}: depth")
@@ -69,10 +69,10 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
     """Convert an array (h, w) or (h, w, 1) with ``unit`` metres per step; None means 0.001 for integers and 1 for floats.
 
     Values that no sensor measures become 0: NaN, infinite and negative values, the largest value of an
-    integer type, 65535 and 65.535 in a floating-point one, and floats above 1e9 m (1e10, the largest float).
-    So does the largest value of the image if it is the sensor's limit: a round number in at least a twentieth of all
-    pixels, far more frequent than any other, but not the only value measured. Raises ``InputError``, whose message begins
-    with ``what``, for arrays of another shape or type and a unit that is not positive.
+    integer type, 65535 and 65.535 in floating-point arrays, floats from 1e10 on, and depths above 1e9 m. The largest
+    value of the image also becomes 0 if it is the sensor's limit: a round number of metres or a value with all bits set, in
+    at least a twentieth of all pixels, and far more frequent than any other value. Raises ``InputError``, whose message
+    begins with ``what``, for an array of another shape or type, and for a unit that is not positive.
     """
     values = to_numpy(raw)
     values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
@@ -138,7 +138,7 @@ def _at_limit(values: np.ndarray, metres: np.ndarray, unmeasured: np.ndarray) ->
 class DepthReader:
     """Reads the depth images of a recording, and warns once about each kind of value that means "not measured".
 
-    ``documented`` are the kinds that the recording's format defines, by their names in
+    ``documented`` lists the kinds that the recording's format defines, by their names in
     ``DepthImage.replaced``; they cause no warning.
     """
 
@@ -146,7 +146,7 @@ class DepthReader:
         self._mentioned = set(documented)
 
     def __call__(self, path: Path, unit: float) -> DepthImage:
-        """Read an image as ``read_depth_image`` does. New kinds of values cause an ``InputWarning``."""
+        """Read an image as ``read_depth_image`` does. A kind of value not seen before causes an ``InputWarning``."""
         found = read_depth_image(path, unit)
         new = {name: count for name, count in found.replaced.items() if name not in self._mentioned}
         if new:

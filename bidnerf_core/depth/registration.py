@@ -15,12 +15,12 @@ from bidnerf_core.geometry import SE3, rigid_pose
 from bidnerf_core.io import read_record, resampled
 
 EXTRINSICS = "T_colour_depth"
-"""The key, in a depth sensor's file, of the 4x4 matrix (metres, OpenCV axes) that accompanies the intrinsics."""
+"""Key, in a depth sensor's file, of the 4x4 matrix T_colour_depth (metres, OpenCV axes) next to the intrinsics."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthCamera:
-    """A depth camera next to a colour camera, to whose images its depth is registered."""
+    """A depth camera mounted next to a colour camera; its depth is registered to the colour images."""
 
     camera: Intrinsics
     T_colour_depth: SE3  # metres, OpenCV axes
@@ -49,13 +49,13 @@ class DepthCamera:
         """Register depth to the colour camera (planar z, metres); error messages begin with ``file``.
 
         Each measurement is transformed to the colour camera's frame and written to the pixel into which it
-        projects. If several fall into one pixel, the nearest is kept, which removes what is occluded from the
-        colour camera. The result is 0 where none falls.
+        projects. If several measurements fall into one pixel, the nearest is kept, which removes surfaces that
+        are occluded from the colour camera. Pixels without a measurement are 0.
 
         Depth of a lower resolution than the colour image is registered at its own resolution and then
         resampled, since its points would otherwise be too far apart to occlude each other. Raises
-        ``InputError`` for depth whose aspect ratio is not the sensor's, and if none of it falls into the
-        colour image.
+        ``InputError`` for depth whose aspect ratio is not the sensor's, and if none of a thousand or more
+        measurements falls into the colour image.
         """
         height, width = depth.shape
         camera = Raster(width, height).upright(self.camera)
@@ -69,7 +69,7 @@ class DepthCamera:
         rays = camera.unproject(camera.pixel_centres(torch.float64)[measured])
         points = self.T_colour_depth.apply(rays * depth[measured].double()[:, None])
         found = nearest_depth(points[_ahead(points, coarse)], coarse)
-        # A few measurements may all be at its borders.
+        # A small number of measurements may all lie outside.
         if int(measured.sum()) >= 1000 and not bool((found > 0).any()):
             away = float(torch.linalg.vector_norm(self.T_colour_depth.translation))
             raise InputError(
@@ -82,7 +82,7 @@ class DepthCamera:
 
 
 def nearest_depth(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Float[Tensor, "h w"]:
-    """Return planar z (metres) of the nearest point (camera frame) in each pixel, 0 where none falls."""
+    """Return planar z (metres) of the nearest of the ``points`` (camera frame) in each pixel; 0 if there is none."""
     row, column, inside = camera.cells(points)
     empty = torch.full((camera.height * camera.width,), torch.inf)
     place = (row * camera.width + column)[inside]
@@ -91,7 +91,7 @@ def nearest_depth(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Float[Ten
 
 
 def _ahead(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Bool[Tensor, "n"]:
-    """Return which points lie within the image's frustum; a polynomial lens model maps some others into the image as well."""
+    """Return which points lie within the image's frustum; a polynomial lens model also maps some points outside it into the image."""
     centres = camera.pixel_centres(torch.float64)
     border = torch.cat([centres[[0, -1]].reshape(-1, 2), centres[:, [0, -1]].reshape(-1, 2)])
     edge = camera.unproject(border)[:, :2]

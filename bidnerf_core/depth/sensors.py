@@ -1,7 +1,7 @@
 """Depth sensors: their accuracy as known beforehand, and as estimated from one depth image.
 
 All assumptions about the accuracy of measured depth are stated here. Standard deviations are one sigma. An
-error of the scale or the offset is the same in all pixels of an image and shifts the whole pose; noise is
+error in the scale or the offset is the same in all pixels of an image and shifts the whole pose; noise is
 independent between pixels.
 """
 
@@ -23,7 +23,7 @@ from bidnerf_core.geometry import MAD_TO_SIGMA
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """The standard deviation of a pixel's depth, a polynomial in the depth."""
+    """The standard deviation of a pixel's depth as a polynomial in the depth."""
 
     constant: float = 0.0  # metres
     linear: float = 0.0  # metres per metre, hence independent of the unit of length
@@ -46,8 +46,8 @@ class DepthNoise:
 class DepthSensorModel:
     """The errors of one kind of depth sensor, as standard deviations.
 
-    Lengths in metres are stated only for named sensors. For an unknown sensor everything is relative, since a
-    scene may have any unit of length.
+    Only named sensors have errors in metres. For an unknown sensor, all errors are relative, since a scene may
+    have any unit of length.
     """
 
     scale: float  # relative error of the factor shared by all depths of the sensor
@@ -92,11 +92,11 @@ DEPTH_SENSORS: dict[str, DepthSensorModel] = {
     # Depth computed from a model of the scene: exact up to rounding, such as to the whole millimetres of a PNG from 1 m on.
     "rendered": DepthSensorModel(scale=0.0, noise=DepthNoise(linear=0.001)),
 }
-"""Sensors by the names that users give; others may be added."""
+"""Sensor models by the names that users give; more may be added."""
 
 
 def find_depth_sensor(name: str) -> DepthSensorModel:
-    """Return the model of a sensor. Raises ``InputError``, which lists the known names, for an unknown name."""
+    """Return the model of the sensor called ``name``. Raises ``InputError``, which lists the known names, for any other name."""
     if name not in DEPTH_SENSORS:
         raise unknown_name("depth sensor", name, DEPTH_SENSORS)
     return DEPTH_SENSORS[name]
@@ -105,19 +105,19 @@ def find_depth_sensor(name: str) -> DepthSensorModel:
 WINDOW_SIDE = 8
 """Side, in pixels, of the square windows to which planes are fitted."""
 LEAST_WINDOWS = 20
-"""Minimum number of windows in a depth range from which its noise is estimated."""
+"""Minimum number of windows in a range of depths for estimating the noise in that range."""
 LEAST_VALUES = 8
-"""Minimum number of distinct rows and columns of a resampled depth image, and of distinct values of one that is stored in steps."""
+"""Minimum number of distinct rows and columns in a resampled depth image, and of distinct values in an image stored in steps."""
 
 
 def estimated_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -> DepthNoise | None:
     """Return the noise of a depth image (planar z, metres, 0: not measured), as a function of the depth.
 
-    Its relative noise is constant or grows linearly, ``linear + quadratic * z``; it is fitted to the larger
-    of the robust residuals of local planes and the rounding of stored values. Returns None if too few windows
+    The relative noise is ``linear + quadratic * z``, constant or growing; it is fitted to the larger of the
+    robust residuals of local planes and the rounding of stored values. Returns None if too few windows
     are measured without gaps. Errors shared by neighbouring pixels go unnoticed, such as those of a warped
-    image, or of a lidar whose measurements were interpolated. If hardly any window is planar, relief of the
-    scene counts as noise.
+    image, or of a lidar whose measurements were interpolated. If hardly any window is planar, the relief of
+    the scene counts as noise.
     """
     if min(depth.shape) < WINDOW_SIDE:
         return None
@@ -175,7 +175,7 @@ def _lines_of_sensor(depth: Float[Tensor, "h w"]) -> tuple[Int[Tensor, "r"], Int
 
 
 def noise_remark(depth: Float[Tensor, "h w"], intrinsics: Intrinsics, sensor: str) -> str | None:
-    """Return one line that compares the noise estimated from a depth image (metres) with that of a named sensor.
+    """Return one line that compares the noise estimated from a depth image (metres) with the noise of ``sensor``.
 
     Returns None if the noise cannot be estimated from the image.
     """

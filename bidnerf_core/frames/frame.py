@@ -1,4 +1,4 @@
-"""Images with their cameras, and posed images."""
+"""Frames, which are images with their cameras, and views, which are frames with poses."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class _Colours:
 
     def __get__(self, frame: Frame | None, owner: type) -> Float[Tensor, "h w 3"]:
         if frame is None:
-            raise AttributeError("rgb")  # by which dataclasses learn that the field has no default
+            raise AttributeError("rgb")  # tells dataclasses that the field has no default
         return as_floats(frame.rgb_bytes)
 
     def __set__(self, frame: Frame, colours: Shaped[Tensor, "h w channels"]) -> None:
@@ -128,7 +128,7 @@ class Frame:
             raise WhollyHidden(found, where=where, expected="booleans that leave something visible")
         if self.depth is not None:
             hidden = self.hidden.to(self.depth.device)
-            # An image in a store is left there; the host does not wait for an accelerator.
+            # A depth image that needs no change stays in its store; the host does not wait for an accelerator.
             if hidden.device.type != "cpu" or bool((self.depth[hidden] != 0).any()):
                 self.__dict__["depth"] = torch.where(hidden, 0, self.depth)
 
@@ -158,19 +158,19 @@ class Frame:
         The camera is given by at most one of ``camera`` (intrinsics, or a file, see
         ``bidnerf_core.camera.files``; photos from fisheye lenses are undistorted), ``focal`` (focal length in
         pixels of the image file) and ``hfov`` (horizontal field of view of the upright image, degrees).
-        Otherwise it comes from the focal length in EXIF. A camera for another resolution is scaled, and one that describes the image as stored is turned with it. ``camera_source`` of the result
-        states in one line where the camera comes from.
+        Otherwise it comes from the focal length in EXIF. A camera for another resolution is scaled, and a camera of the stored
+        image is turned upright with the image. ``camera_source`` of the result states in one line where the camera comes from.
 
         ``depth`` is an image or a ``.npy`` file of planar z, in steps of ``depth_unit`` metres. Without a
         unit, 0.001 m is assumed for integers and 1 m for floats, with an ``InputWarning``, which also lists
         values that mean "nothing measured" (NaN, infinite, negative, 65535, 1e10 and the like); they become
         0. Depth at another resolution is resampled to the nearest measurement. Transparent pixels get the background of the map in
         which the frame is localized. If the longer side exceeds ``largest`` pixels, the image is downscaled to that size. ``mask``
-        is an image whose black pixels are ignored: they become ``hidden``. ``read`` takes another background, inverted masks and
-        cameras to assume.
+        is an image whose black pixels are ignored: they become ``hidden``. ``read`` also accepts a background, masks of the other
+        polarity, and cameras to assume.
 
         Raises ``InputError`` if a file cannot be read or exceeds 100 megapixels, if the camera is unknown or
-        given twice, and if camera or depth belong to an image of another aspect ratio.
+        given twice, and if the camera or the depth has another aspect ratio than the image.
         """
         given, hides = CameraSource(camera, focal, hfov), None if mask is None else MaskFile(Path(mask))
         return Frame.read(path, given, depth=depth, depth_unit=depth_unit, largest=largest, mask=hides)
@@ -189,7 +189,7 @@ class Frame:
     ) -> Frame:
         """Read a photo as ``open`` does, with any source of its camera.
 
-        Depth is registered to it from ``sensor``, if given. ``background`` (rgb in [0, 1], "white" or "black") lies behind
+        If ``sensor`` is given, its depth is registered to the photo. ``background`` (rgb in [0, 1], "white" or "black") lies behind
         transparent pixels, by default that of the map in which the frame is localized.
         """
         path, behind = Path(path), BLACK if background is None else background_colour(background)
@@ -287,12 +287,11 @@ class Frame:
         ``rgb`` is (h, w) or (h, w, 1 to 4): uint8 in [0, 255], uint16 in [0, 65535], or floats in [0, 1]; a
         second or fourth channel is alpha, which may be given as ``alpha`` (h, w) instead. Colours are
         straight (not premultiplied) and composited over ``background``, by default that of the map in which the
-        frame is localized. ``depth`` (planar z), ``depth_unit``
-        and the scaling of ``camera`` are as in ``open``. ``hidden`` (h, w) holds booleans, true where a pixel
-        is to be ignored.
+        frame is localized. ``depth`` (planar z), ``depth_unit`` and the scaling of ``camera`` are as in
+        ``open``. ``hidden`` (h, w) is true for the pixels to ignore.
 
-        Raises ``InputError`` for other types and shapes, NaN, floats outside [0, 1], and if camera or depth
-        belong to an image of another aspect ratio.
+        Raises ``InputError`` for other types and shapes, for NaN or floats outside [0, 1], and if the camera or
+        the depth has another aspect ratio than the image.
         """
         where = f"frame {name}"
         _check_camera(where, camera)
@@ -327,7 +326,7 @@ class Frame:
         return Frame(name, laid, intrinsics, metres, cover, hidden=unused, awaits_background=awaits)
 
     def replace(self, **changes: Any) -> Frame:
-        """Return the frame with other attributes, as ``dataclasses.replace`` does, without converting its colours."""
+        """Return the frame with ``changes`` to its attributes, as ``dataclasses.replace`` does, without converting its colours."""
         return replace(self, **({"rgb": self.rgb_bytes} | changes))
 
     def to(self, device: torch.device | str) -> Frame:
@@ -357,7 +356,7 @@ class Frame:
         return cast(Tensor, self.__dict__["rgb"])
 
     def colours_at(self, rows: Int[Tensor, "*p"], columns: Int[Tensor, "*p"]) -> Float[Tensor, "*p 3"]:
-        """Return the colours in [0, 1] of some pixels."""
+        """Return the colours in [0, 1] of the pixels at ``rows`` and ``columns``."""
         there = self.rgb_bytes.device
         return as_floats(self.rgb_bytes[rows.to(there), columns.to(there)])
 
@@ -387,8 +386,8 @@ def _check_camera(where: str, camera: object) -> None:
 
 
 def _check_image(where: str, what: str, image: object, camera: Intrinsics) -> None:
-    """Raise ``InputError`` unless the image is a tensor of the camera's size with measured, finite floats (bytes also for ``rgb``,
-    booleans for ``hidden``).
+    """Raise ``InputError`` unless the image is a dense tensor of the camera's size that holds finite floats without gradients
+    (``rgb`` may hold bytes, ``depth`` NaN; ``hidden`` holds booleans).
     """
     if not isinstance(image, Tensor):
         raise InputError(
@@ -424,7 +423,7 @@ def _check_image(where: str, what: str, image: object, camera: Intrinsics) -> No
 
 
 def _is_finite(image: Tensor) -> bool:
-    """Return whether all values are finite. On an accelerator this is skipped: waiting for it would delay each frame."""
+    """Return whether all values are finite; always True on an accelerator, since waiting for it would delay each frame."""
     # The sum is cheaper than a mask, which is only computed if the sum is not finite.
     return image.device.type != "cpu" or math.isfinite(image.sum()) or bool(image.isfinite().all())
 
@@ -451,7 +450,7 @@ class View:
 
     frame: Frame
     T_ref_camera: SE3
-    landmarks: SeenLandmarks | None = None  # those from which training takes distances
+    landmarks: SeenLandmarks | None = None  # landmarks from which training takes distances
     motion: Float[Tensor, "6"] | None = None
     """Motion of the camera during readout, see ``rolling_shutter``; the pose is then that of the middle row."""
 

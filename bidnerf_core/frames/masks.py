@@ -23,7 +23,7 @@ from bidnerf_core.errors import InputError, amount
 from bidnerf_core.io import IMAGE_SUFFIXES, decode, resampled
 
 HiddenColour = Literal["black", "white"]
-"""The colour in masks of the pixels that are ignored."""
+"""The mask colour that marks pixels to ignore."""
 INVERTED = "if it marks what should be used, the masks are inverted (--mask-hides, mask_hides in Python)"
 
 
@@ -45,9 +45,9 @@ def read_mask(
     """Return which pixels of an image of ``size`` (width, height) the mask in file ``path`` hides.
 
     ``raster`` is the raster of the image file; a mask that fits the stored image is turned upright with it. A mask of another
-    resolution is resampled to the nearest of its pixels. Masks whose values are all small, such as 0 and 1,
-    hide the pixels that are 0; otherwise the bright half of the values is white. If the colours are uniform, the alpha
-    channel is the mask. Raises ``InputError`` if the file is not an image, or has another aspect ratio, and
+    resolution is resampled by nearest neighbour. Values in the upper half of the range count as white, others as black;
+    if all values are in the lower half, such as 0 and 1, every value above 0 is white. If the colours are uniform, the alpha
+    channel is the mask. Raises ``InputError`` if the file is not an image or has another aspect ratio, and
     ``WhollyHidden`` if it hides everything.
     """
     white = raster.turned(torch.from_numpy(_white(decode(path))), "mask", path)
@@ -60,7 +60,7 @@ def read_mask(
 
 
 def hides_everything(path: Path, hides: HiddenColour = "black") -> bool:
-    """Return whether a mask leaves nothing of any image visible. Raises ``InputError`` if the file is not an image."""
+    """Return whether a mask hides every pixel. Raises ``InputError`` if the file is not an image."""
     return bool((_white(decode(path)) == (hides == "white")).all())
 
 
@@ -81,7 +81,7 @@ class MaskFolder:
 
     The mask of ``NAME.jpg`` is ``NAME.png``, ``NAME.jpg.png`` (COLMAP's convention), or has ``mask`` before
     or after the name (``dynamic_mask_NAME.png``, ``NAME_mask.png``). If photos are in subfolders, their masks
-    may be too. Any image format is accepted. ``hides`` is the colour that is ignored. Raises ``InputError``
+    may be too. Any image format is accepted. ``hides`` is the colour of the pixels to ignore. Raises ``InputError``
     if there is no such folder, or no image in it.
     """
 

@@ -1,4 +1,4 @@
-"""The files of photos, and depth of the same size as its photo."""
+"""Photo files in a folder, and depth images resized to their photos."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DEPTH_STEM = ".depth"
 
 
 def pinhole_of(camera: Camera, depth: Path) -> Intrinsics:
-    """Return a camera to which depth can be registered. Raises ``InputError`` for a lens whose images are resampled."""
+    """Return ``camera`` if depth can be registered to it. Raises ``InputError`` for a lens whose images are resampled."""
     if not isinstance(camera, Intrinsics):
         raise InputError(
             f"depth cannot be registered to {camera.sentence}", where=depth, expected="undistorted images"
@@ -71,6 +71,6 @@ def _is_photo(file: Path) -> bool:
 
 
 def natural_order(name: str) -> list[tuple[int, str]]:
-    """Return a sort key that compares digits as numbers."""
+    """Return a sort key that ignores case and compares runs of digits as numbers."""
     parts = re.split(r"(\d+)", name.lower())
     return [(int(part), "") if place % 2 else (-1, part) for place, part in enumerate(parts)]

@@ -26,7 +26,7 @@ from bidnerf_core.frames.frame import Frame, View
 
 @runtime_checkable
 class PixelDrawer(Protocol):
-    """Draws ``count`` pixels (column, row) of a frame; they are on the device of ``generator``."""
+    """Draws ``count`` pixels (column, row) of a frame, as a tensor on the device of ``generator``."""
 
     def __call__(self, frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]: ...
 
@@ -42,7 +42,7 @@ def uniform(frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"
 
 
 def all_pixels(frame: Frame) -> Int[Tensor, "n 2"]:
-    """Return all pixels (column, row) of a frame, row by row: their centres at +0.5, truncated."""
+    """Return all pixels (column, row) of a frame, row by row."""
     return frame.intrinsics.pixel_centres().long().reshape(-1, 2)
 
 
@@ -52,7 +52,7 @@ def observe(
     dtype: torch.dtype = torch.float32,
     device: torch.device | str | None = None,
 ) -> Observations:
-    """Return the measurements of ``view`` at ``pixels``, as half-lines in its reference frame.
+    """Return the measurements of ``view`` at ``pixels`` (column, row), as rays in the view's reference frame.
 
     The measurements are on ``device``, by default the image's device. Nothing is copied if the image, the pose and
     ``pixels`` are already there.
@@ -95,7 +95,7 @@ def draw(
 def measured_middle(views: Sequence[View]) -> Float[Tensor, "3"] | None:
     """Return the component-wise median of the measured points, in the views' reference frame; None if there are none.
 
-    Every fourth pixel is used, and fewer in an image with millions of them.
+    Every fourth pixel is used, and fewer in an image with millions of pixels.
     """
     points = []
     for view in views:
@@ -115,7 +115,7 @@ DrawerName = Literal["uniform", "interest-points", "interest-regions"]
 
 
 def interest_points(frame: Frame) -> Int[Tensor, "n 2"]:
-    """Return corners (column, row) by Shi and Tomasi 1994, "Good features to track"; possibly none."""
+    """Return the corners (column, row) of a frame (Shi and Tomasi 1994, "Good features to track"), possibly none."""
     if min(frame.rgb_bytes.shape[:2]) <= 3:  # no larger than the margin that the detector needs
         return torch.zeros((0, 2), dtype=torch.long)
     grey = rgb_to_grayscale(frame.rgb.detach().float().cpu().permute(2, 0, 1)[None])

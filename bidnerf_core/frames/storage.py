@@ -1,6 +1,6 @@
 """Storage for the images of many frames, from which pixels of many images are read at once.
 
-They are stored in a few large blocks of memory or, if there are many, in a mapped file.
+The images are stored in a few large blocks of memory or, if there are many images, in mapped files.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame, as_floats
 
 BLOCK = 2**28
-"""Bytes per block, unless an image is larger. With few blocks it is cheap to draw pixels from all images at once. Images that fill more than
-one are held in a file, whose pages the system may drop when it needs memory."""
+"""Bytes per block, unless an image is larger. If there are only a few blocks, drawing pixels from all images at once is cheap.
+Images that need more than one block are held in files, whose pages the system may drop when it needs memory."""
 ALIGNMENT = 16
 MOST_BLOCKS = 64
 """Number of separate blocks of memory above which images are copied into one."""
 
 
 class PixelStore:
-    """Holds the images of frames one after another.
+    """Stores the images of frames one after another.
 
     ``expected`` is the number of bytes that will be stored. If it exceeds ``BLOCK``, the images go to unnamed
     files in ``folder`` (by default, the system's folder for temporary files) that vanish with the process.
@@ -47,7 +47,7 @@ class PixelStore:
         return frame.replace(rgb=self.copied(frame.rgb_bytes), **images)
 
     def copied(self, image: Shaped[Tensor, "*n"]) -> Shaped[Tensor, "*n"]:
-        """Return an image with its values in the store."""
+        """Copy an image into the store and return the copy."""
         size = image.numel() * image.element_size()
         start = -(-self._used // ALIGNMENT) * ALIGNMENT
         if start + size > len(self._block):
@@ -87,9 +87,9 @@ def bytes_of(frame: Frame) -> int:
 class ImagePixels:
     """The pixels of images with the same number of channels; pixels of an image are numbered row by row."""
 
-    blocks: Sequence[Shaped[Tensor, "_"]]  # each flat; of one type within a block
+    blocks: Sequence[Shaped[Tensor, "_"]]  # flat; all values of a block have the same type
     block: Int[Tensor, "v"]  # index of the block that holds each image; -1 if there is no image
-    start: Int[Tensor, "v"]  # index of its first value in that block
+    start: Int[Tensor, "v"]  # index of the image's first value in that block
     channels: int
     default: float = 0.0  # the value of missing images
 
@@ -128,7 +128,7 @@ class ImagePixels:
         return ImagePixels(flat, block, start, channels, default)
 
     def at(self, image: Int[Tensor, "p"], pixel: Int[Tensor, "p"]) -> Float[Tensor, "p c"]:
-        """Return the values of pixels, each from the image with that index; bytes become floats in [0, 1]."""
+        """Return the values of one pixel per row from the image with that index; bytes become floats in [0, 1]."""
         block = self.block[image][:, None]
         first = self.start[image] + pixel * self.channels
         index = first[:, None] + torch.arange(self.channels, device=first.device)

@@ -31,8 +31,8 @@ LOSSES: dict[RobustName, Callable[[Tensor, float], Tensor]] = {
     "l1": lambda r, c: c * r.abs(),  # its derivative at 0 is taken as 0
     "cauchy": lambda r, c: (
         c**2 * torch.log1p(0.5 * (r / c) ** 2)
-    ),  # large residuals have less and less influence
-    # bounded by 2 c^2: large residuals have almost none
+    ),  # the influence of large residuals decreases
+    # bounded by 2 c^2: large residuals have almost no influence
     "geman-mcclure": lambda r, c: 2 * c**2 * (r / c) ** 2 / ((r / c) ** 2 + 4),
 }
 """``rho(r)`` of each loss at a scale c."""
@@ -47,7 +47,7 @@ WEIGHTS: dict[RobustName, Callable[[Tensor, float], Tensor]] = {
 
 
 def inlier_weight(squared: Values, half: Values | float) -> Values:
-    """Return ``1 / (1 + s / half^2)`` of squared residuals s: 1 at 0, a half where the residual is ``half``.
+    """Return ``1 / (1 + s / half^2)`` of squared residuals s: 1 at 0, and 1/2 where the residual is ``half``.
 
     This is the weight of ``cauchy_loss``. It is also the degree to which a residual is an inlier (Geman and
     McClure 1985): the loss of Geman and McClure is one minus this value, and its least-squares weight is the
@@ -57,11 +57,11 @@ def inlier_weight(squared: Values, half: Values | float) -> Values:
 
 
 def cauchy_loss(squared: np.ndarray, half: float) -> float:
-    """Return Cauchy's loss of squared residuals s, summed: ``half^2 / 2 log(1 + s / half^2)``; see
+    """Return the sum of Cauchy's loss ``half^2 / 2 log(1 + s / half^2)`` over squared residuals s; see
     ``inlier_weight``.
 
-    Unlike ``cauchy``, it takes squared lengths of vectors, and its scale is the residual at which the weight
-    is one half.
+    Unlike ``cauchy`` in ``LOSSES``, this function takes squared lengths of vectors, and its scale is the
+    residual at which the weight is one half.
     """
     return 0.5 * half**2 * float(np.log1p(squared / half**2).sum())
 
@@ -104,11 +104,11 @@ def chi_squared_quantile(probability: float, count: int) -> float:
 
 
 KEYPOINTS_PER_INDEPENDENT = 10.0
-"""Number of keypoints that count as one measurement if a map does not state its own."""
+"""Number of keypoints that count as one independent measurement if a map does not store a number of its own."""
 CORNERS_PER_INDEPENDENT = 4.0
-"""Number of corners tracked between frames that count as one measurement."""
+"""Number of corners tracked between frames that count as one independent measurement."""
 
 
 def independent(drawn: float, most: float) -> float:
-    """Return how many independent measurements ``drawn`` correlated ones amount to, which is never more than ``most``."""
+    """Return how many independent measurements ``drawn`` correlated measurements are worth: at most ``most``."""
     return drawn * most / (drawn + most - 1)

@@ -1,6 +1,6 @@
 """Rotations and updates of single poses in NumPy, in microseconds per call.
 
-``SE3`` and SciPy are built for batches and take a millisecond.
+``SE3`` and SciPy are built for batches and take about a millisecond per call.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def cross_matrix(phi: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def rotation_matrix(phi: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation by the vector ``phi`` (radians; Rodrigues' formula)."""
+    """Return the rotation matrix of the rotation vector ``phi`` (radians), by Rodrigues' formula."""
     cross, angle = cross_matrix(phi), math.sqrt(float(phi @ phi))
     if angle < SERIES_ANGLE:
         return np.eye(3) + (1 - angle**2 / 6) * cross + 0.5 * cross @ cross
@@ -35,19 +35,19 @@ def rotation_matrix(phi: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def rotation_vector(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
-    """Return the rotation vector (radians) of a rotation, of angle 0 to pi."""
+    """Return the rotation vector (radians) of a rotation matrix, with an angle from 0 to pi."""
     skew = 0.5 * (rotation - rotation.T)
     axis = np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
     sine, cosine = math.sqrt(float(axis @ axis)), 0.5 * (float(np.trace(rotation)) - 1)
     angle = math.atan2(sine, cosine)
-    if angle > 2.5:  # beyond it, the skew part does not determine the axis well
+    if angle > 2.5:  # beyond this angle, the skew part does not determine the axis well
         found: np.ndarray = Rotation.from_matrix(rotation).as_rotvec()
         return found
     return axis * (1 + angle**2 / 6 if angle < SERIES_ANGLE else angle / sine)
 
 
 def left_jacobian(phi: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Return V(phi), which maps a tangent vector's translation to that of its exponential (Sola et al. 2018, eq. 145)."""
+    """Return V(phi), which maps the translation of a tangent vector to that of its exponential (Sola et al. 2018, eq. 145)."""
     cross, angle = cross_matrix(phi), math.sqrt(float(phi @ phi))
     if angle < SERIES_ANGLE:
         return np.eye(3) + cross / 2 + cross @ cross / 6
@@ -56,7 +56,7 @@ def left_jacobian(phi: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def retracted(T: SE3, tangent: Float[Tensor, "6"]) -> SE3:
-    """Return the right update ``T @ exp(tangent)``, as ``SE3.retract`` does; float64, without derivatives."""
+    """Return ``T @ exp(tangent)`` (metres, radians), as ``SE3.retract`` does; float64, without derivatives."""
     step = tangent.numpy()
     rotation, translation = T.rotation.numpy(), T.translation.numpy()
     moved = translation + rotation @ (left_jacobian(step[3:]) @ step[:3])
@@ -64,7 +64,7 @@ def retracted(T: SE3, tangent: Float[Tensor, "6"]) -> SE3:
 
 
 def update_between(a: SE3, b: SE3) -> Float[Tensor, "6"]:
-    """Return the right update from ``a`` to ``b``: ``(a.inverse() @ b).log()``; float64, without derivatives."""
+    """Return the right update ``(a.inverse() @ b).log()`` (metres, radians); float64, without derivatives."""
     back = a.rotation.numpy().T
     phi = rotation_vector(back @ b.rotation.numpy())
     rho = np.linalg.solve(left_jacobian(phi), back @ (b.translation - a.translation).numpy())

@@ -37,7 +37,7 @@ class SE3:
 
     @staticmethod
     def from_matrix(matrix: Float[Tensor, "*b 4 4"]) -> SE3:
-        """Convert homogeneous matrices to transforms, without checking that these are rigid (see ``is_rigid``).
+        """Convert homogeneous matrices to transforms; whether they are rigid is not checked (see ``is_rigid``).
 
         Raises ``InputError`` unless ``matrix`` is a tensor of 4x4 matrices.
         """
@@ -51,7 +51,7 @@ class SE3:
 
     @staticmethod
     def exp(tangent: Float[Tensor, "*b 6"]) -> SE3:
-        """Return the exponential map (Sola et al., eq. 172): ``[exp(phi), V(phi) rho]``."""
+        """Return the exponential ``[exp(phi), V(phi) rho]`` of tangent vectors (rho, phi) (Sola et al., eq. 172)."""
         rho, phi = tangent[..., :3], tangent[..., 3:]
         squared, small, angle = _guarded_angle(phi)
         b = torch.where(small, 0.5 - squared / 24 + squared**2 / 720, (1 - angle.cos()) / angle**2)
@@ -62,7 +62,7 @@ class SE3:
         return SE3(_polynomial(phi, a, b), rho + b[..., None] * once + c[..., None] * twice)
 
     def log(self) -> Float[Tensor, "*b 6"]:
-        """Return the inverse of ``exp``, with the rotation angle in [0, pi] (eq. 173): ``[V(phi)^-1 translation, phi]``."""
+        """Return the tangent vector ``[V(phi)^-1 translation, phi]`` of this transform (eq. 173), with an angle in [0, pi]."""
         phi = rotation_matrix_to_axis_angle(self.rotation)
         squared, small, angle = _guarded_angle(phi)
         half = angle / 2  # eq. 146, where (1 + cos t) / sin t = 1 / tan(t / 2): finite at pi
@@ -127,7 +127,7 @@ class SE3:
         return SE3(transposed, -_matvec(transposed, self.translation))
 
     def apply(self, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*q 3"]:
-        """Transform points from the right-hand frame to the left-hand one; the batch broadcasts against leading axes."""
+        """Transform points from frame b to frame a of ``T_a_b``; the batch broadcasts against their leading axes."""
         return _matvec(self.rotation, points) + self.translation
 
     def rotate(self, vectors: Float[Tensor, "*p 3"]) -> Float[Tensor, "*q 3"]:
@@ -135,13 +135,13 @@ class SE3:
         return _matvec(self.rotation, vectors)
 
     def translated(self, offset: Float[Tensor, "3"]) -> SE3:
-        """Return the transform with ``offset`` added to its translation; the left-hand frame stays parallel."""
+        """Return the transform with ``offset`` (metres) added to its translation, and the same rotation."""
         return SE3(self.rotation, self.translation + offset.to(self.translation))
 
     def retract_linearly(self, tangent: Float[Tensor, "*c 6"]) -> SE3:
         """Approximate ``retract`` to first order in ``tangent``.
 
-        It is cheaper, with the same value and derivative at 0, but not rigid elsewhere.
+        This is cheaper and has the same value and derivative at 0, but elsewhere the result is not rigid.
         """
         rho, phi = tangent[..., :3], tangent[..., 3:]
         return SE3(self.rotation + self.rotation @ skew(phi), self.translation + _matvec(self.rotation, rho))
@@ -158,7 +158,7 @@ class SE3:
         return torch.cat([top, bottom], dim=-2)
 
     def normalized(self) -> SE3:
-        """Return the nearest rigid transform, since rounding makes long products of transforms drift off the group."""
+        """Return the nearest rigid transform: rounding errors make long products of transforms drift away from rigidity."""
         u, _, vh = torch.linalg.svd(self.rotation)
         sign = torch.ones_like(self.translation)
         sign = torch.cat([sign[..., :2], torch.linalg.det(u @ vh)[..., None]], dim=-1)
@@ -187,7 +187,7 @@ class SE3:
         return self.translation.device
 
     def to(self, *args: Any, **kwargs: Any) -> SE3:
-        """Convert to another dtype or device, given as for ``Tensor.to``."""
+        """Convert to another dtype or device; the arguments are those of ``Tensor.to``."""
         return SE3(self.rotation.to(*args, **kwargs), self.translation.to(*args, **kwargs))
 
     def __getitem__(self, index: Any) -> SE3:

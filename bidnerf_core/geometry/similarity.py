@@ -1,7 +1,7 @@
 """Poses in other frames, units and conventions, and similarity transforms between corresponding points.
 
-Our covariances of poses are those of ``se3``: of a right update ``T exp(xi)`` with xi = (translation, rotation), both in the
-camera's own axes.
+Pose covariances follow the convention of ``se3``: they belong to a right update ``T exp(xi)``, xi = (translation, rotation),
+metres and radians, along the camera's own axes.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ LengthUnit = Literal["metres", "units"]
 CovarianceConvention = Literal["bidnerf", "gtsam", "ros"]
 """Order and frame of the rows of a covariance.
 
-- ``"bidnerf"``: translation, then rotation, of a right update in the camera's axes (as Sophus has it).
+- ``"bidnerf"``: translation, then rotation, of a right update in the camera's axes (as in Sophus).
 - ``"gtsam"``: rotation, then translation, of a right update in the camera's axes: the tangent of GTSAM's ``Pose3``.
 - ``"ros"``: ``geometry_msgs/PoseWithCovariance``: x, y, z, then the rotations about the fixed x, y and z axes of the world.
 """
 RIGID_TO = 5e-3
 """Largest entry of R^T R - 1 that is attributed to rounding (matrices printed with three decimals reach 2e-3)."""
 FARTHEST_CAMERA = 1e12
-"""Largest coordinate of a camera; squares of larger ones lose all precision."""
+"""Largest coordinate of a camera; squares of larger coordinates lose all precision."""
 
 
 def symbol(unit: LengthUnit) -> str:
@@ -98,8 +98,8 @@ def covariance_in(
     """Convert a pose covariance in our convention, at ``T_world_camera``, to another convention (float64).
 
     A right update by (rho, phi) moves the position by ``R rho`` in the world and premultiplies the rotation
-    by ``exp(R phi)``, to first order, so both blocks are rotated for ROS. Case does not matter. Raises ``InputError``
-    for an unknown convention.
+    by ``exp(R phi)``, to first order, so both blocks are rotated for ROS. The case of ``convention`` does not matter. Raises
+    ``InputError`` for an unknown convention.
     """
     convention = cast(CovarianceConvention, str(convention).lower())
     if convention not in get_args(CovarianceConvention):
@@ -117,7 +117,7 @@ def covariance_in(
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """``x -> T.apply(scale * x)``."""
+    """A similarity transform, ``x -> T_target_source.apply(scale * x)``."""
 
     scale: float  # target units per source unit
     T_target_source: SE3  # applied after scaling
@@ -137,7 +137,7 @@ def fit_similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -
     34 to 43).
 
     If the points are collinear, the rotation about their line is arbitrary, but the scale is still
-    determined. Raises ``InputError`` if all points of either set coincide.
+    determined. Raises ``InputError`` if all points of either set coincide, or if no similarity fits.
     """
     source, target = source.double(), target.double()
     largest = max((float(x.abs().max()) for x in (source, target) if x.numel()), default=0.0)
@@ -162,6 +162,6 @@ def fit_similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -
 
 
 def spread(points: Float[Tensor, "n 3"]) -> float:
-    """Return the root mean square distance from the mean, or 0 if all points coincide up to rounding."""
+    """Return the points' root mean square distance from their mean, or 0 if they all coincide up to rounding."""
     found = float((points - points.mean(0)).square().sum(-1).mean().sqrt())
     return found if found > 1e-12 * float(points.abs().amax()) else 0.0

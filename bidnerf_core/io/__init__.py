@@ -1,4 +1,4 @@
-"""Reading files that users name, and writing whole files: text, JSON, images, arrays."""
+"""Input and output: reading files that users name, and writing whole files (text, JSON, images, arrays)."""
 
 from lazy_loader import attach_stub
 

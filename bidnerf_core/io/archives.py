@@ -11,9 +11,9 @@ from bidnerf_core.errors import InputError, amount
 from bidnerf_core.io.files import PackedFile, open_binary
 
 LARGEST_MEMBER = 256 * 2**20
-"""Bytes that an unpacked member has at most, unless stated otherwise. A small archive can hold members that unpack to any size."""
+"""Default limit on the unpacked size of a member (bytes). A small archive can hold members that unpack to any size."""
 DAMAGES = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, OSError)
-"""What the standard library raises for archives that are damaged or of an unknown kind."""
+"""Exceptions that the standard library raises for archives that are damaged or of an unsupported kind."""
 
 
 class Archive:
@@ -22,7 +22,7 @@ class Archive:
     def __init__(
         self, path: Path, expected: str = "a zip archive", largest_member: int = LARGEST_MEMBER
     ) -> None:
-        """``largest_member``: the largest size of an unpacked member in bytes."""
+        """Open the archive at ``path``. ``largest_member`` limits the unpacked size of a member (bytes)."""
         self.path, self._expected, self._largest = path, expected, largest_member
         with open_binary(path, expected) as file:
             begins = file.read(2)

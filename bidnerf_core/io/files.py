@@ -18,7 +18,8 @@ from filelock import lock_descriptor
 from bidnerf_core.errors import InputError
 
 LARGEST_TEXT = 128 * 2**20
-"""Bytes. Parsed text takes ten times as much memory as its file, so the size is checked before reading."""
+"""Default limit on the size of a file (bytes). Parsed text takes ten times as much memory as its file, so the size is checked
+before reading."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class PackedFile:
 
 
 def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
-    """Open a regular file for reading. ``expected`` briefly describes what it should be ("an image file").
+    """Open a regular file for reading. ``expected`` briefly describes what the file should be ("an image file").
 
     Raises ``InputError`` if there is no such file, if reading is not permitted, for a Git LFS pointer, and for
     folders, pipes and devices: reading from a pipe could block forever.
@@ -51,7 +52,7 @@ def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
     try:
         mode = path.stat().st_mode
         file = path.open("rb") if stat.S_ISREG(mode) else None
-        # Begins a file that stands for another one in a repository cloned without Git LFS.
+        # The beginning of a file that stands for another one in a repository cloned without Git LFS.
         pointer = b"version https://git-lfs.github.com/spec/"
         is_pointer = file is not None and file.peek(len(pointer)).startswith(pointer)
     except FileNotFoundError as error:
@@ -101,14 +102,14 @@ def temporary(path: Path) -> Path:
 
 
 def is_temporary(name: str) -> bool:
-    """Return whether a name belongs to a temporary file, left behind if its process was killed while writing."""
+    """Return whether ``name`` is that of a temporary file, such as a process leaves if it is killed while writing."""
     return re.fullmatch(r"\..+\.[0-9a-f]{8}", name) is not None
 
 
 def write_file(path: Path, content: bytes) -> None:
     """Write a file atomically: it appears under its name only once its whole content is on disk.
 
-    Raises ``OSError``, which names the file; an existing file of that name is then left untouched.
+    Raises ``OSError``, which names the file, if writing fails; an existing file of that name is then left untouched.
     """
     beside = temporary(path)
     try:
@@ -137,9 +138,9 @@ class FileInUse(InputError):
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold the lock of an existing file or folder.
+    """Hold the lock of an existing file or folder within the context.
 
-    Raises ``FileInUse`` if another process holds it, or held it and removed the file or folder.
+    Raises ``FileInUse`` if another process holds the lock, or held it and removed the file or folder.
     """
     used = FileInUse(
         "another bidnerf process is writing here; name another place, or wait until it ends", where=path
@@ -174,7 +175,7 @@ def take_lock(number: int) -> bool:
 
 def available_memory() -> int:
     """Return the available memory in bytes: the machine's, or the rest of the container's limit if that is less."""
-    import psutil  # imported here, since few commands ask for it
+    import psutil  # imported here, since few commands need it
 
     available: int = psutil.virtual_memory().available
     with contextlib.suppress(OSError, ValueError):  # no container, or one without a limit
@@ -203,7 +204,7 @@ def output_folder(
     A folder that is not empty is rejected unless ``overwrite`` is set; temporary files, and those that
     ``is_leftover`` recognizes, do not count. ``described`` returns a description of a folder's content, for the message. If
     the work fails before anything is in the folder, the folder is removed again, with the parents that were
-    created for it. Raises ``InputError``.
+    created for it. Raises ``InputError`` if a check fails.
     """
 
     def check() -> None:
@@ -235,7 +236,7 @@ def output_folder(
     except OSError as error:
         found, expected = f"cannot be written ({error.strerror})", "a folder that can be created and written"
         raise InputError(found, where=out, expected=expected) from error
-    # While the lock is held: afterwards, the folder may be another process's.
+    # The folder is removed while the lock is held: afterwards, it may belong to another process.
     with locked(out), removed_on_failure():
         check()  # another process may have finished meanwhile
         yield

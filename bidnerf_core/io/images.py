@@ -28,7 +28,7 @@ ImageSource: TypeAlias = Path | PackedFile
 """An image file, or one inside an archive."""
 
 LARGEST_IMAGE = 178_000_000
-"""Pixels: the most that Pillow opens, and more than the 108 megapixels of phones. A small file can describe
+"""Largest number of pixels: the most that Pillow opens, and more than the 108 megapixels of phones. A small file can describe
 an image of any size, so the size is checked before memory is allocated."""
 STRIP = 2**21
 """Number of pixels converted at a time: a conversion takes many times as much memory as the bytes of the image."""
@@ -46,7 +46,7 @@ CONVERTED = ("CMYK", "YCbCr", "HSV")
 warnings.filterwarnings("ignore", module=r"PIL\.", append=True)
 FULL_SCALE = {"bool": 1, "uint8": 255, "uint16": 65535}
 COLOUR_ROUNDING = 1e-3
-"""Tolerance by which a floating-point channel may exceed [0, 1], as happens in resampling and colour conversion."""
+"""Amount by which a floating-point channel may lie outside [0, 1], as after resampling and colour conversion."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class ImageHeader:
 
 
 def read_header(path: ImageSource) -> ImageHeader:
-    """Read size and channels, but no pixels. Raises ``InputError`` for the same defects as ``read_image``."""
+    """Read the size of an image and whether it has alpha, but no pixels. Raises ``InputError`` as ``open_image`` does."""
     with open_image(path) as image:
         has_alpha = image.mode in ("LA", "RGBA", "PA") or (image.mode == "P" and image.has_transparency_data)
         return ImageHeader(image.width, image.height, has_alpha)
@@ -101,7 +101,7 @@ def read_compact_image(
     with open_image(path) as image:
         if image.mode in ("L", "RGB", *CONVERTED) and not _is_deep(image):
             if size is not None and image.format == "JPEG":
-                # It decodes to a half, a quarter or an eighth along each side. Images whose sizes are not multiples are decoded
+                # JPEG decodes to a half, a quarter or an eighth along each side. Images whose sizes are not multiples are decoded
                 # whole, since their last column or row would be weighted too heavily.
                 sides = [tuple(side // f for side in image.size if side % f == 0) for f in (8, 4, 2)]
                 fitting = [s for s in sides if len(s) == 2 and s[0] >= size[0] and s[1] >= size[1]]
@@ -219,7 +219,7 @@ def _strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[np.ndarray,
             yield _pixels(path, image.crop((0, top, image.width, min(top + rows, image.height)))), None
         return
     whole = _pixels(path, image)
-    # Values of 10, 12 or 14 bits are stored in 16; the fewest bits that fit the largest value are assumed. Alpha has all of them.
+    # Values of 10, 12 or 14 bits are stored in 16; the fewest bits that fit the largest value are assumed. Images with alpha use all 16.
     has_alpha = whole.ndim == 3 and whole.shape[2] in (2, 4)
     bits = next((bits for bits in (10, 12, 14) if whole.max(initial=0) < 2**bits and not has_alpha), 16)
     for top in range(0, len(whole), rows):
@@ -255,7 +255,7 @@ def _pixels(path: ImageSource, image: Image.Image) -> np.ndarray:
     if image.mode in ("P", "PA", *CONVERTED):
         image = image.convert("RGBA" if image.has_transparency_data else "RGB")
     pixels = np.array(image)
-    # Pillow before 11.3 has 32 bits for a PNG of 16; other formats have them themselves, and are refused.
+    # Pillow before 11.3 decodes a 16-bit PNG to 32 bits. Other images of 32 bits are stored that way, and are rejected later.
     return pixels.astype(np.uint16) if image.format == "PNG" and pixels.dtype == np.int32 else pixels
 
 
@@ -305,7 +305,7 @@ def open_image(path: ImageSource) -> Iterator[Image.Image]:
 
 
 def _check_segments(path: ImageSource, file: BinaryIO) -> None:
-    """Raise ``InputError`` for a JPEG file that would take far longer to decode than its size suggests; rewind any other file."""
+    """Raise ``InputError`` for a JPEG file that would take far longer to decode than its size suggests; rewind the file."""
     content = file.read() if file.read(2) == b"\xff\xd8" else b""
     file.seek(0)
     # Each scan goes through the whole image, and libjpeg's usual script has ten of them. The depth map that a phone stores with a
@@ -347,7 +347,7 @@ def looks_like_image(path: Path) -> bool:
 
 
 def reason(error: Exception) -> str:
-    """Return the first line of a decoder's message."""
+    """Return the first line of a decoder's message, or the error's type if the message is empty."""
     text = str(error).strip()
     return text.splitlines()[0][:120] if text else type(error).__name__
 

@@ -33,12 +33,12 @@ EXPECTED = {
     "dict_type": "an object", "list_type": "a list", "tuple_type": "a list", "missing": "a longer list",
     "greater_than_equal": "an integer of at most 64 bits", "less_than_equal": "an integer of at most 64 bits",
 }  # fmt: skip
-"""What messages expect, by the type of pydantic's error; pydantic's own text for others."""
+"""What messages state as expected, by pydantic's error type; other types use pydantic's own text."""
 STRICT: dict[str, dict[str, Any]] = {
     "bool": {"strict": True}, "str": {"strict": True}, "float": {"strict": True, "allow_inf_nan": False}, "list": {"fail_fast": True},
     "int": {"strict": True, "ge": -LARGEST_INTEGER, "le": LARGEST_INTEGER}, "tuple": {"fail_fast": True},
 }  # fmt: skip
-"""What is added to the parts of pydantic's schemas, by their types: text is no number, but a list may stand for a tuple."""
+"""Settings added to the parts of pydantic's schemas, by type: text is not accepted as a number, but a list is as a tuple."""
 
 
 def read_json(path: Path, expected: str) -> Any:
@@ -49,8 +49,8 @@ def read_json(path: Path, expected: str) -> Any:
 def parse_json(content: bytes | str, where: str, expected: str) -> Any:
     """Parse JSON text (UTF-8). Raises ``InputError`` for text that is not JSON, or whose value could not be written as JSON again.
 
-    ``where`` begins the message (the file, or nothing), and ``expected`` briefly describes what should be
-    there.
+    The message begins with ``where`` (the file, or nothing) and ends with ``expected``, a brief description of what should
+    be there.
     """
     try:
         text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
@@ -121,8 +121,9 @@ class Record:
         return float(found)
 
     def homogeneous(self, key: str, rows: list[Any] | None) -> tuple[list[list[float]], float]:
-        """Return the first three of a matrix's 3 or 4 ``rows``, divided by w, and w itself (1 up to rounding), where w is the last
-        entry of a fourth row 0 0 0 w. ``key`` is their key, for messages.
+        """Return the first three of a matrix's 3 or 4 ``rows`` divided by w, and w, the last entry of a fourth row 0 0 0 w.
+
+        Without a fourth row, or if w is 1 up to rounding, w is 1. ``key`` is the matrix's key, for messages.
         """
         if rows is None:
             raise self.error(f"no {key}", expected="a 4x4 matrix of a pose")
@@ -215,7 +216,7 @@ def with_tensors(plain: Any, tensors: Mapping[str, Tensor], where: str) -> Any:
 def from_plain(kind: type[_T], value: Any, where: str) -> _T:
     """Convert ``value``, as read from JSON, to the type ``kind``: a dataclass, or a list, tuple or dict of these and of plain values.
 
-    Missing keys take their defaults, and lists become tuples where ``kind`` says so. Raises ``InputError``, which begins with
+    Missing keys take their defaults, and lists become tuples where ``kind`` has tuples. Raises ``InputError``, whose message begins with
     ``where``, for an unknown key, a missing required key, a value of the wrong type, and values that ``kind`` itself
     rejects.
     """
@@ -248,13 +249,13 @@ def _strict(node: Any) -> Any:
         return node
     given = ("default", "expected", "metadata", "config")  # values of ours rather than parts of the schema
     found = {key: part if key in given else _strict(part) for key, part in node.items()}
-    if found.get("type") == "union":  # the part of an error's path that stands for a member is no key
+    if found.get("type") == "union":  # the part of an error's path that stands for a member is not a key
         found["choices"] = [(choice, "") for choice in found["choices"]]
     return found | STRICT.get(str(found.get("type")), {})
 
 
 def _first_error(errors: Sequence[Any], where: str, of: Any) -> InputError:
-    """Return the first of pydantic's errors with a value of type ``of``, with all types of a union that the value is not of."""
+    """Convert the first of pydantic's ``errors`` about a value of type ``of``; for a union, the error lists all expected types."""
     first = errors[0]
     kind, path = first["type"], [where, *(p for p in first["loc"] if p and isinstance(p, str))]
     if "error" in first.get("ctx", {}):  # what a dataclass raised
@@ -276,10 +277,10 @@ def parse_yaml(content: bytes, where: str, expected: str) -> Any:
 
     Raises ``InputError``, whose message begins with ``where``, if the text is malformed, too large or too deep, or has aliases.
     """
-    import yaml  # imported here, since few commands read any
+    import yaml  # imported here, since few commands read YAML
 
     loader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
-    # Bytes, of which a calibration with the points of all its images takes some 100,000, and nested lists and mappings
+    # Limits on bytes (a calibration with the points of all its images takes some 100,000) and on the depth of nesting
     most, deepest = 2**20, 50
     if len(content) > most:
         found = f"has {len(content):,} bytes of YAML"

@@ -78,7 +78,7 @@ def read_ply_header(path: Path, expected: str = "a PLY file") -> PlyHeader:
     for (
         name,
         element,
-    ) in elements.items():  # any number of elements without properties would fit into no bytes
+    ) in elements.items():  # elements without properties take no bytes, so any number would fit
         if element.count and not element.properties and not element.lists:
             raise InputError(f"the elements {name!r} have no properties", where=path, expected=expected)
     return PlyHeader(order == "=", elements, stop + 1)
@@ -105,7 +105,7 @@ def read_ply(path: Path, expected: str = "a PLY file") -> dict[str, np.ndarray]:
                     for column, (part, of) in zip(columns, element.properties.items(), strict=True):
                         with np.errstate(invalid="ignore", over="ignore"):
                             found[name][part] = column
-                        # Programs write 255.0 for a byte, but 256 or 0.5 is none.
+                        # Some programs write 255.0 for a byte, but 256 and 0.5 are not bytes.
                         if np.dtype(of).kind in "iu" and (found[name][part] != column).any():
                             raise ValueError(f"{part} is not of its type")
                 elif kind.itemsize:

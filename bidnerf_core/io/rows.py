@@ -11,7 +11,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.io.files import read_file
 
 LARGEST_ROWS = 256 * 2**20
-"""Bytes. A trajectory over a whole day at 100 Hz is about this large."""
+"""Default limit on the size of a file (bytes), about that of a trajectory over a whole day at 100 Hz."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def parse_rows(content: bytes, path: Path, expected: str, columns: str) -> list[
 
 
 def read_lines(path: Path, expected: str, columns: str, most: int = LARGEST_ROWS) -> list[Row]:
-    """Read all lines of a text file in any encoding, including empty ones and comments.
+    """Read all lines of a text file, including empty lines and comments; bytes that are not UTF-8 are replaced.
 
     Raises ``InputError`` as ``read_file`` does.
     """

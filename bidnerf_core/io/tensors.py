@@ -29,7 +29,7 @@ from bidnerf_core.io.files import open_binary
 _Part = TypeVar("_Part")
 
 LARGEST_ARRAY = 800_000_000
-"""Bytes: an image of 100 megapixels in double precision."""
+"""Largest size of an array (bytes): an image of 100 megapixels in double precision."""
 TENSOR_FILE = "a safetensors file"
 
 
@@ -107,18 +107,18 @@ def read_tensors_and_metadata(
 class TensorKind:
     """The shape, type and range of a tensor in a file; other values would make later computations fail or overflow."""
 
-    shape: str  # such as "n 3"; a letter is the same number in all tensors of a file, and a capital letter is not 0
+    shape: str  # such as "n 3"; a letter stands for the same number in all tensors of a file; it is not 0 if capital
     dtype: torch.dtype = torch.float32
     least: float = -math.inf
     most: float = math.inf
     is_unit: bool = False  # whether the vectors along the last axis have length 1
-    index_of: str = ""  # the letter whose number limits the values, which are indices
+    index_of: str = ""  # if the values are indices: the letter whose number they must stay below
 
 
 def check_tensors(tensors: Mapping[str, Tensor], kinds: Mapping[str, TensorKind]) -> None:
     """Check tensors against their kinds, in order.
 
-    Raises ``KeyError`` for a missing tensor, and ``ValueError`` for one of another shape, type or range, NaN or infinity.
+    Raises ``KeyError`` for a missing tensor, and ``ValueError`` for a tensor of another shape, type or range or with NaN or infinity.
     """
     sizes: dict[str, int] = {}
     for name, kind in kinds.items():
@@ -154,7 +154,7 @@ def load_part(
 
 
 def packed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return contiguous copies on the CPU, as safetensors requires."""
+    """Return contiguous copies of ``tensors`` on the CPU, as safetensors requires."""
     return {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
 
 
@@ -173,7 +173,7 @@ def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
 
     ``expected`` briefly describes what the file should be. With ``mapped``, tensors stay in the file until they are used, so that
     a file of any size is recognised quickly; files in the format of torch before version 1.6, which are not zip archives,
-    cannot be mapped and are read. Raises a one-line ``InputError`` if the file is missing or damaged, or would run code or unpack to
+    cannot be mapped and are read. Raises a one-line ``InputError`` if the file is missing or damaged, would run code, or unpacks to
     more than its own size. Unless ``mapped``, a tensor whose storage is smaller than its shape (stride 0) is rejected as well.
     """
     open_binary(
