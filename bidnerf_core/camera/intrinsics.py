@@ -69,7 +69,8 @@ class Intrinsics:
     def from_focal(focal: float, width: int, height: int) -> Intrinsics:
         """Return an undistorted camera with focal length ``focal`` (pixels) and its principal point at the image centre.
 
-        Raises ``InputError`` for a focal length that no lens has."""
+        Raises ``InputError`` for a focal length that no lens has.
+        """
         camera = Intrinsics(focal, focal, 0.0, 0.0, width, height)
         question_focal(focal, width, height)
         if focal > 1000 * max(width, height):  # a field of view of 0.06 degrees, as of a telescope
