@@ -74,9 +74,7 @@ def sharpness(grey: np.ndarray, hidden: Bool[Tensor, "h w"] | None = None) -> fl
     counted = None
     if hidden is not None:
         shown = cv2.resize((~hidden.cpu().numpy()).astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        reach = np.ones(
-            (6 * COARSE + 1,) * 2, np.uint8
-        )  # reach of the blur and the differences to both sides
+        reach = np.ones((6 * COARSE + 1,) * 2, np.uint8)  # of the blur and the differences, to both sides
         away = cv2.erode((shown >= 1).astype(np.uint8), reach) > 0
         counted = away if away.mean() >= 0.02 else None
     fine, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1.0, COARSE))

@@ -284,9 +284,8 @@ def adjusted_poses(
         pixels = _image_motion(seen, fit.points, given, fit.T_world_camera)
         tracked, noticed = tracked.at(fit.T_world_camera, fit.motion), False
         seen, points = tracked.triangulated(config)
-        if (
-            motion == STILL and number < ROUNDS - 1
-        ):  # a motion found in the last round could not be estimated any more
+        # A motion found in the last round could not be estimated any more.
+        if motion == STILL and number < ROUNDS - 1:
             motion = common_motion(seen, points, KEYPOINTS_PER_INDEPENDENT)
             noticed = motion != STILL
         consistency = PoseRefinement(before, noise_of(seen, points))
