@@ -6,29 +6,34 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 PACKAGES = [ROOT / "bidnerf_core", *sorted(f.parent for f in (ROOT / "backends").glob("*/__init__.py"))]
 FILES = sorted(file for package in PACKAGES for file in package.rglob("*.py"))
 LONGEST = 500
 
-TREES = {f.relative_to(ROOT).as_posix(): ast.parse(f.read_text(encoding="utf-8")) for f in FILES}
-
 Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+@pytest.fixture(scope="module")
+def trees() -> dict[str, ast.Module]:
+    return {f.relative_to(ROOT).as_posix(): ast.parse(f.read_text(encoding="utf-8")) for f in FILES}
 
 
 def test_every_import_package_is_typed() -> None:
     assert [package.name for package in PACKAGES if not (package / "py.typed").is_file()] == []
 
 
-def test_files_are_short_and_say_what_they_are() -> None:
+def test_files_are_short_and_say_what_they_are(trees: dict[str, ast.Module]) -> None:
     lengths = {f.relative_to(ROOT).as_posix(): len(f.read_text(encoding="utf-8").splitlines()) for f in FILES}
     assert {name: lines for name, lines in lengths.items() if lines > LONGEST} == {}
-    assert [name for name, tree in TREES.items() if not ast.get_docstring(tree)] == []
+    assert [name for name, tree in trees.items() if not ast.get_docstring(tree)] == []
 
 
-def test_public_functions_are_annotated() -> None:
+def test_public_functions_are_annotated(trees: dict[str, ast.Module]) -> None:
     """Also where mypy would infer a type: annotations are what the run-time checks of the tests read."""
-    bare = {name: [part for f in _public(tree) for part in _bare(f)] for name, tree in TREES.items()}
+    bare = {name: [part for f in _public(tree) for part in _bare(f)] for name, tree in trees.items()}
     assert {name: parts for name, parts in bare.items() if parts} == {}
 
 
@@ -38,10 +43,10 @@ BY_NAME = {
 }
 
 
-def test_only_the_registry_imports_by_name() -> None:
+def test_only_the_registry_imports_by_name(trees: dict[str, ast.Module]) -> None:
     """The core reaches a backend through ``load_backend`` alone."""
     found = {
-        name: _names(tree) & {"import_module", "__import__", "entry_points"} for name, tree in TREES.items()
+        name: _names(tree) & {"import_module", "__import__", "entry_points"} for name, tree in trees.items()
     }
     surplus = {name: calls - BY_NAME.get(name, set()) for name, calls in found.items()}
     assert {name: calls for name, calls in surplus.items() if calls} == {}
