@@ -1,9 +1,9 @@
-"""Acceptance of poses: the measures, a table of their bounds, and the confidence.
+"""Acceptance of poses: the evidence for a pose, the bounds on it, and the confidence.
 
-The confidence of a landmark-based pose is from a logistic model of its evidence. Without landmarks, agreement alone is weak evidence, as a plain
-wall looks the same from everywhere: a pose must explain the measurements better than its rivals, which are poses displaced by more than
-the tolerated error, the best different pose of a search, and images rendered in their mean colour. One test serves colours,
-depths and points on the surface: the difference of each measurement's cost between the rival and the pose.
+The confidence of a landmark-based pose comes from a logistic model of its evidence. Without landmarks, agreement alone is weak evidence, as
+a plain wall looks the same from everywhere: a pose must explain the measurements better than its rivals, which are poses displaced by more
+than the tolerated error, the best different pose of a search, and images rendered in their mean colour. Colours, depths and points on the
+surface share one test: how much more each measurement costs at the rival than at the pose.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.settings import Range
 
 ACCEPTED = 0.4
-"""Minimum confidence of an accepted pose by landmarks.
+"""Minimum confidence at which a landmark-based pose is accepted.
 
-It was lowered from 0.5 because right poses in small synthetic scenes had confidences of 0.39 to 0.46. More than a third of the
-answers that the model was fitted to show falsified cameras, which may be why; no separate record supports this value.
+It was lowered from 0.5 because correct poses in small synthetic scenes had confidences of 0.39 to 0.46. A possible cause is that more than
+a third of the answers to which the model was fitted had falsified cameras. No separate record supports this value.
 """
 
 
@@ -41,8 +41,8 @@ class Evidence:
     # false alarms of the matches by descriptors alone; 0 if the pose was found by other means
     log10_nfa: float
     inliers: int  # matches by projection within three standard deviations
-    by_chance: float  # such matches expected at a wrong pose
-    recall: float  # fraction of the landmarks in view, or of the keypoints, that match
+    by_chance: float  # number of such matches expected at a wrong pose
+    recall: float  # fraction of the landmarks in view, or of the keypoints if they are fewer, that match
     spread: float  # fraction of the image's cells that contain a match
     noise_ratio: float  # keypoints' noise relative to that of the map's images
     other_place: float  # probability of another place or of a mirrored image
@@ -50,7 +50,7 @@ class Evidence:
     replaced: float  # probability that neither the stated camera nor the map's is even approximately right
     precision: float  # standard deviation of the position relative to the scene's distance
     mass: float  # probability that the pose is within the tolerance, and its camera credible
-    searched: bool  # whether landmarks found the pose, or only confirm one found by other means
+    searched: bool  # whether the pose was found by landmarks, not only confirmed by them
     on_surface: float | None = None  # fraction of the measured points on the surface
     colour_inliers: float | None = None  # fraction of the measured points on the surface and with its colour
 
@@ -70,7 +70,7 @@ class Bound(NamedTuple):
     reason: str  # with the value as ``{0}``, and the limit as ``{1}``
 
     def keeps(self, value: float) -> bool:
-        """Return whether a value satisfies the limit, which NaN never does."""
+        """Return whether a value satisfies the limit; NaN never does."""
         return value >= self.limit if self.is_least else value <= self.limit
 
 
@@ -84,13 +84,13 @@ LANDMARK_BOUNDS = (
     Bound("precision", 0.03, False, Outcome.IMPRECISE, "the position is uncertain by {0:.1%} of the distance"),
     Bound("mass", 0.8, True, Outcome.UNCERTAIN, "the pose is within the tolerance with a probability of {0:.0%}"),
 )  # fmt: skip
-"""The bounds of a pose by landmarks, the most serious reason first; the first does not apply to one that was found by other means."""
+"""Bounds on the evidence for a landmark-based pose, most serious first. The first bound does not apply to a pose found by other means."""
 
 
 def judge(evidence: Evidence, log_odds: float = 0.0) -> Verdict:
     """Return the verdict of the first violated bound or, if all bounds hold, of the logistic model.
 
-    ``log_odds`` are the prior log odds of the pose before its image was seen, relative to an image that may have been taken anywhere.
+    ``log_odds`` are the prior log odds of the pose, relative to those of an image that may have been taken anywhere.
     """
     confidence = model().probability(features(evidence), log_odds)
     for bound in LANDMARK_BOUNDS if evidence.searched else LANDMARK_BOUNDS[1:]:
@@ -150,7 +150,9 @@ def model() -> LogisticModel:
 
 
 def least_confidence(risk: float) -> float:
-    """Return the confidence required by the largest calibrated risk that does not exceed ``risk``.
+    """Return the minimum confidence of accepted answers for a tolerated fraction ``risk`` of wrong ones.
+
+    It is the confidence calibrated for the largest risk that does not exceed ``risk``.
 
     Raises ``InputError`` for a risk outside the calibrated range.
     """
@@ -164,9 +166,9 @@ def least_confidence(risk: float) -> float:
 
 
 DISPLACEMENT = 0.1
-"""Displacement of rivals: a fraction of the distance to the scene, and an angle about it in radians.
+"""Displacement of rivals along each axis, as a fraction of the distance to the scene, and about each axis, in radians.
 
-It is three times the maximum standard deviation of an accepted position by landmarks.
+It is about three times the largest standard deviation of position, relative to that distance, at which a landmark-based pose is accepted.
 """
 SUPPORT_BOUNDS = (
     Bound("mean_loss", 0.02, False, Outcome.HIGH_LOSS, "mean loss {0:.3g}, must be below {1:.3g}"),
@@ -175,15 +177,15 @@ SUPPORT_BOUNDS = (
     Bound("free_space_violations", 0.15, False, Outcome.FREE_SPACE_VIOLATED, "{0:.0%} of the lines of sight pass through the surface"),
     Bound("runner_up_margin", 0.15, True, Outcome.AMBIGUOUS, "another pose fits about as well"),
     Bound("rendered_inliers", 0.8, True, Outcome.RENDERING_MISMATCH, "only {0:.0%} of the rendered rays agree with the measurements"),
-    # Of the answers on record, 16 of the 17 right ones were more precise, and 2 of the 15 wrong ones, most of which had wrong intrinsics.
+    # Of the answers on record, 16 of the 17 right ones and 2 of the 15 wrong ones (most with wrong intrinsics) were more precise.
     Bound("precision", 0.015, False, Outcome.IMPRECISE, "the position is uncertain by {0:.1%} of the distance"),
     Bound("determined", 1.0, True, Outcome.UNDETERMINED, "the measurements do not determine the pose"),
     Bound("new_inliers", 0.93, True, Outcome.RENDERING_MISMATCH, "{0:.0%} of newly drawn rays agree with the measurements, expected {1:.0%}"),
     Bound("confidence", 0.8, True, Outcome.UNDETERMINED, "{2} fits about as well"),
     Bound("explained", 0.5, True, Outcome.RENDERING_MISMATCH, "the pose explains only {0:.0%} of the contrast of the image"),
-    # Right poses before a wall of weak texture, from twelve places, have steps of up to 0.018: the noise of the rays.
+    # At right poses in front of a weakly textured wall, seen from twelve places, the noise of the rays causes steps of up to 0.018.
     Bound("further_step", 0.02, False, Outcome.NOT_SETTLED, "newly drawn rays give a further step of {0:.3g}, expected {1:g} at most"),
-    # A wrong pose can be the best one far around, so that rivals nearby are no better, but its colours differ more. On test images of
+    # A wrong pose can be a local optimum whose nearby rivals are no better, but its colours differ more. On test images of
     # Lego and the room, the ratio was 0.8 to 1.4 at right poses, and 2.1 and more at wrong ones.
     Bound("colour_ratio", 1.8, False, Outcome.RENDERING_MISMATCH, "the colours differ {0:.1f} times as much as in the map's own images"),
 )  # fmt: skip
@@ -193,10 +195,10 @@ RIVALS = {
     "displaced": (Outcome.UNDETERMINED, f"a pose displaced by {DISPLACEMENT:.0%} of the distance to the scene"),
     "other": (Outcome.AMBIGUOUS, "another pose"),
 }  # fmt: skip
-"""The rivals of a pose without landmarks, by the names of the log odds against them: a plain image, the best of the displaced poses, and
-the best different pose of a search."""
+"""The outcome and the description of each rival of a pose without landmarks, by the name of the log odds against it: a single-colour image,
+the best of the displaced poses, and the best different pose of a search."""
 Costs = Callable[[SE3], Float[Tensor, "h n"]]
-"""Returns each of n measurements' part of the cost, from each of h poses."""
+"""Returns the cost of each of n measurements at each of h poses."""
 
 
 @dataclass(frozen=True)
@@ -205,11 +207,11 @@ class Support:
 
     # those of ``SUPPORT_BOUNDS``, and the log odds against ``RIVALS``; None or absent: not measured
     measures: dict[str, float | None]
-    limits: dict[str, float] = field(default_factory=dict)  # by measure, of the method's settings
+    limits: dict[str, float] = field(default_factory=dict)  # by measure; they replace the usual limits
 
     @property
     def bounds(self) -> Iterator[tuple[Bound, float]]:
-        """The bounds of the measures that were taken, with the limits of the method, and the measures."""
+        """The bounds on the measures that were taken, with the method's limits, each paired with the value of its measure."""
         for bound in SUPPORT_BOUNDS:
             value = self.measures.get(bound.measure)
             if value is not None:
@@ -229,7 +231,7 @@ class Support:
 
 
 def odds(log_odds: float) -> float:
-    """Return the odds for given log odds, limited to the range of floating-point numbers."""
+    """Return the odds for ``log_odds``, clamped to the range of floating-point numbers."""
     return math.exp(max(-500.0, min(500.0, log_odds)))
 
 
@@ -240,11 +242,11 @@ def support(
     plain: Float[Tensor, "n"] | None = None,
     others: SE3 | None = None,
 ) -> dict[str, float | None]:
-    """Compare a pose with its rivals, and return the measures of ``Support`` that this gives.
+    """Compare a pose with its rivals; return log odds, confidence and explained contrast, as in ``Support.measures``.
 
-    ``middle`` is the middle of the visible scene (metres, last camera's frame), about which rivals are displaced. ``plain`` is
-    each measurement's cost in images rendered in their mean colour; None if more than colours is compared. ``others`` are
-    poses (h) found by a search; those within the displacement do not count as rivals.
+    ``middle`` is the middle of the visible scene (metres, last camera's frame), about which rivals are displaced. ``plain`` is each
+    measurement's cost in images rendered in their mean colour; None unless colours alone are compared. ``others`` are poses (h) found by a
+    search; those within ``DISPLACEMENT`` of ``T`` do not count as rivals.
     """
     here, about = costs(T[None])[0], Pivot.at_point(middle.to(T.translation))
     reach = float(torch.linalg.vector_norm(middle))
@@ -266,11 +268,11 @@ def support(
 
 
 def log_odds(rivals: Float[Tensor, "h n"], here: Float[Tensor, "n"]) -> Float[Tensor, "h"]:
-    """Return the log odds of the pose against each rival, from the costs of each measurement for both; 0 where not finite."""
+    """Return the log odds of the pose against each rival, from the costs of each measurement at both; 0 where not finite."""
     difference = rivals - here
     error = difference.std(-1) * difference.shape[-1] ** 0.5
     # Half a unit of log odds per standard error of the difference: independent measurements would justify more, but the errors of
-    # a field's rays are correlated. It was chosen on frames held out for tuning.
+    # a field's rays are correlated. The factor was chosen on frames held out for tuning.
     odds = 0.5 * difference.sum(-1) / error.clamp(min=1e-12)
     return torch.where(odds.isfinite(), odds, 0)
 

@@ -16,10 +16,10 @@ from bidnerf_core.localization.settings import AdamSettings
 from bidnerf_core.progress import check_cancelled
 
 WINDOW = 20
-"""Steps over which the noisy loss of a few rays is averaged."""
+"""Number of steps over which the noisy loss of randomly drawn rays is averaged."""
 Loss = Callable[[SE3], Tensor]
 RATE = 0.0125
-"""Usual learning rate: of translations as a fraction of the distance to the pivot, of rotations in radians."""
+"""Default learning rate: for translations as a fraction of the distance to the pivot, for rotations in radians."""
 BETAS = (0.9, 0.999)
 """Decay rates of the moments (Kingma and Ba 2015, Alg. 1)."""
 

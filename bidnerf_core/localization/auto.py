@@ -70,7 +70,7 @@ def _on_surface(
             raise InputError("method 'auto' then needs a start; give one", where=why)
         descended = bid(problem, BidConfig(), seed)
         return replace(descended, reason=f"{why}; {descended.reason}")
-    # Where usual images of the map have 150 matches, one without recognised landmarks shows something else.
+    # If the map's own images usually have 150 matches, an image without recognised landmarks shows something else.
     if surface is None or (loop is not None and loop.landmarks.usual_matches >= 150):
         return best or unrecognized(problem)
     config = config if loop is None else replace(config, rounds=1)
@@ -80,7 +80,7 @@ def _on_surface(
         if found is None:
             break
         if occluder is not None and given is not problem:
-            # An occluder lies in front of the surface, but for a tenth of its points.
+            # At least nine tenths of an occluder's points lie in front of the surface.
             if not found.converged or occluder.share_in_front(surface, found.T_world_camera) < 0.9:
                 continue
             share = f"the nearest {occluder.share:.0%} of the measured points, which are on an occluder"
@@ -103,7 +103,10 @@ def _on_surface(
 
 
 def _uncertain_camera(found: Localization, problem: Problem) -> Localization:
-    """Reject a surface-based pose if the focal length is approximate: only landmarks can separate focal length from distance."""
+    """Reject a surface-based pose if the focal length is approximate, unless all depth is from another depth sensor.
+
+    Only landmarks can separate focal length from distance.
+    """
     by_rays = problem.depth_rays is not None and not any(view.frame.has_depth for view in problem.views)
     if not found.converged or not problem.focal_is_approximate or by_rays:
         return found

@@ -54,7 +54,7 @@ POINT_STAGES = (
     (2000, 4, 1, 0.0, 1.0),
 )
 IMAGE_STAGES = ((16, 0, 48), (16, 8, 12), (24, 8, 4), (48, 8, 2), (96, 5, 2))
-"""Pixels of the longer side, steps, poses kept."""
+"""Stages of the search by images: pixels of the longer side, steps, poses kept."""
 DETAILED_STAGES = ((32, 0, 64), (32, 6, 16), (48, 8, 6), (96, 6, 2), (192, 4, 1))
 """Stages for partly hidden images: in smaller thumbnails, nearly every pixel would contain part of the occluders."""
 
@@ -63,7 +63,7 @@ DETAILED_STAGES = ((32, 0, 64), (32, 6, 16), (48, 8, 6), (96, 6, 2), (192, 4, 1)
 def localize_by_depth(
     problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int
 ) -> Localization | None:
-    """Align measured points with the surface, in rounds until a pose is acceptable, then refine the pose on rendered rays as well.
+    """Align measured points with the surface, in rounds until a pose is acceptable, then refine this pose with rendered rays as well.
 
     Returns None if too few points were measured.
     """
@@ -101,7 +101,7 @@ def localize_by_depth(
     T = best.T[0].normalized()
     evidence |= support(lambda T: finest.costs(states_at(T)), T, middle)
     covariance, precision = _covariance(problem, refined, best, middle)
-    # A map with landmarks would confirm a pose by a camera as stated; where it does not, the alignment must be as tight as by such a camera.
+    # If the stated camera is right, landmarks should confirm the pose; if they do not, the alignment must be as precise as with it.
     found_by = Support(evidence | {"precision": None if problem.matcher is None else precision})
     verdict = found_by.verdict(
         f"{evidence['colour_inliers']:.0%} of the measured points match the surface in position and colour"
@@ -112,10 +112,10 @@ def localize_by_depth(
 
 
 def localize_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:
-    """Compare the images with renderings of the surface, in rounds until an answer is accepted; each answer is refined.
+    """Localize by comparing the images with renderings of the surface, in rounds until an answer is accepted.
 
-    The first round is fast. Later rounds assume that part of the scene is occluded. If no answer is accepted, the answer with the
-    smallest loss is returned.
+    Each answer is refined on rays rendered from the field. The first round is fast; later rounds assume that part of the scene is occluded.
+    If no answer is accepted, the one with the smallest loss is returned.
     """
     began, steps, answers = time.perf_counter(), config.by_colour, list[Localization]()
     problem, count = problem.without_depth(), config.hypotheses
@@ -141,7 +141,7 @@ def localize_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig
 
 
 def by_depth(problem: Problem, points: Surface, count: int, seed: int) -> SearchResult:
-    """Align measured points with the surface from ``count`` hypotheses throughout the scene; return the poses, best first.
+    """Align measured points with the surface from ``count`` hypotheses throughout the scene; return the result, best pose first.
 
     Scores are mean costs per point, from 0 to 2.
     """
@@ -162,10 +162,9 @@ def by_images(
 ) -> tuple[SearchResult, Float[Tensor, "3"]]:  # fmt: skip
     """Compare the images with renderings of the surface from ``count`` hypotheses throughout the scene, then run ``later`` stages.
 
-    Returns the best poses and the middle of the visible scene (metres, last camera's frame). Rays cast from the keyframes
-    show how far the scene typically is, and whether it has a background. ``detailed`` is for partly occluded images: its
-    colour scales are narrow, as wider ones favour poses that partly explain the occluders' colours, and the exposure stays close to
-    that of the map.
+    Returns the result, best pose first, and the middle of the visible scene (metres, last camera's frame). Rays cast from keyframes give
+    the typical distance of the scene, and whether it has a background. ``detailed`` is for partly occluded images: colour scales are
+    narrow, as wider ones favour poses that partly explain the occluders' colours, and the exposure stays close to the map's.
     """
     small = moved(Thumbnail.of(problem.views[-1], 16), surface.device)
     keyframes = SE3.from_matrix(surface.keyframes[:: max(1, len(surface.keyframes) // 16)]).to(small.flat)
@@ -177,7 +176,7 @@ def by_images(
     has_background = float(seen.met.float().mean()) < 1 - 0.2
     middle = torch.tensor([0.0, 0.0, away], dtype=torch.float64)
     renderer = surface_renderer(surface, problem.bounds.background if has_background else None)
-    # Wide scales find images that were exposed twice or half as long.
+    # Wide scales cope with images exposed twice or half as long as the map's.
     scales = ColourScales(colour=0.07) if detailed else ColourScales(gain=1.0, rounds=5)
     sizes = DETAILED_STAGES if detailed else IMAGE_STAGES
     start = states_at(hypotheses(surface, problem.start, middle, count, False, seed))
@@ -190,10 +189,10 @@ def hypotheses(
 ) -> SE3:
     """Return ``count`` poses from which a query may have been taken, on the CPU so that a seed gives the same poses on any device.
 
-    Half are keyframe poses, slightly displaced for points or where keyframes repeat. For points, the other half align the points'
-    ``middle`` with the middle of the scene, which suits cameras around an object; their orientations are near those of keyframes or,
-    for a quarter of them, random. For images, the other half are keyframe poses displaced about the middle of their view, every fourth
-    one rolled. If there is a start, a quarter of all poses are the start and poses near it.
+    Half are keyframe poses, slightly displaced if ``by_points`` is true or keyframes repeat. With ``by_points``, the other half align the
+    points' ``middle`` (metres, last camera's frame) with the middle of the scene, which suits cameras around an object; their orientations
+    are near those of keyframes or, for a quarter of them, random. For images, the other half are keyframe poses displaced about ``middle``,
+    every fourth one rolled. If there is a start, a quarter of all poses are the start and poses near it.
     """
     generator, extent = Generator().manual_seed(seed), surface.extent
     keyframes = SE3.from_matrix(surface.keyframes).to("cpu", torch.float64)
@@ -247,7 +246,7 @@ def _score(points: Surface) -> Callable[[States], Float[Tensor, "h"]]:
 
 
 def compared_at(points: Surface) -> Surface:
-    """Return the term at the fixed scale used to compare poses."""
+    """Return the points' term at the fixed scale at which poses are compared."""
     return replace(points, noise=ON_SURFACE / 2 * points.surface.extent, colour_weight=1.0)
 
 
@@ -262,7 +261,7 @@ def _exposed(points: Surface, best: States, middle: Float[Tensor, "3"]) -> tuple
 
 
 def _evidence(points: Surface, best: States, margin: float) -> dict[str, float | None]:
-    """Measure how well the points, seen from one pose, fit the surface, as in ``Support``; each point counts with its inlier weight.
+    """Return the measures of ``Support`` for the points at one pose; each point counts with its inlier weight.
 
     Points without a colour are left out of the colour inliers, unless no point has a colour.
     """
@@ -274,7 +273,7 @@ def _evidence(points: Surface, best: States, margin: float) -> dict[str, float |
     ends, origin = T.apply(some), T.apply(points.origins[:SIGHT_LINES])
     length = (ends - origin).norm(dim=-1).float()
     met = trace(surface, origin.float(), ((ends - origin).float() / length.clamp(min=1e-9)[:, None]))
-    # Well before the point, as grazing rays hit coarse cells early.
+    # Only hits well before the point count, because grazing rays hit coarse cells early.
     slack = max(2 * ON_SURFACE * surface.extent, 4 * surface.cell)
     violations = float((met < length - slack).double().mean())
     fractions = {"on_surface": float(near.mean()), "colour_inliers": float(both.mean())}
@@ -319,7 +318,7 @@ class Occluder:
     """The nearest large segment of a depth image, and the problem without its pixels."""
 
     rest: Problem
-    share: float  # its fraction of the measured pixels
+    share: float  # fraction of the measured pixels that it covers
     points: Float[Tensor, "n 3"]  # some of its points, in the camera's frame, metres
 
     @torch.no_grad()
@@ -334,7 +333,9 @@ class Occluder:
 
 
 def nearest_piece(problem: Problem) -> Occluder | None:
-    """Return the segment of a single depth image that may be an occluder: the nearest large one.
+    """Return the nearest large segment of a single depth image as a possible occluder.
+
+    Returns None if there is no such segment or hardly any depth outside it, or if there are several images or another depth sensor.
 
     Returns None if there is no such segment, if nothing else was measured, or if there are several images or another depth sensor.
     """

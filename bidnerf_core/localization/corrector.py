@@ -25,7 +25,7 @@ class Corrector:
     """
 
     def __init__(self, localizer: Localizer) -> None:
-        """Start the thread."""
+        """Start the thread, which localizes frames with ``localizer``."""
         self.T_world_odom: SE3 | None = None  # the correction from the last accepted answer
         self.found: Localization | None = None  # the last answer, accepted or not
         self._localizer, self._errors = localizer, deque[BaseException](maxlen=1)

@@ -1,7 +1,7 @@
 """Hypotheses about a query's camera and the camera's motion, each with a prior probability.
 
-An explanation is a Gaussian prior on the nuisances of ``states``; a proposal is a pose from which all explanations are refined. Other places,
-and other images such as the mirror image, are modes of the ``loop``, each with all explanations.
+An explanation is a Gaussian prior on the nuisances of ``states``; a proposal is a pose from which all explanations are refined. Other
+places and the mirror image are modes in ``loop``, each with all explanations.
 """
 
 from __future__ import annotations
@@ -21,33 +21,34 @@ from bidnerf_core.mapping import LandmarkMap, N, States
 # fmt: off
 STATED = (
     # log focal, centre (u and v), k1, log aspect, skew, probability, whether a pose under it counts as right
-    ("exact", 0.0005, 0.0005, 0.0005, 0.0005, 0.0005, 0.0, 0.40, True),  # of this very camera, as for the map's own images
+    ("exact", 0.0005, 0.0005, 0.0005, 0.0005, 0.0005, 0.0, 0.40, True),  # calibration of this very camera, as for the map's own images
     ("right", 0.005, 0.005, 0.005, 0.005, 0.001, 0.0, 0.25, True),  # well calibrated
-    ("inexact", 0.01, 0.01, 0.01, 0.01, 0.001, 0.0, 0.27, True),  # of another unit of the model, or at another focus
+    ("inexact", 0.01, 0.01, 0.01, 0.01, 0.001, 0.0, 0.27, True),  # calibration of another unit of the model, or at another focus
     ("wrong", 0.1, 0.02, 0.02, 0.05, 0.001, 0.0, 0.05, True),
     ("cropped", 0.01, 0.1, 0.1, 0.01, 0.001, 0.0, 0.02, True),
     ("bent", 0.01, 0.01, 0.01, 0.3, 0.001, 0.0, 0.01, True),  # the lens was not stated
     ("resized", 0.3, 0.15, 0.15, 0.05, 0.001, 0.0, 0.003, False),
     ("unlike", 0.3, 0.3, 0.3, 0.1, 0.1, 0.1, 0.001, False),  # a photo of a picture, a stretched or a sheared image
 )
-"""What may be true of a stated camera: standard deviations of its corrections (see ``NUISANCES``), and prior probabilities.
+"""Hypotheses about a stated camera: standard deviations of its corrections (see ``NUISANCES``), and prior probabilities.
 
-The more an explanation frees, the rarer it is, and a pose is not trusted if only a camera that explains any warp of the image fits.
+The more freedom an explanation gives the camera, the lower its prior. A pose is not trusted if only a camera that can explain almost any
+warp of the image fits.
 """
 APPROXIMATE = (
     ("nominal", 0.2, 0.01, 0.01, 0.03, 0.001, 0.0, 0.96, True),
     ("cropped", 0.2, 0.1, 0.1, 0.03, 0.001, 0.0, 0.03, True),
     ("unlike", 0.3, 0.3, 0.3, 0.1, 0.1, 0.1, 0.01, False),
 )
-"""What may be true of a camera whose focal length is stated to be approximate, in the columns of ``STATED``."""
+"""Hypotheses about a camera whose focal length is stated to be approximate, in the columns of ``STATED``."""
 # fmt: on
 OF_MAP = (
     ("map", 0.0005, 0.0005, 0.0005, 0.0005, 0.0005, 0.0, 0.6),
     ("map, about", 0.005, 0.005, 0.005, 0.005, 0.001, 0.0, 0.4),
 )
-"""Standard deviations about the camera of the map's images, as in ``STATED``, with shares of its odds."""
+"""Hypotheses that the camera is one of the map's: standard deviations about that camera, as in ``STATED``, and shares of its odds."""
 NEARLY = (0.002, 0.002, 0.002, 0.002, 0.001, 0.001)
-"""Differences of two good calibrations of one camera."""
+"""Differences to be expected between two good calibrations of one camera, in the order of ``NUISANCES``."""
 CAMERAS = {
     "exact": "the given camera",
     "right": "the given camera (well calibrated)",
@@ -63,9 +64,9 @@ CAMERAS = {
 }
 """Descriptions of the explanations of the camera."""
 USUAL = ("exact", "right", "inexact", "nominal", "map", "map, about")
-"""Explanations by which the stated camera or one of the map's is at least approximately right."""
+"""Names of the explanations under which the stated camera, or one of the map's, is at least approximately right."""
 MOVING = " moving"
-"""Ending of the names of explanations in motion."""
+"""Suffix of the names of explanations with a moving camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +76,12 @@ class Proposal:
     name: str
     T: SE3  # T_world_rig
     camera: Float[Tensor, "6"]
-    distance: float  # metres: of the scene
+    distance: float  # metres, to the scene
 
 
 @dataclass(frozen=True, eq=False)
 class Explanations:
-    """Gaussian priors on the nuisances."""
+    """The explanations (k) of a query, as Gaussian priors on the nuisances."""
 
     names: tuple[str, ...]
     mean: Float[Tensor, "k N"]
@@ -104,7 +105,7 @@ class Explanations:
     def first(self, proposal: Proposal, mode: int, noise: float) -> States:
         """Return the initial states of the search: one for each kind of camera, and one with the stated camera in motion.
 
-        If the focal length or the principal point changes, the camera is moved along its axis and turned to see about the same view.
+        If the focal length or the principal point changes, the camera is moved along its axis and turned to keep about the same view.
         """
         # These three are not tried by themselves at first, since they are similar to others.
         kinds = [
@@ -144,10 +145,10 @@ def explanations(
 ) -> Explanations:
     """Return all explanations of the images.
 
-    ``distance`` (metres) is the distance of the scene, for the prior on motion; ``depth_scale`` is the relative deviation of measured
-    depth. Images from different cameras are explained only by their stated intrinsics.
+    ``distance`` (metres) is the distance of the scene, for the prior on motion; ``depth_scale`` is the relative standard deviation of the
+    scale of measured depth. Images from different cameras are explained only by their stated intrinsics.
     """
-    # Of each: its name, the mean corrections of the camera and their deviations, its probability, and whether it is credible.
+    # For each explanation: its name, the mean corrections of the camera and their deviations, its probability, and whether it is credible.
     rows = list[tuple[str, list[float], list[float], float, bool]]()
     if query.has_one_camera:
         known = cameras_of_map(query, landmarks)
@@ -182,7 +183,7 @@ def explanations(
     mean, deviation, prior = (
         torch.tensor(values, dtype=torch.float64) for values in (means, deviations, shares)
     )
-    # Landmarks of this map suggest corrections of right intrinsics, too; see ``calibration_scatter``.
+    # Landmarks of this map suggest corrections even of right intrinsics; see ``calibration_scatter``.
     if query.has_one_camera:
         deviation[:, :4] = torch.hypot(deviation[:, :4], landmarks.calibration_scatter.double())
     return Explanations(names, mean, deviation, prior.log(), torch.tensor(right))
@@ -191,7 +192,8 @@ def explanations(
 def motion_prior(landmarks: LandmarkMap, distance: float) -> tuple[float, list[float]]:
     """Return the prior probability that the camera moved during the readout, and the standard deviations of that motion.
 
-    The motion is from the first row to the last, and relative to the ``distance`` (metres) of the scene.
+    The standard deviations are those of a motion from the first row to the last: three of translation (metres), proportional to the
+    ``distance`` (metres) of the scene, and three of rotation (radians).
     """
     return max(1 / 30, 0.8 * landmarks.moving), [0.005 * distance] * 3 + [0.01] * 3
 
