@@ -101,7 +101,7 @@ def localize_by_depth(
     T = best.T[0].normalized()
     evidence |= support(lambda T: finest.costs(states_at(T)), T, middle)
     covariance, precision = _covariance(problem, refined, best, middle)
-    # If the stated camera is right, landmarks should confirm the pose; if they do not, the alignment must be as precise as with it.
+    # With the right camera, landmarks should confirm the pose; where they do not, only a precise alignment is accepted.
     found_by = Support(evidence | {"precision": None if problem.matcher is None else precision})
     verdict = found_by.verdict(
         f"{evidence['colour_inliers']:.0%} of the measured points match the surface in position and colour"

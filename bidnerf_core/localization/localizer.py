@@ -44,9 +44,9 @@ from bidnerf_core.progress import counter, current_job, job_context
 
 NO_DISTANCES = "the map's photos are from one place and show no distances"
 LOADERS: list[Callable[[Path], SceneMap]] = []
-"""How the map in a folder is loaded. The package of stored maps, which builds on this one, adds its function."""
+"""Functions that load the map in a folder. The package of stored maps, which builds on this one, registers its function here."""
 Start = SE3 | Float[Tensor, "4 4"] | np.ndarray | Sequence[Sequence[float]]
-"""A pose T_world_camera: an ``SE3``, or any 4x4 matrix, by rows."""
+"""A pose T_world_camera: an ``SE3``, or a 4x4 matrix as a tensor, an array or rows of numbers."""
 
 
 class Localizer:
@@ -93,7 +93,7 @@ class Localizer:
             self._warm_up()
 
     def __repr__(self) -> str:
-        """A one-line description of the map and the method."""
+        """Return a one-line description of the map and the method."""
         return f"<Localizer in {self.scene!r} by {self.method}>"
 
     def __call__(
@@ -152,7 +152,7 @@ class Localizer:
         total, count = length_hint(queries), counter("localizing", "images")
 
         def begin() -> None:
-            set_threads_here(1)  # the other cores are better used for other queries than for parts of one
+            set_threads_here(1)  # the other cores are better spent on other queries than on parts of this one
             if device.type == "cuda":
                 torch.cuda.set_stream(torch.cuda.Stream(device))
 
@@ -164,7 +164,7 @@ class Localizer:
                     return error
 
         if device.type == "cuda":
-            # Streams do not wait for what was queued on another, such as what a first use of the field prepares.
+            # A stream does not wait for work queued on another one, such as preparations at the first use of the field.
             self._warm_up()
             wait_for(device)
         with ThreadPoolExecutor(workers, "bidnerf-localizer", begin) as pool:
@@ -198,7 +198,10 @@ class Localizer:
         return rig(self.scene, views, T_world_camera, depth_rays, self.matcher)
 
     def solved(self, problem: Problem, seed: int = 0) -> Localization:
-        """Solve a ``problem`` created by this localizer."""
+        """Solve a ``problem`` created by this localizer; the pose is in the map's own coordinates.
+
+        Raises ``InputError`` if the seed is unsuitable, or if the method does not return a ``Localization``.
+        """
         # On a CPU, operators are so short that sharing each of them among threads takes longer, and far longer on a busy machine.
         # Four threads suffice for the host of a GPU, which has little to compute.
         with threads_at_most(1 if problem.device.type == "cpu" else 4):
@@ -333,7 +336,7 @@ def shown_in(scene: SceneMap, frame: Frame) -> Callable[[Localization], str]:
 
 
 def picture_at(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
-    """Return the image of a map from a camera (colours in [0, 1], on the CPU): the field or, without a field, the landmarks as dots.
+    """Return the map as seen by a camera (colours in [0, 1], on the CPU): the rendered field or, without a field, the landmarks as dots.
 
     The pose is in the map's own coordinates.
     """

@@ -1,8 +1,8 @@
 """The loop: propose a pose, refine it under all explanations, fuse all measurements, and accept the pose or try the next one.
 
-``docs/methods.md#code`` says which module does which step. A further measurement becomes a term in ``Loop._fused``; it decides between
-places only through the log odds in ``Loop._posterior``. Anything else that the image may be, such as a mirror image of the scene,
-becomes a mode in ``Loop._other_modes``, and its outcome is chosen in ``Loop._judged``. The minimal solvers are called in
+``docs/methods.md#code`` lists which module does which step. A further kind of measurement becomes a term in ``Loop._fused``; it affects the
+choice between places only through the log odds in ``Loop._posterior``. Anything else that the image may be, such as a mirror image of the
+scene, becomes a mode in ``Loop._other_modes``, and its outcome is chosen in ``Loop._judged``. The minimal solvers are called in
 ``propose.consensus``.
 """
 
@@ -65,11 +65,11 @@ from bidnerf_core.mapping import (
 MIRROR = "mirror image"
 """Name of the mode of an image whose mirror image fits."""
 DEPTH_WIDTH = 2.0
-"""Ratio of the prior's deviation of the depth scale to that of the sensor's model, since some sensors are off by far more."""
+"""Ratio of the prior standard deviation of the depth scale to that of the sensor's model, since some sensors are off by far more."""
 RADII = (3.0, 1.5)
 """Radii of the rounds of matching by projection, in units of the inlier threshold."""
 HEAVY_TAILS = 1.7
-"""Factor of the covariance by which the ellipsoid of a Gaussian's 95 % holds 95 % of the poses: errors have heavier tails."""
+"""Factor on the covariance that makes a Gaussian's 95 % ellipsoid hold 95 % of the poses, since errors have heavier tails."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ class Mode:
     name: str
     query: QueryKeypoints
     matches: Matches
-    by_descriptors: Matches  # alone
+    by_descriptors: Matches  # found by descriptors alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +92,8 @@ class LandmarkAnswer:
     landmarks: Landmarks
     covariance: Float[
         Tensor, "6 6"
-    ]  # of the right update, translation first; that of the map's own poses included
-    distance: float  # median distance of the matched landmarks
+    ]  # of a right update, translation (metres) first; includes that of the map's own poses
+    distance: float  # metres: median distance of the matched landmarks
     evidence: Evidence
     verdict: Verdict
     contradicted: bool  # whether hardly more landmarks match than by chance, although many should
@@ -146,7 +146,7 @@ class Loop:
 
     @torch.no_grad()
     def __call__(self) -> LandmarkAnswer | None:
-        """Return the best answer; None if no pose agrees with any landmarks."""
+        """Return the best answer; None if no pose agrees with enough landmarks."""
         answer: LandmarkAnswer | None = None
         for proposal, nearest, nfa in self._proposals():
             found = self.answer(proposal, nearest, nfa)
@@ -158,7 +158,7 @@ class Loop:
 
     @torch.no_grad()
     def at(self, T_world_rig: SE3) -> LandmarkAnswer | None:
-        """Return the answer at a pose found by other means; None if no landmarks match there."""
+        """Return the answer at a pose found by other means; None if too few landmarks match there."""
         distance = self._distance(T_world_rig)
         proposal = Proposal("elsewhere", T_world_rig, torch.zeros(6, dtype=torch.float64), distance)
         return self.answer(proposal, self.nearest(STRONGEST), 0.0, searched=False)
@@ -166,7 +166,7 @@ class Loop:
     def answer(
         self, proposal: Proposal, nearest: Nearest, nfa: float, searched: bool = True
     ) -> LandmarkAnswer | None:
-        """Refine a proposal under all explanations of the images, fuse all measurements, and judge the result."""
+        """Refine a proposal under all explanations of the images, fuse all measurements, and judge the pose; None if few matches agree."""
         scale = 0.0 if self.problem is None else DEPTH_WIDTH * self.problem.sensor.scale
         given = explanations(self.query, self.landmarks, proposal.distance, scale, self.moving)
         modes, states = self._modes(nearest, proposal, given, nfa, searched)
@@ -318,9 +318,9 @@ class Loop:
     ) -> Iterator[tuple[str, QueryKeypoints, Matches, Proposal]]:
         """Yield the hypotheses that compete with the place of the state ``best``.
 
-        A scene may be repetitive, such as two rooms with the same furniture: keypoints that agree with the state may agree as well
-        with similar landmarks elsewhere. The image may also be mirrored. No hypotheses are tried unless a first pose, be it a wrong
-        one, agrees with at least ``LEAST_AGREEING`` matches of the image as it is.
+        A scene may be repetitive, such as two rooms with the same furniture: keypoints that agree with the state may agree as well with
+        similar landmarks elsewhere. The image may also be mirrored. No hypotheses are tried unless a first pose, even a wrong one, agrees
+        with at least ``LEAST_AGREEING`` matches of the image as it is.
         """
         query = self.query
         modes: list[tuple[str, QueryKeypoints, Matches]] = []
@@ -369,7 +369,7 @@ class Loop:
             # If less than a tenth of the points lies on the surface, depth is in another unit or of another scene, and is left
             # out. No pose on record with fewer was right, nor would any have been accepted without depth.
             points = replace(points, noise=noise) if float(near) >= 0.1 else None
-        # Only landmarks are matched at another place and in a mirror image.
+        # At another place, or in a mirror image, only landmarks are used.
         if points is not None and found.mode == 0:
             terms.append(points)
             fused.append("depth")
@@ -377,10 +377,10 @@ class Loop:
             best, minima = run_on(self.device, fit, best, terms, given, 5)
             found = self._posterior(minima, landmarks)
         before = found  # rays about one camera's pose must not decide between cameras
-        # Rays add to landmarks if the projection of the scene that these determine is uncertain by more than 0.6 pixels.
+        # Rays are worth rendering if landmarks alone leave the projection of the scene uncertain by more than 0.6 pixels.
         position = float(found.mixture()[:3, :3].trace().sqrt().nan_to_num(math.inf))
         blurred = float(landmarks.focal.max()) * position / landmarks.distance(found.chosen) > 0.6
-        # Rays move a pose too little to make enough matches agree that was found by chance.
+        # Rays move a pose that was found by chance too little to make enough matches agree.
         by_chance = searched and self._log10_nfa(modes[0], found.chosen) > LANDMARK_BOUNDS[0].limit
         if problem is not None and self.rays and found.mode == 0 and blurred and not by_chance:
             where = "cpu" if problem.device == self.device else None
@@ -391,7 +391,7 @@ class Loop:
             best = States.cat([found.chosen, best[1:]])
             minima, by_rays = run_on(self.device, fit_with_rays, best, terms, rays, given)
             systematic = torch.zeros_like(minima[0].hessian)
-            # The variance of the rays' gradients is ten times that by their noise: neighbouring rays share the field's errors.
+            # The variance of the rays' gradients is ten times that due to their noise: neighbouring rays share the field's errors.
             systematic[:1] = 9 * by_rays.hessian
             found = self._posterior(minima, landmarks, systematic)
         if points is not None:

@@ -146,15 +146,15 @@ STRONGEST = 700
 AMBIGUITY = 0.9
 """Largest ratio of the descriptor distances of the best and the second-best landmark (Lowe 2004)."""
 OCTAVES, OBLIQUE = 1.0, math.radians(40)
-"""For matches by projection: limits of the differences in size and direction."""
+"""Limits of the differences in size (octaves) and in viewing direction (radians) for matches by projection."""
 
 
 class LandmarkMatcher:
     """Finds the landmarks whose descriptors are nearest to given keypoint descriptors.
 
-    Above some thousand landmarks, it uses an inverted file: k-means divides the landmarks into sqrt(n) cells (more in large
-    maps), and only the cells nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). Threads may share
-    a matcher. The matcher also computes ``LandmarkMap.cells`` for matching by projection.
+    Above a few thousand landmarks, it uses an inverted file: k-means divides the landmarks into sqrt(n) cells (more in large maps), and
+    only the cells nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). Threads may share a matcher. The
+    matcher also computes ``LandmarkMap.cells`` for matching by projection.
 
     Descriptors are compared on the device of the descriptors of ``landmarks``; all other computations with landmarks run on the CPU. On an
     accelerator the search is always exhaustive.
@@ -198,7 +198,8 @@ class LandmarkMatcher:
     ) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
         """Return the squared distances and the indices of the ``count`` nearest landmarks, nearest first.
 
-        If there are fewer landmarks, the remaining distances are infinite and the indices 0. Both are on the CPU.
+        With fewer landmarks, missing distances are infinite and missing indices 0. Both results are on the CPU. Raises ``InputError`` if
+        the number of channels differs from that of the map's descriptors.
         """
         channels = self._descriptors.shape[1]
         if descriptors.shape[1] != channels:
@@ -402,7 +403,7 @@ class Projected:
             self._parts.append((own, index, image.focal, expected, tree))
 
     def matches(self, radius: float, shift: float = 0.0) -> Matches:
-        """Return the matches within ``radius`` pixels; with keypoints displaced by ``shift``, all matches are due to chance."""
+        """Return the matches within ``radius`` pixels; if keypoints are displaced by ``shift`` (pixels), all matches are due to chance."""
         query, landmarks = self.query, self.landmarks
         pairs = []
         for own, index, focal, expected, tree in self._parts:
@@ -430,7 +431,7 @@ class Projected:
         second = second.scatter_reduce_(0, keypoint[~is_best], distance[~is_best], "amin")
         good = is_best & (distance <= most) & (distance <= AMBIGUITY**2 * second[keypoint])
         keypoint, landmark, distance = keypoint[good], landmark[good], distance[good]
-        # A landmark is seen once by each view.
+        # Each view observes a landmark at most once.
         key = query.view[keypoint] * len(landmarks) + landmark
         least = torch.full((len(query.images) * len(landmarks),), torch.inf).scatter_reduce_(
             0, key, distance, "amin"

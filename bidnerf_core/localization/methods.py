@@ -1,10 +1,10 @@
-"""``Method``, with which plugins register their own localization methods; the methods by name; and those that need a start.
+"""``Method``, with which plugins register their own localization methods; the registry of methods; and the methods that need a start.
 
-The first-order methods are Adam on the loss of sampled rays: ``bid`` uses colour and depth of one or several images at the coarse level
-(BID-NeRF, Alg. 1), and ``inerf`` the colours of one image in full detail (Yen-Chen et al. 2021, iNeRF), that is, of the field itself,
-which a NeRF renders hierarchically with its coarse and fine networks. iNeRF optimizes the magnitude and axis of one screw motion
-from the start; here, each step is a separate update in the same frame, the world's. The two differ to second order, and updates have
-no axis that is undefined at magnitude 0.
+The first-order methods apply Adam to the loss of sampled rays. ``bid`` uses colour and depth of one or several images at the coarse level
+(BID-NeRF, Alg. 1). ``inerf`` uses the colours of one image in full detail (Yen-Chen et al. 2021, iNeRF): those of the field itself, which a
+NeRF renders hierarchically with its coarse and fine networks. iNeRF optimizes the magnitude and axis of one screw motion from the start;
+here, each step is a separate update in the same frame, the world's. The two differ only to second order, and such an update has no axis
+that is undefined at magnitude 0.
 
 The second-order methods run successive halving on poses around the start, from coarse to fine: ``bid-lm`` on colour and depth,
 ``inerf-lm`` on colour.
@@ -62,7 +62,7 @@ from bidnerf_core.registry import PluginError, Plugins, interface_defects
 from bidnerf_core.settings import Range, Settings, from_flat
 
 RAYS = 1024
-"""Number of rays on which the pose that a first-order method found is judged."""
+"""Number of rays by which the pose that a first-order method found is judged."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def _defects(method: Any) -> Iterator[str]:
 
 
 METHODS: Plugins[Method] = Plugins("methods", _defects, first=("auto", "bid", "inerf", "bid-lm", "inerf-lm"))
-"""The methods by name."""
+"""The localization methods by name, those of plugins included."""
 
 
 def find_method(name: str) -> Method:
@@ -124,7 +124,7 @@ def require_use_of_depth(method: str) -> None:
 
 
 def require_start(method: str, given: bool) -> None:
-    """Raise ``InputError`` for a method that needs a start if none is given."""
+    """Raise ``InputError`` if a method needs a start and none is ``given``."""
     if find_method(method).needs_start and not given:
         others = _names_of(lambda other: not other.needs_start)
         raise InputError(f"method {method!r} needs a start; give one by --start, or use method {others}")
@@ -179,12 +179,12 @@ class InerfConfig(Settings):
 
 
 def bid(problem: Problem, config: BidConfig, seed: int = 0) -> Localization:
-    """Descend from ``problem.start``; pixels are drawn from ``seed``."""
+    """Refine ``problem.start`` with Adam on colour and depth; pixels are drawn with ``seed``. Raises ``InputError`` without a start."""
     return descended(problem, config, config.depth, config.reach, seed, "bid")
 
 
 def inerf(problem: Problem, config: InerfConfig, seed: int = 0) -> Localization:
-    """Descend from ``problem.start`` on colour alone. Raises ``InputError`` for more than one image."""
+    """Refine ``problem.start`` with Adam on colour alone. Raises ``InputError`` for more than one image, or without a start."""
     if len(problem.views) > 1:
         raise InputError(f"method inerf takes one image, got {len(problem.views)}; method bid takes several")
     return descended(problem, config, None, ReachSettings(), seed, "inerf")
@@ -195,7 +195,7 @@ def descended(
 ) -> Localization:  # fmt: skip
     """Descend with Adam from ``problem.start`` (Alg. 1), then accept or reject the pose.
 
-    Low-contrast images have a small loss even at a wrong pose, so other rays must also support the pose.
+    Low-contrast images have a small loss even at a wrong pose, so newly drawn rays must also support the pose.
     """
     began, start, device = time.perf_counter(), problem.start_for(method), problem.device
     if depth is not None and depth.depth_scale is None:
@@ -278,14 +278,14 @@ class InerfLmConfig(Settings):
 
 
 def bid_lm(problem: Problem, config: BidLmConfig, seed: int = 0) -> Localization:
-    """Refine poses around ``problem.start``; poses and pixels are drawn from ``seed``."""
+    """Refine poses around ``problem.start`` on colour and depth, drawn with ``seed``. Raises ``InputError`` without a start."""
     return _halved(problem, config, config.depth, (0.1, 0.12), seed, "bid-lm")
 
 
 def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localization:
-    """Refine poses around ``problem.start``; poses and pixels are drawn from ``seed``.
+    """Refine poses around ``problem.start`` on colour alone; poses and pixels are drawn with ``seed``.
 
-    The method needs only the field; it uses neither measured depth nor a baked surface.
+    The method needs only the field; it uses neither measured depth nor a baked surface. Raises ``InputError`` if there is no start.
     """
     return _halved(problem.without_depth(), config, None, (0.04, 0.25), seed, "inerf-lm")
 
@@ -293,7 +293,7 @@ def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localiza
 def _halved(
     problem: Problem, config: BidLmConfig | InerfLmConfig, depth: DepthLossSettings | None, spread: tuple[float, float], seed: int, method: str
 ) -> Localization:  # fmt: skip
-    """Refine poses around the start; ``spread`` holds their standard deviations: relative to the distance of the scene, and radians.
+    """Refine poses around the start; ``spread``: their deviations, as a fraction of the distance of the scene, and in radians.
 
     Colours alone have a narrow basin of convergence, so images without depth are first compared with small renderings.
     """

@@ -1,6 +1,6 @@
 """The posterior over the explanations of one query: probabilities by Laplace's approximation, and the pose as a mixture.
 
-Beside it are the steps of the loop that depend on tensors alone, each of which a GPU replays as one graph.
+The module also holds the steps of the loop that depend on tensors alone; a GPU replays each of them as one graph.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from bidnerf_core.mapping import (
 )
 
 TOLERANCE = 0.03
-"""Within which the position must be, relative to the distance of the scene."""
+"""Largest position error of a right pose, relative to the distance of the scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Posterior:
     states: States
     normal: Normal
     probability: Float[Tensor, "h"]
-    covariance: Float[Tensor, "h 6 6"]  # of the pose under each
+    covariance: Float[Tensor, "h 6 6"]  # of the pose under each explanation
     update: Float[Tensor, "h 6"]  # from the pose of the most probable explanation
     best: int
 
@@ -61,8 +61,9 @@ class Posterior:
     ) -> Posterior:
         """Compare explanations within a mode by their cost, and modes by the evidence of landmarks and their prior ``log_odds``.
 
-        ``terms`` are the quadratic models of all terms, with minima ``states`` and ``normal``. ``systematic`` is the scatter of their
-        gradient (in its units) beyond the scatter due to independent errors. Most of the computation runs on ``device``.
+        ``terms`` are the quadratic models of all terms, and ``states`` and ``normal`` their minima under each explanation. ``systematic``
+        is the scatter of the models' gradients (in the units of ``terms``) beyond that of independent errors. Most of the computation runs
+        on ``device``.
         """
         by_mode, information = run_on(device, _information, states, normal, terms, landmarks, systematic)
         log = log_evidence(states, normal)
@@ -89,13 +90,13 @@ class Posterior:
 
     @property
     def _own(self) -> Float[Tensor, "h"]:
-        """Probabilities given the most probable mode."""
+        """The probabilities of the explanations, given the most probable mode; 0 for those of other modes."""
         own = self.probability * (self.states.mode == self.mode)
         return own / own.sum()
 
     @property
     def mean(self) -> Float[Tensor, "6"]:
-        """The update to the mean pose of the most probable mode."""
+        """The right update (metres, then radians) from the pose of the best explanation to the mean pose of the most probable mode."""
         return (self._own[:, None] * self.update).sum(0)
 
     def pose(self) -> SE3:
@@ -107,14 +108,14 @@ class Posterior:
         return self.states.T[int(own.argmax())]
 
     def camera_of(self, row: int) -> tuple[Float[Tensor, "6"], Float[Tensor, "6"]]:
-        """Return the correction of the stated camera under an explanation of the best mode, and its standard deviations."""
+        """Return the correction of the stated camera under an explanation of the best mode, and its standard deviations (six each)."""
         index = int(((self.states.mode == self.mode) & (self.states.row == row)).nonzero()[0, 0])
         deviation = self.states.deviation[index, CAMERA]
         variance = torch.linalg.inv_ex(self.normal.hessian[index]).inverse.diagonal()[6:][CAMERA]
         return self.states.nuisances[index, CAMERA], deviation * variance.clamp(min=0).sqrt()
 
     def mixture(self) -> Float[Tensor, "6 6"]:
-        """Return the covariance of the pose over the most probable mode."""
+        """Return the covariance of the pose (metres, then radians) over all explanations of the most probable mode."""
         off = self.update - self.mean
         spread = self.covariance + off[:, :, None] * off[:, None]
         own = self._own
@@ -132,7 +133,7 @@ class Posterior:
 def mass_within(
     weight: Float[Tensor, "h"], off: Float[Tensor, "h 6"], covariance: Float[Tensor, "h 6 6"], distance: float
 ) -> float:
-    """Return the probability mass of a Gaussian mixture of updates within ``TOLERANCE`` of the ``distance`` (metres) and 0.05 rad."""
+    """Return the mass of a Gaussian mixture of updates within 0.05 rad and, in translation, ``TOLERANCE`` of ``distance`` (metres)."""
     sane = covariance.isfinite().all(-1).all(-1)
     factor, info = torch.linalg.cholesky_ex(
         torch.where(sane[:, None, None], covariance, torch.eye(6, dtype=covariance.dtype))
@@ -182,12 +183,12 @@ def _robust_covariance(
 ) -> Float[Tensor, "h P P"]:
     """Return the covariance of the unknowns, treating landmarks as an M-estimator and all other terms as a Gaussian likelihood.
 
-    With the Cholesky ``factor`` of the Hessian in ``unit``, its curvature is ``factor curvature factor^T``; the covariance is infinite
-    where the factor is not ``sound``.
+    In the scaling by ``unit``, the Hessian has the Cholesky ``factor``, and the cost has the curvature ``factor curvature factor^T``. The
+    covariance is infinite where ``sound`` is false.
     """
     values, vectors = torch.linalg.eigh(curvature)
-    # With few matches the curvature may be indefinite; well-behaved residuals keep it near the Hessian. It counts as at least a
-    # fifth of the reweighted one.
+    # With few matches the curvature may be indefinite; well-behaved residuals keep it near the Hessian. The curvature counts as
+    # at least a fifth of the reweighted Hessian.
     basis = torch.linalg.solve_triangular(factor.mT, vectors, upper=True) / values.clamp(min=0.2)[:, None]
     bread = basis @ torch.linalg.solve_triangular(factor.mT, vectors, upper=True).mT
     found = unit[..., None] * (bread @ scatter @ bread.mT) * unit[..., None, :]
@@ -265,7 +266,7 @@ def linearize(best: States, terms: Sequence[CostTerm], given: Explanations) -> Q
 
 
 def settle(best: States, term: Landmarks, given: Explanations) -> tuple[States, Minima, States]:
-    """Return the results of ``fit``, and then the most probable state of each mode."""
+    """Fit the landmarks with newly estimated noise; return the results of ``fit``, and then the most probable state of each mode."""
     best, (quadratic, states, normal) = fit(term.with_noise(best), [term], given, 4)
     member = states.mode[None] == best.mode[:, None]
     log = torch.where(member, log_evidence(states, normal)[None], -torch.inf)
@@ -294,6 +295,6 @@ def agreement(points: Surface, state: States) -> tuple[Tensor, Tensor]:
 
 
 def fit_noise(points: Surface, state: States) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the noise of the points at a state, and the points' agreement with that state."""
+    """Return the noise (metres) of the points at a state, and the fractions that ``agreement`` returns at that noise."""
     fitted = points.fitted_noise(state)
     return torch.as_tensor(fitted.noise), *agreement(fitted, state)

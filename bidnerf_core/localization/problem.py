@@ -103,7 +103,7 @@ class Problem:
     start: SE3 | None  # guess at T_world_K; None if there is none
     depth_rays: Observations | None  # from a lidar or similar, in the frame of the last camera
     surface: SurfaceMap | None  # baked from the field
-    # Of the map's landmarks, with a cache of the images' keypoints, see ``for_query``
+    # Matcher of the map's landmarks, with a cache of the images' keypoints, see ``for_query``
     matcher: LandmarkMatcher | None
     # Root mean square difference between the field's colours and its training images; None if unknown.
     colour_noise: float | None
@@ -156,7 +156,7 @@ class Problem:
 
 
 def landmark_cameras(scene: SceneMap) -> tuple[Intrinsics, ...]:
-    """Return the cameras of the images from which the landmarks of a map were built; photos without a focal length may share them."""
+    """Return the cameras of the images from which a map's landmarks were built; photos without a focal length may be from them as well."""
     return () if scene.landmarks is None else scene.landmarks.cameras
 
 
@@ -169,7 +169,7 @@ def rig(
 ) -> Problem:
     """Return the problem of localizing ``views`` with known poses in any common frame.
 
-    ``start`` and ``depth_rays`` belong to the last view.
+    ``start`` and ``depth_rays`` belong to the last view. Raises ``InputError`` if there are no views, or if a pose is not rigid.
     """
     if not views:
         raise InputError("nothing to localize:", expected="at least one view")
@@ -190,7 +190,8 @@ def rig(
 def window(sequence: Sequence[_Item], last: int, size: int, stride: int = 1) -> tuple[_Item, ...]:
     """Return ``size`` items up to item ``last``, ``stride`` apart; fewer at the beginning of the sequence.
 
-    Views in temporal order give the paper's moving window. Raises ``InputError`` if there is no such item.
+    Views in temporal order give the paper's moving window. Raises ``InputError`` if there is no item ``last``, or for a size or stride
+    below 1.
     """
     if size < 1 or stride < 1:
         raise InputError(f"the window has size {size} and stride {stride}", expected="1 or more for both")
@@ -210,7 +211,7 @@ class Pivot:
 
     @staticmethod
     def at_point(point: Float[Tensor, "3"]) -> Pivot:
-        """Return the pivot at a point given in the camera's frame, metres; on the device of the point."""
+        """Return the pivot at a point in the camera's frame (metres), on the device of the point."""
         return Pivot(SE3(torch.eye(3, dtype=torch.float64, device=point.device), point.to(torch.float64)))
 
     @property

@@ -19,13 +19,16 @@ from bidnerf_core.mapping import LandmarkMap, States, project, rays_through
 CONVINCING = -20.0
 """Log10 of the number of false alarms below which no other camera is tried."""
 LEAST_AGREEING = 6
-"""Least number of matches that agree on a pose."""
+"""Minimum number of matches that must agree on a pose."""
 
 
 def best_consensus(
     query: QueryKeypoints, landmarks: LandmarkMap, matches: Matches
 ) -> tuple[Proposal, float] | None:
-    """Return the proposal with the fewest false alarms, over the stated camera, the map's cameras and a ladder of focal lengths."""
+    """Return the proposal with the fewest false alarms, and log10 of their number; None without a consensus.
+
+    The stated camera, the map's cameras and a ladder of focal lengths are tried in turn, until a proposal is convincing.
+    """
     best = None
     for camera in cameras(query, landmarks):
         found = consensus(query, landmarks, matches, camera)
@@ -37,13 +40,16 @@ def best_consensus(
 
 
 def cameras(query: QueryKeypoints, landmarks: LandmarkMap) -> Iterator[Float[Tensor, "6"]]:
-    """Yield the cameras to try: the stated one, the map's, and others with the principal point in the middle."""
+    """Yield the cameras to try, as corrections of the stated camera (see ``NUISANCES``).
+
+    The stated camera comes first, then those of the map, then other focal lengths with the principal point in the middle.
+    """
     yield torch.zeros(6, dtype=torch.float64)
     yield from cameras_of_map(query, landmarks)
     if not query.has_one_camera:
         return
     c = query.camera
-    # Focal lengths of 0.5, 0.7, 1.4 and 2 times the stated one are tried if that gives no consensus.
+    # If no consensus is convincing so far, 0.5, 0.7, 1.4 and 2 times the stated focal length are tried.
     for log_focal in (-0.35, 0.35, -0.7, 0.7):
         middle = [log_focal, (c.width / 2 - c.cx) / c.fx, (c.height / 2 - c.cy) / c.fy]
         yield torch.tensor([*middle, 0.0, 0.0, 0.0], dtype=torch.float64)

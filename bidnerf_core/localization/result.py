@@ -1,7 +1,7 @@
 """The result of a localization, common to all methods.
 
-Beside it are the meaning of each outcome and what to try first, and the record of a search for visualization, which is kept only if one
-is requested.
+The module also holds the meaning of each outcome with what to try first, and the record of a search for visualization, which is kept only
+if one is requested.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class Localization:
     shown: Callable[[Localization], str] | None = None  # returns the picture for a notebook; not stored
 
     def _repr_html_(self) -> str:
-        """The answer in a notebook: the photo, the map rendered at the estimated pose, and a blend of both, above a line of text."""
+        """Return HTML for a notebook: the photo, the map rendered at the estimated pose, and a blend of both, above a line of text."""
         picture = "" if self.shown is None else self.shown(self)
         return f"{picture}<div>{html.escape(repr(self))}</div>"
 
@@ -107,7 +107,7 @@ class Localization:
         return self.__dict__ | {"shown": None}
 
     def __repr__(self) -> str:
-        """A one-line description, without the steps and the covariance."""
+        """Return a one-line description, without the steps and the covariance."""
         x, y, z = self.T_world_camera.translation.tolist()
         sure = "" if self.confidence is None else f", confidence {self.confidence:.3g}"
         where = f"at ({x:.4g}, {y:.4g}, {z:.4g}) {symbol(self.unit)}"
@@ -126,7 +126,7 @@ class Localization:
         )  # fmt: skip
 
     def covariance_in(self, convention: CovarianceConvention) -> Float[Tensor, "6 6"] | None:
-        """Return the covariance in another convention, see ``CovarianceConvention``; None if unknown.
+        """Return the covariance in another convention, see ``CovarianceConvention``; None if the covariance is unknown.
 
         Raises ``InputError`` for an unknown convention.
         """
@@ -140,17 +140,17 @@ class Localization:
         return self.outcome is Outcome.CONVERGED
 
     def translated(self, offset: Float[Tensor, "3"]) -> Localization:
-        """Return the answer in a parallel world frame in which positions have ``offset`` added."""
+        """Return the answer in a world frame with parallel axes, in which ``offset`` (same unit) is added to all positions."""
         T, poses = self.T_world_camera.translated(offset), self.poses.translated(offset)
         return replace(self, T_world_camera=T, poses=poses)
 
     def rejected(self, why: Verdict) -> Localization:
-        """Return the answer with another verdict, whose reason is put before the present reason."""
+        """Return the answer with another verdict, whose reason is prepended to the current one."""
         reason = f"{why.reason}; {self.reason}"
         return replace(self, outcome=why.outcome, reason=reason, confidence=why.confidence)
 
     def frame_as_taken(self, frame: Frame) -> Frame:
-        """Return the last image's frame with the intrinsics of the pose: the given or the corrected ones."""
+        """Return ``frame``, the last image, with the corrected intrinsics if there are any."""
         return frame if self.intrinsics is None else frame.replace(intrinsics=self.intrinsics)
 
     def plain(self) -> dict[str, Any]:
@@ -340,4 +340,4 @@ ADVICE = {
         "If the image shows another place, try that place's map; else take a sharper, brighter one from nearer to where the map's images were taken, and check its camera.",
     ),
 }
-"""Advice for each outcome but ``CONVERGED``; a test compares it with the page."""
+"""Advice for each outcome except ``CONVERGED``; a test compares it with the documentation."""

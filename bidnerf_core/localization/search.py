@@ -1,4 +1,4 @@
-"""Search without landmarks: successive halving of many poses, with finer terms as fewer poses remain, and its verdict.
+"""Search without landmarks: successive halving of many poses, with finer terms as fewer poses remain, and the verdict on the best pose.
 
 A search ends with steps on rendered rays: at first few rays at the coarsest level, in the end many rays from a single pose.
 """
@@ -34,7 +34,7 @@ from bidnerf_core.progress import check_cancelled
 SHAPE_SIGMA = 0.012
 """Uncertainty of the map's surfaces in coarse steps with depth, relative to the scene's mean side."""
 COLOUR_SIGMA = SHAPE_SIGMA / 5
-"""Uncertainty of the map's surfaces in steps by colour alone from a search, relative to the scene's mean side."""
+"""Uncertainty of the map's surfaces in steps by colour alone that follow a search, relative to the scene's mean side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +54,8 @@ class SearchResult:
     states: States  # (h), best first
     scores: Float[Tensor, "h"]
     margin: float  # score of the best different pose minus that of the best; infinite if there was none
-    rivals: States  # the best ones that differed from the best pose when there were several for the last time
-    before: States  # (1) the best one of the stage before the last
+    rivals: States  # the best poses that differ from the best one, of the last stage that had any
+    before: States  # (1) the best pose before the last stage
     path: SE3  # (s + 1): from the winning hypothesis to the best pose
     losses: Float[Tensor, "s"]  # of the path before each step; costs of different stages are not comparable
 
@@ -143,7 +143,7 @@ class RayTerms:
         self, problem: Problem, count: int, seed: int, level: int | None = None, blur: int = 1,
         wide: float = 1.0, sigma: float = 0.0,
     ) -> RenderedRays:  # fmt: skip
-        """Draw ``count`` rays and return their residual term at a level of the field (0 is the coarsest, None the field itself).
+        """Draw ``count`` rays; return their residual term at a level of the field (0 is the coarsest, None the field itself).
 
         Observed colours are averaged over squares of ``blur`` pixels. ``wide`` multiplies the scales of the losses, and ``sigma``
         is the uncertainty of the map's surfaces, relative to the scene's mean side.
@@ -189,9 +189,9 @@ def localization_by_rays(
 ) -> Localization:  # fmt: skip
     """Accept or reject the best pose of a search, using rays to which the pose was not fitted.
 
-    The best poses of the last two stages are compared on these rays, and the better pose is judged. It must agree with the rays, lie at
-    a minimum of their cost, and leave colour differences as small as in the map's own images; and the rays must distinguish the pose
-    from its rivals and from a plain image.
+    The best poses of the last two stages are compared on these rays, and the better pose is judged. It must agree with the rays, lie at a
+    minimum of their cost, and leave colour differences about as small as those in the map's own images; and the rays must distinguish the
+    pose from its rivals and from a plain image.
     """
     some = States.cat([found.before, found.states[:1]])
     best = some[fresh.costs(some).sum(-1).argmin()[None]]
@@ -200,7 +200,7 @@ def localization_by_rays(
     normal = moved(replace(here, term=rays).normal(), "cpu")
     covariance = torch.linalg.inv_ex(normal.hessian[0, :6, :6]).inverse
     determined = bool(covariance.isfinite().all()) and float(torch.linalg.eigvalsh(covariance)[0]) > 0
-    # A step of the visible scene, relative to its distance, and its turn.
+    # The step as the shift of the visible scene, relative to its distance, and the rotation (radians).
     step = -damped_solution(normal, torch.zeros_like(normal.cost))[0, :6]
     shift = SE3.exp(step).apply(middle) - middle
     measures: dict[str, float | None] = {"plain": 0.0, "confidence": 0.25}

@@ -61,7 +61,7 @@ class DepthSettings(DepthLossSettings):
 
 
 def objective_of(colour: ColourSettings, depth: DepthSettings | None) -> Objective:
-    """Return the objective of first-order steps, whose depth scale must be given (eq. 5)."""
+    """Return the objective of first-order steps (eq. 5); the depth settings must have a ``depth_scale``."""
     terms = [colour_term(Robust(colour.colour_loss, colour.colour_scale))]
     if depth is not None and max(depth.depth_weight, depth.free_space_weight, depth.opacity_weight) > 0:
         assert depth.depth_scale is not None
@@ -130,9 +130,9 @@ def mean_side(bounds: SceneBounds) -> float:
 def rendered_depth_scale(bounds: SceneBounds) -> float:
     """Return the depth error (metres) beyond which a rendered ray counts as an outlier.
 
-    A field's resolution, and hence the error of its depth, is a fraction of the field's box, and so is this threshold: 3.8 % of the
-    mean side. The resolution of a baked surface does not matter: it may come from measured depth, which is more accurate than
-    the field's renderings.
+    A field's resolution, and hence the error of its depth, is a fraction of the size of the field's box, and so is this threshold: 3.8 % of
+    the mean side. The resolution of a baked surface does not matter: it may come from measured depth, which is more accurate than the
+    field's renderings.
     """
     return 0.038 * mean_side(bounds)
 
