@@ -34,7 +34,10 @@ def grown(
 def rays_of(
     view: View, wanted: Bool[Tensor, "h w"], share: int
 ) -> tuple[Float[Tensor, "n 3"], tuple[Int[Tensor, "n"], Int[Tensor, "n"]]]:
-    """Return about ``share`` of the wanted pixels, evenly spread: points at z = 1 (camera frame), rows and columns."""
+    """Return about ``share`` (a number) of the wanted pixels, evenly spread.
+
+    The result holds their points at z = 1 (camera frame), and their rows and columns.
+    """
     rows, columns = wanted.nonzero(as_tuple=True)
     stride = max(1, len(rows) // share)
     rows, columns = rows[::stride], columns[::stride]
@@ -53,9 +56,9 @@ def has_outline(view: View) -> bool:
 def carved_box(box: AxisBox, views: Sequence[View]) -> AxisBox:
     """Return the box of the cells that no two views see through and at which many views see something.
 
-    The threshold on that number of views, as a fraction of its maximum over all cells, is the largest for which the box
-    still meets 99.9 % of the rays to pixels with matter. It removes peripheral cells, which so few views see that hardly
-    any could have emptied them. Each of three rounds carves the box that the previous round found.
+    The threshold on the number of views that see something at a cell, as a fraction of its maximum over all cells, is the largest for which
+    the box still meets 99.9 % of the rays to pixels with matter. It removes peripheral cells, which so few views see that hardly any could
+    have emptied them. Each of three rounds carves the box that the previous round found.
     """
     side = 64
     origins, directions = _rays_to_matter(views)
@@ -173,7 +176,7 @@ def _landmark_points(view: View, seen: SeenLandmarks) -> Float[Tensor, "n 3"]:
 
 
 def measured_points(view: View, share: int) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-    """Return about ``share`` of a view's measured points (metres, world) and their distances from the camera (metres)."""
+    """Return about ``share`` (a number) of a view's measured points (metres, world), and their distances from the camera (metres)."""
     depth = view.frame.depth
     if depth is None:
         return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)

@@ -33,7 +33,7 @@ AROUND = np.ones((3, 3), np.uint8)
 
 @dataclass(frozen=True, eq=False)
 class FreeSpace:
-    """The depth up to which a view is free. Level k holds the smallest such depth (planar z) within k pixels of each pixel."""
+    """The depth (planar z) up to which a view's pixels see no matter. Level k holds the least such depth within k pixels of each pixel."""
 
     intrinsics: Intrinsics  # of the shrunken image
     levels: Float[Tensor, "k h w"]  # metres; 0: unknown
@@ -45,8 +45,9 @@ class FreeSpace:
     def seen_by(view: View, tolerance: float = 0.02, footprint: int = 8) -> FreeSpace:
         """Return the free space of a view.
 
-        Its depth image is downsampled by an integer factor to at most 400 pixels a side, keeping the minimum depth of each
-        block; that suffices for coarse cells and bounds the time.
+        The depth image is downsampled by an integer factor to at most 400 pixels a side, keeping the minimum depth of each block; that
+        suffices for coarse cells and bounds the time. ``tolerance`` is the relative error of measured depth, and ``footprint`` the highest
+        level.
         """
         free, camera = _free_depth(view.frame, tolerance), view.frame.intrinsics
         height, width = free.shape
@@ -61,12 +62,12 @@ class FreeSpace:
         return FreeSpace(small, torch.from_numpy(np.stack(levels)), free.amax().item(), _edges(camera))
 
     def may_free(self, points: Float[Tensor, "3 n"], radius: float) -> Bool[Tensor, "n"]:
-        """Return whether the view sees any part of the sphere around each point (camera frame) within its free depth."""
+        """Return a mask of the spheres of ``radius`` around ``points`` (camera frame; metres) that may be partly free in this view."""
         in_sight = (self.edges @ points > -radius).all(dim=0)
         return in_sight & (points[2] > -radius) & (points[2] - radius < self.reach)
 
     def frees(self, points: Float[Tensor, "3 n"], radius: float) -> Bool[Tensor, "n"]:
-        """Return whether the whole sphere of ``radius`` metres around each point (camera frame, metres) is free."""
+        """Return a mask of the points (camera frame, metres) whose sphere of ``radius`` metres is entirely free."""
         deepest = points[2] + radius
         columns, rows, pixels = self._footprint(points, radius)
         count, height, width = self.levels.shape

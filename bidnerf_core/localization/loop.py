@@ -166,7 +166,7 @@ class Loop:
     def answer(
         self, proposal: Proposal, nearest: Nearest, nfa: float, searched: bool = True
     ) -> LandmarkAnswer | None:
-        """Refine a proposal under all explanations of the images, fuse all measurements, and judge the pose; None if few matches agree."""
+        """Refine a proposal under all explanations, fuse all measurements, and judge the pose; None if too few matches agree."""
         scale = 0.0 if self.problem is None else DEPTH_WIDTH * self.problem.sensor.scale
         given = explanations(self.query, self.landmarks, proposal.distance, scale, self.moving)
         modes, states = self._modes(nearest, proposal, given, nfa, searched)

@@ -278,7 +278,10 @@ class InerfLmConfig(Settings):
 
 
 def bid_lm(problem: Problem, config: BidLmConfig, seed: int = 0) -> Localization:
-    """Refine poses around ``problem.start`` on colour and depth, drawn with ``seed``. Raises ``InputError`` without a start."""
+    """Refine poses around ``problem.start`` on colour and depth; poses and pixels are drawn with ``seed``.
+
+    Raises ``InputError`` if there is no start.
+    """
     return _halved(problem, config, config.depth, (0.1, 0.12), seed, "bid-lm")
 
 
@@ -293,7 +296,7 @@ def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localiza
 def _halved(
     problem: Problem, config: BidLmConfig | InerfLmConfig, depth: DepthLossSettings | None, spread: tuple[float, float], seed: int, method: str
 ) -> Localization:  # fmt: skip
-    """Refine poses around the start; ``spread``: their deviations, as a fraction of the distance of the scene, and in radians.
+    """Refine poses around the start; ``spread`` holds their deviations, as a fraction of the scene's distance and in radians.
 
     Colours alone have a narrow basin of convergence, so images without depth are first compared with small renderings.
     """

@@ -133,7 +133,7 @@ class Posterior:
 def mass_within(
     weight: Float[Tensor, "h"], off: Float[Tensor, "h 6"], covariance: Float[Tensor, "h 6 6"], distance: float
 ) -> float:
-    """Return the mass of a Gaussian mixture of updates within 0.05 rad and, in translation, ``TOLERANCE`` of ``distance`` (metres)."""
+    """Return the mass of a Gaussian mixture of updates of at most 0.05 rad and at most ``TOLERANCE * distance`` (metres)."""
     sane = covariance.isfinite().all(-1).all(-1)
     factor, info = torch.linalg.cholesky_ex(
         torch.where(sane[:, None, None], covariance, torch.eye(6, dtype=covariance.dtype))

@@ -120,9 +120,10 @@ class ColourScales:
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """Mean over pixels of ``1 - 1 / (1 + c^2 / s^2)``, with the difference c between rendered and measured colour.
+    """Cost of small images: the mean over pixels of ``1 - 1 / (1 + c^2 / s^2)``, times 60.
 
-    The mean is multiplied by 60, the number of independent measurements in a small image.
+    Here, c is the difference between rendered and measured colour, s is ``ColourScales.colour``, and 60 is the number of independent
+    measurements in a small image.
 
     Colours are linearized with second-order accuracy, using the mean of both images' gradients (Benhimane and Malis 2004, "Real-time
     image-based tracking of planes using efficient second-order minimization"). Only the pose has derivatives. The cost is infinite for

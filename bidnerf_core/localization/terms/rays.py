@@ -21,7 +21,7 @@ from bidnerf_core.localization.terms.surface import sights_of
 from bidnerf_core.mapping import MOTION, Normal, Sights, States, rays_by_camera, rays_through
 
 ALONE = 10.0
-"""Largest number of independent rays without other measurements, at a pose that may be far off."""
+"""Maximum number of independent measurements that rays amount to, if there are no others and the pose may be far off."""
 OUTLIER = 3.0
 """Residual, in scales of the loss, beyond which a ray disagrees with the rendering."""
 
@@ -40,10 +40,8 @@ class RenderedRays:
     rgb: Float[Tensor, "n 3"]
     coloured: Float[Tensor, "n"]  # 1 where a colour was measured, else 0
     distance: Float[Tensor, "n"]  # metres along the ray, 0 where none was measured
-    noise: float | Float[Tensor, ""] = 0.1  # of a channel, in the information of a ray
-    independent: float = (
-        300.0  # largest number of independent measurements, as far as their own noise is concerned
-    )
+    noise: float | Float[Tensor, ""] = 0.1  # standard deviation of a channel, for the information of a ray
+    independent: float = 300.0  # maximum number of independent measurements in the rays
     # of the norm of a colour difference: wide enough for a wide basin, and narrow enough to reject occluders
     loss: Robust = Robust("geman-mcclure", 0.1)
     depth_loss: Robust | None = None  # of depth differences, metres; None: colours alone
@@ -114,7 +112,7 @@ class RenderedRays:
         return ComparedRays(self, value, value[..., None], value)
 
     def costs(self, states: States) -> Float[Tensor, "h n"]:
-        """Return each ray's robust loss, without derivatives, in units of the noise."""
+        """Return each ray's robust loss, divided by the variance of the noise, without derivatives."""
         found = self.at(moved(states, self.rgb.device), derivatives=False)
         return (self._robust(found.value)[0] / self.noise**2).to(states.z.device)
 
@@ -123,7 +121,7 @@ class RenderedRays:
         return self.at(moved(states, self.rgb.device), derivatives=False).agreement().to(states.z.device)
 
     def plain_costs(self) -> Float[Tensor, "n"] | None:
-        """Return each ray's robust loss, in units of the noise, if all rays had the single best-fitting colour.
+        """Return each ray's ``costs``, on the CPU, as if all rays had been rendered in the single colour that fits best.
 
         Returns None with depth, or without colours.
         """
@@ -155,7 +153,7 @@ class RenderedRays:
         return cost, weight
 
     def _sent(self, states: States) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return the sights on the plane z = 1, their lengths and rig-frame directions, and the rays (h n) in the world."""
+        """Return the sights on the plane z = 1, their lengths and rig-frame directions, and the rays' world origins and directions (h n)."""
         rays, sights = rays_through(states, self.sights.image), self.sights
         length = rays.norm(dim=-1, keepdim=True)
         sight, times = rays / length, sights.times[:, None]

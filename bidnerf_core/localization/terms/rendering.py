@@ -28,7 +28,7 @@ from bidnerf_core.fields import (
 LEAST_WEIGHT = 0.01
 """Rendering weight of a sample below which its derivatives are neglected: most samples lie in empty space."""
 Derivatives = tuple[Float[Tensor, "r c"], Float[Tensor, "r c 3"], Float[Tensor, "r c 3"]]
-"""Channels of r rendered rays, and their gradients by the rays' origins and by their directions."""
+"""Channels of r rendered rays, and their gradients with respect to the rays' origins and directions."""
 
 
 def channels(rendering: Rendering, measured: Float[Tensor, "r"] | None, miss: float) -> Float[Tensor, "r c"]:

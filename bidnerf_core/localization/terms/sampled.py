@@ -33,7 +33,7 @@ class SampledLoss:
     def __post_init__(self) -> None:
         problem = self.problem
         self._field, self._bounds = problem.level(self.rays.level), problem.bounds
-        # Preferring the other pixels is worth its cost only if more than 2 % have the background's colour and no measured depth.
+        # Extra candidates are worth their cost only if more than 2 % of pixels have the background's colour and no depth.
         self._candidates = 1
         for frame in (view.frame for view in problem.views) if self.reach.candidates > 1 else ():
             background = constant(problem.bounds.background, frame.rgb)

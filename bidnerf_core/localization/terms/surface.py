@@ -56,7 +56,7 @@ class Surface:
     surface: SurfaceMap
     sights: Sights  # (n) pixels of measured depth; rotation and translation are T_rig_camera
     z: Float[Tensor, "n"]  # metres, measured along the optical axis
-    fixed: Float[Tensor, "n 3"]  # metres: points of another sensor, relative to it, for which z is 0
+    fixed: Float[Tensor, "n 3"]  # metres: points of another sensor, relative to that sensor; their z is 0
     rgb: Float[Tensor, "n 3"]
     coloured: Float[Tensor, "n"]  # 1 where a colour was measured, else 0
     noise: float | Float[Tensor, ""]  # metres

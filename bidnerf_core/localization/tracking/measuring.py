@@ -57,9 +57,9 @@ from bidnerf_core.mapping import (
 )
 
 ENOUGH_LANDMARKS = 40
-"""Number of tracked inliers below which landmarks are recognised anew; fewer are not accepted unless the image confirms them."""
+"""Minimum number of tracked inliers: with fewer, landmarks are recognised anew, and a pose by tracked ones alone is rejected."""
 LEAST_CORNERS, SIGNIFICANT_NFA = 20, -6.0
-"""Minimum number of the corners that agree on a motion, at least half of them, and maximum log10 of its number of false alarms."""
+"""Minimum number of corners that agree on a motion (at least half of all must), and maximum log10 of the motion's false alarms."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class Determined:
 
 @dataclass(frozen=True, eq=False)
 class Measurer:
-    """Corrects predicted poses by what frames show of one map, and judges the corrected poses."""
+    """Corrects predicted poses by comparing frames with one map, and judges the corrected poses."""
 
     scene: SceneMap
     landmarks: LandmarkMap | None
@@ -113,7 +113,7 @@ class Measurer:
     def __call__(
         self, frame: Frame, image: Grey | None, state: TrackerState, predicted: Motion
     ) -> Measurement | None:
-        """Correct a prediction by everything that a frame shows; None if the frame shows nothing of the map.
+        """Correct a prediction by all measurements of a frame; None if the frame shows nothing of the map.
 
         Landmarks tracked to this frame are used as long as there are enough; otherwise, landmarks are recognised anew around the pose
         of the tracked landmarks or around the prediction.
@@ -217,8 +217,8 @@ class Measurer:
         depth, factor = self._depth(frame, state, points, fit.states)
         term = fit.term.weighted_for(fit.states)
         terms: list[CostTerm] = [term] if depth is None else [term, depth.fitted_noise(fit.states)]
-        # Gauss-Newton steps, of which each is right but for the robust weights.
-        # Depth hardly changes them, but few landmarks may be far off without it.
+        # Gauss-Newton steps, each exact except for the robust weights.
+        # Depth hardly changes these weights, but a pose by few landmarks may be far off without depth.
         rounds = [terms] if not bool(rows.any()) else [terms if fit.is_recognised else [term], terms]
         for used in rounds:
             normal = total(states, used)
@@ -257,7 +257,10 @@ class Measurer:
     def _depth(
         self, frame: Frame, state: TrackerState, points: Points, states: States
     ) -> tuple[Surface | None, float]:
-        """Return the term of the measured points, or else the ratio of their depths to the landmarks' depths."""
+        """Return the term of the measured points, or None, and the ratio of their depth to that of the landmarks.
+
+        There is no term without a surface or enough depth, or if the ratio is implausible; the ratio is 1 unless it is implausible.
+        """
         surface, sensor = self.scene.surface, self.sensor
         if surface is None or not shows_shape(frame):
             return None, 1.0
@@ -266,7 +269,7 @@ class Measurer:
         ratio = ratio[depth > 0]
         if len(ratio) >= LEAST_AGREEING:
             scale = float(ratio.median())
-            # Depth is wrong if its scale is five standard deviations from that of the landmarks, which a few of them tell to 1 %.
+            # Depth is wrong if its scale is five standard deviations from that of the landmarks, which a few determine to 1 %.
             if abs(scale - 1) > 5.0 * math.hypot(DEPTH_WIDTH * sensor.scale, 0.01):
                 return None, 1 / scale
         view = View(frame, SE3.identity())
@@ -281,7 +284,7 @@ class Measurer:
         if fit.by_chance is None:
             nfa, chance, recall = fit.log10_nfa, 0.0, count / len(fit.points)
         else:
-            # It is estimated from few counts, hence at least a half.
+            # The number expected by chance is estimated from few counts, hence at least a half.
             nfa = log10_nfa(fit.keypoints, count, min(0.5, max(0.5, fit.by_chance) / fit.keypoints))
             chance, recall = fit.by_chance, count / fit.keypoints
         evidence = Evidence(

@@ -23,7 +23,7 @@ from bidnerf_core.io import LARGEST_NUMBER
 
 @dataclass(frozen=True)
 class Clock:
-    """The time of the last frame. Frames without a time stamp are assumed at the interval of the last two frames that had one."""
+    """The time of the last frame. A frame without a time stamp is assumed to follow at the interval of the last two frames that had one."""
 
     now: float | None  # seconds, from any origin
     interval: float  # seconds
@@ -95,8 +95,8 @@ class Motion:
     def predicted(self, seconds: float, stamped: bool = True) -> Motion:
         """Return the state ``seconds`` later, or earlier if negative.
 
-        After a gap, the pose is unchanged, and its uncertainty grows with the camera's possible speed. Without a time stamp, the
-        interval is an assumption, so the distance covered during the interval is uncertain in proportion.
+        After a gap of more than ``LONGEST_GAP``, the pose is unchanged, and its uncertainty grows with the camera's possible speed. Without
+        a time stamp, the interval is an assumption, so the distance covered during the interval is uncertain in proportion.
         """
         motion = self
         if abs(seconds) > LONGEST_GAP:  # the velocity is unknown
@@ -168,7 +168,7 @@ class Motion:
         return replace(self.corrected(measured), agility=self._observed_agility(off[:3], spread[:3, :3]))
 
     def _acceleration(self, agility: float = 1.0) -> Float[Tensor, "6 6"]:
-        """Return the covariance of the acceleration, per second squared, which suits a hand-held camera that is moved briskly."""
+        """Return the covariance of the acceleration (metres and radians per second squared) of a hand-held camera that is moved briskly."""
         return _scaled(agility * self.reach * 2.0, 4.0)
 
     def _observed_agility(self, off: Float[Tensor, "3"], spread: Float[Tensor, "3 3"]) -> float:

@@ -34,10 +34,10 @@ from bidnerf_core.mapping import grey_image, strongest
 class Tracker:
     """Estimates the pose of each frame of a sequence from the frames before it.
 
-    The tracker predicts each pose with a constant-velocity model and corrects the prediction by landmarks tracked with optical flow,
-    by measured depth, or by colour. Each pose passes through the localizer's acceptance. After a rejected pose, which is marked as such,
-    the tracker relocalizes in the following frames, and meanwhile continues by odometry. Its memory does not grow. Trackers may share
-    a localizer, even across threads, but a tracker itself belongs to one thread.
+    The tracker predicts each pose with a constant-velocity model and corrects the prediction by landmarks tracked with optical flow, by
+    measured depth, or by colour. Each pose passes through the localizer's acceptance. After a rejected pose, which is marked as such, the
+    tracker relocalizes in the following frames, and meanwhile continues by odometry. Its memory use does not grow. Trackers may share a
+    localizer, even across threads, but a tracker itself belongs to one thread.
     """
 
     def __init__(
@@ -164,7 +164,7 @@ class Tracker:
         return self._answer(bridged, predicted), state
 
     def _at(self, frame: Frame, T: SE3, covariance: torch.Tensor | None) -> Motion:
-        """Return the motion of a camera of unknown velocity at a pose, by default with the uncertainty of a start."""
+        """Return the motion of a camera at a pose with unknown velocity; without a ``covariance``, the pose is as uncertain as a start."""
         # A start of unknown uncertainty is off by 3 % of the scene's extent, and by 0.1 radians.
         deviation = torch.tensor([0.03 * self._extent] * 3 + [0.1] * 3, dtype=torch.float64)
         noise, bias = (deviation.square().diag(), 0.0 * deviation.diag())

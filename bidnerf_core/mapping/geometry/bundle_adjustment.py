@@ -31,7 +31,7 @@ constrains a pose that is plainly wrong.
 
 @dataclass(frozen=True, eq=False)
 class PosePrior:
-    """The prior of the poses: their given values, and errors that are independent and isotropic."""
+    """The prior of the poses: their given values, with errors that are independent and isotropic."""
 
     T_world_camera: SE3  # (v), float64
     translation: float  # metres: standard deviation along each axis

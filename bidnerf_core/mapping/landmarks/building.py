@@ -208,7 +208,7 @@ class TrackedViews:
         return replace(self, observations=replace(self.observations, images=images))
 
     def at_distance(self, distance: float) -> TrackedViews:
-        """Return the tracks with ``distance`` (metres, from the camera) as the measured distance of each keypoint."""
+        """Return the tracks with ``distance`` (metres from the camera) as the measured distance of every keypoint."""
         images = [
             replace(p, depth=distance / torch.linalg.vector_norm(p.rays, dim=-1))
             for p in self.observations.images
@@ -224,7 +224,7 @@ class TrackedViews:
         )
 
     def without(self, images: Sequence[int]) -> TrackedViews:
-        """Return the tracks without the keypoints of ``images``, and without known points, which may come from these images."""
+        """Return the tracks without the keypoints of ``images``, and without known positions of points, which may come from these images."""
         left = ~torch.isin(self.observations.image, torch.tensor(images))
         return replace(self, observations=self.observations[left], points=None)
 
@@ -269,7 +269,7 @@ def _joined(
     step: Callable[[], None],
     known: Sequence[tuple[int, int, Matches]] = (),
 ) -> TrackedKeypoints:
-    """Match the keypoints of the pairs of images, and join the matches into tracks, ``known`` ones of ambiguity 0 first."""
+    """Match the keypoints of the pairs of images, and join the matches into tracks, starting with ``known`` ones of ambiguity 0."""
     listed = pairs.tolist()
     matches = _mapped(lambda ij: epipolar_matches(images[ij[0]], images[ij[1]]), listed, step)
     found = [(i, j, m) for (i, j), m in zip(listed, matches, strict=True)]
@@ -311,8 +311,8 @@ def _triangulated(
 ) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Return the inlier keypoints, their points (metres, world), and the points' covariance for a noise of one pixel.
 
-    ``least`` is the minimum parallax (radians) of a point. If ``known`` positions are given, by
-    number, they are used instead of triangulated ones.
+    ``least`` is the minimum parallax (radians) of a point. If ``known`` positions are given, by number, they are used instead of
+    triangulated ones.
     """
     observations, former = observations[_tracked(observations)].compacted()
     count = observations.count

@@ -28,7 +28,7 @@ from bidnerf_core.settings import Range, Settings
 NORM = 512.0
 """Norm of a quantised descriptor, as usual for SIFT: it makes good use of the range of a byte."""
 MANY = 2**16
-"""Number of descriptors converted to floats at a time; all of a large map would take gigabytes."""
+"""Number of descriptors converted to floats at a time; converting all those of a large map at once would take gigabytes."""
 FIRST_CENTRE = 0.5
 """Offset from OpenCV's pixel coordinates to ours: the centre of the first pixel is (0, 0) there, (0.5, 0.5) here."""
 

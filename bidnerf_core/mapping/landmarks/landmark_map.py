@@ -30,7 +30,7 @@ class HeldOutTrial:
     """Accuracy with which images of the map were localized by landmarks built without them."""
 
     images: int = 0
-    found: int = 0  # of these images
+    found: int = 0  # number of these images whose pose was found
     translation: float = 0.0  # metres: median error
     rotation_deg: float = 0.0
 
@@ -199,10 +199,10 @@ class LandmarkMap:
         return moved(self, working_device(device))
 
     def correlation_of(self, matches: int) -> float:
-        """Return how many keypoints amount to one independent measurement in an image with this many ``matches``.
+        """Return how many keypoints amount to one independent measurement in an image with ``matches`` matched keypoints.
 
-        Errors are correlated between neighbouring keypoints, of which there are more in images with many matches. On several
-        captures, the number grew with the square root of the matches.
+        Errors of neighbouring keypoints are correlated, and images with many matches have more neighbours. On several captures, the number
+        grew with the square root of the number of matches.
         """
         if self.usual_matches <= 0:
             return self.correlation

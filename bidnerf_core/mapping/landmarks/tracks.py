@@ -32,9 +32,9 @@ ROWS = 1024
 def likely_pairs(poses: Sequence[SE3], neighbours: int) -> Int[Tensor, "p 2"]:
     """Return pairs (i < j) of cameras with similar ``poses`` (T_world_camera), without duplicates.
 
-    The dissimilarity is the distance between the centres relative to the mean over all pairs, plus 1 - cosine between the
-    optical axes. Half of the neighbours are those with the most similar poses. The other half is
-    every third of the cameras that follow, because successive images of a video have too little baseline for triangulation.
+    The dissimilarity is the distance between the centres relative to the mean over all pairs, plus 1 - cosine between the optical axes.
+    Half of a camera's ``neighbours`` are those with the most similar poses. The other half are every third one of the cameras that follow
+    in this order, because successive images of a video have too little baseline for triangulation.
     """
     others = len(poses) - 1
     if others < 1:
@@ -336,7 +336,7 @@ ENOUGH_DEPTHS = 30
 def keypoint_depth_noise(observations: TrackedKeypoints, points: Float[Tensor, "n 3"]) -> float:
     """Return a robust relative standard deviation of measured depth, by comparison with triangulated points.
 
-    If there are too few points, return the value for an unknown sensor.
+    With too few points, the result is that of an unknown sensor.
     """
     depth = observations.depth
     known = depth > 0
@@ -347,7 +347,7 @@ def keypoint_depth_noise(observations: TrackedKeypoints, points: Float[Tensor, "
 
 
 def depth_ratio(observations: TrackedKeypoints, points: Float[Tensor, "n 3"]) -> float | None:
-    """Return the median ratio of measured depth to the depth of triangulated points; None if there are too few."""
+    """Return the median ratio of measured depth to the depth of triangulated points; None if there are too few such points."""
     z, depth = observations.sightings.in_camera(points)[:, 2], observations.depth
     known = (depth > 0) & (z > 0)
     return float((depth[known] / z[known]).median()) if int(known.sum()) >= ENOUGH_DEPTHS else None
@@ -384,7 +384,7 @@ def placed(
 def _weighted(
     values: Float[Tensor, "m 3"], information: Float[Tensor, "m 3 3"], point: Int[Tensor, "m"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """Return each point's weighted mean of its values, and its covariance."""
+    """Return the weighted mean of each point's values, and the covariance of that mean."""
     count = int(point.max()) + 1 if len(point) else 0
     total = summed(information, point, count)
     weighted = summed((information @ values[..., None])[..., 0], point, count)

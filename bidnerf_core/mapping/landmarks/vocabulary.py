@@ -30,7 +30,7 @@ def k_means(
 ) -> Float[Tensor, "c d"]:
     """Return the centres of k-means clusters (Lloyd 1982) of a sample of twenty descriptors per cluster.
 
-    The centre of a cluster that becomes empty is kept.
+    A cluster that becomes empty keeps its centre.
     """
     sample = torch.randperm(len(descriptors), generator=generator)[: 20 * count]
     values = descriptors[sample.to(descriptors.device)].float()
@@ -80,7 +80,7 @@ def pooled_views(
 ) -> Float[Tensor, "v p"]:
     """Return the VLAD vectors of the landmarks visible to a map's cameras (T_world_camera), and of all landmarks last.
 
-    At most 48 cameras are pooled, evenly spaced, of those with at least eight such landmarks.
+    At most 48 cameras, at regular intervals, are pooled, except those that see fewer than eight landmarks.
     """
     word = vocabulary.nearest(landmarks.descriptors)
     found = []

@@ -89,7 +89,7 @@ def descend(
 
 @dataclass(frozen=True, eq=False)
 class Quadratic:
-    """Quadratic models of terms, one about a state of each mode; linear algebra then evaluates every explanation of a mode's matches.
+    """Quadratic models of terms, one about a state of each mode; with them, linear algebra evaluates all explanations of a mode's matches.
 
     The unknowns are the pose's update (metres, radians) and the nuisances in their own units.
     """
@@ -117,7 +117,7 @@ class Quadratic:
         return Normal(cost, pull * scale, scale[:, :, None] * self.hessian[g] * scale[:, None])
 
     def with_first(self, other: Quadratic) -> Quadratic:
-        """Return the sum with a model of further terms, which is about the state of the first mode."""
+        """Return the models with ``other``, a model of further terms about the first mode's state, added to the first one."""
         names = ("cost", "gradient", "hessian")
         joined = ((getattr(self, name), getattr(other, name)) for name in names)
         return Quadratic(self.here, *(torch.cat([own[:1] + more, own[1:]]) for own, more in joined))

@@ -23,7 +23,7 @@ from bidnerf_core.mapping.resection.descend import Normal, descend
 from bidnerf_core.mapping.resection.states import MOTION, N, Projections, Sights, States, jacobian, project
 
 LEAST_NOISE = 0.05
-"""Pixels: no detector is more accurate."""
+"""Minimum standard deviation of a keypoint (pixels); no detector is more accurate."""
 SCALE = 2.0
 """Residual, in standard deviations, at which the weight of a Student-t residual is one half."""
 
@@ -40,7 +40,7 @@ class Landmarks:
     correlation: Float[Tensor, "g"]  # number of matches that count as one measurement
     share: Float[
         Tensor, "g"
-    ]  # weight of a match's log likelihood, so that the curvature is that of the estimate's covariance
+    ]  # weight of a match's log likelihood, so that the inverse Hessian is the estimate's covariance
     area: float  # of the image, square pixels, over which outliers are spread
     most_noise: float  # pixels: of keypoints that match
 
@@ -139,9 +139,9 @@ class Landmarks:
         return float(away[self.valid[g] > 0].median())
 
     def residuals(self, states: States) -> tuple[Tensor, Tensor, Tensor]:
-        """Return squared residuals in units of their variance (h m).
+        """Return squared residuals in units of their variance (h m), the residuals and their variance.
 
-        Also returns projection minus observation (h m 2, pixels) and its variance (h m, pixels squared).
+        The residuals are projection minus observation (h m 2, pixels), and the variance is that along each axis (h m, square pixels).
         """
         return self._of(states)._residuals(states)
 
@@ -184,7 +184,7 @@ def point_variance(
 
 
 BATCH = 32
-"""Number of images whose poses are estimated at once, which bounds the memory; they see similar numbers of points."""
+"""Number of images whose poses are estimated at once, to bound the memory; the images of a batch see similar numbers of points."""
 
 
 def resections(

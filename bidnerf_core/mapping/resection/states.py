@@ -72,7 +72,7 @@ class States:
         return torch.cat([torch.ones_like(self.z[:, :6]), 1 / self.deviation.clamp(min=1e-9)], -1)
 
     def retract(self, step: Float[Tensor, "h P"]) -> States:
-        """Return the states after a step, with poses ``T exp(step)``, polished. It takes few operations, but has no derivative at 0."""
+        """Return the states after a step, with poses ``T exp(step)``, polished. The formula is fast, but has no derivative at 0."""
         R, t = self.T.rotation, self.T.translation
         twist = (step[:, :6] @ constant(TWISTS, step).view(6, 16)).view(-1, 4, 4)
         squared = step[:, 3:6].square().sum(-1)[:, None, None]
@@ -122,7 +122,7 @@ class Sights:
     times: Float[Tensor, "*h m"]  # of exposure, as fractions of the readout (-0.5 to 0.5)
     rotation: Float[Tensor, "*h m 3 3"]  # T_camera_rig
     translation: Float[Tensor, "*h m 3"]
-    single: bool = False  # whether that is the identity for all points, and need not be applied
+    single: bool = False  # whether T_camera_rig is the identity for all points, and need not be applied
 
     def __getitem__(self, index: Tensor | slice) -> Sights:
         rotation, translation = self.rotation[index], self.translation[index]

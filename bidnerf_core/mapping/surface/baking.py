@@ -51,7 +51,7 @@ def rendered_views(field: RadianceField, bounds: SceneBounds, cameras: Sequence[
 
 @torch.no_grad()
 def colour_noise(field: RadianceField, bounds: SceneBounds, views: Sequence[View]) -> float:
-    """Return the root mean square difference between rendered and photographed colours over pixels of all views."""
+    """Return the root mean square difference between rendered and photographed colours over random pixels of all views."""
     count, generator = max(4096, len(views)), torch.Generator().manual_seed(0)
     pixels = draw(views, count, uniform, generator, device=device_of(field)).flattened()
     seen = render(field, bounds.rays(pixels.origins, pixels.directions), bounds.background)
@@ -83,9 +83,9 @@ def bake(
 ) -> SurfaceMap:
     """Bake the surface on which measured depth of ``views`` and depth rendered from ``cameras`` (T_world_camera) agree.
 
-    Points confirmed by several of these images are fused into surfels and indexed by a grid whose cells are as fine as the
-    images and their noise allow (see ``finest_cell``). Measured depth is more accurate than a field trained on it, so render
-    depth only where none was measured. Raises ``InputError`` if there are no images, or no points on which they agree.
+    Points confirmed by several of these images are fused into surfels and indexed by a grid whose cells are as fine as the images and their
+    noise allow (see ``finest_cell``). Measured depth is more accurate than a field trained on it, so pass only ``cameras`` of images
+    without measured depth. Raises ``InputError`` if there are no images, or no points on which they agree.
     """
     total = len(views) + len(cameras)
     if not total:

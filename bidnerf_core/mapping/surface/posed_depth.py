@@ -42,7 +42,7 @@ class PosedDepthImage:
         return mean_focal(self.intrinsics)
 
     def solid(self, opacity: float) -> Bool[Tensor, "h w"]:
-        """Return a mask of the pixels that show a surface with more than this opacity."""
+        """Return a mask of the pixels that have depth and an opacity of more than ``opacity``."""
         return (self.image.opacity > opacity) & (self.image.depth > 0)
 
     def points(self, pixels: Bool[Tensor, "h w"]) -> Float[Tensor, "p 3"]:
