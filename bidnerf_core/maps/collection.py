@@ -46,7 +46,7 @@ class Placement:
     # all maps, most similar first: the cosine between pooled descriptors, -1 if a map has none
     ranking: Mapping[str, float]
     asked: tuple[str, ...]  # maps in which the image was localized, in order
-    backend: str  # that of the map
+    backend: str  # backend of the map's field
 
     @property
     def converged(self) -> bool:
@@ -85,9 +85,10 @@ class MapCollection:
         """Read the landmarks of all maps.
 
         ``scenes`` is a folder whose subfolders are maps, a list of maps and of folders of maps, or maps by name.
-        ``asked`` is the largest number of maps that are tried, the most similar ones first. ``localizers`` holds
-        existing localizers by the names of their maps. Raises ``InputError`` if there is no map or the same one
-        twice, and ``Cancelled`` once ``cancel`` returns True.
+        ``method`` and ``config`` select how images are localized, see ``Localizer``. ``asked`` is the largest
+        number of maps that are tried, the most similar ones first. ``localizers`` holds existing localizers by
+        the names of their maps. Raises ``InputError`` if there is no map or the same one twice, and
+        ``Cancelled`` once ``cancel`` returns True.
         """
         if asked < 1:
             raise InputError(f"asked is {asked}", expected="1 or more")
@@ -96,7 +97,7 @@ class MapCollection:
         self._given_localizers = localizers or {}
         self._localizer = functools.lru_cache(maxsize=6)(
             self._loaded
-        )  # so many maps stay in memory after use
+        )  # this many maps stay in memory after use
         self._infos = {
             name: scene.info if isinstance(scene, Map) else load_info(scene)
             for name, scene in self._maps.items()
@@ -108,7 +109,7 @@ class MapCollection:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the maps: their folders' names, with as many parent folders as distinguish the maps."""
+        """The names of the maps: the given ones or folder names, with as many parent folders as needed to be unique."""
         return tuple(self._maps)
 
     def __len__(self) -> int:
@@ -134,7 +135,7 @@ class MapCollection:
         return Localizer(stored, self.method, self.config, warm_up=False)
 
     def ranked(self, frame: Frame) -> dict[str, float]:
-        """Return the similarity of an image to each map, most similar first; -1 for a map without landmarks."""
+        """Return the cosine similarity of an image to each map, most similar first; -1 where it cannot be computed."""
         vectors: dict[tuple[str, int], Float[Tensor, "p"]] = {}
         for key, vocabulary in self._vocabularies.items():
             descriptors = detected(find_features(key[0]), frame.rgb).descriptors if frame.has_colour else None
@@ -150,9 +151,9 @@ class MapCollection:
         """Find the map that a frame shows, and the pose of the frame in that map.
 
         The frame is localized with the landmarks of the most similar maps in turn until one map accepts it, and
-        then in the next map as runner-up. The full method then localizes the frame in the best of the maps
-        tried: an accepting one if there is any, then the one with the most inliers. Raises ``InputError`` for a
-        frame that cannot be localized at all.
+        then in one more map, as a possible runner-up. The full method then localizes the frame in the best of
+        the maps tried: among those that accept it, or among all if none does, the one with the most inliers.
+        Raises ``InputError`` for a frame that cannot be localized at all.
         """
         ranking = self.ranked(frame)
         quick: dict[str, Localization] = {}
@@ -218,7 +219,7 @@ def maps_in(folder: Path) -> list[Path]:
 
 
 def _named(maps: Sequence[Map | str | Path] | Mapping[str, Map]) -> Mapping[str, Map | Path]:
-    """Return the maps by the last part of their paths, or by as many trailing parts as distinguish them."""
+    """Return the maps by folder name, preceded by as many parent folders as needed to distinguish them."""
     if isinstance(maps, Mapping):
         return maps
     placed, found = list[tuple[tuple[str, ...], Map | Path]](), dict[str, Map | Path]()
@@ -244,7 +245,7 @@ def _named(maps: Sequence[Map | str | Path] | Mapping[str, Map]) -> Mapping[str,
 
 
 def _unrecognised(reason: str, method: str) -> Localization:
-    """Return the answer of a map in which an image was not recognized at all; its pose is meaningless."""
+    """Return the answer for a map in which an image was not recognized at all; its pose is meaningless."""
     T = SE3.identity()
     return Localization(
         T, Outcome.TOO_FEW_MATCHES, reason, 0, 0.0, math.nan, method, SE3.stack([T]), torch.zeros(0, dtype=torch.float64)

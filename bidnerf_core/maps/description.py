@@ -22,7 +22,7 @@ from bidnerf_core.settings import Above, NotNegative, Range, Settings
 VERSION = 1
 DESCRIPTION = "map.json"
 PART_NAMES = ("weights", "training", "surface", "landmarks", "capture")
-"""The keys that name files."""
+"""The keys of ``map.json`` whose values are file names."""
 ANCHOR = "anchor.json"
 LandmarkSource = Literal["photos", "rendered images"]
 
@@ -58,7 +58,7 @@ class Anchor(Settings):
         return pose_from_matrix(torch.tensor(rows, dtype=torch.float64), "T_enu_world")
 
     def scaled(self, factor: float) -> Anchor:
-        """Return the anchor of the map after its lengths were multiplied by ``factor``."""
+        """Return the anchor for the same map with all lengths multiplied by ``factor``."""
         return replace(self, metres_per_unit=self.metres_per_unit / factor)
 
 
@@ -74,7 +74,7 @@ class FieldFrame(Settings):
 class MapInfo:
     """The content of ``map.json``."""
 
-    backend: str  # of the field; empty if it has none and none was begun
+    backend: str  # of the field; empty if the map has no field, not even an unfinished one
     config: dict[str, Any]
     bounds: SceneBounds
     step: int  # training steps done; 0 in a map of landmarks alone, which has no field
@@ -84,8 +84,9 @@ class MapInfo:
     cameras: tuple[StoredCamera, ...] = ()
     pose_refinement: PoseRefinement | None = None  # of the cameras; None if nothing is known
     unit: LengthUnit = "units"  # of all lengths in the map; "units" if their length is unknown
-    # Of the map's own coordinates, in the world of poses that enter and leave it. All positions of the map, such as those
-    # of its cameras and bounds, are relative to it: in survey coordinates, single precision resolves only decimetres.
+    # Origin of the map's own coordinates, in the world frame of the poses passed to and returned by the map. All
+    # positions in the map, such as those of its cameras and bounds, are relative to the origin, since single precision
+    # resolves only decimetres in survey coordinates.
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     added: int = 0  # number of cameras added after training, at the end of ``cameras``
     gravity_up: tuple[float, float, float] | None = (
@@ -110,7 +111,7 @@ class MapInfo:
 
     @property
     def interruption(self) -> str | None:
-        """A clause that says where training stopped and how to resume it; None if training is complete."""
+        """Where training stopped and how to resume it, as a clause; None if training is complete."""
         if self.complete:
             return None
         if not self.step:
@@ -118,7 +119,7 @@ class MapInfo:
         return f"its training stopped at step {self.step}; 'bidnerf train' with --resume continues it"
 
     def scaled(self, factor: float, unit: LengthUnit) -> MapInfo:
-        """Return the description with lengths multiplied by ``factor``; the weights keep the unit of training."""
+        """Return the description of the map scaled by ``factor`` to ``unit``; the weights keep the unit of training."""
         frame = self.field_frame or FieldFrame(1.0, self.bounds)
         scale = frame.scale * factor
         return replace(
@@ -132,12 +133,12 @@ class MapInfo:
         )
 
     def in_map_unit(self, field: RadianceField) -> RadianceField:
-        """Convert a field, as built by its backend, to the length unit of the map."""
+        """Return a field built by the backend, converted to the length unit of the map."""
         return field if self.field_frame is None else scaled_field(field, self.field_frame.scale)
 
 
 def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
-    """Return the intrinsics and ``T_world_camera`` (float64) of each training image."""
+    """Return the intrinsics and ``T_world_camera`` (float64, relative to the map's origin) of each training image."""
     return [(c.intrinsics, c.pose) for c in info.cameras]
 
 
@@ -147,7 +148,7 @@ def longest_side(info: MapInfo) -> int | None:
 
 
 def load_info(folder: Path) -> MapInfo:
-    """Load and check ``map.json``. Raises ``InputError`` unless it describes a map of this format version."""
+    """Load and check ``map.json`` and any ``anchor.json``. Raises ``InputError`` unless they describe a map of this version."""
     path = folder / DESCRIPTION
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "no such folder"

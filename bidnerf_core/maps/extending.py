@@ -52,11 +52,11 @@ from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, cou
 log = logging.getLogger("bidnerf")
 
 NewPhotos: TypeAlias = Sequence[Frame] | Sequence[View] | Capture | str | Path
-"""Photos to add: frames, a dataset or the path to one (whose own poses are ignored), or the path to a photo
-or a folder of photos."""
+"""Photos to add: frames, views, a dataset or the path to one, or the path to a photo or a folder of photos.
+Poses that come with them are ignored."""
 
 LeftOut: TypeAlias = tuple[str, str]
-"""The name of a photo that is not added, and the reason."""
+"""The name of a photo that was left out, and the reason."""
 
 
 def extend(
@@ -70,7 +70,7 @@ def extend(
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Map:
-    """Extend a map with more photos of its scene and return it; a map in a folder is replaced there only at the end.
+    """Extend a map with more photos of its scene, and return it; a map in a folder is replaced only at the end.
 
     The photos are localized in the map; photos that cannot be localized, and photos from which the map was
     built, are left out. Training continues with the new photos and with ``data``, the images from which the map
@@ -80,9 +80,9 @@ def extend(
     surface is rebaked from all cameras.
 
     A map that already contains all the photos is returned unchanged. Raises ``InputError`` if the photos show
-    another scene, if the map has no landmarks for localizing them, and if the map's folder changes meanwhile;
-    raises ``Cancelled`` once ``cancel`` returns True. In these cases, and if the process is killed, the map in
-    the folder is unchanged.
+    another scene, if the map has no field or no landmarks or is not fully trained, and if it is retrained
+    meanwhile; raises ``Cancelled`` once ``cancel`` returns True. In these cases, and if the process is killed,
+    the map in the folder is unchanged.
     """
     if steps is not None and (isinstance(steps, bool) or steps < 1):
         raise InputError(f"steps is {steps!r}", expected="a positive whole number")
@@ -105,9 +105,9 @@ def extend(
 
 
 def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> list[View]:
-    """Localize frames in a map, and return those that are new to the map, under names that it does not use yet.
+    """Localize frames in a map, and return those that are new to it as views, with names that the map does not use yet.
 
-    ``unread`` lists photos that could not be read, which count as left out. Raises ``InputError`` if the map
+    ``unread`` lists the photos that could not be read; they count as left out. Raises ``InputError`` if the map
     has no landmarks, and if hardly any frame is localized.
     """
     where = scene.name
@@ -116,7 +116,8 @@ def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> li
             "has no landmarks for localizing photos; 'bidnerf bake MAP --data DATA' builds them", where=where
         )
     localizer, cameras = Localizer(scene), {camera.name: camera.pose for camera in scene.info.cameras}
-    # A photo that has the name of one of the map's counts as that photo if it was taken this near to it.
+    # A photo with the name of one of the map's photos counts as that photo if it was taken within this
+    # distance of it.
     near, count = 0.02 * scene.bounds.side, counter("locating", "photos")
     views, left_out, known, outcomes = list[View](), list(unread), 0, list[Outcome]()
     for number, frame in enumerate(frames, start=1):
@@ -140,7 +141,7 @@ def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> li
         count(number, len(frames))
     for name, why in left_out:
         log.info(f"{name}: left out: {why}")
-    # Photos of which fewer are localized do not show the scene of the map.
+    # If fewer photos than this are localized, they do not show the scene of the map.
     if len(views) + known < max(1.0, 0.25 * len(frames)):
         problem = f"localizes {len(views) + known} of {amount(len(frames), 'photo')}"
         expected = "photos of its scene"
@@ -186,7 +187,7 @@ def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], lis
 
 
 def _old_views(scene: Map, data: Images | None, split: str) -> list[View]:
-    """Return the images that the map was built from, or renderings at their cameras."""
+    """Return the images in ``data`` at the map's poses or, without ``data``, renderings from the map's cameras."""
     if data is not None:
         _, views = views_again(scene.info, data, DatasetOptions(split=split))
         own = {camera.name for camera in scene.info.cameras}
@@ -220,7 +221,7 @@ def _extended(
     steps: int | None,
     config: BakeConfig,
 ) -> Map:
-    """Return the map with new photos; ``complete`` states whether ``old`` are its own photos, not renderings."""
+    """Return the map extended with ``new``; ``complete`` is whether ``old`` holds the map's photos rather than renderings."""
     where, everything = scene.name, [*old, *new]
     given = everything if complete else new
     tracked = tracked_views(given, scene.info.landmark_features)
@@ -230,7 +231,7 @@ def _extended(
         parts = zip(given, tracked.seen(DEFAULT_LANDMARKS), strict=True)
         seeing = [v if v.frame.has_dense_depth else replace(v, landmarks=part) for v, part in parts]
     new, weighted = (seeing[len(old) :], seeing) if complete else (seeing, [*old, *seeing])
-    if old and not complete:  # renderings have fewer pixels than photos, but are to count as much
+    if old and not complete:  # renderings have fewer pixels than photos, but should count as much
         pixels = [
             sum(v.frame.intrinsics.width * v.frame.intrinsics.height for v in part) / len(part)
             for part in (old, new)
@@ -243,8 +244,8 @@ def _extended(
         added=scene.info.added + len(new),
     )
     grown = replace(grown, info=info)
-    # The surface is baked from measured depth and, unlike by ``bake_surface``, also from depth rendered from the other
-    # cameras: the photos of these are not at hand, and what they measured must not be lost.
+    # Unlike in ``Map.with_surface``, the surface is baked from measured depth and also from depth rendered from the
+    # other cameras: their photos are not at hand, and what they measured must not be lost.
     measured = [view for view in seeing if view.frame.has_dense_depth]
     names = {view.frame.name for view in measured}
     others = [(c.intrinsics, c.pose) for c in info.cameras if c.name not in names]
@@ -280,7 +281,10 @@ def _extended(
 
 
 def _trained_on(scene: Map, views: Sequence[View], steps: int | None, share: float) -> Map:
-    """Return the map in memory, with its baked parts and a copy of its field that is trained further."""
+    """Train a copy of the map's field further on ``views``, and return the map in memory with the new field.
+
+    By default, the number of steps is proportional to ``share``, the fraction of views that are new.
+    """
     info, field = scene.info, trained_field(scene.field)
     backend = load_backend(info.backend, str(scene.folder or ""))
     settings: Any = from_plain(backend.config_type, info.config, "config")
@@ -314,7 +318,8 @@ def _in_field_unit(view: View, factor: float) -> View:
 def _present(landmarks: LandmarkMap, more: LandmarkMap) -> Bool[Tensor, "n"]:
     """Return a mask of the landmarks of ``more`` that match one of ``landmarks``.
 
-    Landmarks match if they are close, given their standard deviations, and have similar descriptors.
+    Two landmarks match if their distance is at most three times the sum of their standard deviations, and
+    their descriptors are similar.
     """
     count = min(4, len(landmarks))
     away, near = cKDTree(landmarks.positions.numpy()).query(more.positions.numpy(), k=count)
@@ -322,12 +327,13 @@ def _present(landmarks: LandmarkMap, more: LandmarkMap) -> Bool[Tensor, "n"]:
     index = torch.from_numpy(np.asarray(near).reshape(len(more), -1))
     deviation = more.deviations.amax(-1)[:, None] + landmarks.deviations.amax(-1)[index]
     descriptors = landmarks.descriptors[index].float() - more.descriptors[:, None].float()
-    # Descriptors of one landmark are nearer to each other than this fraction of the distance between those of different ones.
+    # Descriptors of the same landmark differ by less than this fraction of the usual distance between descriptors of
+    # different landmarks.
     alike = descriptors.norm(dim=-1) <= 0.42 * landmarks.unrelated_distance
     return ((distance <= 3 * deviation) & alike).any(-1)
 
 
 def _names_like(name: str, taken: Container[str]) -> list[str]:
-    """Return the names in ``taken`` used for photos called ``name``: the name itself and names derived from it."""
+    """Return the names in ``taken`` that photos called ``name`` have: the name itself, then NAME_2, NAME_3 and so on."""
     derived = itertools.chain([name], (f"{name}_{n}" for n in itertools.count(2)))
     return list(itertools.takewhile(lambda each: each in taken, derived))

@@ -1,4 +1,4 @@
-"""Importers: plugins, found by name like backends, that read a trained field, a mesh or the like from a file."""
+"""Importers: plugins, found by name like backends, that read trained fields, meshes and the like from files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from bidnerf_core.mapping import Keypoints
 from bidnerf_core.registry import Plugins, interface_defects
 
 UNMOVED = Similarity(1.0, SE3.identity())
-"""The identity placement: the field stays in its file's coordinates."""
+"""The identity placement, which leaves a field in the coordinates of its file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class ImportedField:
 
 @runtime_checkable
 class Importer(Protocol):
-    """Reads fields of one kind."""
+    """Reads fields from files of one kind."""
 
     @property
     def summary(self) -> str:
@@ -93,7 +93,7 @@ def _defects(importer: Any) -> Iterator[str]:
 
 
 IMPORTERS: Plugins[Importer] = Plugins("importers", _defects)
-"""The importers by name."""
+"""The installed importers, by name."""
 
 
 def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
@@ -130,7 +130,7 @@ def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
 def robust_box(
     points: Float[Tensor, "n 3"], outside: float = 0.005, margin: float = 0.05
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Return the corners of a box around all points except the fraction ``outside`` at each end of each axis.
+    """Return the lower and upper corner of a box around all but the fraction ``outside`` of points at each end of each axis.
 
     The box is then widened on every side by ``margin`` times its longest side.
     """
@@ -148,7 +148,8 @@ def bounds_about(
     """Return scene bounds for geometry at ``points`` (metres, world) whose training images are unknown.
 
     If much of the geometry lies far outside the box around most of it, the scene is unbounded: the box then
-    encloses only the dense part, and ``contracted`` is set.
+    encloses only the dense part, and ``contracted`` is set. ``background`` (RGB in [0, 1]) and ``footprint``
+    (metres) are copied to the result.
     """
     inner, outer = robust_box(points, 0.15, 0.25), robust_box(points)
     sides = [float((upper - lower).max()) for lower, upper in (inner, outer)]

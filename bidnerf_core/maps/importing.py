@@ -51,9 +51,9 @@ log = logging.getLogger("bidnerf")
 
 CAMERA = Intrinsics.from_hfov(70.0, 192, 192)
 VIEWS = 48
-"""Number of viewpoints."""
+"""Number of cameras placed around an object, and largest number of cameras placed inside a room."""
 DIRECTIONS = 48
-"""Number of rays from each place, evenly over the sphere."""
+"""Number of rays from each candidate position, spread evenly over the sphere."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def import_map(
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Map:
-    """Build a map from a field in a file: splats, a checkpoint, or whatever an installed importer reads.
+    """Build a map from a field in a file: splats, a checkpoint, or any other format that an installed importer reads.
 
     A COLMAP model yields a map without a field, whose landmarks come from the model's points and tracks;
     ``train`` adds a field.
@@ -197,12 +197,14 @@ def _of_structure(
     scene, _ = scene.with_landmarks(read.views, tracked=tracked)
     if scene.landmarks is None:
         raise InputError("its images give no landmarks", where=capture.path)
-    # Of keypoints alone, nothing is known about the photos.
+    # The quality of photos cannot be surveyed from keypoints alone.
     return scene if structure.keypoints else scene.with_survey(read.views, tracked)
 
 
 def _described(structure: Structure, features: str, origin: Origin) -> tuple[ReadViews, TrackedViews]:
-    """Return blank views with their known keypoints, which are grouped into tracks by the points they observe.
+    """Return the images of a structure as blank views, and their stored keypoints grouped into tracks.
+
+    Keypoints that observe the same point form a track. Positions are relative to ``origin``.
 
     Raises ``InputError`` if the descriptors are not those of the detector ``features``.
     """
@@ -223,7 +225,8 @@ def _described(structure: Structure, features: str, origin: Origin) -> tuple[Rea
         assert T is not None
         camera, T = stored.at_most(USEFUL_SIDE), T.translated(offset)
         order = (observed < 0).long().argsort(stable=True)
-        # As many keypoints are used as SIFT finds in a query; if more observe a point, all of these.
+        # At most as many keypoints are used as SIFT finds in a query, or all that observe a point if these
+        # are more.
         order = order[: max(int((observed >= 0).sum()), 2000)]
         size = torch.tensor([camera.width, camera.height])
         scale = size / torch.tensor([stored.width, stored.height])
@@ -240,7 +243,7 @@ def _described(structure: Structure, features: str, origin: Origin) -> tuple[Rea
     files = {shot.name: os.path.relpath(shot.file, capture.path) for shot in capture.shots if shot.file}
     read = ReadViews(views, capture.path.name, str(capture.path), BLACK, files=files)
     label, points = torch.cat(labels), structure.positions + offset
-    # A keypoint that observes no point is a track of its own.
+    # A keypoint that observes no point forms a track by itself.
     label = torch.where(label >= 0, label, len(points) + torch.arange(len(label)))
     return read, TrackedViews(TrackedKeypoints(images, label, torch.arange(len(label))), features, points)
 
@@ -274,7 +277,7 @@ def ratio_to_measured_depth(field: RadianceField, bounds: SceneBounds, views: Se
     count = max(4096, len(measured))
     pixels = draw(measured, count, uniform, generator, device=device_of(field)).flattened()
     seen = render(field, bounds.rays(pixels.origins, pixels.directions), bounds.background)
-    both = (pixels.distance > 0) & (seen.opacity > 0.5)  # the depth of a less opaque ray means nothing
+    both = (pixels.distance > 0) & (seen.opacity > 0.5)  # the depth of a less opaque ray is meaningless
     if int(both.sum()) < 200:
         return None
     return float((pixels.distance[both] * seen.opacity[both] / seen.distance[both]).median())
@@ -317,7 +320,8 @@ def viewpoints(
     nearest = torch.where(hit, distance, torch.inf).quantile(0.1, dim=1)  # exceeded by nine out of ten rays
     # Closer to matter than this, little is visible; a place is inside a room or the like if most rays from it hit matter.
     free = (nearest > 0.04 * bounds.side) & (hit.float().mean(1) > 0.6)
-    # An object with hollows (Lego: 0.09) has some such places, and a room (0.5) has many: it is viewed from inside.
+    # An object with hollows (Lego: 0.09) has some such places, and a room (0.5) has many; only a room is viewed
+    # from inside.
     if not is_solid and float(free.float().mean()) > 0.2:
         poses = _within(places[free], distance[free], up)
     else:  # from all around the box, at a distance from which it fills the images
@@ -358,7 +362,8 @@ def _within(
     away = torch.full_like(places[:, 0], torch.inf)
     for _ in range(min(VIEWS // 4, len(places))):
         eye = places[number]
-        # In each of four sectors about the vertical, the direction with the farthest matter: it shows most.
+        # In each of four sectors about the vertical, the direction with the farthest matter, which shows the
+        # most.
         for sector in sectors:
             allowed = sector & level & (distance[number] > 0)
             if bool(allowed.any()):

@@ -24,10 +24,10 @@ from bidnerf_core.localization import origin_of
 from bidnerf_core.maps.map import Map
 
 Position = Sequence[float] | Float[Tensor, "3"]
-"""Three coordinates."""
+"""Three coordinates (x, y, z)."""
 Place = str | Position
-"""A point of a map: its three coordinates, the name of one of its cameras, or ``NAME@U,V``, what that camera
-shows at a pixel."""
+"""A point of a map: three coordinates, the name of a camera of the map (its centre), or ``NAME@U,V``, the
+point that a camera shows at pixel (U, V)."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def _camera_of(scene: Map, name: str) -> StoredCamera | None:
 
 
 def _no_camera(scene: Map, name: str) -> str:
-    """Return the error text for a name that no camera of the map has, with other ways to specify a point."""
+    """Return the error message for a name that no camera of the map has, with other ways to specify a point."""
     names = [camera.name for camera in scene.info.cameras]
     if not names:
         return "it has no cameras; expected coordinates X,Y,Z"
@@ -140,7 +140,10 @@ def _no_camera(scene: Map, name: str) -> str:
 
 @torch.no_grad()
 def _seen_at(scene: Map, camera: StoredCamera, u: float, v: float) -> Float[Tensor, "3"]:
-    """Return the point that the field shows at a pixel of a camera."""
+    """Return the point (float64, relative to the map's origin) that the field shows at a pixel of a camera.
+
+    Raises ``InputError`` for a pixel outside the image or on the background.
+    """
     if not (0 <= u <= camera.intrinsics.width and 0 <= v <= camera.intrinsics.height):
         size = f"{camera.intrinsics.width}x{camera.intrinsics.height}"
         raise InputError(f"pixel {u:g},{v:g} is outside {camera.name}, whose image in the map is {size}")

@@ -170,12 +170,12 @@ class Map:
 
     @cached_property
     def training(self) -> str:
-        """Identifier of the training run: the weights file's name or, in memory, a content digest."""
+        """Identifier of the training run: the weights file's name or, for a map in memory, a content digest."""
         return self.info.weights or f"memory-{content_digest(self.field, self.surface, self.landmarks)}"
 
     @property
     def name(self) -> str:
-        """The map's name in messages: its folder or, in memory, its dataset."""
+        """The name of the map in messages: its folder or, for a map in memory, its dataset."""
         return str(self.folder or self.info.data or "map in memory")
 
     def to(self, device: torch.device | str) -> Map:
@@ -322,10 +322,10 @@ class Map:
     ) -> tuple[Map, TrackedViews | None]:
         """Return the map with new landmarks, and the tracked keypoints from which they were built.
 
-        Landmarks are built from ``views`` or, without views, from rendered images, which require a field; there
-        are none if the images show too little texture. Without views, existing landmarks from photos are kept
-        unless ``rendered`` is set, and no keypoints are returned for them. The caller must hold the folder's
-        lock, as for ``with_parts``.
+        Landmarks are built from ``views`` or, without views, from rendered images, which require a field. If
+        the images show too little texture, none are built. Without views, existing landmarks from photos are
+        kept unless ``rendered`` is set, and no keypoints are returned for them. The caller must hold the
+        folder's lock, as for ``with_parts``.
         """
         check_cancelled("landmarks")
         if not views and not rendered and self.info.landmark_source != "rendered images":
@@ -355,8 +355,8 @@ class Map:
         except InputError as error:
             log.info(f"{self.name}: no landmarks: {error}")
         else:
-            # New poses are compared with others from the same source as the given ones. If training kept those,
-            # except for some wrong ones, their errors are negligible.
+            # Poses found in the map are compared with poses from the source of the training poses. If training
+            # kept most of these, few poses have an update and their errors count as negligible.
             by_source = update_scatter(pose_updates(info.cameras))
             landmarks = replace(landmarks, pose_covariance=landmarks.pose_covariance + by_source)
             if views:
@@ -373,7 +373,7 @@ class Map:
     def with_surface(
         self, views: Sequence[View], config: BakeConfig, surface: SurfaceMap | None = None
     ) -> Map:
-        """Return the map with a new surface: ``surface`` if given, else a baked one.
+        """Return the map with a new surface: ``surface``, or a newly baked one if that is None.
 
         Baking uses the measured depth of the views, or else depth rendered by the field from the map's cameras or,
         if it has none, from those of the views. Raises ``InputError`` if there are no cameras at all, and if the
@@ -426,7 +426,7 @@ class Map:
         landmarks: LandmarkMap | None = None,
         record: CaptureReport | None = None,
     ) -> Map:
-        """Replace parts of the map by the given ones, store them, and return the map; the caller must hold the folder's lock."""
+        """Return the map with the given parts replaced, also in its folder; the caller must hold the folder's lock."""
         info = self.info
         if landmarks is not None:
             landmarks = with_images(landmarks, info)
@@ -484,8 +484,8 @@ class Map:
 def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool = True) -> Map:
     """Load the map in ``folder`` onto ``device``, with its field built by the map's backend and frozen.
 
-    ``baked`` says whether to load the surface and landmarks. Raises ``InputError`` if the folder does not hold
-    a map, or the map is damaged.
+    ``baked`` is whether to load the surface and landmarks. Raises ``InputError`` if the folder does not hold a
+    map, or the map is damaged.
     """
     folder = Path(folder)
     info, weights, surface, landmarks = read_parts(folder, baked)

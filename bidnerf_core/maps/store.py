@@ -60,16 +60,16 @@ _NAMES = (
     r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|capture-\d{8,}-[0-9a-f]{8}\.json)"
 )
 OURS = re.compile(rf"{_NAMES}|\.({_NAMES}|map\.json)\.[0-9a-f]{{8}}")
-"""Names of the files that saving may leave behind, of earlier versions as well; other files are never removed."""
+"""Pattern of the names of files that saving, also by earlier versions, may leave behind. Other files are never removed."""
 
 
 USUAL_SECONDS = 60.0
-"""Time between checkpoints."""
+"""Time between checkpoints (seconds)."""
 
 
 @dataclass(frozen=True)
 class PartFile:
-    """How one kind of part is stored in a file of its own."""
+    """How one kind of map part is written to its file and read from it."""
 
     encode: Callable[[Any], bytes]
     read: Callable[[Path], Any]
@@ -167,7 +167,7 @@ def read_parts(
     """
     info = load_info(folder)
     # A training run may replace the map between the reading of its description and of its parts. Checkpoints are seconds
-    # apart, so that each further failure takes a disk slower than that.
+    # apart, so each further failure requires a disk slower than that.
     for _ in range(5):
         try:
             weights = read_part(folder, info, "weights") or {}
@@ -242,14 +242,14 @@ class Checkpoints:
         self._saved = time.monotonic()
 
     def finish(self, field: RadianceField) -> None:
-        """Save once more if the backend ended without reporting its last step."""
+        """Save the trained field if the backend ended without saving a complete state."""
         if not self.info.complete and isinstance(field, nn.Module):
             self._total = self._step
             self.save(TrainingState(self._step, field.state_dict(), {}))
 
 
 def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingState:
-    """Return the state from which the interrupted training of ``field`` can be resumed."""
+    """Return the state from which to resume the training of ``field``. Raises ``InputError`` if training is complete."""
     if info.training is None:
         raise InputError(
             f"training is complete ({amount(info.step, 'step')}), nothing to resume", where=folder
@@ -275,7 +275,7 @@ def with_images(landmarks: LandmarkMap, info: MapInfo) -> LandmarkMap:
 
 
 def with_tracks_in(info: MapInfo, landmarks: LandmarkMap, names: Sequence[str]) -> LandmarkMap:
-    """Return landmarks built from images with these ``names``, with tracks that refer to the images of the map."""
+    """Return landmarks that were built from the images ``names``, with tracks renumbered to the images of the map."""
     if landmarks.tracks is None:
         return landmarks
     numbers = {camera.name: number for number, camera in enumerate(info.cameras)}
@@ -303,7 +303,7 @@ def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path
         if (found.shape, found.is_floating_point()) != (value.shape, value.is_floating_point()):
             kinds = [f"dtype {t.dtype}, shape {list(t.shape)}".replace("torch.", "") for t in (found, value)]
             raise InputError(f"tensor {name!r} has {kinds[0]}", where=path, expected=kinds[1])
-        # Products of larger weights would overflow in float32; trained ones stay far below it.
+        # Products of larger weights would overflow in float32; trained weights are far smaller.
         largest = 1e9 if name in trained else math.inf
         if found.is_floating_point() and not bool((found.abs() <= largest).all()):
             raise InputError(
@@ -321,13 +321,14 @@ def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path
 def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None = None) -> RadianceField:
     """Build the field described by ``info`` with the weights ``tensors``; no parameter requires a gradient.
 
-    ``folder`` locates the files that error messages name. Raises ``InputError`` if the backend cannot build the
+    ``folder`` is the map's folder, for error messages. Raises ``InputError`` if the backend cannot build the
     field, or the weights do not match it.
     """
     if not info.step:
         return info.in_map_unit(NoField())
     where, path, checked = str((folder or Path()) / DESCRIPTION), (folder or Path()) / info.weights, False
-    # This is outside of the context below, in which the tensors of its module would have no values.
+    # The backend is loaded outside the context below, in which the tensors of its module would have no
+    # values.
     load_backend(info.backend, where)
     try:  # only the shapes, before memory is allocated for a field of whatever size map.json describes
         with torch.device("meta"):
@@ -400,10 +401,10 @@ def map_folder(out: Path, overwrite: bool) -> Iterator[None]:
 def _adopt_anchor(folder: Path) -> None:
     """Move the content of a user-written ``anchor.json`` into the description of the map in the folder.
 
-    Thus, even if writing is interrupted, the anchor never lies next to the description of another map.
+    Even if writing is then interrupted, the anchor never ends up next to the description of another map.
     """
     if (folder / ANCHOR).exists():
-        with contextlib.suppress(InputError):  # no map that the anchor could be of, or a damaged one
+        with contextlib.suppress(InputError):  # no map to which the anchor could belong, or a damaged one
             write_file(folder / DESCRIPTION, _json(load_info(folder)))
             (folder / ANCHOR).unlink()
 

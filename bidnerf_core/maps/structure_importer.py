@@ -1,6 +1,7 @@
-"""Import of an existing COLMAP model: its images, poses, points and tracks, from which a map of landmarks is made.
+"""Importing an existing COLMAP model: its images, poses, points and tracks become a map of landmarks.
 
-The files of the model are only read. Its names, cameras and world stay those of the map.
+The files of the model are only read. The map keeps the cameras and image names of the model, and its world unless the user moves or scales
+it.
 """
 
 from __future__ import annotations
@@ -40,17 +41,17 @@ class StructureSettings(Settings):
 
 
 class StructureImporter:
-    """Reads COLMAP projects, with a database of SIFT keypoints, with hloc's features, or with photos."""
+    """Reads COLMAP models, with keypoints from a COLMAP database, from hloc's feature file, or detected in the photos."""
 
     summary = "COLMAP models with their database or photos, as landmarks ('train' adds a field)"
     config_type = StructureSettings
 
     def recognises(self, path: Path) -> bool:
-        """Return whether a folder is a COLMAP project, or has a model in it."""
+        """Return whether a folder is a COLMAP project or contains a COLMAP model."""
         return path.is_dir() and bool(colmap_models(path))
 
     def read(self, path: Path, config: StructureSettings, placement: Similarity) -> ImportedField:
-        """Read the model in a folder, see ``Importer``."""
+        """Read the COLMAP model in a folder; see ``Importer.read``."""
         model, folder, images, cameras, files = colmap_project(path)
         _, points = read_model(model)
         found = [f"{model}: {amount(len(images), 'image')}, {amount(len(points.ids), 'point')}"]
@@ -76,7 +77,7 @@ class StructureImporter:
                 left_out.append(f"{image.name}: it has no keypoints in the file of them")
             elif not known and image.name not in files:
                 left_out.append(f"{image.name}: no such photo in {folder}")
-            elif int((observed[number] >= 0).sum()) < 6:  # too few even for its own pose by consensus
+            elif int((observed[number] >= 0).sum()) < 6:  # too few to determine even its own pose by RANSAC
                 left_out.append(f"{image.name}: it observes fewer than 6 points")
             else:
                 kept.append(number)
@@ -101,7 +102,7 @@ class StructureImporter:
 
 
 def _numbers(observed: Tensor, ids: Tensor, sound: Tensor) -> Tensor:
-    """Return the indices of observed points, given by their ids; -1 for points that are unknown or not finite."""
+    """Convert the ids of observed points to their indices in ``ids``; -1 for points that are unknown or not finite."""
     if not len(ids):
         return torch.full_like(observed, -1)
     place = torch.searchsorted(ids, observed).clamp(max=len(ids) - 1)
@@ -109,7 +110,7 @@ def _numbers(observed: Tensor, ids: Tensor, sound: Tensor) -> Tensor:
 
 
 def _misfit(known: Mapping[str, Keypoints], counts: Mapping[str, int], cameras: list[object]) -> str | None:
-    """Return why keypoints do not fit images with these ``counts`` of keypoints, or cannot be used; None if they fit."""
+    """Return why stored keypoints cannot be used for images with these ``counts`` of keypoints; None if they can."""
     named = [name for name in counts if name in known]
     if not named:
         return "it has no keypoints of any image of the model"

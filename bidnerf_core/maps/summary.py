@@ -1,4 +1,4 @@
-"""Summaries for users: the facts about a map, and the quality of its rendering of a photo."""
+"""Summaries for users: the facts about a map, and how well it renders a photo."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DESCRIBED = (
     "backend", "data", "added", "unit", "distances", "step", "complete", "bounds", "origin", "config", "bidnerf",
     "colour_noise",
 )  # fmt: skip
-"""The attributes of a map's description that are facts for users."""
+"""The attributes of a map's description that its summary includes."""
 
 
 @dataclass(frozen=True)

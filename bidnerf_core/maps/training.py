@@ -129,14 +129,14 @@ def train(
 ) -> Map:
     """Train a map on images: check and refine their poses, train the field, and bake a surface and landmarks.
 
-    ``data`` is a dataset, the path to one, or views whose reference frame is the world; ``options.images`` says
-    how to read the images, such as which split. The path may also be a folder of photos without poses, or a
-    video: ``find_poses`` then finds the poses first, in the folder OUT-poses next to the map. ``backend`` is
+    ``data`` is a dataset, the path to one, or views whose reference frame is the world; ``options.images``
+    holds the split and other options for reading it. The path may also be a folder of photos without poses, or
+    a video: ``find_poses`` then finds the poses first, in the folder OUT-poses next to the map. ``backend`` is
     the name of an installed backend, and ``config`` holds its settings: an object of its ``config_type``, a
     dict of the settings that differ from the defaults, or "quick" for the settings of a short training. The map
-    is stored in folder ``out`` during training, or only kept in memory if that is None. ``bake`` may hold the
-    settings of baking. If ``out`` holds a landmark-only map, such as an imported one, that map gets a field and
-    a surface, and keeps its landmarks, cameras and poses.
+    is stored in folder ``out`` during training, or kept only in memory if ``out`` is None. ``bake`` is whether
+    to bake, or the settings of baking. If ``out`` holds a landmark-only map, such as an imported one, a field
+    and a surface are added to it, and its landmarks, cameras and poses are kept.
 
     ``progress`` receives each step, and remarks go to the logger "bidnerf". Once ``cancel`` returns True,
     ``Cancelled`` is raised; a map in a folder then keeps the parts finished so far, landmarks first, and
@@ -144,8 +144,8 @@ def train(
     folder is then that of the last checkpoint, at most ``options.checkpoint_seconds`` old.
 
     Images with more than ``options.images.largest`` pixels along the longer side are downscaled to that size,
-    by default to 1600, or fewer if the images would take more than 2 GB or a quarter of the available memory;
-    the map's cameras are scaled accordingly.
+    by default to 1600 pixels, or to fewer if the images would take more than 2 GB or a quarter of the available
+    memory; the map's cameras are scaled accordingly.
 
     Raises ``InputError`` if data, settings or folder cannot be used, and if the poses contradict most pairs of
     images unless ``options.trust_poses`` is set; the folder must be empty unless ``options.overwrite`` is set.
@@ -160,7 +160,7 @@ def train(
     if place is not None and not options.overwrite:
         with contextlib.suppress(InputError):
             there = load_info(place)
-            # A map that is complete without a field, as an imported one may be, gets one.
+            # A map that is complete without a field, such as an imported COLMAP model, gets a field.
             known = there if there.complete and not there.step else None
     with (
         job_context(progress, cancel),
@@ -210,7 +210,7 @@ def train(
 
 
 def given_settings(config: Any, kind: type, what: str) -> Any:
-    """Return the settings of a backend or an importer: ``config`` itself, or its dict of those that differ from the defaults.
+    """Return the settings of a backend or an importer, given as an object or as a dict of non-default values.
 
     Raises ``InputError`` if ``config`` is neither, and for unknown settings or values out of range.
     """
@@ -225,7 +225,7 @@ def given_settings(config: Any, kind: type, what: str) -> Any:
 def _with_field(
     scene: Map, data: Images, images: DatasetOptions, options: TrainOptions
 ) -> tuple[Map, list[View], TrackedViews | None]:
-    """Prepare a landmark-only map for training a field; return it with its images at the stored poses, and their keypoints."""
+    """Prepare a landmark-only map for training a field. Return the map, its images at the stored poses, and their keypoints."""
     info, images = scene.info, replace(images, largest=longest_side(scene.info))
     read, views = views_again(info, data, images, options.depth_points, options.point_choice, scene.folder)
     own = {camera.name for camera in info.cameras}
@@ -240,7 +240,7 @@ def _with_field(
 
 @contextlib.contextmanager
 def finished_parts(folder: Path | None) -> Iterator[None]:
-    """If the work in the context is cancelled, list in the error the parts of the map that are finished."""
+    """Name the finished parts of the map in the ``Cancelled`` that the work in the context raises."""
     try:
         yield
     except Cancelled as stopped:
@@ -334,9 +334,9 @@ def posed_images(
 ) -> Iterator[tuple[Images, DatasetOptions]]:
     """Yield images with poses, and the options with which to read them.
 
-    For a folder of photos without poses, or a video, structure from motion finds the poses, and the dataset of
-    these is yielded. It lies next to the map ``out``, or in a temporary folder for a map in memory; existing
-    poses are reused. Any other ``data`` is yielded unchanged.
+    For a folder of photos without poses, or a video, structure from motion finds the poses and writes a
+    dataset, whose path is yielded. The dataset is in a folder next to the map ``out``, or in a temporary
+    folder for a map in memory; poses found earlier are reused. Any other ``data`` is yielded unchanged.
     """
     if not isinstance(data, str | Path) or not lacks_poses(data):
         yield data, options
@@ -368,7 +368,7 @@ def poses_folder(out: Path) -> Path:
 
 
 def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> None:
-    """Raise ``InputError`` for views (or their depth or background) that differ from those the training began with."""
+    """Raise ``InputError`` if the views, their masks, sparse depth or background are not those with which training began."""
     if stored_cameras(read.views) != as_given(info.cameras):
         part = f"split {split!r} has" if read.source else "these have"
         raise InputError(
@@ -402,7 +402,7 @@ def _completed(
     """Run the stages that the map has not completed: landmarks, field, surface, and the capture record of its photos.
 
     ``tracked`` holds the keypoints of ``views``, ``state`` the training state to resume from, and ``out`` the
-    folder for the field.
+    folder in which to store the field. Nothing is baked if ``baking`` is None.
     """
     if baking is not None and scene.landmarks is None:
         scene, tracked = scene.with_landmarks(views, tracked=tracked)
@@ -430,7 +430,7 @@ def train_field(
 ) -> Map:
     """Train the field described by a map to completion: from ``state``, from the ``weights`` of a field, or from scratch.
 
-    The views are in the unit of the training.
+    The poses and depths of ``views`` are in the field's length unit. Raises ``Cancelled`` if training is stopped.
     """
     out, device = scene.folder, working_device(options.device)
     backend, where = load_backend(scene.info.backend, str(out or "")), scene.name
@@ -459,7 +459,7 @@ def train_field(
 
 
 def baked_if_possible(scene: Map, bake: Callable[[Map], Map]) -> Map:
-    """Return the result of ``bake`` or, if the images do not allow baking, the map as it is, valid without a surface."""
+    """Return the result of ``bake`` or, if the images do not allow baking, the map without a new surface."""
     try:
         return bake(scene)
     except PluginError:  # nothing that other images would fix

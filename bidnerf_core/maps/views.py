@@ -45,11 +45,11 @@ log = logging.getLogger("bidnerf")
 Images: TypeAlias = Capture | Sequence[View] | str | Path
 """Images with poses: a dataset, the path to one, or views whose reference frame is the world."""
 AS_STORED = DatasetOptions()
-"""Images of split "train" as their dataset stores them."""
+"""The options for images of split "train" as the dataset stores them."""
 
 
 Origin: TypeAlias = tuple[float, float, float]
-"""The origin of a map's own coordinates, see ``Map.origin``."""
+"""The origin of a map's local coordinate frame, in world coordinates; see ``Map.origin``."""
 
 
 def chosen_origin(points: Float[Tensor, "n 3"]) -> Origin:
@@ -95,8 +95,8 @@ class ReadViews:
     def with_files(self, cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
         """Return the cameras of the views, with the file of each image.
 
-        The file is left out where an image shows only part of its file (a face of a panorama, the pinhole image
-        of another lens) or its mirror image: the camera would not be that of the file.
+        An image gets no file if it shows only part of the file (a face of a panorama, the pinhole image of
+        another lens) or its mirror image, since its camera is then not that of the file.
         """
         frames = {view.frame.name: view.frame for view in self.views}
         found = []
@@ -121,9 +121,9 @@ def read_views(
     """Read the views of ``data``; for a dataset, ``options.split`` selects the split, or "all" for all splits.
 
     Dataset images with more than ``options.largest`` pixels along the longer side are downscaled to that size,
-    by default to ``useful_size``. Images are held as bytes and, if there are many, in a nameless file in
+    by default to ``useful_size``. Images are held as bytes and, if there are many, in an unnamed file in
     ``folder``, see ``PixelStore``. The background behind images with an alpha channel is by default that of the
-    dataset; the other options apply only to the path to a dataset.
+    dataset; the other options apply only if ``data`` is a path.
 
     Images without depth get depth from the points of the COLMAP model in folder ``depth_points``, see
     ``SparsePoints``. Raises ``InputError`` if there are no views, and if the views or the model cannot be used.
@@ -216,11 +216,10 @@ def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path |
 
 
 USEFUL_SIDE, LEAST_SIDE = 1600, 800
-"""Pixels along the longer side: more are of little use to a map, whose keypoints are found at the latter;
-fewer harm it."""
+"""Pixels along the longer side of images. More than 1600 are of little use to a map; fewer than 800, the size
+at which keypoints are detected, harm it."""
 MOST_BYTES = 2_000_000_000
-"""Bytes that the images of a training run use by default; on machines with little memory, a quarter of what
-is available."""
+"""Default limit on the bytes of a training run's images, unless a quarter of the available memory is less."""
 
 
 def useful_size(frame: Frame, count: int) -> int:
@@ -235,7 +234,7 @@ def useful_size(frame: Frame, count: int) -> int:
 
 
 def _unit_of(views: Sequence[View]) -> LengthUnit:
-    """Return metres if a view has dense measured depth, since training rejects poses that contradict the depth; else units."""
+    """Return "metres" if a view has dense measured depth, since training rejects poses that contradict it; else "units"."""
     return "metres" if any(view.frame.has_dense_depth for view in views) else "units"
 
 
@@ -264,10 +263,10 @@ def views_again(
     point_choice: SparseChoice | None = None,
     folder: Path | None = None,
 ) -> tuple[ReadViews, list[View]]:
-    """Read images of a map that ``info`` describes, as ``read_views`` does, with poses in the map's own coordinates.
+    """Read images of the map that ``info`` describes, as ``read_views`` does, with poses relative to the map's origin.
 
-    The background is by default the one with which its field was begun. Also returns the views at the poses that
-    the map has for them, where training refined the given ones.
+    The background is by default that with which the training of the field began. Also returns the views at the
+    poses stored in the map, which training may have refined.
     """
     if options.background is None and isinstance(data, str | Path) and info.backend:
         options = replace(options, background=info.bounds.background)

@@ -1,7 +1,7 @@
 """COLMAP's database of photos: their cameras, keypoints, and the pairs of photos that match.
 
-Photos of the same size whose EXIF states the same lens share a camera. Its initial focal length is that of
-EXIF, or a typical one, and is estimated with the poses. A given camera is kept fixed.
+Photos of the same size whose EXIF states the same lens share a camera. The initial focal length is that of
+EXIF or a typical one, and is refined together with the poses. A camera given by the user is kept fixed.
 """
 
 from __future__ import annotations
@@ -34,18 +34,20 @@ from bidnerf_core.progress import counter
 from bidnerf_core.structure.sources import SourceImage
 
 LARGEST = 1600
-"""Pixels along the longer side to which photos are downscaled: more give slightly more accurate poses, but
-take far longer."""
+"""Pixels along the longer side of downscaled photos: more give slightly more accurate poses, but take far longer."""
 DETECTOR = Sift(count=4096, largest=LARGEST)
 NEIGHBOURS = 10
-"""Number of photos on either side, in order of name or time, with which each is matched."""
+"""Number of photos before and after each photo, in order of name or time, with which it is matched."""
 
 Pairs: TypeAlias = list[tuple[int, int]]
-"""Pairs (i < j) of photos."""
+"""Pairs (i, j) of photos with i < j."""
 
 
 def pycolmap_for(what: str) -> Any:
-    """Import pycolmap, silenced. Raises ``InputError``, whose message begins with ``what``, if it is not installed."""
+    """Import pycolmap and silence its log.
+
+    Raises ``InputError`` if pycolmap is missing or too old; the message begins with ``what``.
+    """
     try:
         import pycolmap
     except ImportError as error:
@@ -64,7 +66,7 @@ def pycolmap_for(what: str) -> Any:
 
 @dataclass(frozen=True)
 class ListedPhoto:
-    """A readable photo: its size as stored, the size at which its keypoints are found, and the number of its camera."""
+    """A readable photo: its size as stored, the size at which keypoints are detected, and the number of its camera."""
 
     image: SourceImage
     number: int  # in the database, from 1
@@ -87,7 +89,7 @@ class Described:
 def described(images: Sequence[SourceImage], given: Intrinsics | str | Path | None) -> Described:
     """Read the headers of photos, and group the photos by camera.
 
-    Raises ``InputError`` for a ``given`` camera that does not fit.
+    Raises ``InputError`` for a ``given`` camera that does not fit the photos.
     """
     found, numbers = Described([], {}, {}, {}), dict[Any, int]()
     for number, image in enumerate(images, start=1):
@@ -117,15 +119,15 @@ def _first_guess(photo: ListedPhoto, given: Intrinsics | str | Path | None) -> t
 
 
 def key(number: int) -> str:
-    """Return the name in the database of the photo with this number.
+    """Return the name of a photo in the database, made from its number.
 
-    Its file name may contain spaces, which COLMAP's pair lists do not allow.
+    The file name of a photo may contain spaces, which COLMAP's pair lists do not allow.
     """
     return f"{number:06d}"
 
 
 def to_colmap(intrinsics: Intrinsics, number: int, pycolmap: Any) -> Any:
-    """Convert to a pycolmap camera, whose pixel coordinates follow the same convention as ``Intrinsics``.
+    """Convert intrinsics to a pycolmap camera, which uses the same pixel convention.
 
     Raises ``InputError`` for a lens without a COLMAP model.
     """
@@ -136,7 +138,7 @@ def to_colmap(intrinsics: Intrinsics, number: int, pycolmap: Any) -> Any:
 
 
 def write_cameras(database: Any, found: Described, fixed: bool, pycolmap: Any) -> None:
-    """Write cameras and photos to an empty database. A camera that is not ``fixed`` has one radial coefficient."""
+    """Write cameras and photos to an empty database. Cameras get one radial distortion coefficient unless ``fixed``."""
     with pycolmap.DatabaseTransaction(database):
         for number, intrinsics in found.cameras.items():
             size = intrinsics.width, intrinsics.height
@@ -159,9 +161,9 @@ def write_cameras(database: Any, found: Described, fixed: bool, pycolmap: Any) -
 
 
 def write_keypoints(database: Any, found: Described, pycolmap: Any) -> None:
-    """Find the keypoints missing from the database; photos that cannot be decoded become unusable.
+    """Detect the keypoints that the database lacks; photos that cannot be decoded are moved to ``found.unusable``.
 
-    Keypoints found until the job is cancelled are stored.
+    If the job is cancelled, the keypoints detected so far stay in the database.
     """
     count, total = counter("finding keypoints", "photos"), len(found.photos)
     missing = [photo for photo in found.photos if not database.exists_keypoints(photo.number)]
@@ -186,7 +188,7 @@ def write_keypoints(database: Any, found: Described, pycolmap: Any) -> None:
 
 
 def _keypoints(photo: ListedPhoto) -> Keypoints | InputError:
-    """Return the keypoints of the downscaled photo, without those on its background."""
+    """Return the keypoints of the downscaled photo, without those on its transparent background, or the error."""
     try:
         rgb, alpha = read_image(photo.image.file, size=photo.reduced)
     except InputError as error:
@@ -205,11 +207,11 @@ def _without_file(error: InputError, image: SourceImage) -> str:
 
 
 def similar_pairs(descriptors: Sequence[np.ndarray]) -> Pairs:
-    """Return the pairs of photos that are neighbours or among the twenty most similar, given the descriptors (n, 128) of each.
+    """Return the pairs of photos to match: neighbours, and each photo with its 20 most similar ones by descriptors (n, 128).
 
-    Neighbours are likely to overlap since photos and frames are taken one after another. Similar photos close loops, and connect
-    photos in arbitrary order. The similarity of two photos is the product of their vectors of locally aggregated descriptors (VLAD,
-    Jégou et al. 2010), whose words are found in the photos themselves.
+    Neighbours are likely to overlap, since photos and frames are taken one after another. Similar photos close loops, and connect
+    photos that are in arbitrary order. The similarity of two photos is the product of their vectors of locally aggregated
+    descriptors (VLAD, Jégou et al. 2010), whose words are found in the photos themselves.
     """
     count, known = len(descriptors), [torch.from_numpy(own) for own in descriptors]
     pairs = {(i, j) for i in range(count) for j in range(i + 1, min(count, i + NEIGHBOURS + 1))}
@@ -223,9 +225,10 @@ def similar_pairs(descriptors: Sequence[np.ndarray]) -> Pairs:
 
 
 def match(database: Path, pairs: Pairs, threads: int, pycolmap: Any) -> None:
-    """Match the ``pairs`` of photos, by number, that are missing from the database, and verify the matches by two-view geometry.
+    """Match the ``pairs`` of photos (by number) that the database lacks, and verify the matches by two-view geometry.
 
-    Matches found until the job is cancelled are stored. A batch of pairs cannot be interrupted.
+    If the job is cancelled, the matches found so far stay in the database. A batch of pairs cannot be
+    interrupted.
     """
     count = counter("matching photos", "pairs")
     with pycolmap.Database.open(database) as stored:

@@ -1,4 +1,4 @@
-"""The model of photos: its registration by COLMAP's incremental mapper, its orientation and check, and its dataset."""
+"""The COLMAP model of photos: incremental mapping, orientation, a consistency check, and export as a dataset."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from bidnerf_core.structure.colmap import Described, ListedPhoto
 from bidnerf_core.structure.record import MODEL, TRANSFORMS
 
 LEAST_PHOTOS = 3
-"""Photos in the smallest model: two have a single baseline, which allows no check."""
+"""Smallest number of photos in a model: two photos have a single baseline, which allows no check."""
 
 
 def reconstructed(
     database: Path, folder: Path, found: Described, fixed: bool, threads: int, pycolmap: Any
 ) -> list[Any]:
-    """Reconstruct the photos of a database, keeping their cameras if ``fixed``; models are written to ``folder``.
+    """Reconstruct models from the photos in a database, with constant cameras if ``fixed``; models are written to ``folder``.
 
-    Returns the models, largest first; parts of the scene without overlap become separate models. There may be no model at all.
+    Returns the models, largest first; photos without overlap form separate models. The list may be empty.
     """
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=threads,
@@ -51,7 +51,7 @@ def reconstructed(
     models = pycolmap.incremental_mapping(
         database, folder, folder, options, next_image_callback=lambda: count(min(next(placed), total), total)
     )
-    # COLMAP also registers photos by matches without depth, which occur between photos from one place.
+    # COLMAP also registers photos by matches that determine no depth, as between photos from one place.
     for model in models.values():
         for number in list(model.reg_image_ids()):
             if model.image(number).num_points3D < 15:
@@ -78,7 +78,7 @@ def turn_upright(model: Any, photos: Mapping[int, ListedPhoto], pycolmap: Any) -
 
 
 def _upright_axes(photo: ListedPhoto) -> tuple[np.ndarray, np.ndarray]:
-    """Return the right and up axes of the upright photo, in the camera of the photo as stored (x right, y down)."""
+    """Return the right and up axes of the upright photo in the camera frame of the photo as stored (x right, y down)."""
     turned = photo.exif.orientation
     x, y = (-1.0 if flips else 1.0 for flips in (turned.mirrors_columns, turned.mirrors_rows))
     if turned.transposes:
@@ -87,7 +87,7 @@ def _upright_axes(photo: ListedPhoto) -> tuple[np.ndarray, np.ndarray]:
 
 
 def full_size(model: Any, photos: Mapping[int, ListedPhoto]) -> None:
-    """Scale the cameras and keypoints of a model from downscaled photos to photos as stored."""
+    """Scale the cameras and keypoints of a model from the downscaled photos to the photos as stored."""
     sizes = {photo.camera: photo for photo in photos.values()}
     for number, photo in sizes.items():
         if model.exists_camera(number):
@@ -101,14 +101,14 @@ def full_size(model: Any, photos: Mapping[int, ListedPhoto]) -> None:
 
 
 def agreement(model: Any, database: Any, pycolmap: Any) -> tuple[int, int]:
-    """Compare the verified pairs of a database with the poses and cameras of a model.
+    """Count the verified pairs of photos, and those that contradict the poses and cameras of a model.
 
     Places that look alike, such as the doors of a corridor, can be taken for one place. The model is then folded, although its points
-    project where they should. A folded model contradicts other pairs of photos, whose many matches cannot be due to chance.
+    project where they should. A folded model contradicts other pairs of photos, which have too many matches to be due to chance.
 
-    Returns the number of pairs of registered photos with at least a hundred verified matches, since pairs of different places
-    with repeated details have up to 80, and the number of those that contradict the model's poses: fewer than half of their
-    matches are within four pixels of their epipolar lines, in the photos in which keypoints were found.
+    Returns the number of pairs of registered photos with at least 100 verified matches (pairs that show different places with
+    repeated details have up to 80), and how many of these pairs contradict the model: fewer than half of their matches are within
+    four pixels of the epipolar lines, measured in the downscaled photos.
     """
     placed, keypoints = set(model.reg_image_ids()), dict[int, np.ndarray]()
     pairs = contradicting = 0
@@ -135,9 +135,10 @@ def agreement(model: Any, database: Any, pycolmap: Any) -> tuple[int, int]:
 def left_out(
     found: Described, models: list[Any], partners: Counter[int], keypoints: Mapping[int, int]
 ) -> dict[str, str]:
-    """Return, by photo name, why the left-out photos are in no model, or not in the largest.
+    """Return, by name, the reason why each photo that is not in the largest model was left out.
 
-    ``partners`` holds how many photos each photo overlaps with, and ``keypoints`` how many keypoints it has.
+    ``partners`` counts the photos that overlap with each photo, and ``keypoints`` its keypoints, both by
+    photo number.
     """
     of_model = {number: model for model in reversed(models) for number in model.reg_image_ids()}
     reasons = dict(found.unusable)
@@ -154,7 +155,7 @@ def left_out(
 
 
 def write_dataset(folder: Path, photos: Mapping[int, ListedPhoto], model: Any, base: Path) -> None:
-    """Write a model, with cameras for the ``photos`` (by number) as stored in ``base``, and its ``transforms.json``."""
+    """Write a model of ``photos`` (by number) and its ``transforms.json`` to ``folder``; the model names images relative to ``base``."""
     entries = []
     for number in sorted(model.reg_image_ids()):
         photo, image = photos[number], model.image(number)

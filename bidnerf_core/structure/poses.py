@@ -79,10 +79,10 @@ def find_poses(
     radial distortion are estimated, starting from EXIF. If the photos fall into several models, the largest
     is kept.
 
-    The dataset is a ``transforms.json`` that refers to the photos in place; ``poses.json`` lists those that
-    were left out and why, and ``sparse/0`` is the model in COLMAP's format. The unit of length is arbitrary, and z
-    points up. Interrupted work in the same folder is resumed; poses already found for the same photos are
-    returned immediately, unless ``overwrite`` is set and ``reuse`` is not.
+    The dataset is a ``transforms.json`` that refers to the photos in place; ``poses.json`` is the returned record,
+    with the photos that were left out and why; ``sparse/0`` is the model in COLMAP's format. The unit of length is
+    arbitrary, and z points up. Interrupted work in the same folder is resumed; poses already found for the same
+    photos are returned immediately, unless ``overwrite`` is set and ``reuse`` is not.
 
     ``progress`` receives each step; once ``cancel`` returns True, ``Cancelled`` is raised. Raises
     ``InputError`` if fewer than three photos can be read or registered, if poses are already known, if the folder
@@ -138,7 +138,7 @@ def find_poses(
 def _search(
     source: Path, images: list[SourceImage], work: Path, inputs: str, camera: Intrinsics | str | Path | None, pycolmap: Any,
 ) -> FoundPoses:  # fmt: skip
-    """Find the poses of ``images``, or of frames of a video if there are none, and write the dataset beside the ``work`` folder."""
+    """Find the poses of ``images`` or, if there are none, of frames of the video ``source``; write the dataset next to ``work``."""
     began, folder, database, video = time.monotonic(), work.parent, work / "database.db", not images
     fixed, threads = camera is not None, max(1, torch.get_num_threads())
     if video:
@@ -158,7 +158,7 @@ def _search(
         keypoints = {photo.number: opened.num_keypoints_for_image(photo.number) for photo in found.photos}
         numbers = [number for number, count in keypoints.items() if count]
         pairs = list(itertools.combinations(numbers, 2))
-        # Beyond so many photos, matching all pairs would take hours.
+        # For more photos than this, matching all pairs would take hours.
         if len(numbers) > (60 if video else 150):
             similar = similar_pairs([opened.read_descriptors(number).data for number in numbers])
             pairs = [(numbers[i], numbers[j]) for i, j in similar]

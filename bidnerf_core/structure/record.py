@@ -31,10 +31,10 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class FoundPoses:
-    """Poses found by structure from motion; the dataset next to this record holds them.
+    """The record of poses found by structure from motion; the poses are in the dataset next to it.
 
-    The unit of the world is that of the first pair of photos, not metres, and z points up as far as the
-    photos show. ``str()`` gives a human-readable summary.
+    The length unit of the world depends on the first pair of photos and is not metres; z points up, as
+    estimated from the cameras. ``str()`` gives a human-readable summary.
     """
 
     source: str  # name of the folder of photos, or of the video
@@ -56,10 +56,10 @@ class FoundPoses:
 
     @property
     def doubt(self) -> str | None:
-        """Why the poses may be wrong as a whole, with a remedy; None if there is no sign of that.
+        """Why the poses may be wrong as a whole, and a remedy; None if nothing indicates that they are.
 
-        Repeated details cause contradicting pairs, too, though rarely above half a per cent: at 1.2 % a model is folded (record
-        ``photos_corridor``), but another is right at 2.5 %.
+        Repeated details also cause contradicting pairs, though rarely more than 0.5 %: one model with 1.2 % is folded (record
+        ``photos_corridor``), but another with 2.5 % is correct.
         """
         if self.contradicting <= 0.005 * self.sure_pairs:
             return None
@@ -109,7 +109,7 @@ def read_found(folder: Path) -> FoundPoses | None:
 
 
 def begun(folder: Path) -> dict[str, Any]:
-    """Return the state of interrupted work in a folder: the digest of its ``inputs``, and whether they are a ``video``."""
+    """Return the state of interrupted work: the digest ``inputs`` and whether they are a ``video``; empty if there is none."""
     with contextlib.suppress(InputError):
         found = read_json(folder / WORK / "begun.json", "the state of interrupted work")
         return found if isinstance(found, dict) else {}
@@ -117,7 +117,7 @@ def begun(folder: Path) -> dict[str, Any]:
 
 
 def begin(folder: Path, inputs: str, video: bool) -> Path:
-    """Return the work folder, emptied unless it was begun with the same inputs.
+    """Return the work folder, which is emptied unless the work in it has the same inputs.
 
     Raises ``InputError`` if the frames of a video would be written among other images.
     """

@@ -36,12 +36,12 @@ from bidnerf_core.io import open_binary, read_header
 from bidnerf_core.progress import counter
 
 STEP = 0.04
-"""Image motion between chosen frames, in diagonals."""
+"""Image motion between chosen frames, as a fraction of the image diagonal."""
 MOST = 400
-"""Largest number of chosen frames: longer videos use longer steps."""
+"""Largest number of chosen frames; in long videos, the steps are longer."""
 
 Measure: TypeAlias = tuple[float, float]
-"""The accumulated motion (diagonals) until a frame, and its sharpness (octaves)."""
+"""The motion accumulated up to a frame (in image diagonals), and the sharpness of the frame (octaves)."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +98,8 @@ def _listed(folder: Path, out: Path | None) -> list[Path]:
 def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
     """Return the photos without smaller copies of others, as in ``images_2`` and ``images_4`` beside ``images``.
 
-    A folder holds copies if all its photos have the names of those in a folder beside it, and the same aspect ratio; a
-    remark names such folders.
+    A folder holds copies if a folder beside it has larger photos of the same names and aspect ratio; a remark names
+    such folders.
     """
     groups: dict[Path, list[Path]] = {}
     for photo in photos:
@@ -197,7 +197,7 @@ def measured(video: Path) -> list[Measure]:
 
 
 def chosen(frames: Sequence[Measure]) -> list[int]:
-    """Return the indices of the frames to find poses for: one for each step of motion, the sharpest near it."""
+    """Return the indices of the frames to find poses for: for each step of motion, the sharpest frame near it."""
     motion, sharp = np.array(frames).T
     step = max(STEP, float(motion[-1]) / (MOST - 1))
     found = set[int]()
