@@ -214,8 +214,8 @@ def measured(
 ) -> tuple[TrialResult, float]:
     """Run a trial as ``run_trial`` does, and also return the samples per ray in its last frame at the true pose.
 
-    These are the mean number of valid samples on uniformly drawn rays, at the level of detail that the method
-    uses, else the finest.
+    The samples per ray are the mean number of valid samples on uniformly drawn rays, at the level of detail
+    that the method uses or, if it uses none, for the field itself.
     """
     result = run_trial(trial, scene, registered)
     stored, dataset = scene or opened(trial.map, trial.data, trial)
@@ -242,10 +242,10 @@ def map_bytes(stored: Scene) -> int:
 
 
 def named_maps(scenes: Sequence[Scene] | Mapping[str, Scene]) -> dict[str, Scene]:
-    """Return the maps by name, given or the shortest that distinguishes them; maps in memory of one backend are numbered.
+    """Return the maps by unique name: the given names, else folder names, or numbered backend names for maps in memory.
 
-    Folders are named by as few of their last parts as make the names unique. Raises ``InputError`` without maps, for a single map
-    that is not in a list, and for a folder that is named twice.
+    A folder name has as few trailing parts of the path as make all folder names unique. Raises ``InputError`` without maps, for a
+    single map that is not in a list, and for a folder that is named twice.
     """
     if isinstance(scenes, str | Path | Map):
         raise InputError(

@@ -30,7 +30,7 @@ from bidnerf_core.settings import LARGEST_SEED, Range, Settings, WholeNumbers, t
 
 
 def bid_start(T_true: SE3, size: float, seed: int, widest: float = math.pi / 4) -> SE3:
-    """Return the start of BID-NeRF, ``T_true exp((e_t u1, e_r u2))`` with random unit u1, u2 and e_t = ``size``.
+    """Return the start of BID-NeRF, ``T_true exp((e_t u1, e_r u2))`` with random unit vectors u1, u2 and e_t = ``size``.
 
     The paper does not state which e_r belongs to which e_t, only that errors stay below 45 degrees. Here e_r grows
     linearly from 0.2 rad at e_t = 0.5 to ``widest`` (rad) at e_t = 3.4, the ends of the range of e_t in the paper's
@@ -58,7 +58,7 @@ def inerf_start(T_true: SE3, seed: int) -> SE3:
     """Return a start perturbed as in iNeRF (Yen-Chen et al. 2021, IV-A), by up to 40 degrees and 0.2 along each axis.
 
     The camera is rotated about a random axis through its own centre by an angle drawn uniformly from -40 to 40
-    degrees; the offsets are uniform in -0.2 to 0.2.
+    degrees; the offsets (in the unit of the poses) are uniform from -0.2 to 0.2.
     """
     generator = torch.Generator().manual_seed(seed)
     axis = random_units(1, generator)[0]
@@ -138,7 +138,8 @@ def once_each(frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
 class Protocol:
     """A way of choosing frames, seeds and starts.
 
-    ``start`` takes the true pose, a size, the seed and the number of frames.
+    ``start`` takes the true pose, a size, the seed and the number of frames, and returns the start, or None
+    for no start.
     """
 
     summary: str
@@ -209,7 +210,7 @@ PROTOCOLS = {
         cases_of=once_each,
     ),
 }
-"""All protocols by name."""
+"""All protocols, by name."""
 
 
 def find_protocol(name: str) -> Protocol:
@@ -425,10 +426,9 @@ def _rigs(plan: Plan, dataset: Capture, names: list[str], data: str) -> list[tup
 def arc(poses: Sequence[SE3], last: int, count: int, angle_deg: float) -> tuple[int, ...] | None:
     """Return the indices of ``count`` frames ending with ``last``, ``angle_deg`` apart about a common centre (BID-NeRF, Table 2).
 
-    The centre is the point that the surrounding cameras look at, the least-squares intersection of their
-    optical axes. At each step about the vertical axis, the frame nearest in direction from the centre is
-    chosen. Both senses of rotation are tried, and the better fit is returned; None if at some step no unused
-    frame lies within half a step.
+    The centre is the point at which the cameras look: the least-squares intersection of their optical axes. At each step
+    about the vertical axis, the frame nearest in direction from the centre is chosen. Both senses of rotation are tried,
+    and the better fit is returned; None if at some step no unused frame lies within half a step.
     """
     rotations, positions = (
         torch.stack([T.rotation for T in poses]),

@@ -47,14 +47,15 @@ PER_INCH = 13
 MOST_SITUATIONS = 16
 """Maximum number of situations in a figure; larger figures can be neither drawn nor read."""
 BOUND: dict[str, Any] = {"color": "#999", "linewidth": 0.8, "linestyle": (0, (4, 3))}
-"""The look of a bound."""
+"""The line style of a bound."""
 
 
 class Quantity(NamedTuple):
-    """A quantity of trials that panels show.
+    """A quantity of trials that a panel shows.
 
-    It has a label, the axis label for the share of trials, the bound for right answers, and a function that
-    returns the value for a result and a criterion, infinite for trials that never count.
+    Its fields are the axis label of the quantity, the axis label of the share of trials, the bound for right
+    answers (None: no bound), and a function that returns the value for a result and a criterion, infinite for
+    trials that never count.
     """
 
     label: str
@@ -83,13 +84,14 @@ Panel = tuple[str, Callable[[Any], None]]
 
 
 Figure = tuple[Path, str]
-"""An SVG, next to which the same figure lies as PNG, and its caption."""
+"""The path of an SVG, next to which the same figure is stored as PNG, and its caption."""
 
 
 class Figures:
     """Draws figures of ``groups`` and saves them as PNG and SVG in ``folder``. Raises ``InputError`` without matplotlib.
 
-    ``criterion`` defines success by step. Images without faults are drawn, if there are any, in at most ``MOST_SITUATIONS`` situations.
+    ``criterion`` defines success by step. If there are trials without faults, only these are drawn, in at most ``MOST_SITUATIONS``
+    situations.
     """
 
     def __init__(self, groups: Sequence[Group], folder: Path, criterion: str) -> None:
@@ -113,7 +115,7 @@ class Figures:
         return f" At most {MOST_SITUATIONS} of {count} situations are drawn; the tables have all."
 
     def errors(self) -> Figure | None:
-        """Draw, for each situation, the share of trials within each error, and the share answered rightly within each time."""
+        """Draw the cumulative share of trials over their errors, and that of right answers over time, for each situation."""
         return self._by_situation(
             "errors", self.groups, self.cumulative(),
             "Cumulative errors: the share of all trials whose final error is at most that on the axis; answers that the"
@@ -143,7 +145,7 @@ class Figures:
         for group in groups:
             values = sorted(value(result, self.criterion) for result in group.results)
             known = [each for each in values if each < NEVER]
-            if bound is not None:  # smaller errors than a 500th of the bound are equal on a logarithmic axis
+            if bound is not None:  # errors below bound / 500 are drawn as equal on the logarithmic axis
                 known = np.maximum(known, bound / 500).tolist()
             if known:
                 shares = [100 * place / len(values) for place in range(len(known) + 1)]

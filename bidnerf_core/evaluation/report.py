@@ -77,7 +77,7 @@ def write_report(
 
 
 def chosen_criterion(given: str | None, groups: Sequence[Group]) -> str:
-    """Return the criterion to use where a report shows a single one.
+    """Return the criterion to use where a report shows a single one: ``given``, or one that applies to all groups.
 
     Raises ``InputError`` for an unknown criterion, and for one that applies to no trial.
     """
@@ -134,9 +134,10 @@ def page(
 
 
 def worst(rows: Sequence[TrialResult]) -> list[TrialResult]:
-    """Return the trials in order of concern, and by decreasing error.
+    """Return the trials, the most worrying ones first.
 
-    Wrongly accepted trials (beyond 5 degrees or 0.05 units) come first, then the refused ones, then the others.
+    Wrongly accepted trials (beyond 5 degrees or 0.05 units) come first, then the refused ones, then the others;
+    each kind is sorted by decreasing error.
     """
 
     def rank(row: TrialResult) -> tuple[bool, bool, float]:
@@ -147,7 +148,7 @@ def worst(rows: Sequence[TrialResult]) -> list[TrialResult]:
 
 
 def pictured(rows: Sequence[TrialResult], data: Sequence[str | Path]) -> list[tuple[TrialResult, str | None]]:
-    """Return each trial with its image, with its faults, as a JPEG in base64; None if the trial's dataset is not in ``data``."""
+    """Return each trial with its image (with faults) as a base64-encoded JPEG, or with None if its dataset is not in ``data``."""
     folders = {Path(os.path.realpath(folder)).name: str(folder) for folder in data}
     opened: dict[tuple[str, str], Capture] = {}
     found: list[tuple[TrialResult, str | None]] = []

@@ -74,7 +74,7 @@ class ResultTable:
 
     @cached_property
     def groups(self) -> list[Group]:
-        """The results by situation (what was to be localized) and by condition (what localized it)."""
+        """The results, grouped by situation (what was to be localized) and condition (what localized it)."""
         return grouped(self.rows)
 
     @cached_property
@@ -116,13 +116,13 @@ class ResultTable:
 def aligned(lines: Sequence[Sequence[str]]) -> str:
     """Format lines of cells as text: the first column is flush left and the others are flush right.
 
-    A line with a single cell is a heading, which may be wider than its column; a very wide first cell takes a
-    line of its own. Characters that could control a terminal are escaped.
+    A line with a single cell is a heading, which may be wider than its column; a very wide first cell is put
+    on a separate line. Characters that could control a terminal are escaped.
     """
     cells: list[list[str]] = []
     for line in lines:
         first, *others = map(printable, line)
-        # A first cell that is too wide has a line of its own.
+        # A first cell that is too wide is put on a separate line.
         cells += [[first], ["", *others]] if others and len(first) > 60 else [[first, *others]]
     columns = [[line[i] for line in cells if len(line) > max(i, 1)] for i in range(max(map(len, cells)))]
     widths = [max(map(len, column)) for column in columns]
@@ -135,7 +135,7 @@ def aligned(lines: Sequence[Sequence[str]]) -> str:
 
 
 def key_of(trial: Trial) -> str:
-    """Return a key that is equal for two trials if and only if they are the same trial, wherever their folders lie."""
+    """Return a key that is equal for two trials if and only if they are the same trial, wherever their folders are."""
     return json.dumps(to_plain(trial.portable), sort_keys=True)
 
 
@@ -143,7 +143,7 @@ def read_results(paths: Iterable[Path]) -> list[TrialResult]:
     """Return the results of all files in order; a result in several files is returned once.
 
     An incomplete last line is ignored. Raises ``InputError`` for a file that cannot be read or contains
-    something else.
+    anything but results.
     """
     found: dict[Any, TrialResult] = {}
     for path in paths:
@@ -171,7 +171,7 @@ def _parsed(path: Path, content: bytes) -> tuple[list[TrialResult], int]:
 
 
 class ResultsFile:
-    """A file of results, one JSON object a line, locked by the process that has it open. Use it as a context manager.
+    """A file of results, one JSON object per line, locked by the process that has it open. Use it as a context manager.
 
     The file stays valid if the process is killed at any moment: a line is on disk before its trial counts as done, and an
     incomplete last line is removed when the file is next opened. Any other line that is not a result raises an error that
@@ -235,7 +235,7 @@ class ResultsFile:
         self.values = {key: self.values[key] for key in order}
 
     def _unmoved(self, path: Path) -> BinaryIO:
-        """Return the open file. Raises ``InputError`` if it is no longer at ``path``: lines would be lost unnoticed."""
+        """Return the open file. Raises ``InputError`` if it is no longer at ``path``, since lines would be lost."""
         assert self._file is not None
         if not (path.exists() and os.path.samestat(os.fstat(self._file.fileno()), path.stat())):
             raise InputError(
@@ -271,7 +271,7 @@ def as_line(plain: Any) -> bytes:
 # How results were made: command, code and machine.
 
 RUNS = ".meta.json"
-"""The ending of the file that lists the runs behind a results file, next to it."""
+"""The ending of the file next to a results file that lists the runs that made it."""
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ CHANGED = {
     "points": "depth points than {trial.depth_points} has now",
     "surface": "surface than map {trial.map} has now, which was rebaked",
 }
-"""Meaning of a change in each digest of a trial's input, by the digest's name."""
+"""The meaning of a change in a digest of a trial's input, by the name of the digest."""
 
 
 def evaluate(
@@ -124,11 +124,11 @@ def run_trials(
 ) -> None:
     """Run the trials that have no result in ``file``, and store each result as soon as it is available.
 
-    At most as many trials as there are workers run concurrently, so that a kill loses little. No trial begins
-    once the job is cancelled. A trial that fails ends the run with its error, after the results of the other
-    running trials have been stored. ``scene`` is the map and data of all trials, by default those that the
-    trials name; other processes read them from folders. Raises ``InputError`` as ``left_to_do`` does, and
-    ``Cancelled``.
+    At most as many trials run concurrently as there are workers, so that little is lost if the process is
+    killed. No trial begins once the job is cancelled. A trial that fails ends the run with its error, after
+    the results of the other running trials have been stored. ``scene`` is the map and data of all trials, by
+    default those that the trials name; other processes read them from folders. Raises ``InputError`` as
+    ``left_to_do`` does, and ``Cancelled``.
     """
     todo = left_to_do(trials, file, scene)
     if len(todo) < len(trials):

@@ -19,7 +19,7 @@ NEVER = math.inf
 """Steps to success of a trial that did not succeed."""
 
 RELATIVE, ABSOLUTE = "10%", "5deg 0.05"
-"""The criterion used where only one is shown: with a start, and without."""
+"""The criteria used where only one is shown: for trials with a start, and for trials without."""
 
 
 # Groups.
@@ -126,7 +126,7 @@ WORDS: dict[str, Callable[[Any], str]] = {
     "backend": str,
     "device": str,
 }
-"""How a property is named where it distinguishes conditions; others as ``depth weight 0.5``."""
+"""Functions that put properties into words where they distinguish conditions; others read like ``depth weight 0.5``."""
 
 
 def _labels(conditions: Sequence[dict[str, Any]]) -> dict[str, str]:

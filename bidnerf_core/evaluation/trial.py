@@ -191,7 +191,7 @@ def input_digests(trial: Trial, stored: Map, views: list[View]) -> InputDigests:
 
 
 def open_map(name: str, device: str = "cpu") -> Map:
-    """Return the map in a folder, or of a closed-form scene."""
+    """Load the map in a folder, or build the map of a closed-form scene."""
     where = working_device(device)
     return closed_form_map(name) if is_closed_form(name) else load_map(Path(name), where)
 
@@ -304,7 +304,7 @@ def forget_peak_memory() -> None:
 
 
 def peak_memory_bytes() -> int:
-    """Return the peak GPU memory if a GPU is in use, else the peak resident memory of this process."""
+    """Return the peak GPU memory if a GPU is in use, else the peak resident memory of this process (0 if unknown)."""
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         return int(torch.cuda.max_memory_allocated())
     with contextlib.suppress(OSError):

@@ -124,7 +124,7 @@ class RaySampler(Protocol):
 
 @runtime_checkable
 class RadianceField(Protocol):
-    """A differentiable scene. Only reverse-mode derivatives are required."""
+    """A scene as differentiable density and colour. Only reverse-mode derivatives are required."""
 
     @property
     def sampler(self) -> RaySampler: ...
@@ -270,7 +270,7 @@ def _tensors_of(field: object, kind: str) -> Iterator[Tensor]:
 
 
 LARGEST_LENGTH = 1e15
-"""Metres. Squares of larger lengths approach the largest single-precision number."""
+"""Largest length (metres): squares of larger lengths approach the largest single-precision number."""
 
 
 @dataclass(frozen=True)

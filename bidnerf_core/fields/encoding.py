@@ -19,7 +19,7 @@ Network: TypeAlias = Callable[
 
 
 def encoded_width(frequencies: int, include_input: bool = True) -> int:
-    """Return the number of values in a point's encoding."""
+    """Return the number of values in the frequency encoding of a point."""
     return 3 * (2 * frequencies + include_input)
 
 

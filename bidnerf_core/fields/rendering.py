@@ -34,7 +34,7 @@ from bidnerf_core.progress import check_cancelled
 class Observations:
     """Half-lines in a reference frame with the colours and distances that sensors measured along them.
 
-    They are the pixels of an RGB-D image, the returns of a lidar or the points of structure from motion.
+    Examples are the pixels of an RGB-D image, the returns of a lidar and the points of structure from motion.
     """
 
     origins: Float[Tensor, "*p 3"]  # metres, reference frame
@@ -120,7 +120,7 @@ class Observations:
         return self[index.to(self.distance.device)].to(device, dtype)
 
     def to(self, device: torch.device | str | None, dtype: torch.dtype) -> Observations:
-        """Return a copy on another device and in another floating-point type."""
+        """Return these rays on another device and in another floating-point type."""
         return self._changed(lambda part: part.to(device, dtype if part.is_floating_point() else part.dtype))
 
     def rays(self, T_world_ref: SE3, bounds: SceneBounds) -> Rays:
@@ -216,7 +216,8 @@ def query_packed(
     order = valid.cumsum(0)
     kept = valid & (order <= room)
     slot = torch.arange(room, device=valid.device)
-    # A slot that stays empty takes any sample: many gradients for the same point are added one after another.
+    # An empty slot takes some sample of its own, since many gradients for the same point would be added one
+    # after another.
     index = torch.cat([slot, slot[:1]]).index_copy(
         0, torch.where(kept, order - 1, room), torch.arange(total, device=valid.device)
     )[:room]
@@ -264,9 +265,10 @@ def render(
     background: tuple[float, float, float] | Float[Tensor, "*#r 3"] = (0.0, 0.0, 0.0),
     jitter: Generator | None = None,
 ) -> Rendering:
-    """Render rays; differentiable in the field's parameters and in the rays.
+    """Render rays in front of a background colour (RGB in [0, 1]), one for all rays or one per ray.
 
-    Hits are composited as ``w_i = alpha_i prod_{j<i} (1 - alpha_j)``, which is eq. 3 with ``alpha = 1 - exp(-sigma dt)``.
+    The result is differentiable in the field's parameters and in the rays. ``jitter`` randomizes the samples. Hits are
+    composited as ``w_i = alpha_i prod_{j<i} (1 - alpha_j)``, which is eq. 3 with ``alpha = 1 - exp(-sigma dt)``.
     """
     if isinstance(field, HitField):
         hits = field.hits(rays)
@@ -354,10 +356,10 @@ def render_image(
     field: RadianceField, intrinsics: Intrinsics, T_world_camera: SE3, bounds: SceneBounds, chunk: int = 8192,
     motion: Float[Tensor, "6"] | None = None,
 ) -> RenderedImage:  # fmt: skip
-    """Render a whole image from a pose, ``chunk`` rays at a time.
+    """Render a whole image from a pose (``T_world_camera``), ``chunk`` rays at a time.
 
-    ``motion`` is the camera's motion from the first row to the last, see ``rolling_shutter``; without it, the
-    camera is static.
+    ``motion`` is the camera's motion from the first row to the last (translation in metres, then rotation in
+    radians), see ``rolling_shutter``; without it, the camera is static.
     """
     pixels = intrinsics.pixel_centres().reshape(-1, 2)
     return _image_of(_rendered(field, intrinsics, T_world_camera, bounds, pixels, chunk, motion), intrinsics)
@@ -397,7 +399,7 @@ def _rendered(
     field: RadianceField, intrinsics: Intrinsics, T_world_camera: SE3, bounds: SceneBounds, pixels: Float[Tensor, "n 2"],
     chunk: int, motion: Float[Tensor, "6"] | None = None,
 ) -> Float[Tensor, "n 5"]:  # fmt: skip
-    """Return colour, planar depth where the opacity is at least one half, and opacity of some pixels."""
+    """Return the colour, planar depth (metres; 0 unless the opacity exceeds one half) and opacity of the given pixels."""
     ray, length = intrinsics.rays(pixels)
     device = device_of(field)
     T = T_world_camera.to(dtype=torch.float32, device=device)

@@ -20,16 +20,16 @@ from bidnerf_core.geometry import Robust
 Residual: TypeAlias = Callable[[Rendering, Observations], Float[Tensor, "*p c"]]
 """Compares renderings with measurements, ray by ray; differentiable in the rendering."""
 DepthResidual: TypeAlias = Callable[[Rendering, Observations], Float[Tensor, "*p"]]
-"""Compares rendered with measured distances. Not NaN where nothing was measured, which is masked only afterwards."""
+"""Compares rendered with measured distances. Must not be NaN where nothing was measured, since such rays are masked only afterwards."""
 
 
 def depth_residual(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p"]:
-    """Return rendered minus measured distance, metres (eq. 5). A ray that hits nothing has a rendered distance of 0."""
+    """Return rendered minus measured distance (metres; eq. 5). A ray that hits nothing has a rendered distance of 0."""
     return rendering.distance - observed.distance
 
 
 def truncated_depth_residual(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p"]:
-    """Return ``sum_i w_i clip(t_i - d) + (1 - sum_i w_i) 0.3``, metres, where clip limits to +-0.3.
+    """Return ``sum_i w_i clip(t_i - d) + (1 - sum_i w_i) 0.3`` (metres), where clip limits to +-0.3.
 
     At a silhouette, part of the weight lies on a surface far behind. Here the contribution of this weight is limited, however far
     away the surface is; in the paper's residual it counts with its full distance.
@@ -40,7 +40,7 @@ def truncated_depth_residual(rendering: Rendering, observed: Observations) -> Fl
 
 
 def first_surface_residual(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p"]:
-    """Return rendered minus measured distance of the first surface, metres; 0 for a ray that no surface stops.
+    """Return rendered minus measured distance of the first surface (metres); 0 for a ray that no surface stops.
 
     The first surface is where the cumulative weight reaches half of the ray's total; its distance is the weighted mean within
     0.1 m.
@@ -66,7 +66,7 @@ DEPTH_RESIDUALS: dict[str, DepthResidual] = {
 
 
 def free_space(rendering: Rendering, distance: Float[Tensor, "*p"], margin: float) -> Float[Tensor, "*p"]:
-    """Return how far (metres) matter on a ray lies in front of ``distance - margin``, summed with the rendering weights.
+    """Return the weighted sum, over the samples of a ray, of how far (metres) they lie in front of ``distance - margin``.
 
     A sensor that measured a distance saw nothing in front of it. The error of the mean distance can be 0 even
     with matter on both sides of the measured point; this residual cannot.
@@ -98,12 +98,12 @@ class Term:
 
 @dataclass(frozen=True)
 class Objective:
-    """A sum of terms."""
+    """The objective that first-order methods minimize: a sum of terms."""
 
     terms: tuple[Term, ...]
 
     def loss(self, rendering: Rendering, observed: Observations) -> Float[Tensor, ""]:
-        """Return ``1/K sum_i [mean_r rho(rgb) + lambda_d mean_r rho(d)]`` (eqs. 5 and 6) of rays of shape (K images, rays).
+        """Return ``1/K sum_i [mean_r rho(rgb) + lambda_d mean_r rho(d)]`` (eqs. 5 and 6) for rays of shape (K images, rays).
 
         Each term is a mean over the rays that it applies to: the depth term over those where depth was measured.
         """

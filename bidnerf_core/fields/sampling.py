@@ -41,7 +41,7 @@ density for a cell that is only partly dense; what lies behind the empty part mu
 
 @dataclass(frozen=True)
 class Stratified:
-    """``count`` intervals of [near, far]; with jitter, their borders are shifted randomly by up to half an interval.
+    """A sampler of ``count`` intervals of [near, far]; jitter shifts their inner borders by up to half an interval.
 
     The intervals have equal length in the coordinate of ``SceneBounds.spacing`` or, without bounds, in distance.
     """
@@ -63,7 +63,7 @@ class Stratified:
 
 @dataclass(frozen=True)
 class OccupiedOnly:
-    """The samples of another sampler; only those in cells that may hold matter are valid."""
+    """A sampler that invalidates the samples of another one in cells that cannot hold matter."""
 
     occupancy: OccupancyMask
     sampler: RaySampler
@@ -87,7 +87,7 @@ def rows_of(of: OfRays, index: Int[Tensor, "n"]) -> OfRays:
 
 @dataclass(frozen=True)
 class Importance:
-    """Hierarchical sampling (Mildenhall et al. 2020, section 5.2): more intervals where the weights of ``field`` are large.
+    """A hierarchical sampler (Mildenhall et al. 2020, section 5.2): more intervals where the weights of ``field`` are large.
 
     The field's own valid intervals are split at ``count`` further distances; space that its sampler skips,
     such as one with an occupancy grid, remains skipped. No gradient flows through the choice of distances.
@@ -186,11 +186,11 @@ class HierarchicalField(nn.Module):
 
 @dataclass(frozen=True)
 class Concentrated:
-    """At most ``count`` intervals per ray, short where the weights of the field ``guide`` are large, and long elsewhere.
+    """A sampler of at most ``count`` intervals per ray, short where the weights of the field ``guide`` are large, and long elsewhere.
 
-    Three quarters of the borders divide the guide's weight over its own valid intervals into equal parts; the
-    others divide their length. Each interval is as long as what it replaces. A ray with ``count`` intervals
-    or fewer keeps them. No gradient flows through the choice.
+    Three quarters of the borders divide the guide's weight over its own valid intervals into equal parts; the others
+    divide their length. Each new interval has the total length of the pieces that it replaces. A ray with ``count``
+    intervals or fewer keeps them. No gradient flows through the choice.
     """
 
     guide: RadianceField
@@ -244,7 +244,7 @@ def concentrated(
     )
     at = samples.starts.gather(-1, owner) + (middle - laid.gather(-1, owner))
     starts, ends = at - half, at + half
-    # Neither rounding nor an interval that spans a gap may make two of them overlap.
+    # Neither rounding nor an interval that spans a gap may make two intervals overlap.
     between = (ends[..., :-1] + starts[..., 1:]) / 2
     starts = torch.cat([starts[..., :1], torch.maximum(starts[..., 1:], between)], dim=-1)
     ends = torch.cat([torch.minimum(ends[..., :-1], between), ends[..., -1:]], dim=-1)
@@ -352,12 +352,12 @@ class ScaledSampler:
 
 
 def trained_field(field: RadianceField) -> RadianceField:
-    """Return the field as its backend built it, in the length unit of training; its weights are those that are stored."""
+    """Return the field as its backend built it, in the length unit of training. Its weights are those that maps store."""
     return field.trained if isinstance(field, ScaledField) else field
 
 
 class NoField(nn.Module):
-    """The field of a map of landmarks alone. Sampling or querying it raises ``InputError``, which says how to add one."""
+    """The field of a landmark-only map. Sampling or querying it raises ``InputError``, whose message states how to add one."""
 
     def sampler(self, *_: object) -> NoReturn:
         raise InputError(

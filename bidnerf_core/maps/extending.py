@@ -283,7 +283,8 @@ def _extended(
 def _trained_on(scene: Map, views: Sequence[View], steps: int | None, share: float) -> Map:
     """Train a copy of the map's field further on ``views``, and return the map in memory with the new field.
 
-    By default, the number of steps is proportional to ``share``, the fraction of views that are new.
+    By default, the number of steps is the usual one times ``share``, the fraction of new views, or times 0.25
+    if that is more.
     """
     info, field = scene.info, trained_field(scene.field)
     backend = load_backend(info.backend, str(scene.folder or ""))

@@ -1,4 +1,4 @@
-"""Answers for a run of images, photos or frames of a sequence, in one map or several: as JSON, pose files and summaries."""
+"""The answers for a run of images (photos or frames) in one map or several, and their output as JSON, pose files and tables."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ class Answers:
     """
 
     def __init__(self, scene: SceneMap | MapCollection | None = None, is_sequence: bool = False) -> None:
-        """Start without answers in the given map or maps. With ``is_sequence``, JSON answers include the time of each frame."""
+        """Create an empty collection for a map or maps. With ``is_sequence``, JSON answers include the time of each frame."""
         self.scene, self.is_sequence = scene, is_sequence
         self.given: list[Answer | Failure] = []
         self.unread = 0  # frames of a sequence whose files could not be read
@@ -148,7 +148,7 @@ class Answers:
         truth: SE3 | None = None,
         number: int | None = None,
     ) -> Answer:
-        """Add the answer to the next frame of a sequence, and return it.
+        """Add the answer for the next frame of a sequence, and return it.
 
         ``number`` is the frame's index in its sequence, by default one more than the last. ``time`` is in
         seconds, ``truth`` is the true T_world_camera.
@@ -208,7 +208,7 @@ class Answers:
 
     @property
     def remark(self) -> str | None:
-        """A remark if one similarity explains the errors of all poses, so that the true poses are in another world; else None."""
+        """A remark if one similarity transform explains all pose errors, as for true poses in another world frame; else None."""
         known = self._known
         if (
             known is None or len(known[0].translation) < 4
@@ -220,7 +220,7 @@ class Answers:
         except InputError:
             return None
         left, error = (torch.linalg.vector_norm(found - of, dim=-1) for of in (worlds.apply(true), true))
-        if not bool(left.max() < 0.1 * error.median()):  # it is to explain the errors of all poses
+        if not bool(left.max() < 0.1 * error.median()):  # it must explain the errors of all poses
             return None
         T = worlds.T_target_source
         turn, shift = float(rotation_angle(T.rotation)), float(torch.linalg.vector_norm(T.translation))
@@ -382,10 +382,11 @@ def localize_each(
     """Localize each query in a map, or in the one of several maps that the query shows.
 
     A query that cannot be read or localized does not stop the others, but if it is the only query, its error is
-    raised. ``start`` returns the initial T_world_camera of a query; method ``auto`` needs none, and several
-    maps take none. ``answers`` is the object that collects the answers, by default a new one; if an error ends
-    the run, it holds the answers so far. ``each`` is called with each query and its answer; for a failure, the
-    query has only a name. Raises ``InputError``, and ``Cancelled`` once ``cancel`` returns True.
+    raised. ``start`` returns the initial T_world_camera of a query; method ``auto`` needs none, and with
+    several maps ``start`` is not used. ``answers`` is the object that collects the answers, by default a new
+    one; if an error ends the run, it holds the answers so far. ``each`` is called with each query and its
+    answer; for a failure, the query has only a name. Raises ``InputError``, and ``Cancelled`` once ``cancel``
+    returns True.
     """
     if answers is None:
         answers = Answers(localizer if isinstance(localizer, MapCollection) else localizer.scene)

@@ -1,7 +1,7 @@
 """COLMAP text models: ``images.txt``, with ``cameras.txt`` and ``points3D.txt`` next to it.
 
 See https://colmap.github.io/format.html. COLMAP's poses are world to camera, quaternions have the scalar
-first, and pixel centres are at +0.5, like ours.
+first, and pixel centres are at +0.5, as in this package.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ HEAD = "# written by bidnerf"
 def check_pose_file(path: Path) -> None:
     """Check that a pose file may be written under this name, before any work is done.
 
-    Raises ``UsageError`` for a name that does not end like one of the formats, and ``InputError`` for an
+    Raises ``UsageError`` for a name without the ending of a known format, and ``InputError`` for an
     images.txt next to another program's cameras.txt or points3D.txt, which would be overwritten.
     """
     if pose_format(path) != "images.txt":
@@ -62,7 +62,7 @@ def write_colmap_model(
     """Write a COLMAP text model; image names, poses and cameras must already be those of the stored files.
 
     ``points`` holds the rows of points3D.txt, and ``keypoints`` the POINTS2D[] entries of each image: x, y, and
-    the number of the point. Characters of names that would break a row are escaped.
+    the number of the point. Characters in names that would break a row are escaped.
     """
     cameras, listed = dict[Intrinsics, int](), ""
     rows = list[str]()

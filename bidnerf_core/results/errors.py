@@ -1,8 +1,8 @@
 """Errors of poses (``T_world_camera``) and of trajectories, and criteria for success.
 
-The errors of trajectories are raw, after alignment (ATE), and of the motion between frames (RPE), as in Sturm et al. 2012, "A
-benchmark for the evaluation of RGB-D SLAM systems". Poses in a map need no alignment, so their raw error is what counts; the
-others make them comparable with odometry.
+The errors of a trajectory are measured without alignment (raw), after a rigid alignment (ATE), and for the motion between
+frames (RPE), as in Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems". Poses in a map need no
+alignment, so the raw error is what counts; ATE and RPE allow comparison with odometry.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from bidnerf_core.geometry import SE3, LengthUnit, chi_squared_quantile, fit_sim
 
 @dataclass(frozen=True, eq=False)
 class PoseError:
-    """The translation and rotation error of one pose or a batch, for example of all steps of a run."""
+    """The translation and rotation error of one pose, or of a batch of poses such as all steps of a run."""
 
     translation: Float[Tensor, "*b"]  # between the camera centres, in ``unit``
     rotation_deg: Float[Tensor, "*b"]  # geodesic angle, degrees, 0 to 180
@@ -61,11 +61,11 @@ def pose_error(found: SE3, true: SE3, unit: LengthUnit = "units") -> PoseError:
 def normalized_error_squared(
     found: SE3, true: SE3, covariance: Float[Tensor, "*c 6 6"]
 ) -> Float[Tensor, "*b"]:
-    """Return ``xi^T C^-1 xi`` with ``true = found exp(xi)``.
+    """Return the squared error normalized by its covariance C: ``xi^T C^-1 xi`` with ``true = found exp(xi)``.
 
-    It follows a chi-squared distribution with 6 degrees of freedom if the covariance C is consistent
-    (Bar-Shalom et al. 2001, "Estimation with applications to tracking and navigation", 5.4.2). It is infinite
-    or NaN if the covariance has no inverse.
+    xi and C hold the translation (unit of the poses), then the rotation (radians). If C is consistent, the
+    result follows a chi-squared distribution with 6 degrees of freedom (Bar-Shalom et al. 2001, "Estimation
+    with applications to tracking and navigation", 5.4.2). It is infinite or NaN if C has no inverse.
     """
     xi = (found.to(dtype=torch.float64).inverse() @ true.to(dtype=torch.float64)).log()
     solved, _ = torch.linalg.solve_ex(covariance.double(), xi[..., None])
@@ -73,7 +73,7 @@ def normalized_error_squared(
 
 
 def standard_deviations(covariance: Float[Tensor, "6 6"]) -> tuple[float, float]:
-    """Return the standard deviations of the position (metres) and of the rotation (radians) implied by a covariance."""
+    """Return the standard deviations of position (metres) and rotation (radians), given their covariance (position first)."""
     position, rotation = (float(part.sum().clamp(min=0).sqrt()) for part in covariance.diagonal().split(3))
     return position, rotation
 
@@ -83,14 +83,15 @@ def within(
 ) -> Bool[Tensor, "*b"]:
     """Return whether the error of ``found`` lies within its covariance's bound for a probability.
 
-    The bound is the quantile of the chi-squared distribution with 6 degrees of freedom, 12.59 for 0.95. With
-    a consistent covariance, that fraction of errors lies within. False if the covariance has no inverse.
+    The bound is the quantile of the chi-squared distribution with 6 degrees of freedom, 12.59 for 0.95. If
+    the covariances are consistent, that fraction of errors lies within the bound. The result is False if the
+    covariance has no inverse.
     """
     return normalized_error_squared(found, true, covariance) <= chi_squared_quantile(probability, 6)
 
 
 def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Return a rotation's angle (radians, 0 to pi); ``acos`` of the trace would lose half of the digits near either end."""
+    """Return the angle of a rotation (radians, 0 to pi); ``acos`` of the trace would lose half of the digits near 0 and pi."""
     skewed = rotation - rotation.mT
     twice_axis = torch.stack([skewed[..., 2, 1], skewed[..., 0, 2], skewed[..., 1, 0]], dim=-1)
     trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -129,7 +130,7 @@ CRITERIA: dict[str, Criterion] = {
     "5deg 0.05": Within(5.0, 0.05),
     "1deg 0.02": Within(1.0, 0.02),
 }
-"""The criteria reported side by side: the paper's, a common one and a strict one."""
+"""The criteria reported side by side: that of BID-NeRF, a common one and a strict one."""
 
 
 def steps_to_success(trace: PoseError, criterion: Criterion) -> int | None:
@@ -276,8 +277,8 @@ class TrajectoryErrors:
 def alignment_errors(found: SE3, true: SE3) -> Float[Tensor, "n"] | None:
     """Return the absolute trajectory error of each pose: its distance (metres) from the truth after a rigid alignment.
 
-    The alignment brings the camera centres nearest to the true ones, without scaling. Returns None if the camera did not move,
-    since the rotation is then undetermined.
+    The alignment minimizes the squared distances between the estimated and the true camera centres, without scaling. Returns
+    None if the camera did not move, since the rotation is then undetermined.
     """
     source, target = found.translation.double(), true.translation.double()
     try:

@@ -31,7 +31,7 @@ log = logging.getLogger("bidnerf")
 Exporter: TypeAlias = Callable[[Map, Path], Sequence[Path]]
 """A function that writes a map, whose surface and landmarks are on the CPU, into an existing folder and returns the files.
 
-It raises ``InputError``, before it writes anything, for a map that lacks what the format needs.
+Before writing anything, it raises ``InputError`` for a map that lacks what the format needs.
 """
 
 
@@ -40,24 +40,24 @@ def _defects(exporter: Any) -> Iterator[str]:
 
 
 EXPORTERS: Plugins[Exporter] = Plugins("exporters", _defects, first=("ply", "colmap", "transforms.json"))
-"""The formats in which maps are exported, by name."""
+"""The exporters, by the names of their formats."""
 
 
 def export_map(scene: Map | str | Path, out: str | Path, to: str, overwrite: bool = False) -> list[Path]:
     """Export a map, given directly or by its folder, to folder ``out`` in a format of other software; return the files.
 
     - ``"ply"``: surface.ply (points with normals and colours), landmarks.ply (points with colours and the number of photos that show
-      each) and cameras.ply (a pyramid for each camera), and cameras.json (the cameras as 3D Gaussian splatting writes them, from which
-      ``import`` looks at the surface);
-    - ``"colmap"``: cameras.txt, images.txt and points3D.txt, whose points are the landmarks with the keypoints that they were
-      built from as tracks;
+      each) and cameras.ply (a pyramid for each camera), and cameras.json (the cameras in the format of 3D Gaussian splatting, which
+      ``import`` uses as viewpoints of the surface);
+    - ``"colmap"``: cameras.txt, images.txt and points3D.txt, where the points are the landmarks, and their tracks the keypoints
+      from which they were built;
     - ``"transforms.json"``: the cameras in nerfstudio's format, and landmarks.ply as sparse points;
     - or an installed exporter, such as ``"splat.ply"`` of ``bidnerf-gaussians`` and ``"mesh.glb"`` of ``bidnerf-scan``.
 
-    The first three use the world frame and unit of the map, stated in the headers, in double precision if its origin is not 0;
-    installed exporters may write coordinates relative to that origin, see ``Map.origin``. Images are named by their files: relative to the
-    folder of the dataset or, for COLMAP, to the folder that contains all of them. Cameras are those of the images in the size
-    that the map uses, which may be smaller. Parts that the map lacks are left out.
+    The first three use the world frame and unit of the map, stated in the headers, in double precision if its origin is not 0; installed
+    exporters may write coordinates relative to that origin, see ``Map.origin``. Images are named by their files: relative to the folder of
+    the dataset or, for COLMAP, to the folder that contains all of them. Cameras describe the images at the size that the map uses, which
+    may be smaller than that of the files. Parts that the map lacks are left out.
 
     Raises ``InputError`` for an unknown format, for a map that has nothing to export, and for a folder that is not empty unless
     ``overwrite`` is set.
@@ -134,8 +134,8 @@ def export_colmap(scene: Map, out: Path) -> list[Path]:
                 for landmark, (u, v) in zip(seen.tolist(), pixels.tolist(), strict=True):
                     tracks[landmark].append(f" {number + 1} {len(keypoints[number])}")
                     keypoints[number].append(f"{u:.6g} {v:.6g} {landmark + 1}")
-        # The error of a point is its mean distance from its keypoints. A single one says nothing, and -1 is COLMAP's
-        # value for an unknown error.
+        # The error of a point is the mean distance of its projections from its keypoints. With a single keypoint,
+        # the error is unknown, for which COLMAP has the value -1.
         errors = torch.where(count > 1, total / count.clamp(min=1), -1).tolist()
         colours = (_colours(scene).clamp(0, 1) * 255).round().long().tolist()
         digits = 16 if any(scene.origin) else 9
@@ -197,9 +197,11 @@ def _write_landmarks(scene: Map, images: list[PosedImage], out: Path) -> Path:
 
 
 def ply(columns: dict[str, Tensor], comments: list[str], faces: np.ndarray | None = None) -> bytes:
-    """Return a binary PLY of points; keys of ``columns`` name the properties of each row.
+    """Return a binary PLY of points, with triangles if there are ``faces``.
 
-    Colours in [0, 1] are written as bytes, integers with 32 bits, and others in their own precision.
+    The keys of ``columns`` are the names of properties, separated by spaces, and the values have one row per
+    point. Colours in [0, 1] are written as bytes, integers with 32 bits, and other numbers in their own
+    precision.
     """
     kinds, values = list[tuple[str, str]](), list[np.ndarray]()
     stored = {"uchar": "u1", "float": "<f4", "double": "<f8", "int": "<i4"}

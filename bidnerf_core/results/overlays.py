@@ -23,8 +23,8 @@ from bidnerf_core.localization import Localization, SceneMap, Start, checked_map
 from bidnerf_core.results.answers import Answer
 
 SIDE = 240
-"""Pixels on the longer side of each of many pictures, since each rendered pixel takes time, and the width to which smaller
-images are enlarged, so that captions fit."""
+"""Pixels along the longer side of pictures drawn in large numbers, since each rendered pixel takes time; also the width
+to which smaller images are enlarged, so that captions fit."""
 
 
 def overlay(
@@ -32,8 +32,8 @@ def overlay(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return one picture of a photo, the map rendered from a pose, and both blended with the edges of each.
 
-    ``found`` is the answer for the photo, whose corrected intrinsics are used if it has any, or a pose
-    ``T_world_camera``. With a ``start``, the picture also shows the rendering from there. The photo is
+    ``found`` is the localization of the photo, whose corrected intrinsics are used if it has any, or a pose
+    ``T_world_camera``. If ``start`` is given, a second row shows the map rendered from that pose. The photo is
     downscaled to at most 640 pixels a side, since each rendered pixel takes time. Raises ``InputError`` for arguments
     that are not a map, a frame or a pose.
     """
@@ -174,7 +174,7 @@ class TrackingVideo:
             self._partial.replace(self._file)
 
     def add(self, frame: Frame, answer: Answer) -> None:
-        """Add a frame beside the rendered map: its colours or, if none were recorded, its depth as grey values up to 5 m."""
+        """Add a frame next to the rendered map; a frame without colour is shown by its depth, as grey values up to 5 m."""
         import av
 
         found = answer.found
@@ -190,11 +190,11 @@ class TrackingVideo:
             tile(painter.rendered(found.T_world_camera), caption),
         )
         picture = Image.fromarray(np.concatenate(tiles, axis=1))
-        # Without time stamps, the rate is the usual one.
+        # Frames without timestamps are shown at 30 frames per second.
         time = answer.number / 30 if answer.time is None else answer.time
         if self._stream is None:
             self._output, self._began = av.open(str(self._partial), "w"), time
-            # The quality is almost without visible loss.
+            # At this quality, hardly any loss is visible.
             codec = CODECS[self._file.suffix.lower()]
             self._stream = self._output.add_stream(codec, rate=1000, options={"crf": "20"})  # times in ms
             self._stream.width, self._stream.height = picture.width // 2 * 2, picture.height // 2 * 2

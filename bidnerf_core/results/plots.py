@@ -58,7 +58,7 @@ def styled() -> Any:
 
 
 def new_figure(width: float, height: float) -> Any:
-    """Return an empty figure of this size (inches), without a window and not kept alive by pyplot."""
+    """Return an empty figure of the given size (inches) that has no window and is not managed by pyplot."""
     require_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -78,8 +78,8 @@ def save_figure(figure: Any, folder: Path, name: str) -> Path:
 def write_figure(figure: Any, *paths: Path, dpi: int = 150) -> None:
     """Write a figure atomically to each path, in the format of its suffix.
 
-    Its text, which includes names of files, frames and settings, is made printable and truncated to a
-    drawable length.
+    The text in the figure, which includes names of files, frames and settings, is made printable and
+    truncated to a drawable length.
     """
     require_matplotlib()
     from matplotlib.text import Text
@@ -96,17 +96,17 @@ def write_figure(figure: Any, *paths: Path, dpi: int = 150) -> None:
         file, suffix = io.BytesIO(), path.suffix.lstrip(".") or "png"
         figure.savefig(file, format=suffix, dpi=dpi, metadata={"Date": None} if suffix == "svg" else {})
         write_file(path, file.getvalue())
-        figure.set_layout_engine("none")  # to lay it out again would take as long as to draw it
+        figure.set_layout_engine("none")  # laying it out again would take as long as drawing it
 
 
 def _drawable(text: str) -> str:
-    """Return a text without unprintable characters, its lines truncated to 200 characters."""
+    """Return text without unprintable characters, with each line truncated to 200 characters."""
     lines = (printable(line) for line in text.split("\n"))
     return "\n".join(line if len(line) <= 200 else line[:197] + "..." for line in lines)
 
 
 def line_look(place: int) -> dict[str, Any]:
-    """Return the colour and the dashes of line number ``place``."""
+    """Return the colour, dash pattern and width of line number ``place``."""
     turn, colour = divmod(place, len(COLOURS))
     return {"color": COLOURS[colour], "linestyle": ("-", "--", ":", "-.")[turn % 4], "linewidth": 1.6}
 
@@ -187,7 +187,8 @@ def draw_path(
         ):
             projection = torch.stack([right, upward], dim=-1).numpy()
             places = poses.translation.double().numpy() @ projection
-            # A sample of the surfels around the path is drawn, as far as half of the scene's extent or more.
+            # A sample of the surfels around the path is drawn, up to a distance of at least half of the
+            # scene's extent.
             if surface is not None:
                 surfels = moved(surface.surfels, "cpu")
                 points, middle = surfels.positions.double().numpy() @ projection, places.mean(0)

@@ -42,7 +42,7 @@ class PosedImage:
     # Of the tangent at the camera (translation in ``unit``, rotation in rad).
     covariance: Float[Tensor, "6 6"] | None = None
     unit: LengthUnit = "units"  # of the position
-    orientation: Orientation | None = None  # how the file's image was turned upright; None: as its EXIF says
+    orientation: Orientation | None = None  # how the stored image was turned upright; None: according to EXIF
 
     @property
     def pose(self) -> SE3:
@@ -85,7 +85,7 @@ def common_unit(images: Sequence[PosedImage]) -> LengthUnit:
 
 
 def frame_of(images: Sequence[PosedImage], direction: str = "camera to world") -> str:
-    """Return the statement on poses for a file header: direction, axes, and the unit of lengths if there are poses."""
+    """Return a description of the poses for a file header: direction, axes, and the unit of lengths if there are poses."""
     if not images:
         return f"{direction}, {OPENCV_AXES}"
     lengths = "metres" if common_unit(images) == "metres" else "units of the map (not known to be metres)"
@@ -254,9 +254,9 @@ def _numbers(where: str, values: Any, expected: str) -> Tensor:
 
 
 def pose_of(poses: dict[str, SE3], name: str, path: str | Path) -> SE3:
-    """Return the pose of an image among those of a file; a single one applies to every image.
+    """Return the pose of an image from the poses of a file; if there is only one, it applies to every image.
 
-    Raises ``InputError`` if the file has several poses but none under that name.
+    Raises ``InputError`` if the file has several poses, but none of that name.
     """
     if len(poses) == 1:
         return next(iter(poses.values()))
@@ -268,7 +268,7 @@ def pose_of(poses: dict[str, SE3], name: str, path: str | Path) -> SE3:
 
 
 def pose_entries(path: Path, content: bytes) -> list[Any]:
-    """Return the list of objects in a pose file, or of its single matrix."""
+    """Return the objects in a pose file, or its single matrix, as a list."""
     try:
         found = parse_json(content, str(path), EXPECTED_POSE)
     except InputError:

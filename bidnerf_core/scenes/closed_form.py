@@ -35,9 +35,9 @@ class ClosedFormScene:
     def intersect(
         self, origins: Float[Tensor, "*#r 3"], directions: Float[Tensor, "*r 3"]
     ) -> tuple[Float[Tensor, "*r"], Float[Tensor, "*r 3"]]:
-        """Return the first surface along unit ``directions`` (metres, world). One origin may be shared by all rays.
+        """Intersect rays (metres, world; unit ``directions``) with the first surface. All rays may share one origin.
 
-        The result is the distance (metres) and the lit colour; inf and the background colour if nothing is hit.
+        Returns the distance (metres) and the lit colour; inf and the background colour if nothing is hit.
         """
         rays = directions.reshape(-1, 3).T.contiguous()
         shared = origins.numel() == 3

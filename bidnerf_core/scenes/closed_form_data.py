@@ -41,14 +41,14 @@ class RenderedShot(Shot):
 
     def frame(self, background: tuple[float, float, float] = BLACK, side: int | None = None) -> Frame:
         """Render this frame; ``background`` is ignored, since the scene has its own."""
-        assert self.T_world_camera is not None  # that of every frame is known
+        assert self.T_world_camera is not None  # the pose of every frame is known
         found = self.render(self.T_world_camera, self.name)
         return found if side is None else found.at_most(side)
 
 
 @dataclass(frozen=True, eq=False)
 class ClosedFormData(Capture):
-    """Frames of a scene with split "test", and split "train" if it has frames to train on.
+    """The frames of a closed-form scene: split "test" and, if the scene has frames to train on, split "train".
 
     Frame "0003@15" is frame 0003 rotated by 15 degrees about the ``middle`` of the scene.
     """
@@ -85,7 +85,7 @@ def is_closed_form(name: str) -> bool:
 
 
 def closed_form_data(name: str) -> ClosedFormData:
-    """Return the data of ``demo:NAME``. Raises ``InputError`` for an unknown name."""
+    """Return the dataset ``demo:NAME``. Raises ``InputError`` for an unknown name."""
     _check(name, ("blobs", "object", "room"), "data")
     training, middle = list[SE3](), (0.0, 0.0, 0.0)
     if name == "demo:blobs":
@@ -107,7 +107,7 @@ def closed_form_data(name: str) -> ClosedFormData:
 
 
 def closed_form_map(name: str) -> Map:
-    """Return the map of ``demo:NAME``. Raises ``InputError`` for a name whose field is not known in closed form."""
+    """Return the map ``demo:NAME``. Raises ``InputError`` for a name whose field is not known in closed form."""
     _check(name, ("blobs",), "map")
     info = MapInfo("closed-form", {}, BLOBS, 0, True, "demo:blobs", weights="exact", unit="metres")
     return Map(info, _blob_field())

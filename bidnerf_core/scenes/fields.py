@@ -50,7 +50,7 @@ class GaussianBlobs:
 
 @dataclass(frozen=True, eq=False)
 class HomogeneousBall:
-    """Constant density and colour within a sphere, whose opacity is 1 - exp(-density * chord)."""
+    """A ball of constant density and colour. The opacity along a chord is 1 - exp(-density * length)."""
 
     radius: float  # metres
     density: float  # per metre

@@ -106,7 +106,7 @@ def _phase(points: Tensor, waves: tuple[Vector, ...], phases: tuple[float, ...])
 
 @dataclass(frozen=True)
 class Sphere:
-    """A ball."""
+    """A ball around the origin of its frame; ``radius`` is in metres."""
 
     radius: float
 
@@ -182,9 +182,9 @@ class Cylinder:
 
 
 Shape: TypeAlias = Sphere | Box | Cylinder
-"""A convex solid around the origin of its own frame (metres): ``reach``, the radius of a ball that contains it; ``interval``, where
-lines enter and leave it, along their directions, possibly negative (leave < enter means a miss); and the outward unit ``normals`` at
-points of its surface.
+"""A convex solid around the origin of its own frame (metres). It has ``reach``, the radius of a ball that contains it; ``interval``,
+where lines enter and leave it, along their directions, possibly negative (leave < enter means a miss); and the outward unit
+``normals`` at points of its surface.
 """
 
 

@@ -92,7 +92,7 @@ class TrainingStopped(Exception):
 
 
 READ_EVERY = 16
-"""Steps after which the host reads the figures of a training on a GPU; in between, it never waits."""
+"""Number of steps on a GPU after which the host reads the loss and other figures; in between, it never waits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +110,8 @@ class Replayable:
 
     ``prepare(step)`` is called before each step. It does the work that must not be part of a graph, such as reading numbers from
     the device, and returns a key: steps with equal keys launch the same operations on tensors of the same shapes, with the same
-    numbers. ``outcome(step, generator)`` draws from a generator on the field's device, must not wait for the device (see
-    ``without_waiting``), and may run for another step of its key.
+    scalar arguments. ``outcome(step, generator)`` draws from a generator on the field's device, must not wait for the device
+    (see ``without_waiting``), and may be replayed for another step with the same key.
     """
 
     prepare: Callable[[int], Hashable]
@@ -142,13 +142,12 @@ def fit(
     seed: int = 0,
     beside: nn.Module | None = None,
 ) -> None:
-    """Minimize the loss of ``outcome(step, generator)`` over parameter ``groups`` (each with its ``lr``) by ``steps`` of Adam.
+    """Minimize the loss of ``outcome(step, generator)`` over parameter ``groups`` (each with its ``lr``) by ``steps`` steps of Adam.
 
-    ``beside`` holds parameters that are learned with the field but not stored with it; they are among the
-    groups. Training resumes from ``report.resume()``, saves when ``report.due`` returns True and, when
-    ``report.stopping`` is set, saves and raises ``TrainingStopped``. A resumed run computes what an
-    uninterrupted one would have; on a GPU, where sums have no fixed order, it does so up to rounding.
-    Raises ``InputError`` if the loss is not finite.
+    ``beside`` holds parameters that are learned with the field but not stored with it; ``groups`` must include them. Training
+    resumes from ``report.resume()``, saves when ``report.due`` returns True and, when ``report.stopping`` is set, saves and raises
+    ``TrainingStopped``. A resumed run computes what an uninterrupted one would have; on a GPU, where sums have no fixed order, it
+    does so up to rounding. Raises ``InputError`` if the loss is not finite.
 
     The generator is on the CPU regardless of the field's device, so that the same rays are drawn everywhere, unless ``outcome``
     is ``Replayable`` and the field on a GPU: then each step is a CUDA graph, and the report receives ``READ_EVERY`` steps at once.
@@ -196,13 +195,14 @@ def fit(
         if (step + 1) % every and step + 1 < steps:
             continue
         figures, stopping = log.tolist(), False
-        for parameter in _parameters(optimizer):  # whose version a replay leaves as it is
+        for parameter in _parameters(optimizer):  # a replay does not increment their versions
             increment_version(parameter)
         for number in range(reported, step + 1):
             loss, mse, samples = figures[number % every]
             _check_finite(loss, number)  # before it spreads to a checkpoint
             report.step(TrainingStep(number + 1, steps, loss, -10 * math.log10(max(mse, 1e-10)), samples))
-            # Read it once: it may change at any time, and a training that stops must have saved its state.
+            # ``stopping`` is read only once, since it may change at any time, and training must not stop
+            # without saving its state.
             stopping = report.stopping or stopping
         reported = step + 1
         if stopping or report.due(step + 1):
@@ -245,7 +245,7 @@ def _restore(
     stored = state.optimizer["generator"]
     if stored.shape == generator.get_state().shape:
         generator.set_state(stored)
-    else:  # that of another kind of device
+    else:  # the state is that of another kind of device
         generator.manual_seed(generator.initial_seed() + state.step)
     if beside is not None:
         beside.load_state_dict(_below("beside.", state.optimizer))

@@ -79,12 +79,12 @@ def distortion(rendering: Rendering, side: float) -> Float[Tensor, ""]:
 
 
 class ColourTransforms(nn.Module):
-    """A gain and an offset per colour channel and image, which transform rendered colours to the image's.
+    """A gain and an offset per colour channel and image, which transform rendered colours to those of the image.
 
     Cameras choose exposure and white balance for each photo separately (Martin-Brualla et al. 2021, section
     4.1; here without a network, so that the transforms cannot explain geometry). Over the images, the
     logarithms of the gains and the offsets have mean 0: the field itself has the colours of a photo with mean
-    exposure. Initially all transforms are the identity.
+    exposure. Initially, all transforms are the identity.
     """
 
     log_gain: Float[Tensor, "images 3"]
@@ -99,13 +99,11 @@ class ColourTransforms(nn.Module):
         """Transform the field's colours to those of each ray's image."""
         gain = (self.log_gain - self.log_gain.mean(dim=0)).exp()
         offset = self.offset - self.offset.mean(dim=0)
-        # The derivative of an index in square brackets sorts the rays by image.
+        # The backward pass of indexing with square brackets would sort the rays by image.
         return rgb * gain.index_select(0, image) + offset.index_select(0, image)
 
     def penalty(self) -> Float[Tensor, ""]:
-        """Return the mean square of the log gains and offsets, a penalty that keeps those that the images do not
-        constrain at 0.
-        """
+        """Return the mean square of the log gains and offsets, a penalty that keeps at 0 those that the images do not constrain."""
         return self.log_gain.square().mean() + self.offset.square().mean()
 
 

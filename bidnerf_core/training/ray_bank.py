@@ -23,7 +23,7 @@ MEASURED_SHARE = 0.25
 """Fraction of a batch's rays drawn from pixels with depth, if these are so few that hardly any would be drawn
 otherwise (in DS-NeRF: half)."""
 HIDDEN_BLOCK = 16
-"""Number of pixels whose visible ones are counted together: half a byte per pixel."""
+"""Number of pixels in a block, whose visible pixels are counted together; the counts take half a byte per pixel."""
 LARGEST_SHARE = 0.5
 """Largest fraction of a GPU's free memory that images may take; the rest is for the training itself."""
 LANDMARK_SHARE = 0.125
@@ -92,8 +92,9 @@ class RayBank:
     def draw(self, count: int, generator: Generator) -> TrainingBatch:
         """Return the rays of ``count`` pixels, drawn uniformly from all visible pixels of the views.
 
-        If only a few pixels have depth, a fixed fraction is drawn from these; another fraction is drawn from
-        pixels with landmarks. Nothing is copied between devices if the generator is on the images' device.
+        If only a few pixels have depth, a fixed fraction of the rays is drawn from these; another fraction is
+        drawn from pixels with landmarks. Nothing is copied between devices if the generator is on the images'
+        device.
         """
         index = self._visible_pixel(self._random(self._drawn, count, generator))
         if len(self._few):
@@ -136,7 +137,8 @@ class RayBank:
         within = index.clamp(max=self.count - 1).reshape(-1)
         view = torch.searchsorted(self.offsets, within, right=True) - 1
         hidden = self._hidden.at(view, within - self.offsets[view])[:, 0].view(index.shape) > 0
-        # In a block, the pixel is preceded by as many visible ones as its rank exceeds that of the block.
+        # In its block, the pixel is preceded by as many visible pixels as the difference between its rank and
+        # the block's.
         passed = (~hidden).cumsum(1) <= (rank - self._visible[block])[:, None]
         return block * HIDDEN_BLOCK + passed.sum(1)
 
@@ -155,7 +157,7 @@ class RayBank:
 
 
 MOST_RAYS = 2**24
-"""Number of pixels, over all different cameras, up to which rays are computed once; beyond that, per batch."""
+"""Largest number of pixels, over all distinct cameras, for which rays are computed in advance rather than per batch."""
 
 
 class _PixelRays:
@@ -174,7 +176,7 @@ class _PixelRays:
         )
 
     def rays(self, view: Int[Tensor, "r"], pixel: Int[Tensor, "r"]) -> Float[Tensor, "r 3"]:
-        """Return the points on the plane z = 1 (camera frame) that the views' pixels show."""
+        """Return the direction of each pixel's ray in the camera frame of its view, with z = 1."""
         kind = self._kind[view]
         if self._grid is not None:
             return self._grid[self._start[kind] + pixel]
@@ -223,7 +225,8 @@ def _home_of(frames: Sequence[Frame], device: torch.device) -> torch.device:
 def _landmark_pixels(
     views: Sequence[View], offsets: Int[Tensor, "v"]
 ) -> tuple[Int[Tensor, "m"], Float[Tensor, "m"], Float[Tensor, "m"]]:
-    """Return the pixels (indices among those of all views) that show a landmark, its distance and its standard deviation (metres).
+    """Return the pixels (indices among those of all views) that show landmarks, and the landmarks' distances and standard
+    deviations (metres).
 
     Views with dense depth have none, since their own measurements are better.
     """

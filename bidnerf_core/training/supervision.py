@@ -82,7 +82,7 @@ class Supervision:
         return self.bank.draw(count, generator)
 
     def loss(self, rendering: Rendering, batch: TrainingBatch) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-        """Return the loss of a rendering of the batch's rays, and its colour term alone for display."""
+        """Return the loss of a rendering of the batch's rays, and its mean squared colour error for display."""
         if self.colours is not None:
             rendering = replace(rendering, rgb=self.colours(rendering.rgb, batch.image))
         weight = None if self.image_weight is None else self.image_weight[batch.image]

@@ -93,4 +93,4 @@ CATALOGUE: dict[str, Fault] = {
         summary="one colour everywhere and no depth"),
 }
 # fmt: on
-"""All bundled faults by name."""
+"""All bundled faults, by name."""

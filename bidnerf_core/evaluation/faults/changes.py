@@ -1,4 +1,4 @@
-"""The changes of the bundled faults: of depth, of the stated camera, of the image, and of the scene.
+"""The changes that the bundled faults make to depth, to the stated camera, to the image and to the scene.
 
 Depth is planar z in metres, and 0 where nothing was measured.
 """
@@ -63,7 +63,7 @@ def noisy(frame: Frame, size: float, generator: Generator, power: int = 1) -> Fr
 
 
 def cleared(frame: Frame, kept: Bool[Tensor, "h w"]) -> Frame:
-    """Return the frame with the depth of the pixels ``kept`` alone."""
+    """Return the frame with depth only at the pixels marked in ``kept``."""
     return frame.replace(depth=depth_of(frame).where(kept, 0))
 
 
@@ -128,7 +128,7 @@ def _largest_plane(points: Float[Tensor, "n 3"], generator: Generator) -> Float[
 
 
 def _on_plane(points: Float[Tensor, "*p 3"], plane: Float[Tensor, "4"]) -> Bool[Tensor, "*p"]:
-    """Return which points are no farther from a plane than a hundredth of their depth."""
+    """Return a mask of the points whose distance from a plane is at most a hundredth of their depth."""
     return (points @ plane[:3] + plane[3]).abs() <= 0.01 * points[..., 2]
 
 
@@ -162,8 +162,8 @@ def nominal(frame: Frame, on: float, generator: Generator) -> Frame:
 def cropped(frame: Frame, share: float, generator: Generator) -> Frame:
     """Crop away a ``share`` of the width and height at a random corner; the stated principal point ignores the crop.
 
-    Its stated offset from the centre of the cropped image equals its true offset from the centre of the whole
-    image.
+    The stated offset of the principal point from the centre of the cropped image equals its true offset from
+    the centre of the whole image.
     """
     camera = frame.intrinsics
     parts = []
@@ -199,7 +199,7 @@ def distorted(frame: Frame, k1: float, generator: Generator) -> Frame:
 def rolling_shutter(frame: Frame, degrees: float, generator: Generator) -> Frame:
     """Simulate a rolling shutter while the camera rotates by ``degrees`` about a random axis through its centre.
 
-    The rows are those of the sensor, which are the columns of a portrait image. The middle one is exposed at
+    The rows are those of the sensor, which are the columns of a portrait image. The middle row is exposed at
     the frame's pose. A camera that only rotates sees the same points, so no depth is needed.
     """
     camera = frame.intrinsics
@@ -217,7 +217,7 @@ def rolling_shutter(frame: Frame, degrees: float, generator: Generator) -> Frame
 
 
 def turned(frame: Frame, on: float, generator: Generator, columns: bool = False, rows: bool = False) -> Frame:
-    """Reverse columns, rows or both, as with a camera held upside down.
+    """Reverse the columns, the rows, or both; with both reversed, the image is that of a camera held upside down.
 
     If only columns or only rows are reversed, no camera pose gives such an image of the scene.
     """
@@ -263,7 +263,7 @@ def blur(frame: Frame, pixels: float, generator: Generator) -> Frame:
 
 
 def jpeg(frame: Frame, quality: float, generator: Generator) -> Frame:
-    """Compress the colours as JPEG of ``quality`` 1 to 100, and decode them."""
+    """Compress the colours as JPEG with a ``quality`` of 1 to 100, and decode them."""
     file = io.BytesIO()
     Image.fromarray((frame.rgb * 255).round().to(torch.uint8).numpy()).save(
         file, "JPEG", quality=int(quality)
@@ -278,7 +278,7 @@ def grey(frame: Frame, share: float, generator: Generator) -> Frame:
 
 
 def vignetting(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Darken the image with the square of the distance from its centre, the corners by ``share``."""
+    """Darken the image in proportion to the squared distance from its centre, by ``share`` in the corners."""
     camera = frame.intrinsics
     middle = frame.rgb.new_tensor([camera.width / 2, camera.height / 2])
     radius = (camera.pixel_centres() - middle).norm(dim=-1, keepdim=True) / middle.norm()
@@ -336,7 +336,8 @@ RIM = 3
 def occluder(frame: Frame, share: float, generator: Generator, is_measured: bool = True) -> Frame:
     """Put a textured object in front of ``share`` of the image.
 
-    If the frame has depth, the object's depth is measured, unless it is too near for that.
+    If the frame has depth, so does the object, unless ``is_measured`` is False, as for an object too near for
+    the sensor.
     """
     height, width = frame.rgb.shape[:2]
     mask, colours = blob(height, width, share, generator), texture(height, width, generator)

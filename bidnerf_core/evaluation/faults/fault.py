@@ -52,7 +52,7 @@ def _defects(fault: Any) -> Iterator[str]:
 
 
 FAULTS: Plugins[Fault] = Plugins("faults", _defects)
-"""All faults by name."""
+"""All installed faults, by name."""
 
 
 def depth_of(frame: Frame) -> Float[Tensor, "h w"]:
@@ -63,7 +63,7 @@ def depth_of(frame: Frame) -> Float[Tensor, "h w"]:
 
 
 def random_units(count: int, generator: Generator) -> Float[Tensor, "n 3"]:
-    """Return unit vectors, uniform on the sphere (float64)."""
+    """Return ``count`` unit vectors, uniformly distributed on the sphere (float64)."""
     normal = torch.randn((count, 3), generator=generator, dtype=torch.float64)
     return torch.nn.functional.normalize(normal, dim=-1)
 
@@ -71,11 +71,11 @@ def random_units(count: int, generator: Generator) -> Float[Tensor, "n 3"]:
 # Faults as text, alone or composed.
 
 NO_FAULT = "none"
-"""The name that leaves a view unchanged."""
+"""The name for the absence of faults, which leaves a view unchanged."""
 
 
 class AppliedFault(NamedTuple):
-    """A fault by name, with its size."""
+    """The name and size of a fault."""
 
     name: str
     size: float
