@@ -6,8 +6,8 @@ import os
 
 from lazy_loader import attach_stub
 
-# OpenMP threads that wait should sleep. On cores shared with other work, spinning made training more than ten times
-# slower in measurements. It has to be set before torch is loaded; a user's own setting is kept.
+# Waiting OpenMP threads should sleep, not spin: on cores shared with other work, spinning made training more than ten
+# times slower. The variable must be set before torch is loaded; a value set by the user is kept.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 # Modules are imported on first use (PEP 562): importing torch takes seconds, and ``bidnerf --help`` does not need it.

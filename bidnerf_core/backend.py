@@ -1,6 +1,6 @@
-"""The interface of a backend, the object that an entry point of ``bidnerf.backends`` names, and the usual way to make one.
+"""The interface of backends (named by entry points of ``bidnerf.backends``), and ``RecipeBackend``, which implements it.
 
-It also re-exports what a backend is written with: the contract of fields and samplers, rendering, and supervision.
+The module also re-exports what backends need: the interfaces of fields and samplers, rendering, and supervision.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def _defects(backend: Any) -> Iterator[str]:
 
 
 BACKENDS: Plugins[Backend] = Plugins("backends", _defects)
-"""The backends by name."""
+"""All backends by name; a backend is imported when it is looked up."""
 
 
 def load_backend(name: str, wanted_by: str = "") -> Backend:
@@ -91,7 +91,7 @@ class UpgradingField(Protocol):
     """Optional interface of a field that accepts states stored by earlier versions of its backend."""
 
     def upgraded_state(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Convert a stored state, of this or an earlier version, to the tensors of the current version."""
+        """Return a state dict that this or an earlier version stored, converted to the current version."""
         ...
 
 
@@ -107,14 +107,14 @@ Config = TypeVar("Config")
 Field = TypeVar("Field", bound=nn.Module)
 
 _seeding = Lock()
-"""Held while torch's global generator has another seed, since fields may be built in several threads."""
+"""Lock held while torch's global generator is temporarily reseeded, since several threads may build fields."""
 
 
 @dataclass(frozen=True)
 class RecipeBackend(Generic[Config, Field]):
-    """A ``Backend`` composed of a config, a field and a training recipe.
+    """A ``Backend`` composed of a config class, a field class and a training recipe.
 
-    The config's ``seed``, an int, makes the initial weights reproducible.
+    The config must have a ``seed``, an int, which makes the initial weights reproducible.
     """
 
     summary: str

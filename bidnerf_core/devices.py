@@ -1,6 +1,4 @@
-"""Torch devices and threads: where tensors reside, when the host may wait for a device, capture of work as
-a CUDA graph, and the number of CPU threads.
-"""
+"""Torch devices and threads: placement of tensors, waiting for a device, CUDA graphs, and the number of CPU threads."""
 
 from __future__ import annotations
 
@@ -25,7 +23,7 @@ from bidnerf_core.errors import InputError
 T = TypeVar("T")
 
 
-# Constants as tensors. Each is created once per device, since creating one copies it there from the host.
+# Constants as tensors. Each is created once per device, since its creation copies data from the host to the device.
 
 _notes: list[list[Tensor]] = []
 
@@ -53,14 +51,14 @@ def forget() -> None:
 # Whether code may make the host wait for the device. On a GPU, each number that the host reads from a tensor,
 # and each size that depends on values, blocks the host until the device has finished all queued work.
 # Skipping needless computation is worth that wait in training and when whole images are rendered, but not in
-# the short steps of a localization: there, code computes more than it needs, in known shapes.
+# the short steps of a localization: there, code computes more than it needs, in shapes known in advance.
 
 _allowed: ContextVar[bool] = ContextVar("waiting_allowed", default=True)
 
 
 @contextmanager
 def without_waiting() -> Iterator[None]:
-    """Make ``may_wait`` return False for all devices but the CPU, in this thread."""
+    """Make ``may_wait`` return False for all devices but the CPU, in this thread and within the block."""
     token = _allowed.set(False)
     try:
         yield
@@ -82,11 +80,11 @@ _capturing = Lock()
 """Allows one capture at a time: a capture begins by waiting for the device, which is forbidden during another."""
 _sharing = Lock()
 _free: dict[torch.device, list[_Lane]] = {}
-"""The lanes of each device that no thread uses now, the last used at the end."""
+"""The lanes of each device that no thread is using, with the most recently used lane at the end."""
 
 
 class Resident:
-    """Base of objects that stay on their device, such as a map's surface: ``run_on`` uses them where they are."""
+    """Base class of objects that stay on their device, such as a map's surface; ``run_on`` does not move them."""
 
 
 def captured(
@@ -97,10 +95,10 @@ def captured(
 ) -> Callable[[], None]:
     """Return a callable equivalent to ``step``; on a GPU, it replays a CUDA graph.
 
-    ``generator`` is the one from which the step draws, if any. Capturing does not execute the step. If the
-    capture fails, ``step`` itself is returned, with a warning. Run a step or two before capturing: they fill caches and
-    load kernels, which is not allowed during a capture. Graphs that are never replayed at the same time may share their
-    temporary ``memory``, a pool and the stream of their captures.
+    ``generator`` is the generator from which ``step`` draws random numbers, if any. Capturing does not execute ``step``.
+    If the capture fails, ``step`` itself is returned, with a warning. Run ``step`` once or twice before capturing it, since
+    filling caches and loading kernels is not allowed during a capture. Graphs that are never replayed at the same time may
+    share their temporary ``memory``: a pool, and the stream on which they are captured.
     """
     if device.type != "cuda":
         return step
@@ -116,7 +114,7 @@ def captured(
             _notes.append(constants)
             with torch.cuda.graph(graph, pool, stream, capture_error_mode="thread_local"):
                 step()
-        except RuntimeError as error:  # it waits for the device somewhere, as a third party's field may
+        except RuntimeError as error:  # the step waits for the device somewhere, as a third-party field may
             if generator is not None and before is not None:
                 generator.graphsafe_set_state(before)  # the registered one still expects a capture
             why = str(error).partition("\n")[0]
@@ -134,8 +132,8 @@ def captured(
 
 
 def graph_memory(device: torch.device) -> tuple[Any, torch.cuda.Stream]:
-    """Return a pool for the temporary memory of graphs, and the stream of their captures."""
-    # Torch hands out the same 32 streams of a priority in turn. Captures use a priority of their own, since whatever
+    """Return a pool for the temporary memory of graphs, and a stream on which to capture them."""
+    # Torch hands out the same 32 streams per priority in turn. Captures use a separate priority, since whatever
     # another thread launches on the stream of a capture would become part of the graph.
     return torch.cuda.graph_pool_handle(), torch.cuda.Stream(device, priority=-1)
 
@@ -150,9 +148,9 @@ def wait_for(device: torch.device) -> None:
 def run_on(device: torch.device, function: Callable[..., T], *values: Any) -> T:
     """Return ``function(*values)``, computed on ``device``, with all tensors of the result on the CPU.
 
-    Tensors in ``values`` are found as by ``moved``, except in modules and in ``Resident`` objects, which must be on the
-    device. Tensors on the CPU are all moved in one copy, and the results return in another, the only point at which
-    the host waits. On a GPU, repeated calls with values of the same shapes replay a CUDA graph, so the
+    Tensors in ``values`` are found as ``moved`` finds them, except that modules and ``Resident`` objects must already be
+    on the device. All CPU tensors are sent in one copy, and all results return in another, which is the only point at
+    which the host waits. On a GPU, repeated calls with values of the same shapes replay a CUDA graph, so the
     function must not draw random numbers, nor let the contents of a tensor decide which operations it runs.
     """
     if device.type == "cpu":
@@ -188,7 +186,7 @@ class _Lane:
 
 
 class _Remote:
-    """A function with fixed tensors on a device for its arguments, as a CUDA graph requires."""
+    """A function whose arguments are copied into fixed tensors on a device, as a CUDA graph requires."""
 
     def __init__(
         self, function: Callable[..., Any], values: Any, tensors: Sequence[Tensor], lane: _Lane
@@ -209,7 +207,7 @@ class _Remote:
             self._arguments.append(argument)
             first += size
 
-        # The shape of the values without their tensors, which would be kept alive.
+        # The structure of the values with empty tensors, so that the original tensors are not kept alive.
         template = _rebuilt(values, (torch.empty(0) for _ in tensors))
 
         def step() -> None:
@@ -227,8 +225,10 @@ class _Remote:
             source.copy_(tensor)
         self._received.copy_(self._sent, non_blocking=True)
         with without_waiting():
-            if self._calls == 1:  # the first call, of a rare shape perhaps, loads kernels and fills caches
-                # A thread cannot create during a capture what it uses for the first time, such as its handles of
+            if (
+                self._calls == 1
+            ):  # not in the first call, which fills caches and may be the only one of its shape
+                # During a capture, a thread cannot create what it uses for the first time, such as its handles for
                 # linear algebra, and another thread may have made the first call.
                 launched = self._step
                 launched()
@@ -243,7 +243,7 @@ class _Remote:
 
 
 def _structure(value: Any, tensors: list[Tensor]) -> Hashable:
-    """Append the tensors in ``value`` to ``tensors``, and return all else that a graph depends on."""
+    """Append the tensors in ``value`` to ``tensors``, and return a key of everything else that a graph depends on."""
     if isinstance(value, Tensor):
         tensors.append(value)
         return value.shape, value.dtype, value.device
@@ -306,7 +306,7 @@ def moved(value: T, device: torch.device | str) -> T:
 
 
 def _mapped(value: Any, change: Callable[[Any], Any], whole: tuple[type, ...]) -> Any:
-    """Apply ``change`` to the tensors in ``value`` and the parts whose type is in ``whole``; return ``value`` itself if none changes."""
+    """Return ``value`` with ``change`` applied to its tensors and its parts of the types ``whole``; ``value`` itself if none changes."""
     if isinstance(value, (Tensor, *whole)):
         return change(value)
     if is_dataclass(value) and not isinstance(value, type):
@@ -342,8 +342,8 @@ _setting = Lock()
 def threads_at_most(count: int) -> Iterator[int]:
     """Run torch operators called from this Python thread on at most ``count`` threads within the block.
 
-    Yields the usual number of threads. With a single thread, sums are the same on any machine. Other Python
-    threads are not affected, and may enter such blocks as well.
+    Yields the number of threads used before the block. With a single thread, sums are the same on any machine.
+    Other Python threads are not affected, and may enter such blocks as well.
     """
     usual = torch.get_num_threads()
     if usual > count:

@@ -1,6 +1,4 @@
-"""Errors for a user's mistakes, and warnings about assumptions: each message is one line that names the file
-and the problem.
-"""
+"""Errors that users can correct, and warnings about assumptions; each one-line message names the file and the problem."""
 
 from __future__ import annotations
 
@@ -9,11 +7,11 @@ from collections.abc import Collection, Sequence
 
 
 class InputError(ValueError):
-    """An input that cannot be used.
+    """Raised for an input that cannot be used.
 
-    The message is a single line that can be shown to the user unchanged, ``where: found, expected ...``, and its
-    parts are attributes. Where ``found`` ends in a colon or a semicolon, no comma follows it. ``InputError(error,
-    where=path)`` adds context to ``error``: ``where`` is put before the error's own, and the other parts are unchanged.
+    The message is a single line, ``where: found, expected ...``, which can be shown to the user unchanged; its parts
+    are attributes. If ``found`` ends in a colon or a semicolon, no comma is added. ``InputError(error, where=path)``
+    adds context to ``error``: ``path`` is put before ``error.where``, and the other parts are unchanged.
     """
 
     where: str | None
@@ -39,37 +37,31 @@ class InputError(ValueError):
 
 
 class UsageError(InputError):
-    """Arguments contradict each other or are out of range, regardless of the files' contents."""
+    """Raised for arguments that contradict each other or are out of range, whatever the files contain."""
 
 
 class InputWarning(UserWarning):
-    """An input was ambiguous and a convention was assumed; the message is a single line that states the convention."""
+    """Warning that an input is ambiguous; the message is a single line that states the convention that was assumed."""
 
 
 class Cancelled(Exception):
-    """Work stopped because ``cancel`` returned True. Partial results were saved where possible, and the
-    message lists them.
-    """
+    """Raised when work stops because ``cancel`` returned True. The message states which partial results were saved."""
 
 
 def unknown_name(what: str, name: str, known: Collection[str]) -> InputError:
-    """Return the error for a name that is not among ``known``; it suggests the closest known spelling."""
+    """Return an error for a name that is not in ``known``; its message suggests the closest name or lists all."""
     hint = spelling_hint(name, known)
     return InputError(f"no {what} {name!r}{hint}", expected=None if hint else f"one of {', '.join(known)}")
 
 
 def spelling_hint(name: str, known: Collection[str], otherwise: str = "") -> str:
-    """Return a question that suggests the closest spelling among ``known``, or ``otherwise`` if none is
-    similar.
-    """
+    """Return ``, did you mean 'NAME'?`` with the closest name in ``known``, or ``otherwise`` if none is similar."""
     near = difflib.get_close_matches(name, known, n=1)
     return f", did you mean {near[0]!r}?" if near else otherwise
 
 
 def refuse_text(what: str, given: object) -> None:
-    """Raise ``InputError`` if a single string is given where a list is expected: it would be read as a list
-    of letters.
-    """
+    """Raise ``InputError`` if ``given`` is a string where a list is expected: iteration would yield its letters."""
     if isinstance(given, str):
         raise InputError(f"{what} is {given!r}", expected=f"a list, such as [{given!r}]")
 
@@ -80,7 +72,7 @@ def amount(count: int, noun: str) -> str:
 
 
 def enumeration(parts: Sequence[str]) -> str:
-    """Join parts as in a sentence: a, b and c."""
+    """Join parts with commas and a final "and", as in a sentence: a, b and c."""
     return " and ".join([*filter(None, [", ".join(parts[:-1])]), *parts[-1:]])
 
 

@@ -1,4 +1,4 @@
-"""Progress of long-running work: what callers receive, and how they cancel it."""
+"""Progress reports and cancellation of long-running work."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class Progress:
 
 
 ProgressCallback: TypeAlias = Callable[[Progress], None]
-"""Receives the progress of long-running work, in the thread that does it. An exception raised here stops the
-work and propagates to the caller."""
+"""Function that receives the progress of long-running work, in the thread that does the work. An exception that it
+raises stops the work and propagates to the caller."""
 Cancel: TypeAlias = Callable[[], bool]
-"""Returns whether the work should stop, such as ``threading.Event().is_set``."""
+"""Function that returns whether the work should stop, such as the ``is_set`` of a ``threading.Event``."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,10 @@ _JOB: ContextVar[Job] = ContextVar("job", default=Job())  # noqa: B039 (it is fr
 
 @contextmanager
 def job_context(progress: ProgressCallback | None = None, cancel: Cancel | None = None) -> Iterator[None]:
-    """Set the callbacks that receive the progress of this thread's work within the block and that may cancel it.
+    """Set the callbacks that receive the progress of this thread's work, or cancel it, within the block.
 
-    Functions that take ``progress`` and ``cancel`` from users open this block once; the functions that they call report by
-    ``counter`` and stop by ``check_cancelled``. A callback that is None is inherited from the enclosing block. Raises ``InputError``
+    Functions that take ``progress`` and ``cancel`` from users open this block once; the functions that they call report with
+    ``counter`` and stop in ``check_cancelled``. A callback that is None is inherited from the enclosing block. Raises ``InputError``
     if ``cancel`` is not callable (for example, if it is an event rather than its ``is_set``).
     """
     kinds = {
@@ -68,19 +68,19 @@ def job_context(progress: ProgressCallback | None = None, cancel: Cancel | None 
 
 
 def current_job() -> Job:
-    """Return the job of this thread's work, for code that passes the callbacks to another thread or calls them itself."""
+    """Return the callbacks of this thread's work, for code that passes them to another thread or calls them directly."""
     return _JOB.get()
 
 
 def check_cancelled(stage: str = "localization") -> None:
-    """Raise ``Cancelled`` if this thread's work should stop, see ``job_context``. Called once per iteration of a long loop."""
+    """Raise ``Cancelled`` if this thread's work should stop (see ``job_context``). Long loops call this once per iteration."""
     cancel = _JOB.get().cancel
     if cancel is not None and cancel():
         raise Cancelled(f"cancelled during stage {stage!r}")
 
 
 def counter(stage: str, unit: str) -> Callable[[int, int], None]:
-    """Return a function of (done, total) that reports progress to the current job and raises ``Cancelled`` if it should stop."""
+    """Return a function of (done, total) that reports to the current job, and raises ``Cancelled`` if the job should stop."""
 
     def count(done: int, total: int) -> None:
         report_progress(Progress(stage, done, total, unit))
@@ -89,7 +89,7 @@ def counter(stage: str, unit: str) -> Callable[[int, int], None]:
 
 
 def report_progress(progress: Progress) -> None:
-    """Report to the current job, see ``job_context``, and raise ``Cancelled`` if it should stop."""
+    """Report progress to the current job (see ``job_context``), and raise ``Cancelled`` if the job should stop."""
     receive = _JOB.get().progress
     if receive is not None:
         receive(progress)

@@ -1,10 +1,10 @@
 """Registration of third-party parts by name: backends, readers, methods, features, faults, writers, importers,
 exporters and protocols of the service.
 
-A distribution provides an object through an entry point of the group ``bidnerf.GROUP``; the bundled ones are
-provided in the same way. A script or a notebook adds one with ``register``. Listing reads only metadata, so a
-broken plugin cannot break the list: the failure surfaces when that plugin is loaded, in an error that names
-the plugin, its distribution and the cause.
+A distribution provides an object through an entry point of the group ``bidnerf.GROUP``, as bidnerf itself does
+for the bundled objects. A script or a notebook adds an object with ``register``. Listing reads only metadata (and
+tables, see ``TABLE``), so a broken plugin does not break the list: it fails when it is loaded, with an error that
+names the plugin, its distribution and the cause.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ GROUPS: Mapping[str, str] = {
     "exporters": "exporter",
     "services": "protocol",
 }
-"""The kinds of object that can be registered, and the noun for each. The entry-point group has the prefix
-``bidnerf.``."""
+"""The groups of plugins, with the noun for an object of each. The name of the entry-point group is that of the group
+with the prefix ``bidnerf.``."""
 
 USUAL_BACKEND, USUAL_METHOD, USUAL_FEATURES = "hashgrid", "auto", "sift"
-"""The plugins that are used unless others are named."""
+"""The backend, method and keypoint detector that are used by default."""
 
 TABLE = "*"
 """The name of an entry point whose object is a mapping of plugins by name. Listing its group imports it."""
 
 Defects: TypeAlias = Callable[[Any], Iterator[str]]
-"""A function that yields the reasons why an object is not of its kind, the most informative one first."""
+"""A function that yields the reasons why an object is not a valid plugin of its kind, the most informative one first."""
 
 Plugin = TypeVar("Plugin")
 
@@ -51,7 +51,7 @@ registered: dict[tuple[str, str], Any] = {}
 
 
 class PluginError(InputError):
-    """A plugin cannot be loaded, or violates the contract of its kind; the message names the plugin and the cause."""
+    """Raised for a plugin that cannot be loaded or violates its contract; the message names the plugin and the cause."""
 
 
 @dataclass(frozen=True)
@@ -91,9 +91,9 @@ class PluginInfo:
 def register(group: str, name: str, value: Any, replace: bool = False) -> None:
     """Make ``value`` available under ``name`` in this process, for scripts and notebooks; other processes do not see it.
 
-    ``group``: one of ``GROUPS``, such as "methods". ``replace``: whether ``value`` may replace a plugin of
-    that name, whether registered before, installed or bundled. Raises ``InputError`` for an unknown group, an
-    invalid name, and a name that is taken.
+    ``group``: one of ``GROUPS``, such as "methods". ``replace``: whether ``value`` may replace an existing plugin
+    of that name (registered, installed or bundled). Raises ``InputError`` for an unknown group, an invalid name,
+    and a name that is taken.
     """
     if not (isinstance(name, str) and re.fullmatch(r"[\w.-]+", name)):
         raise InputError(f"name is {name!r}", where="register", expected="letters, digits, '.', '-' and '_'")
@@ -112,9 +112,10 @@ def registered_names() -> list[tuple[str, str]]:
 
 
 def require_registered(names: Iterable[tuple[str, str]]) -> None:
-    """Raise ``PluginError`` for a group and name that another process registered and this one did not.
+    """Raise ``PluginError`` unless this process has registered the plugins that another process has registered.
 
-    An installed plugin of the same name does not count: the other process refers to its own.
+    ``names`` are the group and name of each. An installed plugin of the same name does not count: the other process
+    uses the one that it registered.
     """
     for group, name in names:
         if (group, name) not in registered:
@@ -211,14 +212,14 @@ def _described(error: BaseException) -> str:
 
 
 class Plugins(Mapping[str, Plugin], Generic[Plugin]):
-    """The plugins of a group by name. Iterating imports nothing; a plugin is imported and checked on look-up."""
+    """Mapping from name to plugin for a group. Iteration imports no plugins; each is imported and checked on look-up."""
 
     def __init__(self, group: str, defects: Defects, first: Sequence[str] = ()) -> None:
-        """``first``: names to list first, in this order, before the other bundled ones and the rest."""
+        """``first``: names to list first, in this order, before the other bundled plugins and then the rest."""
         self._group, self._defects, self._first = group, defects, first
 
     def load(self, name: str, wanted_by: str = "") -> Plugin:
-        """Return a plugin as ``load_plugin`` does."""
+        """Import the plugin called ``name``, check it, and return it, see ``load_plugin``."""
         found: Plugin = load_plugin(self._group, name, self._defects, wanted_by)
         return found
 
@@ -243,11 +244,11 @@ class Plugins(Mapping[str, Plugin], Generic[Plugin]):
 def interface_defects(
     plugin: Any, attributes: Sequence[str], methods: Mapping[str, Sequence[str]]
 ) -> Iterator[str]:
-    """Yield the reasons why an object lacks an interface.
+    """Yield the reasons why an object does not implement an interface.
 
-    ``attributes`` are given by name, ``methods`` by name with their parameters. If ``summary`` is one of the
-    attributes, it must be text; ``config_type`` must be a frozen dataclass with defaults. A plain function counts
-    as an object with the method ``__call__``.
+    ``attributes`` are names, and ``methods`` maps names to the names of parameters. Among the attributes,
+    ``summary`` must be text, and ``config_type`` a frozen dataclass with defaults. A plain function counts as an
+    object with the method ``__call__``.
     """
     missing = [name for name in (*attributes, *methods) if not hasattr(plugin, name)]
     if missing:

@@ -1,8 +1,8 @@
-"""Settings as frozen dataclasses: the range of each field, and the flat names by which users set them.
+"""Settings as frozen dataclasses: the range of each field, and the flat names by which users set the fields.
 
-A method's settings are composed of small groups shared by several methods (`Annotated` fields of nested
-dataclasses). On the command line and in JSON they all have flat names, ``{"rays": 512, "depth_weight": 3}``:
-a name is unique within a method, whichever group it belongs to.
+A method's settings are nested dataclasses with `Annotated` fields, small groups that several methods share. On
+the command line and in JSON, every field has a flat name, as in ``{"rays": 512, "depth_weight": 3}``: a name is
+unique within a method, whichever group it belongs to.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from bidnerf_core.io import LARGEST_NUMBER, from_plain, to_plain
 S = TypeVar("S")
 
 LARGEST_SEED = 2**31 - 1
-"""Largest seed of programs and requests, which every language holds exactly; Python takes larger ones."""
+"""Largest seed that commands and requests accept; every language represents it exactly. Python functions accept larger ones."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def _written(limit: float) -> str:
     return f"{int(limit) if float(limit).is_integer() else limit:,}"
 
 
-# Compared and hashed by identity: the command-line parser hashes it, and a table is not hashable.
+# Compared and hashed by identity, since the command-line parser hashes annotations and a table is not hashable.
 @dataclass(frozen=True, eq=False)
 class OneOf:
     """The names or numbers that a setting accepts: the keys of a table, which users may extend."""
@@ -99,7 +99,7 @@ class Expert:
 EXPERT = Expert()
 
 Count = Annotated[int, Range(1, 10**7)]
-# Numbers of layers of a network: each takes time and memory even if its tensors have only shapes.
+# The number of layers of a network is limited, since each takes time and memory even on the device "meta".
 Layers = Annotated[int, Range(1, 100)]
 NotNegative = Annotated[float, Range(0.0)]
 Positive = Annotated[float, Above(0.0, 1e6)]
@@ -162,7 +162,7 @@ def from_flat(base: S | type[S], values: dict[str, Any], where: str) -> S:
 
 
 def _with_values(default: S, flat: dict[str, Any], where: str) -> S:
-    """Return the settings ``default`` with the values of ``flat``, whichever group declares them."""
+    """Return the settings ``default`` with the values of ``flat`` put into whichever groups declare their names."""
     kind: Any = type(default)
     hints, values = typing.get_type_hints(kind), dict[str, Any]()
     for field in dataclasses.fields(kind):

@@ -16,8 +16,8 @@ from bidnerf_core.fields import Rays, RaySamples, SceneBounds, Stratified
 class Bins:
     """A ``RaySampler`` that returns all bins of each ray, as dense training needs them.
 
-    A ray's bins depend only on the box. The bins are truncated if the ray's own [near, far] is
-    narrower, and do not extend beyond the box if [near, far] is wider.
+    The bins divide the part of the ray that lies in the box, whatever the ray's [near, far]; each bin is then
+    clipped to [near, far].
     """
 
     bounds: SceneBounds
@@ -32,7 +32,7 @@ class Bins:
 
     @torch.no_grad()
     def through(self, rays: Rays) -> Rays:
-        """Return the rays limited to the box only, ignoring their own [near, far]."""
+        """Return the rays with [near, far] set by the box alone."""
         return self.bounds.rays(rays.origins.detach(), rays.directions.detach())
 
 

@@ -15,7 +15,7 @@ from bidnerf_core.fields import FieldValues, OccupancyMask, Rays, RaySamples, Re
 def dense_samples(
     field: AdaNerfField, rays: Rays, room: OccupancyMask | None, generator: Generator
 ) -> tuple[RaySamples, Tensor]:
-    """Return the jittered bins that are shaded, and which of them are known to be empty."""
+    """Return the jittered bins, marked valid if they are shaded, and a mask (r n) of shaded bins that are known to be empty."""
     samples = field.bins(rays, generator)
     if room is None:
         return samples, torch.zeros_like(samples.valid)

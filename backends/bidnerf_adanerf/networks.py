@@ -13,7 +13,7 @@ from bidnerf_core.fields import encoded_width, frequency_encoding, octaves
 
 
 def encode(points: Float[Tensor, "*p 3"], frequencies: int) -> Float[Tensor, "*p f"]:
-    """Return the encoding of points in the cube [-1, 1], in the input order of stored networks."""
+    """Return the frequency encoding of points in the cube [-1, 1], sines first, as stored networks expect it."""
     return frequency_encoding(points, octaves(frequencies, points), sines_first=True)
 
 

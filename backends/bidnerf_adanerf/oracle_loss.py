@@ -34,15 +34,13 @@ def oracle_loss(
 
 
 def by_weight(weights: Float[Tensor, "r n"]) -> Float[Tensor, "r n"]:
-    """Return targets from the mean of a bin's weight and the largest weight around the bin, as a surface may lie between bins."""
+    """Return targets in [0, 1] that rise with a bin's weight and its neighbours' weights, since a surface may lie between bins."""
     beside = functional.max_pool1d(weights[:, None], 3, stride=1, padding=1)[:, 0]
     return ((weights + beside) / 2 / ENOUGH).clamp(max=1)
 
 
 def by_depth(samples: RaySamples, batch: TrainingBatch) -> Float[Tensor, "r n"]:
-    """Return targets that are 1 at the measured depth and fall off with distance from it; 0 on rays without a
-    measurement.
-    """
+    """Return targets that are 1 at the measured depth and fall off with distance from it; 0 on rays without a measurement."""
     width = (samples.ends - samples.starts).clamp(min=1e-9)
     away = (samples.middles - batch.observed.distance[:, None]).abs() / width  # in bins
     near = (1 - away / BLUR).clamp(min=0)

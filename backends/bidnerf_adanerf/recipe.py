@@ -54,13 +54,13 @@ def sparsity(step: int, config: AdaNerfConfig) -> float:
 
 
 def train(field: AdaNerfField, views: Sequence[View], config: AdaNerfConfig, report: Report) -> None:
-    """Fit ``field`` to ``views``; see ``fit`` for checkpoints and stopping."""
+    """Fit ``field`` to ``views``; see ``Supervision.fit`` for checkpoints and stopping."""
     room = room_for_matter(views, field.bounds, config.room_resolution) if config.carve else None
     room = moved(room, device_of(field))
     supervision = Supervision(views, field.bounds, config, device_of(field))
 
     @cache
-    def rays_per_step(sparse: bool) -> int:  # constant in a phase, also where training resumes
+    def rays_per_step(sparse: bool) -> int:  # constant in a phase, even if training is resumed
         probe = supervision.draw(PROBE, Generator().manual_seed(config.seed)).rays
         generator = Generator().manual_seed(config.seed)
         samples = field.sampler(probe) if sparse else dense_samples(field, probe, room, generator)[0]
@@ -96,7 +96,7 @@ def dense_step(
     field: AdaNerfField, supervision: Supervision, batch: TrainingBatch, room: OccupancyMask | None,
     phase: Phase, sparsity_weight: Float[Tensor, ""], generator: Generator,
 ) -> StepOutcome:  # fmt: skip
-    """Return the loss with all bins shaded, each weighted fully or, in the soft phase, according to its score."""
+    """Return the outcome of a step that shades all bins, each weighted fully or, in the soft phase, according to its score."""
     config = supervision.config
     assert isinstance(config, AdaNerfConfig)
     samples, empty = dense_samples(field, batch.rays, room, generator)

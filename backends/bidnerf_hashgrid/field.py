@@ -83,7 +83,7 @@ class HashGridField(nn.Module):
         single = bounds.contracted and config.samples_per_ray > 0
         self.occupancy = OccupancyGrid(bounds, config.grid_resolution, steps_per_cell=1 if single else 2)
         self.coarse_sampler = OccupancyGrid(bounds, config.grid_resolution // 2)
-        self._packed: tuple[Any, fused.PackedNetworks | None] | None = None  # and the weights' versions
+        self._packed: tuple[Any, fused.PackedNetworks | None] | None = None  # with the weights' versions
 
     @property
     def sampler(self) -> RaySampler:
@@ -111,7 +111,7 @@ class HashGridField(nn.Module):
     def query_levels(
         self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"], active: int | None
     ) -> FieldValues:
-        """Return the values with the first ``active`` levels of the encoding only (None: all)."""
+        """Return density and colour as computed from the first ``active`` levels of the encoding (None: all)."""
         shape = positions.shape[:-1]
         points, along = positions.reshape(-1, 3), directions.reshape(-1, 3)
         moving = torch.is_grad_enabled() and (points.requires_grad or along.requires_grad)
@@ -123,7 +123,7 @@ class HashGridField(nn.Module):
         return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
 
     def values_of(self, encoded: Float[Tensor, "p f"], directions: Float[Tensor, "p 3"]) -> FieldValues:
-        """Return the values at encoded positions."""
+        """Return density and colour at encoded positions, seen along unit directions."""
         harmonics = spherical_harmonics(directions, 9)
         log_density, rgb = log_density_and_rgb(self.geometry, self.colour, encoded, harmonics)
         return FieldValues(self._density(log_density), rgb)
@@ -143,7 +143,7 @@ class HashGridField(nn.Module):
         self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"], wanted: Bool[Tensor, "p"] | None,
         active: int | None,
     ) -> FieldDerivatives:  # fmt: skip
-        """Return the values of ``query_levels`` and their derivatives."""
+        """Return the values of ``query_levels`` and their derivatives by position and direction; see ``fused.query`` for ``wanted``."""
         with torch.no_grad():
             kernel = self._kernel(active)
             if kernel is None:

@@ -28,7 +28,7 @@ MOST = 96
 WIDEST = 128
 """Features of the encoding, and units of a layer, up to which a field's tiles fit into the registers of a GPU."""
 POINTS = 64
-"""Points of a tile; twice as many of the field's values alone, and twice as many steps of a ray are looked up at once."""
+"""Number of points in a tile; doubled for the field's values without derivatives, and for the steps of a ray looked up at once."""
 
 
 @lru_cache(maxsize=4)
@@ -38,7 +38,7 @@ def available(device: torch.device) -> bool:
 
 
 def fits(tables: Sequence[Tensor]) -> bool:
-    """Return whether the kernels can encode by these tables: float32, on a suitable GPU, and small enough for 32-bit indices."""
+    """Return whether the kernels can encode with these tables: float32, on a suitable GPU, small enough for 32-bit indices."""
     small = all(table.dtype == torch.float32 and table.numel() < 2**31 for table in tables)
     return small and available(tables[0].device)
 
@@ -62,7 +62,7 @@ def _blocks(count: int, size: int) -> tuple[int]:
 
 
 class Encode(torch.autograd.Function):
-    """Autograd function that encodes points (3 n) in the unit cube by some levels, with zeros for the others."""
+    """Autograd function that encodes points (3 n) in the unit cube with some levels, and writes zeros for the others."""
 
     @staticmethod
     def forward(
@@ -144,7 +144,7 @@ class PackedNetworks:
         return PackedNetworks(first.weight, rest, torch.cat(biases), width, features, len(between), {})
 
     def weights(self, inputs: int) -> Float[Tensor, " w"]:
-        """Return the weights of all layers, with the first ``inputs`` columns of the first."""
+        """Return the weights of all layers; those of the first layer are for its first ``inputs`` inputs only."""
         if inputs not in self.by_inputs:
             into = _padded(self.first[:, :inputs].t(), _power_of_two(inputs), self.width)
             self.by_inputs[inputs] = torch.cat([into.flatten(), self.rest])
@@ -175,7 +175,9 @@ def query(
     box = constant((*bounds.centre, 2 / bounds.side, 1 / bounds.side), values)
     inputs = len(levels) * features
     index = count = torch.empty(0, dtype=torch.long, device=values.device)
-    if wanted is not None:  # their numbers in order, without waiting for how many there are
+    if (
+        wanted is not None
+    ):  # the wanted points' indices in order, without making the host wait for their number
         place = wanted.long().cumsum(0)
         index, count = place.new_empty(n + 1), place[-1:]
         index.scatter_(0, torch.where(wanted, place - 1, n), torch.arange(n, device=place.device))

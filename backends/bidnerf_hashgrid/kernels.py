@@ -15,7 +15,7 @@ import triton.language as tl
 
 @triton.jit
 def _cells(x, y, z, resolution, entries, hashed, stride_y, stride_z):
-    """Return the lower corner's index terms along each axis, the strides to the upper ones, and the position in the cell."""
+    """Return the index terms of the cell's lower corner, and the position in the cell as a fraction, along each axis."""
     last = resolution - 1
     size = resolution.to(tl.float32)
     sx, sy, sz = x * size, y * size, z * size
@@ -226,10 +226,10 @@ def field_kernel(
 ):  # fmt: skip
     """Compute density and colour (n 4) at points (n 3, world) along directions (n 3) and, with ``DERIVATIVES``, (n 4 6).
 
-    Derivatives by position (three) and by direction (three) are propagated forward with the values. ``box`` has the scene's centre,
-    the factor to the cube [-1, 1] and the factor of the density. Layers are padded with zeros to ``WIDTH`` and ``FEATURES``, whose
-    first column is the log density; ``weights`` has them one after the other, each (inputs, outputs). With ``SOME``, only the
-    first ``count`` points of ``index`` are computed.
+    Derivatives by position (three) and by direction (three) are propagated forward with the values. ``box`` holds the scene's
+    centre, the factor to the cube [-1, 1] and the factor of the density. Layers are padded with zeros to ``WIDTH`` units and
+    ``FEATURES`` features, the first of which is the log density; ``weights`` holds the layers one after the other, each (inputs,
+    outputs). With ``SOME``, only the points whose numbers are the first ``count`` entries of ``index`` are computed.
     """
     row = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK))[:, None]
     if SOME:

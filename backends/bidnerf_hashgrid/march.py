@@ -43,8 +43,8 @@ def _slab(o, d, middle, half):
 def _limits(rays, grid, ray, n, CONTRACTED: tl.constexpr):
     """Return a ray's origin and direction, its limits in the coordinate of ``RaySpacing``, and where it leaves and enters the cube.
 
-    ``rays`` are (8 n): origin, direction, near and far. ``grid`` has the cube's centre, half its side, the step, and the number of
-    cells along a side.
+    ``rays`` are (8 n): origin, direction, near and far. ``grid`` holds the cube's centre, half its side, the step, and the number
+    of cells along a side.
     """
     ox, oy, oz = tl.load(rays + ray), tl.load(rays + n + ray), tl.load(rays + 2 * n + ray)
     dx, dy, dz = tl.load(rays + 3 * n + ray), tl.load(rays + 4 * n + ray), tl.load(rays + 5 * n + ray)
@@ -140,7 +140,7 @@ def _absorbed(start, end, there, ox, oy, oz, dx, dy, dz, grid, density, thickest
 
 @triton.jit
 def _neighbour(values, by, J: tl.constexpr):
-    """Return the value ``by`` elements after each value; 0 where there is none."""
+    """Return, for each element, the value that is ``by`` elements later, or 0 if there is none."""
     here, other = tl.arange(0, J)[:, None], tl.arange(0, J)[None, :]
     return tl.sum(tl.where(other == here + by, values[None, :], 0.0), 1)
 

@@ -44,7 +44,7 @@ def log_density_and_rgb(
 
 
 def _networks(flat: Sequence[Tensor], geometry_layers: int) -> tuple[Layers, Layers]:
-    """Return the layers of both networks, or their gradients."""
+    """Group the flat weights and biases of both networks, or their gradients, into layers."""
     layers = list(zip(flat[::2], flat[1::2], strict=True))
     return layers[:geometry_layers], layers[geometry_layers:]
 

@@ -76,7 +76,7 @@ class OccupancyGrid(nn.Module):
     ) -> None:
         """Update peaks and densities with the rendering weights and densities of a batch at ``positions`` (metres, world).
 
-        Without ``valid``, all samples count.
+        In each visited cell, the old values are first multiplied by ``fade``. Without ``valid``, all samples count.
         """
         self.observed = True
         cells = self.grid.numbers(positions)
@@ -86,7 +86,7 @@ class OccupancyGrid(nn.Module):
             # A cell fades once per step, however many samples lie in it.
             if valid is None:
                 flat.index_copy_(0, cells, faded)
-            else:  # what does not count is no minimum and no maximum
+            else:  # invalid samples must change neither the minimum nor the maximum
                 flat.scatter_reduce_(0, cells, torch.where(valid, faded, torch.inf), "amin")
                 values = torch.where(valid, values, 0)
             flat.scatter_reduce_(0, cells, values.to(known), "amax")

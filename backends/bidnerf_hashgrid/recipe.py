@@ -40,7 +40,7 @@ log = logging.getLogger("bidnerf")
 SETTLED = 10
 """Step up to which the number of samples per ray changes so much that it is read in each step."""
 SPARE = 1.25
-"""Room for the samples of a step on a GPU, relative to their expected number: its standard deviation is a few per cent."""
+"""Room for a step's samples on a GPU, relative to their expected number: the standard deviation is a few per cent."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def adapted(config: HashGridConfig, bounds: SceneBounds) -> HashGridConfig:
 
 
 def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, report: Report) -> None:
-    """Fit ``field`` to ``views``; see ``fit`` for checkpoints and stopping."""
+    """Fit ``field`` to ``views``; see ``Supervision.fit`` for checkpoints and stopping."""
     if config.carve and report.resume() is None:
         allowed = occupied_voxels(views, field.occupancy.grid, device=device_of(field))
         field.occupancy.restrict(allowed)
@@ -125,7 +125,7 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
                 count = config.samples_per_step / max(samples, 1.0)
                 if device.type != "cpu":
                     count /= 1 if grid.observed else 4  # before the first step, rays may cross the whole grid
-                    # Few different numbers, as each is captured, and of those for which kernels were compiled.
+                    # Only a few different numbers, since each is captured; multiples of 16 reuse compiled kernels.
                     count = 2 ** (math.floor(2 * math.log2(max(count, 1.0))) / 2)
                     count -= count % 16 if count >= 16 else 0
                 rays[coarse] = max(1, min(config.rays_at_most, int(count)))
@@ -140,7 +140,7 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
         samples = level.sampler(batch.rays, generator)
         if may_wait(device) and step >= config.prune_from:
             active = config.coarse_levels if is_coarse(step) else None
-            # A sample whose weight is a tenth of that up to which a cell is empty does not count, once cells are pruned.
+            # Once cells are pruned, samples are skipped up to a tenth of the weight at which a cell counts as empty.
             least = 0.1 * config.prune_threshold
             values, seen, density = _visible(field, active, batch.rays, samples, least)
         else:

@@ -1,4 +1,4 @@
-"""Threads for operations that torch runs on one core: gathering from a table and scattering into it."""
+"""Threads for operations that torch runs on one core: gathering from a table and scattering into a table."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def threads_for(points: int, device: torch.device) -> int:
 
 
 def slices(count: int, size: int) -> list[slice]:
-    """Return slices of up to ``size`` items that cover ``count`` items: the parts of the work that tasks share."""
+    """Return slices of at most ``size`` items that together cover ``count`` items, to divide work among tasks."""
     return [slice(start, min(start + size, count)) for start in range(0, count, size)]
 
 

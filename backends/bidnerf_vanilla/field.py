@@ -35,7 +35,7 @@ class FieldConfig(NetworkConfig):
 
 
 class Level(nn.Module):
-    """A network and its sampler."""
+    """One level of the field: a network and its sampler."""
 
     def __init__(self, config: NetworkConfig, bounds: SceneBounds, sampler: RaySampler) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ class Level(nn.Module):
 
 
 class VanillaField(HierarchicalField):
-    """The fine level, with the coarse one in ``levels``; its sampler is hierarchical and uses the coarse one (section 5.2)."""
+    """The field of NeRF, whose coarse level places the samples of the fine level (section 5.2); both are in ``levels``."""
 
     def __init__(self, config: FieldConfig, bounds: SceneBounds) -> None:
         super().__init__()

@@ -47,7 +47,7 @@ class VanillaConfig(FieldConfig, SupervisionConfig):
 
 
 def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, report: Report) -> None:
-    """Fit ``field`` to ``views``; see ``fit`` for checkpoints and stopping."""
+    """Fit ``field`` to ``views``; see ``Supervision.fit`` for checkpoints and stopping."""
     if config.carve:
         field.room.cells.copy_(occupied_voxels(views, field.room.grid, device=device_of(field)))
     supervision = Supervision(views, field.bounds, config, device_of(field))
@@ -64,7 +64,7 @@ def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, rep
 def step_outcome(
     field: VanillaField, supervision: Supervision, batch: TrainingBatch, generator: Generator
 ) -> StepOutcome:
-    """Return the loss of both levels (eq. 6), and the colour error and the number of samples per ray of the fine level."""
+    """Return the loss of both levels (eq. 6), and the mean squared colour error and samples per ray of the fine level."""
     coarse, fine = (render(level, batch.rays, batch.background, generator) for level in field.levels)
     rough, _ = supervision.loss(coarse, batch)
     loss, mse = supervision.loss(fine, batch)

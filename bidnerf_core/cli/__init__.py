@@ -1,4 +1,4 @@
-"""The command line ``bidnerf COMMAND ...``: each module of the package holds one command or a few."""
+"""The command line ``bidnerf COMMAND ...``: ``main``, and modules that implement one or more commands each."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ MODULES = {
     "backends": "plugins", "poses": "train", "serve": "view", "compare": "evaluate", "report": "evaluate",
     **dict.fromkeys(("import", "bake", "info", "extend", "export", "scale", "render"), "maps"),
 }  # fmt: skip
-"""The module of a command that has none of its own. A command is the function ``run_COMMAND`` there."""
+"""The module of each command that has no module of its name. The function ``run_COMMAND`` in it runs the command."""
 DONE, BAD_INPUT, WRONG_USAGE, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
-"""Exit statuses; the last two are 128 plus the number of the signal, as is customary for shells. For SIGTERM and SIGHUP the
-status is 143 and 129."""
+"""Exit statuses; the last two are 128 plus the number of the signal, as is customary for shells. SIGTERM and SIGHUP lead to
+143 and 129."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -71,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         return _failed(name, str(error), WRONG_USAGE if isinstance(error, UsageError) else BAD_INPUT)
     except RuntimeError as error:
-        if type(error).__name__ != "OutOfMemoryError":  # it is torch's, whose import --help does not wait for
+        if type(error).__name__ != "OutOfMemoryError":  # torch's class; importing torch would delay --help
             raise
         return _failed(name, f"the GPU's memory is full, try --device cpu ({error})", BAD_INPUT)
     finally:
@@ -127,7 +127,7 @@ def _warnings_as_lines(name: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _remarks_as_lines() -> Iterator[None]:
-    """Print each remark logged by the library as one line on stderr."""
+    """Print each message that the library logs as one line on stderr."""
     logger, handler = logging.getLogger("bidnerf"), _Lines()
     before = logger.level, logger.propagate
     logger.addHandler(handler)
@@ -137,7 +137,7 @@ def _remarks_as_lines() -> Iterator[None]:
         yield
     finally:
         logger.removeHandler(handler)
-        logger.setLevel(before[0])  # which, unlike assigning it, clears the logger's cache
+        logger.setLevel(before[0])  # unlike an assignment, this clears the logger's cache
         logger.propagate = before[1]
 
 

@@ -245,5 +245,5 @@ def run_report(
 
 
 def link_to(page: Path, folder: Path) -> str:
-    """Return the link to a page from another page in a folder."""
+    """Return the relative URL by which pages in ``folder`` can link to ``page``."""
     return quote(Path(os.path.relpath(page.resolve(), folder.resolve())).as_posix())

@@ -1,4 +1,4 @@
-"""``bidnerf localize``: poses of images in one map, or in the one of several maps that each shows."""
+"""``bidnerf localize``: poses of images in one map or, if several are given, in the map that each image shows."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class StartOptions:
         require_one({"--start": self.start, "--perturb": self.perturb})
 
     def of_queries(self, seed: int) -> Callable[[Query], SE3 | None]:
-        """Return a function from a query to its start, or to None if it has none.
+        """Return a function that maps a query to its start pose, or to None if the query has none.
 
         Raises ``UsageError`` if the perturbation is out of range.
         """
@@ -214,7 +214,7 @@ class Run:
     start: Callable[[Query], SE3 | None]
 
     def show(self, query: Query, answer: Answer | Failure) -> None:
-        """Print an answer and draw it."""
+        """Print an answer or a failure, and draw an answer if a folder for drawings was given."""
         from bidnerf_core.io import png_bytes, write_file
         from bidnerf_core.maps import MapCollection
         from bidnerf_core.results import Failure, overlay
@@ -239,8 +239,8 @@ class Run:
     def saved(self) -> Iterator[None]:
         """Write the pose file at the end and, if there are several queries, print how many converged.
 
-        If the run is stopped early, the answers so far are written. Raises ``InputError`` if no pose was accepted and
-        the file holds only accepted poses, and if a query failed.
+        If the run is stopped early, the answers so far are written. Raises ``InputError`` if the file's format takes
+        only accepted poses and there are none, and if a query failed.
         """
         from bidnerf_core.maps import MapCollection
         from bidnerf_core.results import pose_format
@@ -272,7 +272,7 @@ class Run:
 
 
 def answer_lines(answer: Answer, full: bool) -> list[str]:
-    """Return an answer as text: a line, one for the runner-up among several maps and, if ``full``, the uncertainty and the matrix."""
+    """Return an answer as lines: the outcome, the runner-up among several maps and, if ``full``, the uncertainty and the pose."""
     from bidnerf_core.geometry import symbol
     from bidnerf_core.results import OPENCV_AXES, standard_deviations
 

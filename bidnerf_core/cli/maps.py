@@ -1,4 +1,4 @@
-"""``bidnerf info``, ``render``, ``export``, ``scale``, ``bake``, ``extend`` and ``import``: what is done with a map."""
+"""The commands that create, read or change a map: ``bidnerf info``, ``render``, ``export``, ``scale``, ``bake`` and others."""
 
 from __future__ import annotations
 
@@ -205,7 +205,7 @@ def _render_views(scene: Map, level: int | None, views: Sequence[View], out: Pat
 
 
 def write_images(out: Path, name: str, image: RenderedImage) -> None:
-    """Write ``NAME.png`` and ``NAME.depth.png``."""
+    """Write ``NAME.png`` (8-bit RGB) and ``NAME.depth.png`` (16-bit planar z in steps of 0.001 map units) to ``out``."""
     import numpy as np
     import torch
 
@@ -264,7 +264,7 @@ def run_bake(
         )
     if landmark_features is not None:
         find_features(landmark_features)
-    # The parts that are baked may be damaged, and are replaced anyway.
+    # The baked parts may be damaged, so they are not loaded here.
     scene = load_map(map, device, baked=False)
     with working():
         scene.bake(
@@ -333,7 +333,7 @@ def _importer_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
         try:
             if not word.startswith("-"):
                 return importer_of(Path(word))[1].config_type()
-        except InputError:  # not the file; or an invalid one, which is reported later
+        except InputError:  # not the file to import, or an invalid file, which is reported later
             continue
     return None
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from bidnerf_core.maps import Map
 
 TEST_IMAGES = DatasetOptions(split="test")
-"""The default options of images on which a map is tried."""
+"""The default options for images with which a map is tested."""
 
 MapFolder: TypeAlias = Annotated[
     Path, Option("MAP", "folder of a map, as written by 'bidnerf train'", positional=True)
@@ -90,7 +90,7 @@ def require_one(values: Mapping[str, object], required: bool = False) -> None:
 
 
 def refuse(options: Mapping[str, object], reason: str, expected: str | None = None) -> None:
-    """Raise ``UsageError``, which begins with the option and the ``reason``, if one of ``options`` has a value."""
+    """Raise ``UsageError`` if one of ``options`` has a value; the message begins with that option and ``reason``."""
     for option, value in options.items():
         if value is not None and value != ():
             raise UsageError(f"{option} {reason}", expected=expected)
@@ -116,7 +116,7 @@ class CameraOptions:
         require_one({"--focal": self.focal, "--hfov": self.hfov})
 
     def source(self, images: DatasetOptions, assumed: Sequence[Intrinsics] = ()) -> CameraSource:
-        """Return the camera source for single images."""
+        """Return the camera source for single images, where ``assumed`` are candidates for unknown cameras."""
         from bidnerf_core.camera import CameraSource
 
         require_one({"--camera": images.camera, "--focal": self.focal, "--hfov": self.hfov})

@@ -63,8 +63,8 @@ def check_output(out: Path, inputs: Iterable[Path | str | None]) -> None:
     """Raise, before any work is done, if the file ``out`` cannot be written or would replace an input.
 
     Inputs are the files of any map, the ``inputs``, and the files in folders among the ``inputs``. Raises
-    ``UsageError`` if ``out`` would replace an input, and ``InputError`` if ``out`` is a folder or cannot be written
-    in its folder.
+    ``UsageError`` if ``out`` would replace an input, and ``InputError`` if ``out`` is a folder, or if its folder does
+    not exist or is not writable.
     """
     # os.path functions return False for a name that is too long, which is reported when it is written.
     if os.path.isdir(out) or not os.path.isdir(out.parent):

@@ -1,7 +1,7 @@
 """The parser of a command, whose arguments are the parameters of a function and the fields of dataclasses among them.
 
 Each option is named after its parameter, such as ``--depth-unit`` for ``depth_unit``, whichever dataclass declares
-it. Its help text is that of its ``Option``, or the docstring or comment beside the field.
+the parameter. The help text comes from the ``Option`` or, failing that, from the docstring or comment beside the field.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ T = TypeVar("T")
 
 HELP, HELP_ALL = "--help", "--help-all"
 NEGATIVE = re.compile(r"-[\d.]")
-"""Begins a value, such as -1,0,2, that is not an option."""
+"""Matches the beginning of a value such as -1,0,2, which is not an option."""
 KINDS = {
     int: ("INT", "a whole number"),
     float: ("FLOAT", "a number"),
@@ -70,7 +70,7 @@ class Settings:
 
 
 FLAG = "flag"
-"""Marks a bool that has an option for True alone."""
+"""Marks a bool that has an option only for True, and none, such as --no-NAME, for False."""
 Flag = Annotated[bool, FLAG]
 
 
@@ -90,7 +90,7 @@ class Parameter:
 
     @property
     def option(self) -> Option:
-        """The ``Option`` among the annotations, or else one whose metavar is the string among the annotations."""
+        """The ``Option`` among the annotations, or else an ``Option`` whose metavar is the first string among them."""
         return self.note(Option) or Option(
             next((n for n in self.notes if isinstance(n, str) and n != FLAG), None)
         )
@@ -214,7 +214,7 @@ class _Parser(argparse.ArgumentParser):
         )
 
     def _filled(self, text: str, indent: int = 0) -> str:
-        """Return paragraphs wrapped to the width of the terminal."""
+        """Return the paragraphs of ``text``, wrapped to the width of the terminal less ``indent`` columns."""
         paragraphs = (" ".join(part.replace("``", "'").split()) for part in text.split("\n\n"))
         fill = functools.partial(textwrap.fill, width=self.width - indent, break_on_hyphens=False)
         return "\n\n".join(map(fill, paragraphs))
@@ -249,7 +249,7 @@ class _Parser(argparse.ArgumentParser):
         )  # fmt: skip
 
     def values(self, words: Sequence[str]) -> dict[str, Any]:
-        """Parse words, and return the values of the arguments that were given. Raises ``UsageError``."""
+        """Parse words, and return the values of the arguments given, by parameter name. Raises ``UsageError``."""
         self._words = words
         found, more = self.parse_known_intermixed_args(_escaped(words))
         if more:

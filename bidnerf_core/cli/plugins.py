@@ -1,4 +1,4 @@
-"""``bidnerf plugins`` and ``bidnerf backends``."""
+"""The commands ``bidnerf plugins`` and ``bidnerf backends``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What surrounds the work of a command: the signals that stop it, so that results can be saved, and the display of its progress."""
+"""Support for running commands: signals stop the work in a way that lets results be saved, and its progress is displayed."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class _Handler:
     def __init__(self) -> None:
         self.process = os.getpid()
         self.writes = False  # every signal waits until results are written
-        self.works = False  # the first Ctrl-C waits for the next check of the work
+        self.works = False  # the first Ctrl-C waits until the work next checks whether to stop
         self.waiting: int | None = None
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
@@ -156,9 +156,9 @@ def displayed() -> Iterator[None]:
 def working(
     announcement: str = "stopping after this step (Ctrl-C again: at once, back to the last checkpoint)",
 ) -> Iterator[None]:
-    """Display the progress of the work in the context, and let Ctrl-C stop it at its next check; a second one stops it at once.
+    """Display the progress of the work in the context, and let Ctrl-C stop it at its next check; a second Ctrl-C stops it at once.
 
-    Once the work has stopped, a line says what was kept, and ``Interrupted`` is raised.
+    Once the work has stopped at a check, a line states what was kept, and ``Interrupted`` is raised.
     """
     handler, announced = _handler(), threading.Event()
 

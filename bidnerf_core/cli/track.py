@@ -1,4 +1,4 @@
-"""``bidnerf track``: recordings, and with ``--follow`` frames that arrive in a watched folder or as JSON lines on stdin."""
+"""``bidnerf track``: poses of a recording's frames or, with ``--follow``, of those that arrive in a folder or on stdin."""
 
 from __future__ import annotations
 
@@ -217,9 +217,9 @@ def _summarize(path: Answers, seconds: float, frame_seconds: float) -> None:
 
 @dataclass(frozen=True)
 class FrameRequest:
-    """A frame to read."""
+    """A request to track a frame, whose image, depth and mask are files."""
 
-    image: str  # a file, as the depth and the mask
+    image: str  # path, as for the depth and the mask
     depth: str | None = None
     time: float | None = None  # seconds
     depth_unit: float | None = None  # metres per step
@@ -233,7 +233,7 @@ class FrameRequest:
         return from_plain(FrameRequest, parse_json(line.encode(), "request", "a JSON object"), "request")
 
     def read(self, images: DatasetOptions, sensor: DepthCamera | None) -> Frame:
-        """Read the image and its depth. Raises ``InputError`` if they cannot be read or the camera is unknown."""
+        """Read the image, depth and mask. Raises ``InputError`` if one cannot be read or the camera is unknown."""
         from bidnerf_core.frames import Frame, MaskFile
 
         mask = None if self.mask is None else MaskFile(Path(self.mask))
@@ -244,9 +244,9 @@ class FrameRequest:
 
 
 def requests(source: str) -> Iterator[FrameRequest | InputError]:
-    """Yield frames as they arrive: from lines of stdin until it ends, or from the images of a folder until the program is stopped.
+    """Yield requests as they arrive: from lines of stdin until it ends, or from images in a folder until the program is stopped.
 
-    A line that is not a valid request yields the error to answer it with.
+    For a line that is not a valid request, the ``InputError`` to send as its answer is yielded.
     """
     if source != STDIN:
         yield from _arriving(Path(source))
@@ -287,7 +287,7 @@ def _arriving(folder: Path) -> Iterator[FrameRequest]:
 
 
 def _is_steady(file: Path, sizes: dict[Path, tuple[int, int]]) -> bool:
-    """Return whether the size of a file has stayed the same for two checks, so that the file is probably written completely."""
+    """Return whether the size of a file was unchanged in the last two checks, which suggests that it is written completely."""
     try:
         size = file.stat().st_size
     except OSError:

@@ -1,4 +1,4 @@
-"""``bidnerf poses`` and ``train``."""
+"""The commands ``bidnerf poses`` and ``bidnerf train``."""
 
 from __future__ import annotations
 
@@ -218,7 +218,7 @@ def _interrupted(
     for key, value in to_flat(config).items():
         require_same(key, value, unchanged[key], stored[key])
     refinement = info.pose_refinement
-    if refinement is not None:  # None: "never", or too few keypoints for any
+    if refinement is not None:  # None: "never", or too few keypoints for refinement
         before = "always" if refinement.refined or refinement.replaced else "never"
         require_same("refine_poses", given_poses.refine_poses, "auto", before)
     require_same("largest", images.largest, None, longest_side(info))

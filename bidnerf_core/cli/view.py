@@ -1,4 +1,4 @@
-"""``bidnerf view`` and ``serve``: localization for browsers and for other programs."""
+"""``bidnerf view`` and ``bidnerf serve``: localization in the browser, and over HTTP for other programs."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def run_view(
 
 
 def _localized(localizer: Localizer, source: QuerySource) -> tuple[dict[str, Any], ...]:
-    """Localize all queries. Raises ``InputError`` if none of them can be read."""
+    """Localize all queries, and return the page's JSON values of each. Raises ``InputError`` if none can be read."""
     from bidnerf_core.results import BAD_INPUT
     from bidnerf_core.viewer import read_and_localized
 
@@ -149,7 +149,7 @@ def _localized(localizer: Localizer, source: QuerySource) -> tuple[dict[str, Any
 
 
 class Chosen:
-    """A subset of a source's queries."""
+    """A query source that offers only some of another source's queries."""
 
     def __init__(self, source: QuerySource, places: Sequence[int]) -> None:
         self._source, self._places = source, places

@@ -38,7 +38,8 @@ from bidnerf_core.service.web import (
 def application(order: dict[str, Any], limits: ServiceLimits, token: str | None) -> FastAPI:
     """Build the service for the maps, method and device in ``order``, the message that ``worker.main`` receives.
 
-    The workers run between ASGI startup and shutdown. Startup raises ``InputError`` if a map cannot be served.
+    Clients must send the ``token``, unless it is None. The workers run between ASGI startup and shutdown. Startup
+    raises ``InputError`` if a map cannot be served.
     """
     pool, names = Pool(order, limits), list(order["maps"])
 

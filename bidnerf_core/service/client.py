@@ -18,7 +18,7 @@ File: TypeAlias = str | Path | bytes
 
 
 class ServiceError(Exception):
-    """The service did not return a result. ``status`` is the HTTP status, or 0 without an HTTP response."""
+    """Raised if the service returns no result. ``status`` is the HTTP status, or 0 without an HTTP response."""
 
     def __init__(self, status: int, detail: str) -> None:
         super().__init__(detail)
@@ -28,7 +28,7 @@ class ServiceError(Exception):
 class ServiceClient:
     """A client that requests poses from a ``bidnerf serve`` service at ``url``.
 
-    Requests to a busy service are retried for up to ``timeout`` seconds. All methods raise ``ServiceError``.
+    Requests to a busy service are retried for up to ``timeout`` seconds. All methods raise ``ServiceError`` on failure.
     """
 
     def __init__(

@@ -23,13 +23,13 @@ from bidnerf_core.errors import InputError, spelling_hint
 from bidnerf_core.settings import LARGEST_SEED
 
 LONGEST_NAME = 200
-"""Characters of a name in an answer."""
+"""Maximum number of characters of a name in an answer."""
 WIDEST = 170.0
-"""Largest horizontal field of view (degrees): beyond it, the inner half of the angles has less than a twelfth of a pinhole image."""
+"""Largest horizontal field of view (degrees): beyond it, the inner half of the angles fills less than 1/12 of a pinhole image."""
 CAMERAS = ("focal", "hfov", "camera")
-"""The ways to state the camera of a photo."""
+"""The parameters with which a request can state the camera of its photo."""
 ABSENT: Any = None
-"""The default of values that may be left out, but not be null."""
+"""The default of values that may be left out but must not be null."""
 
 
 class Refused(Exception):
@@ -125,7 +125,7 @@ EXPECTED = {
     "list_type": "a list", "too_short": "{min_length} or more values", "too_long": "{max_length} or fewer values",
     "bool_type": "true or false", "bool_parsing": "true or false", "model_type": "a JSON object", "dict_type": "a JSON object",
 }  # fmt: skip
-"""What messages expect, by the type of pydantic's error; other messages are our own."""
+"""What was expected, in words, by pydantic's error type; errors of other types already have a message of ours."""
 
 
 def checked(model: type[Model], values: Any) -> Model:
@@ -154,7 +154,7 @@ def short(value: Any) -> str:
     return shown if len(shown) <= 60 else shown[:57] + "..."
 
 
-# Responses. They describe what is sent, and are not used to make it.
+# Responses. These models describe what is sent, but are not used to build it.
 
 
 class Problem(BaseModel):

@@ -32,11 +32,11 @@ from bidnerf_core.service.models import Refused
 from bidnerf_core.service.settings import ServiceLimits
 
 FORK_SECONDS = 60.0
-"""Time for a new worker to report; on an accelerator it copies the maps first."""
+"""Seconds within which a new worker must report; with an accelerator, it first copies the maps there."""
 PAUSE = 1.0
 """Seconds between two attempts to fork a worker."""
 LOST = (OSError, EOFError, ValueError, psutil.Error)
-"""The exceptions that reading from a process raises if it has died or sends nonsense."""
+"""The exceptions that reading from a process raises if the process has died or sends invalid data."""
 
 
 class Worker:
@@ -45,9 +45,9 @@ class Worker:
     def __init__(self, pid: int, writer: asyncio.StreamWriter) -> None:
         self.pid, self.stopped, self.ended = pid, "", False
         self.reply = asyncio.get_running_loop().create_future()
-        self.reply.cancel()  # nothing was asked yet
+        self.reply.cancel()  # no task has been sent yet
         self._writer = writer
-        # It remembers when the process began, since its number may later be that of another.
+        # psutil remembers when the process began, since another process may later have the same number.
         self._process = psutil.Process(pid)
 
     async def ask(self, task: Any) -> dict[str, Any]:
@@ -117,7 +117,7 @@ class Pool:
         """
         began = time.perf_counter()
         os.makedirs(tempfile.gettempdir(), exist_ok=True)  # something may have removed it
-        for attempt in (1, 2, 3):  # workers that may die of the request before it is refused
+        for attempt in (1, 2, 3):  # the request is refused if three workers die of it
             facts["attempts"] = attempt
             self.waiting += 1
             try:
@@ -192,8 +192,8 @@ class Pool:
                         await self._load()
                     return await self._fork()
                 except InputError:
-                    # The error is the worker's own, such as too little memory on its accelerator, and reloading the maps would
-                    # not help. If the maps cannot be served, their process ends, which is noticed when it is to fork.
+                    # The error concerns only the worker, such as too little memory on its accelerator, so reloading the maps would
+                    # not help. If the maps cannot be served, the process that loads them ends, which the next fork detects.
                     pass
                 except LOST:
                     self._end_maps()
@@ -201,7 +201,7 @@ class Pool:
             await asyncio.sleep(PAUSE)
 
     async def _fork(self) -> tuple[Worker, asyncio.StreamReader]:
-        """Fork a worker and return it with the stream of its answers. Raises the errors of ``_greeting``."""
+        """Fork a worker and return it with the stream of its answers. Raises the same errors as ``_greeting``."""
         assert self._maps is not None
         ours, theirs = socket.socketpair()
         with theirs:
@@ -210,7 +210,7 @@ class Pool:
         return Worker(found["pid"], writer), reader
 
     async def _load(self) -> None:
-        """Start the process that loads the maps. Raises the errors of ``_greeting``."""
+        """Start the process that loads the maps. Raises the same errors as ``_greeting``."""
         ours, theirs = socket.socketpair()
         with theirs:
             process = subprocess.Popen(

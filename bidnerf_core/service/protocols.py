@@ -1,6 +1,6 @@
-"""Further protocols for requesting poses, as plugins of the group ``bidnerf.services``.
+"""Interface of further protocols for requesting poses, which are plugins of the group ``bidnerf.services``.
 
-The name of a protocol is its path: the service answers at ``/NAME``, and at ``/maps/MAP/NAME`` for a given map. A GET
+The name of a protocol is its path: the service answers at ``/NAME``, and at ``/maps/MAP/NAME`` for the map ``MAP``. A GET
 request returns ``{"status": "running"}``, and a POST request returns the plugin's answer to the JSON that was sent.
 """
 
@@ -42,11 +42,11 @@ class ServiceProtocol(Protocol):
     def answer(
         self, body: dict[str, Any], scene: Map, localize: Callable[[Upload], tuple[Answer, dict[str, Any]]]
     ) -> dict[str, Any]:
-        """Return the JSON of an answer.
+        """Return the JSON object that answers a request.
 
-        ``body`` is the JSON of the request. ``localize`` finds the pose of a photo in the map ``scene``, and returns
-        the answer together with its JSON as printed by ``bidnerf localize``. Raises ``InputError``, which the service
-        reports with status 422, and ``Refused``.
+        ``body`` is the JSON object of the request. ``localize`` finds the pose of a photo in the map ``scene``, and
+        returns the answer together with its JSON as printed by ``bidnerf localize``. May raise ``InputError``, which
+        the service reports with status 422, or ``Refused``, which has a status of its own.
         """
 
 

@@ -25,7 +25,7 @@ NEEDS = "the service needs the extra 'serve' (pip install 'bidnerf[serve]')"
 
 
 Scenes: TypeAlias = str | Path | Sequence[str | Path] | Mapping[str, str | Path]
-"""The folders of maps: each has the name of its folder, unless it is given as ``NAME=MAP`` or in a mapping by name."""
+"""The folders of maps. A map is named after its folder, unless ``NAME=MAP`` or a mapping from names to folders names it."""
 
 
 def service_app(
@@ -39,12 +39,12 @@ def service_app(
 ) -> FastAPI:
     """Return an ASGI application that serves the maps in the given folders, to run in your own server.
 
-    ``method`` finds the poses on ``device``. ``config`` holds the settings of the method, as an instance of its
-    settings class or as a dictionary of the settings that differ from the defaults.
+    ``method`` is the name of a localization method, which runs on ``device``. ``config`` holds the settings of the
+    method, as an instance of its settings class or as a dictionary of the settings that differ from the defaults.
 
     The workers are single-threaded processes, started at ASGI startup and stopped at shutdown. Without a ``token``,
     only requests addressed to localhost are answered. Raises ``InputError`` for invalid names and settings, and if
-    the extra ``serve`` is not installed; if a map cannot be loaded, ASGI startup raises it.
+    the extra ``serve`` is not installed. ASGI startup raises ``InputError`` if a map cannot be loaded.
     """
     try:
         from bidnerf_core.service.app import application
@@ -74,13 +74,12 @@ def serve(
 ) -> None:
     """Serve maps over HTTP until the process is interrupted, or ``stop`` is set.
 
-    ``scenes`` is the folder of a map, a list of folders (``NAME=MAP`` serves a map under a name other than its folder's), or
-    a mapping from the names that clients use to folders.
-    Only programs on this machine are answered unless a ``host``, such as 0.0.0.0, is given: clients then need the
-    ``token``, which is generated if none is given. With ``port`` 0, a free port is picked. ``options`` are
-    ``method``, ``config``, ``device`` and ``limits`` of ``service_app``. ``ready`` is called with the address and the
-    token once the service answers requests. Raises ``InputError`` for maps and settings that cannot be served, and if
-    the port is taken.
+    ``scenes`` is the folder of a map, a list of folders (``NAME=MAP`` serves the map in the folder ``MAP`` under the
+    name ``NAME``), or a mapping from the names that clients use to folders. Only programs on this machine are answered
+    unless a ``host``, such as 0.0.0.0, is given: clients then need the ``token``, which is generated if none is given.
+    With ``port`` 0, a free port is picked. ``options`` are ``method``, ``config``, ``device`` and ``limits`` of
+    ``service_app``. ``ready`` is called with the address and the token once the service answers requests. Raises
+    ``InputError`` for maps and settings that cannot be served, and if the port is taken.
     """
     if not hasattr(os, "fork"):
         raise InputError(
@@ -92,10 +91,10 @@ def serve(
 
 
 def token_for(host: str | None, token: str | None, needs: str) -> str | None:
-    """Return the token that clients need: ``token`` if given, else a new one, or None if ``host`` is only this machine.
+    """Return the token that clients need: ``token`` if given, else None for a local ``host`` and a new token for others.
 
-    Raises ``InputError`` with the text ``needs`` if the web server is not installed, and ``InputError`` if the token
-    is too short.
+    Raises ``InputError``, with the text ``needs`` if the web server is not installed, and also if the token is too
+    short.
     """
     try:
         import uvicorn  # noqa: F401 (tried before the maps are read)

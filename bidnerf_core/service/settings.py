@@ -1,4 +1,4 @@
-"""The settings of the service: the limits on requests, and the token."""
+"""The limits on requests to the service, and the check of its token."""
 
 from __future__ import annotations
 

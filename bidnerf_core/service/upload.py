@@ -1,4 +1,4 @@
-"""Reading of photos that are uploaded with requests."""
+"""Reading of photos and their metadata from uploads, and error messages that clients may see."""
 
 from __future__ import annotations
 

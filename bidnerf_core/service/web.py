@@ -44,7 +44,7 @@ SAFE = {
     "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
     "Cache-Control": "no-store",
 }
-"""Headers of every response that has none of its own: names in it are text, whatever a browser might make of them."""
+"""Headers added to responses that do not set them: browsers must not treat text in a response as a page or a script."""
 PROBLEM = "application/problem+json"
 CLIENT_GONE = 499
 """The status in the log and the metrics for a client that disconnected before the response; nobody receives it."""
@@ -62,9 +62,9 @@ ERRORS = {
     503: ("not available", "The service cannot answer at present."),
     504: ("took too long", "The answer took too long."),
 }  # fmt: skip
-"""Titles and descriptions of errors."""
+"""Titles and descriptions of errors, by HTTP status."""
 Report = Callable[[Scope, int, float], None]
-"""Receives the scope, status and duration (seconds) of each request."""
+"""A function that receives the scope, status and duration (seconds) of each request."""
 
 
 class Application(FastAPI):
@@ -127,7 +127,7 @@ class Application(FastAPI):
 class Gate:
     """ASGI middleware that checks access to each request, sets headers on each response, and reports its status and duration.
 
-    With the name of a ``cookie``, a browser may bring the token once, in the address ``/?token=TOKEN``.
+    If ``cookie`` names a cookie, a browser needs to send the token only once, in the address ``/?token=TOKEN``.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ class Gate:
                 message = {**message, "headers": headers.raw}
             await send(message)
 
-        # Cookies are sent to all ports of a host.
+        # The name contains the port, since cookies are sent to all ports of a host.
         cookie = None if self.cookie is None else f"{self.cookie}_{scope['server'][1]}"
         refused = refusal(scope, self.token, cookie)
         try:
@@ -185,7 +185,7 @@ async def _failure(request: Request, error: Exception) -> Response:
         return problem(error.status, error.detail, error.headers, **error.more)
     if isinstance(error, HTTPException):
         headers = error.headers
-        if error.status_code == 405:  # of the methods of a path, each has a route, which knows only its own
+        if error.status_code == 405:  # each method of a path has its own route, which knows no other method
             path = request.scope["route"].path
             same = (route for route in request.app.routes if route.path == path)
             headers = {"Allow": ", ".join(sorted({method for route in same for method in route.methods}))}
@@ -226,13 +226,13 @@ def refusal(scope: Scope, token: str | None, cookie: str | None = None) -> tuple
 
 
 def _brings_token(scope: Scope, token: str) -> bool:
-    """Return whether a request is for ``/?token=TOKEN``, the address that a browser is given."""
+    """Return whether a request is for ``/?token=TOKEN``, the address with which a browser logs in."""
     given = HTTPConnection(scope).query_params.get("token", "")
     return scope["path"] == "/" and hmac.compare_digest(given.encode(), token.encode())
 
 
 def _logged_in(scope: Scope, cookie: str, token: str) -> Response:
-    """Return a response that stores the token in a browser as a cookie, which replaces the header, and leads to the page."""
+    """Return a redirect to the page that stores the token in a cookie, which the browser then sends instead of the header."""
     secure = "https" in (scope["scheme"], HTTPConnection(scope).headers.get("x-forwarded-proto"))
     away = RedirectResponse("/", 303, {"Referrer-Policy": "no-referrer"})
     away.set_cookie(cookie, token, httponly=True, samesite="strict", secure=secure)
@@ -275,7 +275,10 @@ async def body_of(request: Request, limits: ServiceLimits) -> bytes:
 
 
 async def photo_of(request: Request, limits: ServiceLimits) -> Upload:
-    """Read a photo and its metadata from a form, or from a body and query parameters. Raises ``Refused`` and ``InputError``."""
+    """Read a photo and its metadata from a form, or from the body and the query parameters of a request.
+
+    Raises ``Refused`` in the same cases as ``body_of``, and ``InputError`` for missing or invalid fields.
+    """
     content = await body_of(request, limits)
     kind, stem = request.headers.get("content-type", "").partition(";")[0].strip().lower(), ""
     items: list[tuple[str, Any]] = request.query_params.multi_items()
@@ -315,7 +318,7 @@ async def _parts(request: Request, content: bytes) -> list[tuple[str, str | Uplo
 async def answered(request: Request, work: asyncio.Future[Any], seconds: float | None = None) -> Any:
     """Return the result of ``work``, or cancel it if the client disconnects or ``seconds`` pass first.
 
-    Raises ``Refused`` in either case.
+    Raises ``Refused`` if the work is cancelled.
     """
 
     async def left() -> None:
@@ -336,7 +339,7 @@ async def answered(request: Request, work: asyncio.Future[Any], seconds: float |
         work.cancel(reason)
 
 
-# The description.
+# The OpenAPI description.
 
 
 def photo_body(*without: str) -> dict[str, Any]:

@@ -31,10 +31,10 @@ from bidnerf_core.service.upload import public_message, read_upload
 
 
 class Worker:
-    """Everything needed to answer requests, loaded before workers are forked."""
+    """The localizers that answer requests, loaded before workers are forked."""
 
     def __init__(self, maps: Mapping[str, Localizer], max_pixels: float) -> None:
-        """Take the localizers by map name; several maps form a collection, for photos whose map is not known."""
+        """Store the localizers by map name; several maps form a collection, for photos whose map is not known."""
         self.maps, self.max_pixels, first = maps, max_pixels, next(iter(maps.values()))
         self.together: MapCollection | None = None
         if len(maps) > 1:
@@ -121,7 +121,7 @@ def main() -> None:
             _send(stream, {"error": str(error) or type(error).__name__})
             return
         gc.collect()
-        gc.freeze()  # otherwise a collection in a worker would write to, and so copy, every page with an object
+        gc.freeze()  # otherwise garbage collection in a worker would write to, and so copy, every page with objects
         _send(stream, {"maps": worker.describe()})
     while True:
         asked, descriptors, _, _ = socket.recv_fds(control, 1, 1)
@@ -184,7 +184,7 @@ def _serve(worker: Worker, device: str, stream: BufferedRWPair) -> None:
 
 
 def _send(stream: BufferedRWPair, message: Mapping[str, Any]) -> None:
-    """Send a line of JSON, so that the listening process never unpickles data from a worker that a photo may have compromised."""
+    """Send a message as JSON: the listening process must not unpickle data of a worker that a photo may have compromised."""
     stream.write(json.dumps(message).encode() + b"\n")
     stream.flush()
 

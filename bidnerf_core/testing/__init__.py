@@ -1,13 +1,13 @@
-"""The contracts of third-party parts, as test classes for pytest.
+"""Test classes for pytest that check whether plugins fulfil the contracts of their kinds.
 
-A plugin's whole test is::
+A complete test of a backend is::
 
     from bidnerf_core.testing import BackendContract
 
     class TestMine(BackendContract):
         backend = my_package.backend
 
-Readers, methods, detectors and faults have contracts of the same kind; they are named as they are registered::
+Contracts for readers, methods, detectors and faults refer to a plugin by its registered name::
 
     class TestMyReader(ReaderContract):
         name, folder = "mine", "a/small/capture"

@@ -1,4 +1,4 @@
-"""``BackendContract``: the requirements on every backend, one test for each."""
+"""``BackendContract``: the requirements on every backend, with one test for each."""
 
 from __future__ import annotations
 
@@ -231,7 +231,7 @@ class BackendContract:
             return self._backend().build(self._config() if config is None else config, SCENE_BOUNDS)
 
     def _training(self) -> recipes.Training:
-        """Return a training on RGB-D views (once per test class), whose field is frozen like that of a loaded map."""
+        """Train on RGB-D views, once per test class, and return the result, whose field is frozen as in a loaded map."""
 
         def train() -> recipes.Training:
             field, total = self._build(), self._config().steps
@@ -262,17 +262,17 @@ def frozen(field: Any) -> Any:
 
 
 def precise(field: RadianceField) -> tuple[RadianceField, torch.dtype]:
-    """Return a copy in float64 if the field supports it, else the field itself, and the dtype."""
+    """Return a copy of the field in float64 if it supports that, else the field itself in float32, and the dtype."""
     try:
         doubled: Any = copy.deepcopy(field)
-        # A level need not be a module: the modules that it holds are converted.
+        # A level need not be a module itself; then the modules that it holds are converted.
         for part in [doubled] if isinstance(doubled, nn.Module) else vars(doubled).values():
             if isinstance(part, nn.Module):
                 part.double()
         positions, directions = (x.double() for x in points(2))
         if query(doubled, positions, directions, "points").density.dtype == torch.float64:
             return doubled, torch.float64
-    except Exception:  # the test of dtypes reports it
+    except Exception:  # ``test_query_follows_the_dtype`` reports it
         pass
     return field, torch.float32
 

@@ -1,4 +1,4 @@
-"""The requirements on methods, keypoint detectors and faults, one test each."""
+"""The requirements on methods, keypoint detectors and faults, with one test for each."""
 
 from __future__ import annotations
 
@@ -261,7 +261,7 @@ class FeaturesContract(Named):
 
 
 def _images() -> tuple[Float[Tensor, "h w 3"], ...]:
-    """Return images of 256 x 192 pixels."""
+    """Return two images of 256 x 192 pixels."""
     small = torch.stack([view.frame.rgb for view in training_views()[:2]]).movedim(-1, 1)
     large = torch.nn.functional.interpolate(small, scale_factor=2, mode="bicubic").clamp(0, 1).movedim(1, -1)
     return large[0], large[1]

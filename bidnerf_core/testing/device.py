@@ -1,4 +1,4 @@
-"""A simulated device, which lets any machine test that code neither copies between devices nor waits for one.
+"""A simulated device, with which any machine can test that code neither copies between devices nor waits for a device.
 
 Tensors on the device "meta" stand in for those on a GPU. While ``Elsewhere`` is active, their
 values are stored and computed on the CPU, so that code runs as it would on a GPU; but operations that mix tensors
@@ -73,13 +73,13 @@ READS = {
         "is a factorization that waits for the device",
     ),
 }
-"""Operations that make the host wait, by name."""
+"""Operations that make the host wait, by name, with the reason for each."""
 INDEXED = ("index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_index")
 """Operations with indices, which may be masks."""
 
 
 class DeviceFault(AssertionError):
-    """Code waited for the device, copied from or to it, or mixed it with the CPU."""
+    """Raised if code waits for the device, copies from or to it, or mixes its tensors with those on the CPU."""
 
 
 class _There(torch.Tensor):
@@ -171,7 +171,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any], mode: Elsewhere | None) -
         if mode._strict:
             raise DeviceFault(fault)
         mode.waits[name] += 1
-    # PyTorch itself moves numbers, and the indices of a tensor on the device.
+    # PyTorch itself moves tensors without dimensions, and the indices of a tensor on the device.
     indexed = name in INDEXED and isinstance(args[0], _There)
     here = [part for part in _on_cpu(_leaves(args[2:]) if indexed else flat) if part.ndim > 0]
     if there and here and name not in ("_to_copy", "copy_"):
@@ -193,7 +193,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any], mode: Elsewhere | None) -
 
 @cache
 def _signature(func: Any) -> tuple[str, bool, list[tuple[int, str]]]:
-    """Return the name of an operation, whether it returns anything, and the places and names of the arguments that it writes."""
+    """Return the name of an operation, whether it returns anything, and the positions and names of the arguments it writes."""
     schema = func._schema
     places = [
         (place, argument.name)
@@ -204,7 +204,7 @@ def _signature(func: Any) -> tuple[str, bool, list[tuple[int, str]]]:
 
 
 def _leaves(parts: Iterable[Any]) -> list[Any]:
-    """Return the arguments of an operation, whose lists are never nested; far faster than PyTorch's own ``tree_leaves``."""
+    """Return an operation's arguments with lists, which are never nested, flattened; far faster than PyTorch's ``tree_leaves``."""
     found = list[Any]()
     for part in parts:
         if isinstance(part, list | tuple):
@@ -215,7 +215,7 @@ def _leaves(parts: Iterable[Any]) -> list[Any]:
 
 
 def _each(change: Callable[[Any], Any], part: Any) -> Any:
-    """Return an argument or a result with ``change`` applied, to each element if it is a list."""
+    """Return ``change`` applied to an argument or result, or to each element if it is a list or tuple."""
     return type(part)([change(each) for each in part]) if isinstance(part, list | tuple) else change(part)
 
 
@@ -310,7 +310,7 @@ def _problem(field: RadianceField) -> Problem:
 
 
 def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor:
-    """Return the pose (4 4) after two steps: the first fills caches, and the second must stay on the device."""
+    """Return the pose (4 4) after two steps of Adam: the first fills caches, and the second must stay on the device."""
     device, start = problem.device, problem.start_for("bid")
     objective = objective_of(ColourSettings(), DepthSettings(depth_scale=0.1))
     settings = DescentSettings(CHECKED_RAYS, level=level)

@@ -1,4 +1,4 @@
-"""Contract failures, each in one sentence that states what was found and what was expected."""
+"""Helpers of the contracts: each failure is one sentence that states what was found and what was expected."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def require(who: str, *claims: tuple[object, str]) -> None:
 
 
 def is_one_line(text: object) -> bool:
-    """Return whether something is one line of text."""
+    """Return whether ``text`` is a string of one line that is not blank."""
     return isinstance(text, str) and text.strip() != "" and "\n" not in text
 
 
 @contextmanager
 def calling(doing: str, passing: type[Exception] = AssertionError) -> Iterator[None]:
-    """Turn an exception in the backend's code into a contract failure that names the call (``doing``).
+    """Turn an exception in a plugin's code into a contract failure that names the call (``doing``).
 
     Contract failures and exceptions of the type ``passing`` propagate unchanged.
     """
@@ -49,7 +49,7 @@ def equal(a: Tensor | None, b: Tensor | None) -> bool:
 
 
 def are_colours(rgb: Tensor) -> bool:
-    """Return whether all values are from 0 to 1."""
+    """Return whether all values are finite and in [0, 1]."""
     return bool(rgb.isfinite().all() and (rgb >= 0).all() and (rgb <= 1).all())
 
 
@@ -59,14 +59,14 @@ def is_depth(depth: Tensor | None) -> bool:
 
 
 def once(subject: object, make: Callable[[], T]) -> T:
-    """Return what ``make`` makes, once per test class: ``subject`` is one of its instances."""
+    """Return the result of ``make``, which is called only once for the test class of the instance ``subject``."""
     if "_made" not in vars(type(subject)):
         type(subject)._made = make()  # type: ignore[attr-defined]
     return type(subject)._made  # type: ignore[attr-defined]
 
 
 class Named:
-    """Base class of the contracts of plugins that are registered under ``name``."""
+    """Base class of contracts that load a plugin by the ``name`` under which it is registered."""
 
     kind: ClassVar[str] = ""
     name: ClassVar[str] = ""

@@ -162,8 +162,8 @@ def _check_by(
 ) -> None:  # fmt: skip
     """Check the derivatives of density and colour as the argument named ``by`` moves along a curve.
 
-    ``curve(t)`` are the points at ``t`` on their curves, ``speed`` is its derivative at 0. The exact derivatives, in reverse
-    mode, must agree with finite differences at the best step size.
+    ``curve(t)`` returns a point on each curve at the parameter ``t``, and ``speed`` is its derivative at 0. The exact
+    derivatives, from reverse mode, must agree with finite differences at the best step size.
     """
 
     def values(varied: Tensor) -> Float[Tensor, "n 4"]:
@@ -362,7 +362,7 @@ def check_levels(field: RadianceField) -> None:
 def check_hits(field: RadianceField) -> None:
     """Check the hits of a field that provides them.
 
-    Values must be in range, distances in [near, far], and the opacity equal to that of the field's density.
+    Values must be in range and distances in [near, far]; the opacity must match that of the field's density.
     """
     if not isinstance(field, HitField):
         return
@@ -396,7 +396,7 @@ def check_hits(field: RadianceField) -> None:
                 f"distance has shape {given}, expected the rays' shape and one more axis",
             ),
         )
-    # The density of ``query``, summed along rays, must absorb as much light as the hits do.
+    # The density of ``query``, integrated along rays, must absorb as much light as the hits do.
     rays = awkward_rays()["rays from outside"]
     expected = 1 - torch.prod(1 - hits(rays, "rays").alpha, dim=-1)
     samples = Stratified(1024)(rays)

@@ -1,4 +1,4 @@
-"""The requirements on readers, one test each."""
+"""The requirements on readers, with one test for each."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from bidnerf_core.mapping import (
 from bidnerf_core.testing.faults import Named, are_colours, calling, equal, is_depth, once, require
 
 ENOUGH_POINTS = 30
-"""Smallest number of points that several images must agree on for their poses to be judged."""
+"""Minimum number of points on which several images must agree for their poses to be judged."""
 
 
 class ReaderContract(Named):
     """Tests of a reader; to use them, derive a class whose name begins with ``Test`` and set ``name`` and ``folder``.
 
     ``name`` is the name under which the reader is registered, ``folder`` a capture in its format: at least
-    ten images of something textured, taken from different places, as small as possible. It is opened with
-    ``options``.
+    ten images of a textured scene from different positions, as small as possible. The capture is opened
+    with ``options``.
     """
 
     kind = "reader"

@@ -21,11 +21,11 @@ from bidnerf_core.testing.scene import DIMMED_BOUNDS, SCENE_BOUNDS, camera_rays,
 from bidnerf_core.training import TrainingState, TrainingStep, TrainingStopped
 
 EXPOSURE = 0.06
-"""Logarithm of the factor by which the contract's images are brighter and darker than they should be."""
+"""Natural logarithm of the factor by which the images of ``check_exposure`` are made brighter or darker."""
 
 
 class Recorder:
-    """A ``Report`` that records progress, and keeps states as bytes, as a map on disk does."""
+    """A ``Report`` that records progress and saved states, which go through safetensors, as in a map on disk."""
 
     def __init__(
         self, due: Collection[int] = (), stop: int | None = None, state: TrainingState | None = None
@@ -52,14 +52,14 @@ class Recorder:
 
 
 def stored(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors as read back from a safetensors file."""
+    """Return the tensors after a round trip through the safetensors format."""
     with calling("writing the tensors of a state to safetensors"):
         packed = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
         return tensors_from_bytes(tensors_to_bytes(packed))
 
 
 class Training(NamedTuple):
-    """A training of ``config.steps`` steps on RGB-D views, which was to save its state after the first, middle and last one."""
+    """A training on RGB-D views whose report requested the state after the first, middle and last of ``config.steps`` steps."""
 
     field: Any
     before: dict[str, Tensor]  # the field's state
@@ -68,7 +68,7 @@ class Training(NamedTuple):
 
 
 def copied(field: Any) -> dict[str, Tensor]:
-    """Return a copy of the state of a field, empty for one that is no module, as another test reports."""
+    """Return a copy of a field's state, empty if the field is not a module, which another test reports."""
     state = field.state_dict() if isinstance(field, nn.Module) else {}
     return {name: value.detach().clone() for name, value in state.items()}
 
@@ -99,8 +99,8 @@ def check_exposure(backend: Backend, config: Any) -> None:
     exchanged. If the two fields differ as the images do, exposure ended up in the field. A field that
     learns slowly shows little difference.
     """
-    # Within 100 steps, the exposures of the images can be learned. The share of them that ends up in the field is above
-    # 0.1 if a recipe ignores exposure, and 0.01 if it learns it.
+    # The exposures of the images can be learned within 100 steps. The share of them that ends up in the field is above
+    # 0.1 for recipes that ignore exposure, and 0.01 for recipes that learn it.
     config, most = replace(config, steps=max(config.steps, 100)), 0.06
     fields = []
     for log_gain in (EXPOSURE, -EXPOSURE):

@@ -29,8 +29,8 @@ DIMMED_BOUNDS = replace(SCENE_BOUNDS, background=(DIMMED,) * 3)  # the toy's own
 def rgbd_views(coverage: bool = True) -> tuple[View, ...]:
     """Return six views of the toy scene with exact depth.
 
-    With ``coverage`` they have an alpha channel; otherwise they show the toy in front of white, as a sensor
-    would see it.
+    With ``coverage``, the views have an alpha channel; otherwise, they show the toy in front of white, as a
+    sensor would see it.
     """
     seen = seen_from(demo_object(), CAMERA, orbit(3.5, 6))
     return tuple(v if coverage else replace(v, frame=v.frame.replace(alpha=None)) for v in seen)
@@ -52,14 +52,14 @@ def exposed_views(log_gain: float) -> tuple[View, ...]:
 
 
 def camera_rays(T_world_camera: SE3) -> Rays:
-    """Return rays through all pixels, in the precision of the pose and differentiable in it."""
+    """Return the rays through all pixels from a pose, in its precision and differentiable with respect to it."""
     pixels = CAMERA.unproject(CAMERA.pixel_centres()).reshape(-1, 3).to(T_world_camera.translation)
     directions = T_world_camera.rotate(torch.nn.functional.normalize(pixels, dim=-1))
     return SCENE_BOUNDS.rays(T_world_camera.translation.expand_as(directions), directions)
 
 
 def points(count: int, seed: int = 0) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Return random positions within the box, and random unit directions."""
+    """Return random positions (metres) in the scene's box, and random unit directions."""
     generator = torch.Generator().manual_seed(seed)
     lower, size = torch.tensor(SCENE_BOUNDS.lower), torch.tensor(SCENE_BOUNDS.size)
     positions = lower + size * torch.rand((count, 3), generator=generator)
@@ -67,7 +67,7 @@ def points(count: int, seed: int = 0) -> tuple[Float[Tensor, "n 3"], Float[Tenso
 
 
 def awkward_points() -> dict[str, Float[Tensor, "n 3"]]:
-    """Return positions at which a carelessly written field indexes out of range or overflows."""
+    """Return positions (metres), by description, at which a careless field may index out of range or overflow."""
     lower, upper = torch.tensor(SCENE_BOUNDS.lower), torch.tensor(SCENE_BOUNDS.upper)
     share = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
     middle, corners = (lower + upper) / 2, lower + share * (upper - lower)
@@ -80,7 +80,7 @@ def awkward_points() -> dict[str, Float[Tensor, "n 3"]]:
 
 
 def awkward_rays() -> dict[str, Rays]:
-    """Return rays of the kinds that occur in localization."""
+    """Return rays of the kinds that occur in localization, by description."""
     middle = (torch.tensor(SCENE_BOUNDS.lower) + torch.tensor(SCENE_BOUNDS.upper)) / 2
     inside, away = points(24)
     outside = middle - 2 * SIDE * away

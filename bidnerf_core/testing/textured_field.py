@@ -22,7 +22,7 @@ POSES = orbit(1.7, 3, elevation=(50.0, 70.0), seed=5)
 """Poses (T_world_camera) that no training image has."""
 
 
-@dataclass(init=False, eq=False)  # a dataclass, so that its tensors go to a device with it
+@dataclass(init=False, eq=False)  # a dataclass, so that ``moved`` finds its tensors
 class TexturedGround:
     """A ground of height ``h(x, y)`` whose colours are sums of random waves; infinitely differentiable."""
 
@@ -114,7 +114,7 @@ T_MOVED_WORLD = SE3(
     torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64),
     torch.tensor([3.0, -2.0, 0.5], dtype=torch.float64),
 )
-"""Pose of the ground's world in another one, a quarter turn about z, so that its box is still axis-aligned."""
+"""Pose of the ground's world in another world, turned by 90 degrees about z, so that the box stays axis-aligned."""
 
 
 @functools.cache

@@ -84,9 +84,9 @@ def shown_answer(
     surface instead of the field. Poses are shown in the map's own coordinates, see ``Map.origin``.
 
     In the result, ``pose`` and ``truth`` are the 16 numbers of T_world_camera in row-major order, or None if not
-    finite or not known. ``error`` holds the position error and the orientation error (degrees), and ``path`` the
-    positions from the start to the pose found. ``camera`` says which intrinsics were used, ``meaning`` what a
-    rejection means, and ``advice`` what to try.
+    finite or not known. ``error`` holds the position error (in the map's unit) and the orientation error (degrees),
+    and ``path`` the positions from the start to the pose found. ``camera`` describes the intrinsics that were used,
+    ``meaning`` explains why a pose was rejected, and ``advice`` suggests what to try.
     """
     found = found.translated(-origin_of(scene))
     truth = None if truth is None else truth.translated(-origin_of(scene))
@@ -143,9 +143,10 @@ def shown_answer(
 def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> Json | None:
     """Return the two-sigma ellipsoid of a pose's position, or None if the covariance is unknown or not finite.
 
+    ``covariance`` is that of a right update of the pose (translation, then rotation in radians). In the result,
     ``axes`` holds the semi-axes in the world as 9 numbers, one axis after the other, the longest first. ``lengths``
-    holds the lengths of the semi-axes, and ``rotation_deg`` the standard deviations of the orientation about the
-    camera's x, y and z axes.
+    holds the lengths of the semi-axes, and ``rotation_deg`` the standard deviations (degrees) of the orientation
+    about the camera's x, y and z axes.
     """
     if covariance is None or not bool(covariance.isfinite().all()):
         return None
@@ -161,7 +162,8 @@ def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> J
 def depth_difference(image: RenderedImage, frame: Frame) -> Json | None:
     """Return the rendered minus the measured depth as a colour image, or None if no pixel has both.
 
-    ``range`` is the difference at the ends of the colour scale, and ``median`` is the median absolute difference.
+    ``range`` is the difference at the ends of the colour scale, and ``median`` is the median absolute difference,
+    both in the unit of the map.
     """
     if frame.depth is None or not frame.has_depth:
         return None
@@ -215,7 +217,7 @@ def _steps(found: Localization, record: SearchRecord | None) -> tuple[Json, ...]
 
 
 def _step(caption: str, T: SE3, scores: list[float], kept: int, loss: float | None = None) -> Json:
-    """Return one step: the poses that were considered at the same time, the best first, and the ``loss`` of a descent."""
+    """Return one step: the poses that were considered together, the best first, their scores, and the ``loss`` of a descent."""
     poses = packed(T.matrix()[:, :3].detach().cpu().double().flatten(1).numpy())
     known = tuple(map(_finite, scores))
     return {"caption": caption, "poses": poses, "scores": known, "kept": kept, "loss": _finite(loss)}
@@ -229,8 +231,9 @@ def _matches(scene: SceneMap, found: Localization, answer: LandmarkAnswer) -> Js
     """Return the last image's matches at the last pose from landmarks: matches by projection, then further ones by descriptor.
 
     ``keypoints`` and the ``projections`` of their landmarks (NaN behind the camera) are fractions of the image size,
-    float32 (m, 2), and ``accepted`` is uint8 (m). ``by_appearance`` is the number of ``refused`` matches found by
-    descriptor alone. ``pose`` describes the pose of the projections if it is not the pose found.
+    float32 (m, 2), and ``accepted`` is uint8 (m), for at most 600 matches. ``agreeing`` and ``refused`` count all
+    matches, and ``by_appearance`` the refused ones that were found by descriptor alone. ``pose`` describes the pose
+    of the projections, and is empty if it is the pose found.
     """
     if scene.landmarks is None:
         return None
@@ -266,7 +269,7 @@ def _matches(scene: SceneMap, found: Localization, answer: LandmarkAnswer) -> Js
 def _runner_up(
     scene: SceneMap, found: Localization, record: SearchRecord, frame: Frame | None, quick: bool
 ) -> Json | None:
-    """Return an earlier pose from landmarks, or else the next most probable one, or else the best different pose of the search."""
+    """Return a rival pose: an earlier one from landmarks, else the next most probable one, else the best other one searched."""
     answer = last_answer(record)
     if answer is not None:
         if given_up := earlier(found, answer):

@@ -60,7 +60,7 @@ LARGEST_RENDERING = 1024
 class LiveView:
     """Contents of a live viewer: a map, images that can be localized in it, a trajectory, and a table of results.
 
-    ``camera`` is used for photos that come without a camera; by default, theirs is taken from EXIF or the map. The
+    ``camera`` is used for photos sent without a camera; by default, their camera is taken from EXIF or the map. The
     page shows the field of view of ``camera``, and users can change it there.
     """
 
@@ -72,7 +72,7 @@ class LiveView:
 
 
 Read = Callable[[], tuple[Query, SE3 | None, int]]
-"""Reads what is to be localized: a query, a start, and the seed of the search."""
+"""A function that returns the input of a localization: a query, a start pose or None, and the seed of the search."""
 
 
 @dataclass
@@ -86,7 +86,7 @@ class ShownJob:
     answer: Json | None = None
 
     def plain(self, known: str) -> dict[str, Any]:
-        """Return the state as JSON values, with the answer unless the client already has the answer of this state, ``known``."""
+        """Return the state as JSON values, and the answer unless the client already knows it for this state (``known``)."""
         caption = self.record.steps[-1].caption if self.record is not None and self.record.steps else ""
         said = {"id": self.id, "name": self.name, "state": self.state, "caption": caption}
         return said if self.state == known else said | {"answer": to_plain(self.answer)}
@@ -112,7 +112,7 @@ class ShownJob:
 
 
 class Jobs:
-    """Runs localizations in a thread, in the order of their requests; ``shown`` holds the jobs by their ids."""
+    """Runs localizations one at a time in a background thread; ``shown`` holds the jobs by id."""
 
     def __init__(self, localizer: Localizer) -> None:
         self.shown = dict[str, ShownJob]()
@@ -121,7 +121,7 @@ class Jobs:
 
     @contextlib.contextmanager
     def place(self, name: str) -> Iterator[ShownJob]:
-        """Register a localization, and remove it if the block raises an error. Raises ``Refused`` if too many are pending."""
+        """Yield a new job, which is removed if the block raises an error. Raises ``Refused`` if too many jobs are pending."""
         if sum(each.state != "done" for each in self.shown.values()) >= PLACES:
             headers = {"Retry-After": "5", "Connection": "close"}
             raise Refused(429, f"all {PLACES} places are taken, try again later", headers)

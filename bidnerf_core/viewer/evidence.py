@@ -27,7 +27,7 @@ from bidnerf_core.viewer.scene import rows_of
 
 HERE, EARLIER = "the pose found", "an earlier pose by landmarks, which was given up"
 APART, TURNED_DEG = 0.1, 10.0
-"""Distance (fraction of that to the scene) and angle beyond which two poses are different answers."""
+"""Distance (as a fraction of the distance to the scene) and angle beyond which two poses count as different answers."""
 
 
 def last_answer(record: SearchRecord | None) -> LandmarkAnswer | None:
@@ -36,7 +36,7 @@ def last_answer(record: SearchRecord | None) -> LandmarkAnswer | None:
 
 
 def contests(found: Localization, record: SearchRecord | None) -> tuple[Json, ...]:
-    """Return all comparisons: of the pose with other places and the mirror image, of the pose with its rivals, and of cameras."""
+    """Return up to three comparisons: of poses by landmarks and the mirror image, of the pose with its rivals, and of cameras."""
     shown, answer, support = list[Json](), last_answer(record), found.diagnostics
     if answer is not None and len(answer.modes) > 1:
         shown.append(_of_modes(found, answer))
@@ -135,7 +135,7 @@ MEASURES = {
     "on_surface": ("measured points on the surface", ".0%", "share of the measured depth that lies there; not tested by itself"),
     "colour_inliers": ("points with the surface's colour", ".0%", "share that lies there and has its colour; not tested by itself"),
 }  # fmt: skip
-"""The name, format and meaning of each measure of a pose by landmarks, those with a bound first."""
+"""Label, format and meaning of each measure of a pose found by landmarks; the measures with a bound come first."""
 WITHOUT_LANDMARKS = {
     "mean_loss": ("mean loss", ".3g", "of the last steps of the descent"),
     "on_surface": ("measured points on the surface", ".0%", "share of the measured depth that lies on the map's surface"),
@@ -178,7 +178,7 @@ class Figure:
     passed: bool | None  # None if there is no threshold
     bar: Json | None
     meaning: str
-    pose: str = ""  # which one is measured, if not the pose found
+    pose: str = ""  # description of the measured pose, if it is not the pose found
 
     @staticmethod
     def of(
@@ -194,7 +194,7 @@ class Figure:
 
 
 def acceptance_figures(found: Localization, record: SearchRecord | None) -> tuple[Figure, ...]:
-    """Return the measures of the pose found and, if recorded, those of a pose from landmarks that was rejected before."""
+    """Return the measures of the pose found and, if landmarks did not find it, of the last pose that they found; failures first."""
     measured, answer = found.diagnostics, last_answer(record)
     figures = list[Figure]()
     if found.confidence is not None and not isinstance(measured, Support):

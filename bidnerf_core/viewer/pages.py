@@ -1,4 +1,4 @@
-"""The page of a map and localizations in it, for a notebook or the command line, also as one file that opens without a server."""
+"""The page that shows a map and localizations in it, for notebooks, for the live viewer, and as a file that needs no server."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from bidnerf_core.viewer.pictures import Json
 from bidnerf_core.viewer.scene import shown_map, shown_trajectory
 
 MODULES = ("data", "space", "compare", "panel", "table", "track", "live", "main")
-"""The modules of the page, each after those that it imports. They share one scope, so their names must differ."""
+"""The page's JavaScript modules, each after those that it imports. They share a scope, so their names must not clash."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +42,8 @@ class MapView:
     queries: tuple[str, ...] = ()  # names of images that the server can localize
     trajectory: Json | None = None
     results: tuple[Json, ...] = ()
-    hfov: float | None = None  # horizontal field of view (degrees) with which the page's field is filled in
-    # whether photos without a field of view have a given camera, not that of EXIF or the map
+    hfov: float | None = None  # horizontal field of view (degrees) that the page's input field shows at first
+    # whether photos without a field of view have a given camera, rather than that of EXIF or the map
     camera_given: bool = False
 
     def __repr__(self) -> str:
@@ -153,7 +153,7 @@ def localized(
     seed: int = 0,
     follow: Callable[[SearchRecord, Json | None], None] | None = None,
 ) -> Json:
-    """Localize a query, and return the answer with a record of the search. Raises ``InputError`` for an unusable query.
+    """Localize a query, and return the page's JSON values of the answer and its search. Raises ``InputError`` if it cannot be used.
 
     ``follow`` is called twice: before the search with its record, and before the field is rendered with the record
     and an answer whose pictures show the surface.
@@ -187,7 +187,8 @@ def shown_row(row: Any) -> Json:
     """Return the JSON values of a row in the page's table, from a result of an evaluation.
 
     In ``row``, the pose and the covariance are lists of matrix rows. In the result, ``error`` holds the position
-    error and the orientation error (degrees), and ``sigma`` is the standard deviation of the position.
+    error and the orientation error (degrees), ``sigma`` is the standard deviation of the position, and ``pose`` is
+    the 16 numbers of T_world_camera in row-major order. Lengths are in the unit of the row.
     """
     variance = math.nan if row.covariance is None else sum(row.covariance[i][i] for i in range(3))
     return {

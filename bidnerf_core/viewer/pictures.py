@@ -21,7 +21,7 @@ from bidnerf_core.localization import SceneMap, picture_at, surface_renderer
 from bidnerf_core.results import as_picture
 
 Json: TypeAlias = dict[str, Any]
-"""A part of the page's state, which its scripts read. The function that returns it says what it holds."""
+"""A part of the page's state, which the page's scripts read. Its entries are described by the function that returns it."""
 
 
 def packed(array: np.ndarray) -> Json:
@@ -60,7 +60,7 @@ def photograph(image: Float[Tensor, "h w 3"]) -> Json:
 
 
 def drawing(image: UInt8[np.ndarray, "h w channels"]) -> Json:
-    """Return an image, with or without an alpha channel, as ``photograph`` does but as a PNG."""
+    """Return an image, with or without an alpha channel, in the format of ``photograph`` but encoded as PNG."""
     file = io.BytesIO()
     Image.fromarray(image).save(file, "PNG", optimize=True)
     url = "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()
@@ -83,13 +83,13 @@ def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Flo
     bounds = replace(bounds, far=max(bounds.far, distance + beyond))
     if not has_field(scene.field):
         return picture_at(scene, camera, T_world_camera)
-    # After each 4,096 pixels, it is checked whether the rendering is still wanted, see ``job_context``.
+    # After every 4,096 pixels, the rendering stops if the job was cancelled, see ``job_context``.
     return render_image(scene.field, camera, T_world_camera, bounds, 4096).rgb
 
 
 @torch.no_grad()
 def quick_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
-    """Render the colours of the surface, in [0, 1], from a camera, twenty times as fast as those of the field.
+    """Render the colours of the surface, in [0, 1], from a camera, about twenty times as fast as ``field_image``.
 
     If the map has no surface, the field is rendered.
     """

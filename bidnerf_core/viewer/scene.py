@@ -43,7 +43,7 @@ MOST_POINTS = 120_000
 def shown_map(scene: Map, thumbnails: int = 60) -> Json:
     """Return the JSON values of a map; ``thumbnails`` is the maximum number of cameras with a rendered thumbnail.
 
-    ``unit`` is the symbol of the unit of length, ``up_source`` says how the upward direction was found, and
+    ``unit`` is the symbol of the unit of length, ``up_source`` states how the upward direction was found, and
     ``extent`` (in the unit of the map) is the size of the region that the initial view should show.
     """
     up = scene.up
@@ -207,9 +207,9 @@ def shown_trajectory(
     The poses are shown relative to ``origin``, the origin of the map. A remark is logged if the file states a unit
     other than the map's ``unit``. Raises ``InputError`` for a file without poses.
 
-    In the result, ``poses`` are T_world_camera without the last row, float32 (n, 12), ``times`` are in seconds, and
-    ``sigmas`` are standard deviations of the position. Values that the file does not state are None or an empty
-    string.
+    In the result, ``poses`` are T_world_camera without the last row, float32 (n, 12). Each pose has a frame name in
+    ``frames``, a time in seconds, a standard deviation of the position (in the file's unit) in ``sigmas``, and an
+    outcome. Values that the file does not state are None or an empty string.
     """
     content = read_file(path, "a trajectory")
     if path.suffix.lower() in (".json", ".jsonl"):
@@ -240,7 +240,7 @@ def shown_trajectory(
 
 
 _Posed: TypeAlias = tuple[SE3 | None, str, float | None, float | None, str, str | None]
-"""A pose, the frame's name, its time, the standard deviation of the position, the outcome, and the unit of lengths."""
+"""A pose, the name and time (seconds) of its frame, the position's standard deviation, the outcome, and the unit of length."""
 
 
 def _posed(entry: dict[str, Any], path: Path) -> _Posed:

@@ -28,8 +28,8 @@ def serve_view(
     """Serve a page that shows a map and localizes photos in it, until the process is interrupted or ``stop`` is set.
 
     Only browsers on this machine are answered unless a ``host``, such as 0.0.0.0, is given: the address passed to
-    ``ready`` then contains a ``token``, which is generated if none is given. Raises ``InputError`` if the extra
-    ``viewer`` is not installed, and if the port is taken.
+    ``ready`` then contains a ``token``, which is generated if none is given. ``limits`` apply to uploads. Raises
+    ``InputError`` if the extra ``viewer`` is not installed, and if the port is taken.
     """
     token = token_for(host, token, NEEDS)
     from bidnerf_core.viewer.app import viewer_app
