@@ -1,4 +1,4 @@
-"""Readers for posed images and sequences, and writers. All file-format conventions are converted here."""
+"""Readers and writers of posed images and sequences. All conventions of file formats are converted here."""
 
 from lazy_loader import attach_stub
 

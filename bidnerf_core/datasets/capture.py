@@ -70,7 +70,7 @@ class Picture(Protocol):
 class DepthFile:
     """The depth image of a shot: ``read`` returns depth in metres, to be registered from ``sensor`` (if given) to the image."""
 
-    path: Path | str  # for messages; a ``Path`` is a file, without which there is no depth
+    path: Path | str  # for messages; a ``Path`` is a file, and if it is missing, there is no depth
     read: Callable[[], DepthImage]
     sensor: DepthCamera | None = None
 
@@ -89,10 +89,12 @@ class Shot:
     depth: DepthFile | None = None  # planar z
     masks: tuple[MaskFile, ...] = ()
     border: int = 0  # width in pixels of the border of the stored image that shows nothing
-    splits: tuple[str, ...] = ()  # empty if it belongs to no split, as without a pose
+    splits: tuple[str, ...] = ()  # empty if the shot is in no split, for instance without a pose
     name: str = ""  # unique in its capture, which assigns it
     stem: str = ""  # by default the image file's name without its suffix
-    folders: tuple[str, ...] | None = None  # those in front of the stem, by default the image file's
+    folders: tuple[str, ...] | None = (
+        None  # folders in front of the stem; by default, those of the image file
+    )
     usual_side: int | None = None
     """Longer side to which the format's images are downscaled unless the user gives another size."""
     tells_camera: bool = False
@@ -118,11 +120,11 @@ class Shot:
     def frame(self, background: Colour = BLACK, side: int | None = None) -> Frame:
         """Read the image, composited over ``background`` (rgb) if it has an alpha channel, and its depth.
 
-        An image with more than ``side`` pixels along the longer side is downscaled to that. The camera of a file is checked
-        before any pixel is decoded. Registered depth may be of any size: each pixel has the depth of the nearest measurement.
+        An image with more than ``side`` pixels along the longer side is downscaled to ``side``. The camera of a file is checked
+        before any pixel is decoded. Registered depth may be of any size: each pixel gets the depth of the nearest measurement.
         Raises ``InputError`` for an unreadable file, and for a camera or registered depth of another aspect ratio.
         """
-        assert self.image is not None  # else a subclass reads it
+        assert self.image is not None  # otherwise, a subclass reads the image
         pixels = None
         if isinstance(self.image, ImageSource):
             header = read_header(self.image)
@@ -182,7 +184,7 @@ def _hidden(mask: MaskFile, frame: Frame) -> Bool[Tensor, "h w"] | None:
         lens = lens if same_aspect((header.width, header.height), lens.stored_size) else None
     camera = frame.intrinsics if lens is None else lens
     size, orientation = (camera.width, camera.height), frame.orientation
-    stored = orientation.upright_size(*size)  # which exchanges the sides back
+    stored = orientation.upright_size(*size)  # exchanging the sides twice restores them
     hidden = read_mask(mask.path, Raster(*stored, orientation), size, mask.hides)
     if lens is None:
         return hidden
@@ -205,10 +207,10 @@ class Capture:
 
     A frame's name is the stem of its image file. If several files of a split share a stem, the names are prefixed
     with just enough folders to make them unique ("left_0001", "right_0001"); the bare stem is then rejected as
-    ambiguous. Indices and iteration read frames, slices do not.
+    ambiguous. Indexing and iteration read frames; slicing does not.
     """
 
-    # Not a subclass of collections.abc.Sequence: run-time type checkers inspect an item of those, which would read a file.
+    # Not a subclass of collections.abc.Sequence: run-time type checkers inspect an item of a Sequence, which would read a file.
 
     path: Path
     shots: Sequence[Shot]
@@ -218,10 +220,12 @@ class Capture:
         None  # the upward direction in the world if the capture measured gravity, as phones do
     )
     depth_unit: float | None = None  # metres per step of depth images, if the format accepts another unit
-    largest: int | None = None  # longer side to which the user asked to downscale images, not the usual one
+    largest: int | None = (
+        None  # longer side to which the user asked to downscale images; None for the usual one
+    )
     pose_file: Path | str | None = None  # what records the poses, for messages
-    poses_expected: str = "at least one"  # what has to be there for an image to have a pose
-    unposed: str = ""  # why some images have none
+    poses_expected: str = "at least one"  # what must exist for an image to have a pose
+    unposed: str = ""  # why some images have no pose
     rate: float = math.inf  # most frames per second in the dataset, if recordings have more than a map needs
 
     def __post_init__(self) -> None:
@@ -292,7 +296,7 @@ class Capture:
         Raises ``InputError`` if no frame has a mask with a matching name.
         """
         own = [[shot.name, *([shot.stem] if by_stem else [])] for shot in self.shots]
-        for split in self.splits:  # where masks may be named as well
+        for split in self.splits:  # masks may also be named like the frames of a split
             inside = [index for index, shot in enumerate(self.shots) if split in shot.splits]
             for index, name in zip(inside, self.frame_names(split), strict=True):
                 own[index].append(name)
@@ -342,7 +346,7 @@ class Capture:
         """Read the frames ``names``, in that order, or the whole split; no other image is opened.
 
         When reading a whole split, frames that a mask hides entirely are left out. Images with more than ``limit``
-        pixels along the longer side are downscaled to that, unless the user set another size. Raises
+        pixels along the longer side are downscaled to ``limit``, even if the user allows larger ones. Raises
         ``InputError`` for an unknown split or frame, and for a file that is missing or invalid.
         """
         shots, views = self.select(split, names), list[View]()
@@ -363,7 +367,7 @@ class Capture:
         ]
 
     def require_poses(self) -> Capture:
-        """Return the capture, with a remark counting frames without a pose. Raises ``InputError`` if no frame has a pose."""
+        """Return the capture, and count frames without a pose in a remark. Raises ``InputError`` if no frame has a pose."""
         posed = sum(shot.T_world_camera is not None for shot in self.shots)
         where, images = self.pose_file or self.path, amount(len(self), "image")
         if not posed:
@@ -402,7 +406,7 @@ def unique_names(paths: Sequence[tuple[str, ...]]) -> list[str]:
 
 
 def in_other_split(name: str, splits: Mapping[str, Sequence[str]]) -> str | None:
-    """Return an error clause that says which of the ``splits`` contains the frame, or None if none does."""
+    """Return an error clause that names the one of the ``splits`` that contains the frame, or None if none does."""
     found = next((split for split, names in splits.items() if name in names), None)
     return found and f"no frame {name!r}, which is in split {found!r}; choose that split"
 

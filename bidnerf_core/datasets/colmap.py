@@ -82,7 +82,7 @@ class SparsePoints:
         fits = torch.ones(len(known), dtype=torch.bool)
         try:
             for _ in range(2):
-                # The second fit leaves out cameras that are off by several medians, but none that is off by hardly anything.
+                # The second fit leaves out cameras whose error exceeds three times the median, unless it is tiny.
                 used, fit = fits, fit_similarity(there[fits], here[fits])
                 off = torch.linalg.vector_norm(fit.apply(there) - here, dim=-1)
                 fits = off <= max(3 * float(off.median()), 0.01 * spread(here))
@@ -91,7 +91,7 @@ class SparsePoints:
         except InputError as error:
             where = f"{folder}: the unit cannot be estimated from the training cameras"
             raise InputError(error, where=where) from error
-        # More indicates a different scene; a hand-held camera that moved by decimetres reaches 0.03.
+        # A larger misfit indicates a different scene; a hand-held camera that moved by decimetres reaches 0.03.
         if self.misfit > 0.2:
             raise InputError(
                 f"its cameras are {self.misfit:.0%} of their spread away from the training cameras",
@@ -100,7 +100,7 @@ class SparsePoints:
             )
 
     def _image(self, name: str, split: str) -> ModelImage | None:
-        """Return the image of a frame, or None. Folders named train, val or test separate the frames of splits.
+        """Return the model's image of a frame, or None. Folders named train, val or test separate the frames of splits.
 
         Raises ``InputError`` if the name is ambiguous.
         """

@@ -7,8 +7,9 @@ pose to ``images``. pycolmap is not used because it hangs on a truncated ``point
 where nothing was reconstructed.
 
 Keypoints with descriptors are in COLMAP's database or the features of hloc (.h5), in the order in which the model lists an
-image's observations. COLMAP's SIFT descriptors have the same root normalisation and layout as ours, so the two can be matched; its
-scale is half of our diameter. The centre of the first pixel is (0, 0) in hloc's keypoints and (0.5, 0.5) in COLMAP's.
+image's observations. COLMAP's SIFT descriptors have the same root normalisation and layout as ours, so the two can be
+matched; COLMAP's scale is half of our diameter. The centre of the first pixel is (0, 0) in hloc's keypoints and
+(0.5, 0.5) in COLMAP's.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from bidnerf_core.mapping import FIRST_CENTRE, Keypoints, quantized
 MODEL_FILE = "a file of a COLMAP sparse model"
 LARGEST_MODEL = 2**30  # bytes of one file of a model
 UNKNOWN_SCALE = 4.0
-"""Scale (pixels) of keypoints that state none."""
+"""Scale (pixels) assumed for keypoints that are stored without one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +194,7 @@ def _binary(path: Path, columns: _Columns) -> Iterator[_Entry]:
     file = io.BytesIO(content)
 
     def take(size: int) -> bytes:
-        if len(found := file.read(min(size, len(content)))) < size:  # a false size may be beyond any memory
+        if len(found := file.read(min(size, len(content)))) < size:  # a wrong size may exceed the memory
             found_end = f"ends too early, at byte {len(content)};"
             raise InputError(found_end, where=path, expected="a complete COLMAP file")
         return found
@@ -240,7 +241,7 @@ def _text(path: Path, columns: _Columns) -> Iterator[_Entry]:
 
 
 def stored_keypoints(path: Path) -> Iterator[tuple[str, Keypoints]]:
-    """Yield the name and keypoints of each image in a database or feature file, distinguished by file extension.
+    """Yield the name and keypoints of each image in a database or (with the extension .h5) a feature file.
 
     Raises ``InputError`` for a file that cannot be read, and if h5py, required for hloc features, is not installed.
     """
@@ -268,7 +269,7 @@ def _of_database(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.n
         "SELECT name, k.rows, k.cols, k.data, d.rows, d.cols, d.data FROM images"
         " JOIN keypoints AS k ON k.image_id = images.image_id JOIN descriptors AS d ON d.image_id = images.image_id"
     )
-    try:  # immutable: nothing is written beside it
+    try:  # immutable: nothing is written beside the file
         address = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
         with contextlib.closing(sqlite3.connect(address, uri=True)) as opened:
             for name, *found in opened.execute(query):

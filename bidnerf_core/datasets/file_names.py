@@ -21,7 +21,7 @@ def posix_name(name: str) -> PurePosixPath:
 
 
 class FileNames:
-    """Finds the files named in a metadata file below a folder or, failing that, below the ``others``.
+    """Finds the files that a metadata file names, below ``folder`` or, failing that, below the ``others``.
 
     Each folder is listed at most once.
     """
@@ -39,7 +39,7 @@ class FileNames:
         With ``moved``, a relative path may refer to a folder elsewhere, so its trailing parts are tried as well.
         """
         name = posix_name(str(name))
-        # Of a relative name, all parts are looked for; of an absolute or moved one, the last ones too, most first.
+        # All parts of a relative name have to match. Of an absolute or moved name, trailing parts are tried too, longest first.
         is_absolute = name.is_absolute() or bool(name.parts and name.parts[0].endswith(":"))
         last = len(name.parts) if is_absolute or moved else min(1, len(name.parts))
         tails = [name.parts[first:] for first in range(int(is_absolute), last)]

@@ -3,8 +3,8 @@
 ARKit's poses are camera to world with OpenGL axes and +y up, its intrinsics are relative to the centre of the
 upper left pixel, and its confidence is 0 (low), 1 or 2 (high). Depth is kept where the confidence is high,
 and up to the range of the lidar; beyond it, depth was inferred from the photo. Each pixel has the depth of
-the nearest measurement. Photos with more than 640 pixels on the longer side are downscaled to that size, as
-is their camera, unless the user gives another size: a scan has hundreds of them.
+the nearest measurement. Photos with more than 640 pixels on the longer side are downscaled to that size, and
+so are their cameras, unless the user gives another size: a scan has hundreds of photos.
 
 Phones record up to 60 frames a second, far more than a map needs. The dataset of such a recording has five
 frames a second, and the sequence all of them.
@@ -37,7 +37,7 @@ UP = (0.0, 1.0, 0.0)
 class LidarDepth:
     """Reads lidar depth of high confidence only, and remarks once if an image loses all of its depth.
 
-    ``scales`` are the values that may denote high confidence, for apps that do not keep ARKit's values.
+    ``scales`` holds the values that may denote high confidence, for apps that do not keep ARKit's values.
     """
 
     def __init__(self, scales: Sequence[int] = (HIGH_CONFIDENCE,)) -> None:

@@ -73,7 +73,7 @@ class DatasetOptions:
     def open(self, path: str | Path, readers: Sequence[Reader] | None = None) -> Capture:
         """Open the dataset in the folder ``path``.
 
-        Metadata are read and checked immediately, images when views are requested. Files that are listed but
+        Metadata is read and checked immediately, images only when views are requested. Files that are listed but
         missing, and images without a pose, are left out with an ``InputWarning`` that counts them. Raises
         ``InputError`` if the folder does not exist, if no reader recognizes it, if no image is left, and if a
         metadata file is invalid.
@@ -124,14 +124,14 @@ class DatasetOptions:
 
     @property
     def registration(self) -> DepthRegistration | None:
-        """The value of ``register_depth``; False if depth is used without registration."""
+        """The value of ``register_depth``, with False instead of ``"no"``."""
         return False if self.register_depth == "no" else self.register_depth
 
     def sensor(self, where: Path | str, own: DepthCamera | None = None) -> DepthCamera | None:
         """Return the sensor from which depth is registered, or None for no registration; ``own`` is the format's sensor.
 
-        Raises ``InputError``, whose message begins with ``where``, if the option is True but the format has no sensor,
-        and as ``DepthCamera.read`` does.
+        Raises ``InputError``, whose message begins with ``where``, if ``register_depth`` is True but the format has no
+        sensor, and as ``DepthCamera.read`` does.
         """
         from bidnerf_core.depth import DepthCamera
 

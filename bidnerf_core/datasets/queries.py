@@ -120,7 +120,7 @@ def read_depth_points(path: Path) -> Observations:
 
 
 class Photos:
-    """Image files, each of which is a query. ``depth`` contains the depth files of the photos that have depth.
+    """Image files, each of which is a query. ``depth`` maps photos that have depth to their depth files.
 
     If the ``options`` set no background, the background of the map in which a photo is localized is used.
     """
@@ -218,7 +218,7 @@ class DatasetFrames:
 
 
 def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]:
-    """Return the image files among ``paths``, and those in the folders among ``paths``, whose other files are logged.
+    """Return the files among ``paths`` and the images in the folders among them; other files in these folders are logged.
 
     Files of ``depth`` may lie among the photos. Raises ``InputError`` for a folder without photos.
     """

@@ -180,7 +180,7 @@ class Reader(Protocol):
 
 @dataclass(eq=False)
 class Format(Generic[Found]):
-    """A bundled reader, defined by a function that recognizes a folder and one that reads what was found in it."""
+    """A bundled reader, defined by a function that recognizes a folder and a function that reads what the first one found."""
 
     expected: str
     find: Callable[[Path], Found | None]

@@ -33,13 +33,13 @@ from bidnerf_core.io import LARGEST_ROWS, Row, is_file, parse_rows, read_file, r
 
 POSE = "tx ty tz qx qy qz qw"
 LARGEST_GAP = 0.1
-"""Seconds. Within this time a hand-held camera deviates from the interpolated path by a few millimetres;
-motion capture that lost its markers leaves longer gaps, in which no pose is known."""
+"""Largest gap (seconds) between samples to interpolate. In this time, a hand-held camera deviates from the interpolated path
+by a few millimetres; motion capture that lost its markers leaves longer gaps, in which no pose is known."""
 KITTI_ROW = 12
 """Numbers in a KITTI row: a 3x4 matrix."""
 NANOSECONDS = 10**9
 LEAST_NANOSECONDS = 10**14
-"""Integers from here on are nanoseconds: as seconds they would be three million years."""
+"""Integer timestamps from here on are nanoseconds: as seconds, they would be three million years."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class TimedRow:
 
     row: Row
     time: float  # seconds
-    words: list[str]  # what follows the time stamp
+    words: list[str]  # the entries after the timestamp
 
     @property
     def rest(self) -> str:
@@ -173,9 +173,9 @@ class Trajectory:
 
 
 def read_trajectory(path: Path, times: Sequence[float] | None = None) -> Trajectory:
-    """Read a trajectory in one of the formats above.
+    """Read a trajectory in one of the formats that this module supports.
 
-    ``times`` (seconds) are the image times, for KITTI's format, which has none. Poses that are not finite, and
+    ``times`` (seconds) holds the image times, needed only for KITTI's format, which stores none. Poses that are not finite, and
     those whose quaternion is zero, are left out with a remark that counts them. Raises ``InputError``, with the
     file and line, if a row is truncated, a quaternion does not have length 1, two rows have the same time but
     different poses, or the number of KITTI rows differs from the number of images.
@@ -242,7 +242,8 @@ def pose_numbers(where: str, numbers: Sequence[float], order: str = "xyzw") -> l
 def pose_of_numbers(where: str, numbers: Sequence[float], opengl: bool) -> SE3 | None:
     """Return ``T_world_camera`` (OpenCV axes) from a position and quaternion (x y z w), or None if they represent no pose.
 
-    The camera axes are OpenGL's or OpenCV's. Raises ``InputError`` for a quaternion whose length is not 1.
+    The numbers use OpenGL's camera axes if ``opengl`` is set, otherwise OpenCV's. Raises ``InputError`` for a quaternion
+    whose length is not 1.
     """
     found = pose_numbers(where, numbers)
     if found is None:
@@ -286,9 +287,9 @@ def read_matrices(path: Path) -> list[SE3]:
 def read_pose_matrix(path: Path) -> SE3 | None:
     """Read ``T_world_camera`` (metres, OpenCV axes, float64) from a text file with one 4x4 matrix.
 
-    Returns None if the file does not exist, or contains non-finite numbers, which mean that tracking failed.
+    Returns None if the file does not exist, or if it contains non-finite numbers, which mean that tracking failed.
 
-    Raises ``InputError``, which names the offending line.
+    Raises ``InputError`` for any other content.
     """
     if not is_file(path):
         return None

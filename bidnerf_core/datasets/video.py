@@ -1,4 +1,4 @@
-"""Frames of video files; needs the extra ``video`` (PyAV, whose wheels include FFmpeg's libraries).
+"""Frames of video files; reading them needs the extra ``video`` (PyAV, whose wheels include FFmpeg's libraries).
 
 Frame timestamps are read from the file, in seconds from the start, because phones record at a varying rate.
 """

@@ -39,7 +39,7 @@ def write_transforms(
                 f"two frames of split {split!r} have the same name", where=folder, expected="different ones"
             )
         frames = [_written(folder, split, view, background) for view in views]
-        if not frames:  # readers reject a file without any
+        if not frames:  # readers reject a file without frames
             continue
         folder.mkdir(parents=True, exist_ok=True)
         write_file(

@@ -72,7 +72,7 @@ def colmap_project(path: Path) -> tuple[Path, Path, list[ModelImage], dict[int, 
     folder, files = _image_folder(path, model, images)
     others = _models_at(folder.parent / "sparse") if files else []
     if others and model.resolve() not in [each.resolve() for each in others]:
-        # Such a folder is dense/0, whose images are undistorted, while those of sparse/0 lie elsewhere.
+        # For example, the images of dense/0 are undistorted, while those of sparse/0 lie elsewhere.
         text = f"{folder.relative_to(path)} has a model of its own, which is used instead of {model.relative_to(path)}"
         remark(path, text)
         model, images, cameras = _largest(path, others)

@@ -4,7 +4,7 @@
 ``mav0/cam0/sensor.yaml`` has ``T_BS`` (4x4, camera to body), ``intrinsics`` (fx, fy, cx, cy),
 ``distortion_coefficients`` and ``resolution``. ``mav0/state_groundtruth_estimate0/data.csv`` (or
 ``mocap0``, ``vicon0``) has the poses of the body: ``timestamp [ns], px, py, pz, qw, qx, qy, qz``, metres.
-They are interpolated at the image times and transformed to the camera. Images without a pose are in the
+Poses are interpolated at the image times and transformed to the camera. Images without a pose are in the
 sequence but not in the dataset, and a remark counts them. Principal points are relative to the centre of
 the upper left pixel, so half a pixel is added.
 """
@@ -47,7 +47,7 @@ def _find(path: Path) -> Path | None:
 
 
 def _sensor(file: Path, options: DatasetOptions) -> tuple[CameraSource, SE3]:
-    """Return the camera (given or calibrated) and its pose in the body frame. Raises ``InputError``."""
+    """Return the camera (given or calibrated) and T_body_camera. Raises ``InputError`` for an invalid file."""
     text = read_file(file, "EuRoC's sensor.yaml").decode("utf-8", "replace")
     T_body_camera = pose_of_matrix(file, _numbers(file, text, "T_BS", 16), "the rotation of T_BS")
     if options.given_camera is not None:

@@ -66,7 +66,7 @@ def _find(path: Path) -> Path | None:
 
 
 def _calibration(file: Path, camera: str, size: tuple[int, int]) -> tuple[Intrinsics, SE3]:
-    """Return a camera and its pose in the frame of camera 0. Raises ``InputError`` if the file lacks it."""
+    """Return a camera and its pose in camera 0's frame. Raises ``InputError`` if the file lacks the camera."""
     for row in read_rows(file, "KITTI's calib.txt", "P0: 12 numbers"):
         name, _, text = row.text.partition(":")
         if name.strip() == camera:

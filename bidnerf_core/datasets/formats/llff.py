@@ -2,8 +2,8 @@
 
 Each of its rows has 17 numbers for one image of ``images`` in the order of names: a 3x5 matrix, row by row,
 and the nearest and farthest depth. The first four columns of the matrix are the camera-to-world pose whose
-axes point down, to the right and backwards, the fifth is the height, the width and the focal length in
-pixels; the principal point is the image centre. Where ``images`` is missing, its reduced copies
+axes point down, to the right and backwards; the fifth holds the height, the width and the focal length in
+pixels. The principal point is the image centre. Where ``images`` is missing, its reduced copies
 (``images_4`` ...) are used, with cameras scaled to them. The unit of length is arbitrary, as in COLMAP,
 from which the poses come.
 """

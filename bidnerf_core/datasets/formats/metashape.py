@@ -3,8 +3,8 @@
 A ``camera`` has the camera-to-chunk matrix ``transform`` (4x4, row by row; OpenCV axes), the photo's name
 in ``label``, and the ``sensor`` that took it: ``resolution`` and the adjusted ``calibration`` with ``f``
 (pixels), ``cx cy`` (from the image centre) and the distortion ``k1 k2 k3 p1 p2``, whose p1 and p2 are
-OpenCV's p2 and p1. The chunk's ``scale``, if it is georeferenced or has scale bars, makes positions metres;
-its rotation and translation are not applied, so the world is the chunk. Photos are in the folder or in
+OpenCV's p2 and p1. If the chunk is georeferenced or has scale bars, its ``scale`` converts positions to
+metres; its rotation and translation are not applied, so the world is the chunk. Photos are in the folder or in
 ``images``.
 """
 

@@ -4,9 +4,9 @@ The file is a list of reconstructions, of which the one with the most images is 
 ``shots`` have the world-to-camera pose (``rotation`` as an angle-axis vector, ``translation``; OpenCV
 axes), the name of their ``camera`` and the time in ``capture_time`` (seconds). Parameters of ``cameras``
 refer to an image whose longer side is 1 and whose origin is its centre: ``focal`` (or ``focal_x``,
-``focal_y``), ``c_x``, ``c_y``, and the distortion ``k1 k2 k3 p1 p2`` in OpenCV's convention. A pixel's
-centre is at integer coordinates there, so the origin is half a pixel from the middle. Photos are in
-``images``.
+``focal_y``), ``c_x``, ``c_y``, and the distortion ``k1 k2 k3 p1 p2`` in OpenCV's convention. Pixel
+centres are at integer coordinates there, and the origin is at ((width - 1) / 2, (height - 1) / 2), the image
+centre in our convention too. Photos are in ``images``.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import Record, read_json
 
 KINDS = ("perspective", "brown", "simple_radial", "radial", "fisheye_opencv")
-"""The kinds of cameras that are read, besides panoramas."""
+"""The projection types that are read, besides panoramas."""
 
 
 def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:

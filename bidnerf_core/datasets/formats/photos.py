@@ -4,7 +4,7 @@ Images are ordered by timestamp if every name is one (``12.345.png``), else in n
 any, is ``NAME.depth.png``, as written by ``bidnerf render``. Unlike the images of datasets, photos are turned upright
 according to their EXIF orientation, and their camera is read from EXIF unless the user gives one, as in ``Frame.open``.
 
-A video is turned by the rotation in its metadata, so its camera is that of the upright image. It does not record its focal
+A video is turned by the rotation in its metadata, so its camera is that of the upright image. Videos do not record a focal
 length, so the camera has to be given or assumed.
 """
 

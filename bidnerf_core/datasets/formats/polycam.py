@@ -3,7 +3,7 @@
 ``keyframes/cameras/TIME.json`` has ``fx fy cx cy width height`` and ``t_00`` to ``t_23``, the rows of ARKit's
 camera-to-world matrix (OpenGL axes, +y up); TIME is in microseconds. ``keyframes/corrected_cameras`` and
 ``corrected_images`` have the poses after global optimization and undistorted photos; they are used if they
-exist, else ``cameras`` and ``images``. Newer exports store no size, so the photo's size is used.
+exist, otherwise ``cameras`` and ``images``. Newer exports store no size, so the photo's size is used.
 ``keyframes/depth/TIME.png`` is planar z in millimetres at a lower resolution, with
 ``keyframes/confidence/TIME.png`` (0 low, 127 medium, 255 high). See ``lidar`` for how both are read.
 

@@ -3,8 +3,8 @@
 ``results/frame000000.jpg`` and ``results/depth000000.png`` (16-bit planar z) are the frames; ``traj.txt``
 has a row of sixteen numbers for each, the 4x4 camera-to-world matrix (OpenCV axes, metres). The camera and
 the steps of depth per metre (``scale``) are in ``cam_params.json`` of the folder or the one above; without
-it, the published ones apply. Principal points are relative to the centre of the upper left pixel, so half a
-pixel is added.
+this file, the published values apply. Principal points are relative to the centre of the upper left pixel,
+so half a pixel is added.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def _read(path: Path, found: tuple[list[Path], Path], options: DatasetOptions) -
 
 
 def _find(path: Path) -> tuple[list[Path], Path] | None:
-    """Return the images, and the file of their intrinsics."""
+    """Return the images and the file of their intrinsics, or None if something is missing."""
     folders = (folder for name in ("color", "rgb") if (folder := path / name).is_dir())
     images = next((photos for folder in folders if (photos := photos_in(folder)[0])), None)
     intrinsics = _intrinsics(path, "color")

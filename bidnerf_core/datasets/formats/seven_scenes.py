@@ -9,7 +9,7 @@ without split files, every eighth frame (the first, the ninth ...) is held out a
 
 The Kinect's two cameras were not calibrated, and its depth is not registered to its colour images. The poses
 are those of the depth camera (focal length 585 px); the colour camera has 525 px and is mounted 2.6 cm away.
-By default both are handled as in the relocalization literature (ACE, CVPR 2023, and the pseudo ground truth
+By default, poses and depth are handled as in the literature (ACE, CVPR 2023, and the pseudo ground truth
 of Brachmann et al., ICCV 2021): poses are transformed to the colour camera and depth is registered to it,
 using the calibration of another Kinect or a given one. Without registration, images, depth and poses are used
 as they are, with the 585 px stated on the dataset's page for both, as in KinectFusion and its successors;
@@ -54,7 +54,8 @@ T_COLOUR_DEPTH = SE3(
         [-2.5558943178152542e-02, 1.0109636268061706e-04, 2.0318321729487039e-03], dtype=torch.float64
     ),
 ).normalized()
-"""https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html, as used by ACE's ``setup_7scenes.py``."""
+"""Pose of the depth camera in the colour camera's frame, of another Kinect, as used by ACE's ``setup_7scenes.py``:
+https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html."""
 
 SEQUENCE = re.compile(r"seq(?:uence)?-?0*(\d+)", re.IGNORECASE)
 
@@ -123,7 +124,7 @@ def frames_of(
 
 
 def _listed(file: Path, folders: dict[int, Path]) -> list[int]:
-    """Return the numbers of the sequences that a split file lists. Raises ``InputError``."""
+    """Return the numbers of the sequences in a split file. Raises ``InputError`` if it lists none or an unknown one."""
     numbers = list[int]()
     for row in read_rows(file, "a list of sequences", "a sequence such as sequence1"):
         found = SEQUENCE.fullmatch(row.text)

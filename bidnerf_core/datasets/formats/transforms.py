@@ -15,9 +15,9 @@ its white pixels are not used.
 The images of fisheye and division lenses (``camera_model`` as in COLMAP, or ``is_fisheye``, with ``k1`` to ``k4``) are undistorted
 on reading; a panorama (EQUIRECTANGULAR) becomes six frames, see ``PANORAMA_FACES``. Frames whose image is missing are left out,
 and so are missing depth images, with a remark that counts them. ``applied_transform`` and ``applied_scale`` record
-transformations that were already applied to the poses. They are
-not undone, so the world is that of the file. A sequence is ordered by ``time`` or ``timestamp`` of the frames (seconds), or
-by the number that names the file in ``source``; where a frame lacks all of them, by name. Other keys are ignored.
+transformations that were already applied to the poses. They are not undone, so the world is that of the file. A sequence is
+ordered by ``time`` or ``timestamp`` of the frames (seconds), or by the number that names the file in ``source``; if a frame
+lacks all of them, by name. Other keys are ignored.
 
 Images are used as they are stored: poses and intrinsics describe that raster, so the EXIF orientation is not applied.
 """
@@ -88,9 +88,9 @@ def _find(path: Path) -> list[Path]:
 
 
 def _check_images(folder: Path, frames: Sequence[FrameRecord], images: Sequence[Path]) -> None:
-    """Report names that differ from the file names by more than an added extension, in one remark.
+    """Issue one remark if names differ from the file names by more than a missing extension.
 
-    Raises ``InputError`` if parts of several names fit one file.
+    Raises ``InputError`` if several different names match the same file.
     """
     owner, remarked = dict[Path, FrameRecord](), False
     for frame, image in zip(frames, images, strict=True):
@@ -113,7 +113,7 @@ def _camera(frame: FrameRecord, size: tuple[int, int] | None) -> Camera | Camera
 
 
 def _first_size(frames: Sequence[FrameRecord], images: Sequence[Path]) -> tuple[int, int] | None:
-    """Return the size of the first readable image. A remark says that cameras are scaled if its camera has another size."""
+    """Return the size of the first readable image. If its camera has another size, a remark states that cameras are scaled."""
     for frame, image in zip(frames, images, strict=True):
         size, _ = _header(image)
         if size is None:
@@ -127,7 +127,7 @@ def _first_size(frames: Sequence[FrameRecord], images: Sequence[Path]) -> tuple[
 
 
 def _header(image: Path) -> tuple[tuple[int, int] | None, bool]:
-    """Return an image's size and whether it has an alpha channel; None if it is unreadable, which is an error on reading it."""
+    """Return an image's size, or None if it is unreadable (an error only when it is read), and whether it has alpha."""
     try:
         header = read_header(image)
     except InputError:

@@ -21,7 +21,7 @@ from bidnerf_core.io import IMAGE_SUFFIXES, Record, read_record
 METRES_PER_DEPTH_UNIT = 0.001
 SPLIT_FILES = {split: f"transforms_{split}.json" for split in SPLITS}
 UNIT_KEYS = {"depth_file_path": "depth_unit_scale_factor", "depth_path": "integer_depth_scale"}
-"""The keys of a depth image (nerfstudio's; instant-ngp's and NeRFCapture's), and those of the metres per step of its values."""
+"""The key of the metres per step for each key of a depth image: nerfstudio's, then instant-ngp's and NeRFCapture's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +32,9 @@ class FrameRecord:
     file_path: PurePosixPath  # as in the file, without a leading "./"
     camera: CameraRecord
     T_world_camera: SE3
-    scale: float  # removed from its matrix; 1 if that was rigid
+    scale: float  # scale removed from the frame's matrix; 1 if the matrix was rigid
     depth_path: PurePosixPath | None
-    depth_unit: float  # metres
+    depth_unit: float  # metres per step
     time: float | None  # seconds
     mask_path: PurePosixPath | None  # black is hidden
 
@@ -88,7 +88,7 @@ def read_frames(file: Record) -> list[FrameRecord]:
         count, first = len(unposed), next(iter(unposed.values())).get("file_path")
         found = f"{count} of {amount(len(entries), 'frame')} have no pose (transform_matrix is missing, zero or not finite)"
         remark(file.where, f"{found} and are left out, first: {first}")
-    all_are = len(unposed) == len(entries)  # an error when the first is read
+    all_are = len(unposed) == len(entries)  # an error, raised when the first frame is read
     frames = [_frame(file, n, entry) for n, entry in enumerate(entries) if all_are or n not in unposed]
     seen: dict[tuple[str, ...], int] = {}
     for number, frame in enumerate(frames):
@@ -135,7 +135,7 @@ def _depth(record: Record, own: Record) -> tuple[PurePosixPath | None, float]:
     """
     for key, unit_key in UNIT_KEYS.items():
         path = own.text(key)
-        # the other program's if its own is missing
+        # the other program's unit if its own is missing
         units = {name: record.number(name) for name in (unit_key, *UNIT_KEYS.values())}
         stated = [name for name, unit in units.items() if unit is not None]
         unit = units[stated[0]] if stated else METRES_PER_DEPTH_UNIT

@@ -75,7 +75,7 @@ def _read(path: Path, colour_list: Path, options: DatasetOptions) -> Capture:
     depths = [(time, file) for time, file in measured if is_file(file)]
     if lost := len(measured) - len(depths):
         remark(depth_list, f"{lost} of {amount(len(measured), 'depth image')} are missing and left out")
-    # Only what exists is associated: the next depth image may belong to an image whose nearest one is missing.
+    # Only existing files are associated: an image whose nearest depth image is missing may belong to the next one.
     there = [index for index, image in enumerate(images) if is_file(image)]
     partners = associate(
         [times[index] for index in there], [time for time, _ in depths], 0.02
@@ -125,7 +125,7 @@ def associate(times: Sequence[float], others: Sequence[float], largest: float) -
     if not len(times) or not len(others):
         return {}
     ours, theirs = np.array(times), np.array(others)
-    # The nearest time is the one between whose middles with its neighbours a time lies.
+    # A time is nearest to the other time whose interval, bounded by the midpoints to its neighbours, contains it.
     forth = np.searchsorted((theirs[1:] + theirs[:-1]) / 2, ours)
     back = np.searchsorted((ours[1:] + ours[:-1]) / 2, theirs)
     is_pair = (back[forth] == np.arange(len(ours))) & (np.abs(ours - theirs[forth]) <= largest)
