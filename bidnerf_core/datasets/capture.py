@@ -92,9 +92,7 @@ class Shot:
     splits: tuple[str, ...] = ()  # empty if the shot is in no split, for instance without a pose
     name: str = ""  # unique in its capture, which assigns it
     stem: str = ""  # by default the image file's name without its suffix
-    folders: tuple[str, ...] | None = (
-        None  # folders in front of the stem; by default, those of the image file
-    )
+    folders: tuple[str, ...] | None = None  # in front of the stem; by default, those of the image file
     usual_side: int | None = None
     """Longer side to which the format's images are downscaled unless the user gives another size."""
     tells_camera: bool = False
@@ -220,9 +218,7 @@ class Capture:
         None  # the upward direction in the world if the capture measured gravity, as phones do
     )
     depth_unit: float | None = None  # metres per step of depth images, if the format accepts another unit
-    largest: int | None = (
-        None  # longer side to which the user asked to downscale images; None for the usual one
-    )
+    largest: int | None = None  # longer side to which the user asked to downscale images, if any
     pose_file: Path | str | None = None  # what records the poses, for messages
     poses_expected: str = "at least one"  # what must exist for an image to have a pose
     unposed: str = ""  # why some images have no pose
