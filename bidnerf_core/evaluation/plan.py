@@ -123,14 +123,14 @@ MOST_TRIALS = 100_000
 def each_in_turn(frames: int, trials: int, seed: int, times: int = 1) -> list[tuple[int, int]]:
     """Return the frame index and seed of each trial; all seeds are distinct.
 
-    Frames are taken cyclically in random order, each ``times`` in a row.
+    Frames are taken cyclically in random order, each ``times`` times in a row.
     """
     order = torch.randperm(frames, generator=torch.Generator().manual_seed(seed)).tolist()
     return [(order[i // times % frames], seed + i) for i in range(trials)]
 
 
 def once_each(frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
-    """Return frame index and seed of each trial: at most ``trials`` distinct frames, in random order; seeds are distinct."""
+    """Return the frame index and seed of each trial: at most ``trials`` distinct frames, in random order; seeds are distinct."""
     return each_in_turn(frames, min(trials, frames), seed)
 
 
@@ -153,7 +153,7 @@ class Protocol:
     fixed: bool = False  # whether it always chooses from all frames of a split
 
     def cases(self, frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
-        """Return the frame index and seed of each trial of one size; more trials only append cases to the first ones."""
+        """Return the frame index and seed of each trial of one size; a larger number of trials only appends cases."""
         if frames < 1:
             raise InputError("nothing to try:", expected="at least one frame")
         return self.cases_of(frames, trials, seed)
@@ -390,7 +390,7 @@ def listed(frames: Sequence[str]) -> str:
 
 
 def _rigs(plan: Plan, dataset: Capture, names: list[str], data: str) -> list[tuple[str, ...]]:
-    """Return the names of the views for each frame to try, without frames that masks hide entirely."""
+    """Return the view names (a rig) for each frame to try, without frames that masks hide entirely."""
     for name in plan.frames or ():
         if name not in names:
             others = {split: dataset.frame_names(split) for split in dataset.splits}

@@ -57,7 +57,7 @@ Scene: TypeAlias = Map | str | Path
 Workers: TypeAlias = int | str | None
 """A number of processes, None for one per core, or the address of a dask scheduler such as ``tcp://host:8786``."""
 PATIENCE = "20s"
-"""Time to wait for the scheduler of a cluster."""
+"""Time to wait for the scheduler of a cluster to respond."""
 CHANGED = {
     "views": "images, depth, masks or cameras than {trial.data} has now",
     "points": "depth points than {trial.depth_points} has now",
@@ -238,7 +238,7 @@ def left_to_do(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None 
 class InThisProcess(Executor):
     """An executor that runs every call immediately, in this process.
 
-    Calls neither report progress to the current job nor are stopped with it: cancelling ends an evaluation
+    Calls do not report progress to the current job and are not stopped with it: cancelling ends an evaluation
     between trials.
     """
 

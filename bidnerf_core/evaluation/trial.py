@@ -55,7 +55,7 @@ class ScalarPoseError:
 
 @dataclass(frozen=True)
 class Trace:
-    """Errors at the start and after each step; without a start, entry 0 is the method's first pose.
+    """Errors at the start and after each step; without a start, entry 0 is the error of the method's first pose.
 
     Raises ``ValueError`` if the two sequences differ in length or are empty.
     """
@@ -174,7 +174,7 @@ def registered_for(trial: Trial) -> list[tuple[str, str]]:
 
 
 def trial_views(trial: Trial, dataset: Capture) -> list[View]:
-    """Return the views that the method receives, with T_world_camera.
+    """Return the views that the method receives, with their true poses T_world_camera.
 
     The trial's faults are applied to the views, and their depth is removed if the trial withholds depth.
     """

@@ -174,9 +174,9 @@ class RayHits:
 class HitField(RadianceField, Protocol):
     """Optional interface of a field that computes all hits of a ray at once, as splats and meshes do.
 
-    ``render`` then uses ``hits`` instead of ``sampler`` and ``query``. The latter remain available for
-    points and for other ways of sampling rays, and are consistent with ``hits``: the integral of ``query``'s density along a
-    ray gives the opacity of the ray's hits.
+    ``render`` then uses ``hits`` instead of ``sampler`` and ``query``. ``sampler`` and ``query`` remain available for points
+    and for other ways of sampling rays, and are consistent with ``hits``: the integral of ``query``'s density along a ray
+    gives the opacity of the ray's hits.
     """
 
     def hits(self, rays: Rays) -> RayHits:

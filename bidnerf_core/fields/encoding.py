@@ -15,7 +15,7 @@ from bidnerf_core.fields.contract import FieldValues, SceneBounds
 Network: TypeAlias = Callable[
     [Float[Tensor, "p 3"], Float[Tensor, "p 3"]], tuple[Float[Tensor, "p"], Float[Tensor, "p 3"]]
 ]
-"""Returns raw density and rgb in [0, 1] at points of the cube [-1, 1] and unit directions."""
+"""A function that returns raw density and RGB in [0, 1] at points of the cube [-1, 1], seen along unit directions."""
 
 
 def encoded_width(frequencies: int, include_input: bool = True) -> int:

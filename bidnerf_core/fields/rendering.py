@@ -306,8 +306,9 @@ def render_values(
 class _Composite(torch.autograd.Function):
     """Colour (without background), distance, opacity and weights of rays, from density and colour at their samples.
 
-    With ``q_i`` the derivative of the loss by weight i, its derivative by the density of sample i, of length l_i,
-    is ``l_i (T_i+1 q_i - sum_j>i w_j q_j)``, where T_i+1 is the transmittance behind the sample.
+    If ``q_i`` is the derivative of the loss with respect to weight i, the derivative of the loss with respect to
+    the density of sample i, of length l_i, is ``l_i (T_i+1 q_i - sum_j>i w_j q_j)``, where T_i+1 is the
+    transmittance behind the sample.
     """
 
     @staticmethod

@@ -110,11 +110,10 @@ class Importance:
 def inverse_transform(
     samples: RaySamples, weights: Float[Tensor, "*r s"], count: int, jitter: Generator | None
 ) -> tuple[Float[Tensor, "*r n"], Int[Tensor, "*r n"]]:
-    """Return ``count`` distances along each ray, by inverse transform sampling of the piecewise-constant PDF
-    ``weights`` over the intervals.
+    """Return ``count`` distances along each ray by inverse transform sampling, and the index of the interval of each.
 
-    The distances are in ascending order, each with the index of its interval. On a ray without weight, all lie
-    in the first interval.
+    ``weights`` is the piecewise-constant PDF over the intervals. The distances are in ascending order. On a ray without weight, all
+    distances lie in the first interval.
     """
     cdf = torch.cumsum(weights, dim=-1)
     cdf = cdf / cdf[..., -1:].clamp(min=torch.finfo(cdf.dtype).tiny)
@@ -334,7 +333,7 @@ def scaled_field(field: RadianceField, scale: float) -> ScaledField:
 
 
 def shrunk(rays: Rays, scale: float) -> Rays:
-    """Convert rays of a scaled world to the world of the field."""
+    """Convert rays from a world scaled by ``scale`` to the world of the wrapped field."""
     return Rays(rays.origins / scale, rays.directions, rays.near / scale, rays.far / scale)
 
 

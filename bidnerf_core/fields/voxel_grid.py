@@ -105,9 +105,7 @@ class VoxelGrid:
 
 
 class OccupancyMask(nn.Module):
-    """A grid whose cells are marked as occupied or empty, according to where there may be matter. Initially
-    all cells are occupied.
-    """
+    """A grid whose cells are marked as empty or as possibly occupied by matter; initially, all are occupied."""
 
     cells: Bool[Tensor, "x y z"]
 
@@ -117,7 +115,8 @@ class OccupancyMask(nn.Module):
         self.register_buffer("cells", torch.ones(grid.shape, dtype=torch.bool))
 
     def holds(self, positions: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
-        """Return whether there may be matter at ``positions`` (metres, world); positions outside
-        the grid take the value of the nearest border cell.
+        """Return whether there may be matter at ``positions`` (metres, world).
+
+        Positions outside the grid take the value of the nearest border cell.
         """
         return self.grid.at(self.cells, positions)

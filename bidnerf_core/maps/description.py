@@ -119,7 +119,7 @@ class MapInfo:
         return f"its training stopped at step {self.step}; 'bidnerf train' with --resume continues it"
 
     def scaled(self, factor: float, unit: LengthUnit) -> MapInfo:
-        """Return the description of the map scaled by ``factor`` to ``unit``; the weights keep the unit of training."""
+        """Return the description of the map scaled by ``factor``, with lengths in ``unit``; the weights keep the unit of training."""
         frame = self.field_frame or FieldFrame(1.0, self.bounds)
         scale = frame.scale * factor
         return replace(

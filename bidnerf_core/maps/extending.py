@@ -1,4 +1,4 @@
-"""Extending a map with new photos: they are localized, training continues, and landmarks and surface are updated."""
+"""Extending a map with new photos: localizing them, training further, and updating the landmarks and the surface."""
 
 from __future__ import annotations
 

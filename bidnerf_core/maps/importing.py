@@ -221,7 +221,7 @@ def _described(structure: Structure, features: str, origin: Origin) -> tuple[Rea
     views, images, labels = list[View](), list[ImageKeypoints](), list[Tensor]()
     for shot, keypoints, observed in zip(capture.shots, structure.keypoints, structure.observed, strict=True):
         stored, T = shot.camera, shot.T_world_camera
-        assert isinstance(stored, Intrinsics)  # as the importer promises
+        assert isinstance(stored, Intrinsics)  # ensured by the importer
         assert T is not None
         camera, T = stored.at_most(USEFUL_SIDE), T.translated(offset)
         order = (observed < 0).long().argsort(stable=True)

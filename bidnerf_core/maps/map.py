@@ -106,7 +106,7 @@ class Map:
 
     @property
     def has_field(self) -> bool:
-        """Whether the map has a radiance field; a landmark-only map has none and localizes images by its landmarks."""
+        """Whether the map has a radiance field; a landmark-only map has none and localizes images with its landmarks."""
         return has_field(self.field)
 
     @property

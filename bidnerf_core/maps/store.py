@@ -117,7 +117,7 @@ def write_parts(
     landmarks (with landmarks) and the colour error (with landmarks or a capture record) are stored. The caller
     must hold the folder's lock.
 
-    Raises ``InputError`` for landmarks whose detector has no name by which a query could find it, and if the
+    Raises ``InputError`` for landmarks whose detector has no name, so that queries could not use it, and if the
     map was retrained while a part was built.
     """
     if landmarks is not None and not landmarks.features:

@@ -240,7 +240,7 @@ def _with_field(
 
 @contextlib.contextmanager
 def finished_parts(folder: Path | None) -> Iterator[None]:
-    """Name the finished parts of the map in the ``Cancelled`` that the work in the context raises."""
+    """Add the finished parts of the map to the message of a ``Cancelled`` that is raised within the context."""
     try:
         yield
     except Cancelled as stopped:

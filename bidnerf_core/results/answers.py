@@ -290,7 +290,7 @@ class Answers:
 
     @property
     def _known(self) -> tuple[SE3, SE3] | None:
-        """The accepted poses whose true poses are known, and these true poses; None if there are none."""
+        """The accepted poses whose true poses are known, and the true poses; None if there are none."""
         known = [(answer.found.T_world_camera, answer.truth) for answer in self.accepted if answer.truth]
         if not known:
             return None
@@ -379,7 +379,7 @@ def localize_each(
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Answers:
-    """Localize each query in a map, or in the one of several maps that the query shows.
+    """Localize each query in a map or, among several maps, in the one that the query shows.
 
     A query that cannot be read or localized does not stop the others, but if it is the only query, its error is
     raised. ``start`` returns the initial T_world_camera of a query; method ``auto`` needs none, and with

@@ -81,7 +81,7 @@ def standard_deviations(covariance: Float[Tensor, "6 6"]) -> tuple[float, float]
 def within(
     found: SE3, true: SE3, covariance: Float[Tensor, "*c 6 6"], probability: float = 0.95
 ) -> Bool[Tensor, "*b"]:
-    """Return whether the error of ``found`` lies within its covariance's bound for a probability.
+    """Return whether the error of ``found`` lies within the confidence bound that its covariance implies.
 
     The bound is the quantile of the chi-squared distribution with 6 degrees of freedom, 12.59 for 0.95. If
     the covariances are consistent, that fraction of errors lies within the bound. The result is False if the

@@ -63,7 +63,7 @@ class Painter:
         self.observed: Float[Tensor, "h w 3"] = frame.rgb if scale >= 1 else reduced(frame.rgb, *size)
 
     def rendered(self, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
-        """Render the map as the photo's camera would see it."""
+        """Render the map with the photo's camera at a pose."""
         T = T_world_camera.translated(-origin_of(self._map))
         return render_picture(self._map.field, self._camera, T, self._map.bounds).rgb
 
@@ -95,7 +95,7 @@ def as_picture(image: ArrayLike | Tensor, what: str = "image") -> UInt8[np.ndarr
 
 
 def blend(observed: ArrayLike | Tensor, rendered: ArrayLike | Tensor) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the pale mean of two images, with the edges of each in a separate colour; the edges coincide at the true pose."""
+    """Return a pale blend of two images, with the edges of each in a separate colour; at the true pose, the edges coincide."""
     a, b = as_picture(observed, "observed"), as_picture(rendered, "rendered")
     mixed = 0.55 * (a / 2 + b / 2) + 0.45 * 255
     for image, colour in ((b, (235, 0, 140)), (a, (0, 190, 110))):

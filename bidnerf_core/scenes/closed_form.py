@@ -1,7 +1,7 @@
 """Closed-form scenes with exact depth.
 
 A scene is a list of painted solids. Its colour does not depend on the viewing direction, so any radiance field can learn the
-scene; its depth is exact, so any error is the field's.
+scene; its depth is exact, so any error is that of the field.
 """
 
 from __future__ import annotations
@@ -131,8 +131,7 @@ def orbit(
 
 
 def look_around(bounds: SceneBounds, count: int, seed: int = 0, spread: float = 0.5) -> list[SE3]:
-    """Return poses (``T_world_camera``) in a room, at head height, in all compass directions, tilted slightly
-    up or down.
+    """Return poses (``T_world_camera``) at head height in a room, in all compass directions, tilted slightly up or down.
 
     Each camera stands about ``spread`` of the way from the middle of the room to the wall behind it, to see
     much of the room.

@@ -17,7 +17,7 @@ class GaussianBlobs:
     """A sum of isotropic Gaussian clouds with smoothly changing colour; infinitely differentiable.
 
     The field computes in the precision of the positions. ``moved`` moves the whole scene, so that a test can check that
-    moving the world moves the result.
+    results move with the world.
     """
 
     centres: Float[Tensor, "k 3"]  # metres, frame of the field

@@ -218,7 +218,7 @@ class Primitive:
 
 
 def _chord(middle: Tensor, squared: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the interval ``middle`` -+ sqrt(squared); where ``squared`` is negative, it is empty: it ends before it starts."""
+    """Return the interval ``middle`` -+ sqrt(squared); where ``squared`` is negative, the interval is empty and ends before it starts."""
     half = squared.clamp(min=0).sqrt()
     half = torch.where(squared < 0, -torch.inf, half)
     return middle - half, middle + half

@@ -210,7 +210,7 @@ def similar_pairs(descriptors: Sequence[np.ndarray]) -> Pairs:
     """Return the pairs of photos to match: neighbours, and each photo with its 20 most similar ones by descriptors (n, 128).
 
     Neighbours are likely to overlap, since photos and frames are taken one after another. Similar photos close loops, and connect
-    photos that are in arbitrary order. The similarity of two photos is the product of their vectors of locally aggregated
+    photos that are in arbitrary order. The similarity of two photos is the scalar product of their vectors of locally aggregated
     descriptors (VLAD, Jégou et al. 2010), whose words are found in the photos themselves.
     """
     count, known = len(descriptors), [torch.from_numpy(own) for own in descriptors]

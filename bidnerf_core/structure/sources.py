@@ -1,9 +1,9 @@
 """The input of structure from motion: photos of a folder and its subfolders, and frames of a video.
 
 As many frames are chosen as the image motion requires, each the sharpest among its neighbours. The image motion is the displacement
-of tracked corners, accumulated along the video. A shaking camera does not add to it, since corners are tracked from one anchor frame
-until they have moved by a few percent of the image. Frames are chosen at equal steps of the accumulated motion: none while the camera
-rests, many while it turns.
+of tracked corners, accumulated along the video. Camera shake does not add to the motion, since corners are tracked from one anchor
+frame until they have moved by a few percent of the image. Frames are chosen at equal steps of the accumulated motion: none while the
+camera rests, many while it turns.
 """
 
 from __future__ import annotations

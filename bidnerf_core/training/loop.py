@@ -124,7 +124,7 @@ class Replayable:
 
 
 def cosine(step: int, total: int, warmup: int = 100, last: float = 0.02) -> float:
-    """Return the factor on the learning rate: a linear warm-up, then half a cosine down to ``last``."""
+    """Return the factor for the learning rate: a linear warm-up, then half a cosine down to ``last``."""
     warmup = min(warmup, total // 10)
     if step < warmup:
         return (step + 1) / warmup

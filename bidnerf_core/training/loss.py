@@ -34,13 +34,12 @@ def supervised_loss(
 
 
 def ray_termination(rendering: Rendering, batch: TrainingBatch) -> Float[Tensor, ""]:
-    """Return the mean distance (metres) between the rays' weight and their measured depth; 0 if no ray has a
-    measurement.
+    """Return the mean distance (metres) of the rays' weight from their measured depth; 0 if no ray has a measurement.
 
-    Like the ray termination loss of DS-NeRF (Deng et al. 2022) it is smallest if all weight is at the
-    measured depth; an error of the mean depth could also be 0 with equal weight on both sides. If a
-    ray's weights sum to less than 1, the rest counts as if it were at the camera. For distances from landmarks, the mean is also taken over
-    their normal distribution, so that weight within the standard deviation is hardly moved.
+    Like the ray termination loss of DS-NeRF (Deng et al. 2022), it is smallest if all weight is at the measured depth; an error of the mean
+    depth could also be 0 with equal weight on both sides. If a ray's weights sum to less than 1, the rest counts as if it were at the
+    camera. For distances from landmarks, the mean is also taken over their normal distribution, so that weight within the standard
+    deviation is hardly moved.
     """
     measured, distance, deviation = batch.observed.measured, batch.observed.distance, batch.deviation
     weights, middles, opacity = rendering.weights, rendering.samples.middles, rendering.opacity
@@ -55,9 +54,7 @@ def ray_termination(rendering: Rendering, batch: TrainingBatch) -> Float[Tensor,
 
 
 def expected_distance(offset: Float[Tensor, "*p"], deviation: Float[Tensor, "*#p"]) -> Float[Tensor, "*p"]:
-    """Return the mean of ``|offset + e|`` for normal errors ``e`` with a standard deviation of ``deviation``
-    (folded normal).
-    """
+    """Return the mean of ``|offset + e|`` for normal errors ``e`` with standard deviation ``deviation`` (folded normal)."""
     sigma = deviation.clamp(min=torch.finfo(offset.dtype).tiny)
     ratio = (offset / sigma).clamp(-30, 30)
     mean = sigma * sqrt(2 / pi) * torch.exp(-ratio.square() / 2) + offset * torch.erf(ratio / sqrt(2))
@@ -65,8 +62,7 @@ def expected_distance(offset: Float[Tensor, "*p"], deviation: Float[Tensor, "*#p
 
 
 def distortion(rendering: Rendering, side: float) -> Float[Tensor, ""]:
-    """Return the mean distortion of the rays' weights (Barron et al. 2022, eq. 15), with distances in units
-    of ``side``.
+    """Return the mean distortion of the rays' weights (Barron et al. 2022, eq. 15), with lengths in units of ``side``.
 
     The distortion is smallest if a ray's weight is in one short interval. Sums over pairs are computed from cumulative
     sums.

@@ -225,8 +225,7 @@ def _home_of(frames: Sequence[Frame], device: torch.device) -> torch.device:
 def _landmark_pixels(
     views: Sequence[View], offsets: Int[Tensor, "v"]
 ) -> tuple[Int[Tensor, "m"], Float[Tensor, "m"], Float[Tensor, "m"]]:
-    """Return the pixels (indices among those of all views) that show landmarks, and the landmarks' distances and standard
-    deviations (metres).
+    """Return the pixels that show landmarks (indices over all views), and the distances of the landmarks with standard deviations (metres).
 
     Views with dense depth have none, since their own measurements are better.
     """

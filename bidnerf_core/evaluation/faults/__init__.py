@@ -1,6 +1,6 @@
 """Faults of sensors and scenes: named, seeded changes of an image.
 
-They test whether a localizer rejects its wrong answers.
+Faults test whether a localizer rejects its wrong answers.
 """
 
 from bidnerf_core.evaluation.faults.fault import (

@@ -56,7 +56,7 @@ def remeasured(frame: Frame, depth: Float[Tensor, "h w"]) -> Frame:
 
 
 def noisy(frame: Frame, size: float, generator: Generator, power: int = 1) -> Frame:
-    """Add independent Gaussian noise of standard deviation ``size * depth ** power``; 2 is typical of triangulating sensors."""
+    """Add independent Gaussian noise of standard deviation ``size * depth ** power``; power 2 is typical of triangulating sensors."""
     depth = depth_of(frame)
     noise = torch.randn(depth.shape, generator=generator, dtype=depth.dtype)
     return remeasured(frame, depth + size * depth**power * noise)

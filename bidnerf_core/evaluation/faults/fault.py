@@ -1,4 +1,4 @@
-"""A fault: a seeded change of a frame, whose size is one number; faults as text, alone or composed."""
+"""Faults: seeded changes of a frame, each with a size in one number; and faults as text, alone or composed."""
 
 from __future__ import annotations
 
@@ -128,17 +128,17 @@ def parse_faults(text: str) -> tuple[AppliedFault, ...]:
 
 
 def faulty(view: View, faults: str, seed: int) -> View:
-    """Return the view with all faults, applied in order.
+    """Apply all faults to a view, in order, and return the result.
 
-    ``T_ref_camera`` is the true pose of the faulty image. The random choices of a fault depend only on the
-    seed, the frame and the fault, regardless of other faults. Raises ``InputError`` for a depth fault on a
-    frame without measured depth.
+    The ``T_ref_camera`` of the result is the true pose of the faulty image. The random choices of a fault
+    depend only on the seed, the frame and the fault, regardless of other faults. Raises ``InputError`` for a
+    depth fault on a frame without measured depth.
     """
     for applied in parse_faults(faults):
         fault, T_ref_camera = FAULTS.load(applied.name), view.T_ref_camera
         if applied.size == fault.neutral:
             continue
-        # Each fault on each frame has a seed of its own for its random choices.
+        # Each fault has a separate seed on each frame for its random choices.
         text = f"{seed}\n{view.frame.name}\n{applied.name}".encode(errors="surrogatepass")
         stream = int.from_bytes(hashlib.blake2b(text, digest_size=7).digest(), "big")
         changed: Any = fault.change(view.frame, applied.size, torch.Generator().manual_seed(stream))
