@@ -109,7 +109,7 @@ def captured(
     # If a capture fails, torch leaves the thread on the capture's stream; the outer context restores it.
     with _capturing, torch.cuda.device(device), torch.cuda.stream(torch.cuda.current_stream(device)):
         try:
-            # Other threads may continue to launch.
+            # Other threads may continue to launch operations.
             pool, stream = memory or graph_memory(device)
             _notes.append(constants)
             with torch.cuda.graph(graph, pool, stream, capture_error_mode="thread_local"):
@@ -225,9 +225,7 @@ class _Remote:
             source.copy_(tensor)
         self._received.copy_(self._sent, non_blocking=True)
         with without_waiting():
-            if (
-                self._calls == 1
-            ):  # not in the first call, which fills caches and may be the only one of its shape
+            if self._calls == 1:  # the first call fills caches, and may be the only one of its shape
                 # During a capture, a thread cannot create what it uses for the first time, such as its handles for
                 # linear algebra, and another thread may have made the first call.
                 launched = self._step
@@ -358,8 +356,8 @@ def threads_at_most(count: int) -> Iterator[int]:
 def set_threads_here(count: int) -> None:
     """Set how many threads torch's operators use when called from this Python thread only.
 
-    ``torch.set_num_threads`` also sets the number for Python threads that start later, so that number is
-    restored.
+    ``torch.set_num_threads`` also sets the number for Python threads that start later; this function restores
+    that number.
     """
     with _setting:
         torch.get_num_threads()  # on first use, a thread takes the default, which would override a value set before

@@ -45,7 +45,7 @@ class InputWarning(UserWarning):
 
 
 class Cancelled(Exception):
-    """Raised when work stops because ``cancel`` returned True. The message states which partial results were saved."""
+    """Raised when work stops because ``cancel`` returned True. The message states what was saved, if anything."""
 
 
 def unknown_name(what: str, name: str, known: Collection[str]) -> InputError:

@@ -50,7 +50,7 @@ def job_context(progress: ProgressCallback | None = None, cancel: Cancel | None 
 
     Functions that take ``progress`` and ``cancel`` from users open this block once; the functions that they call report with
     ``counter`` and stop in ``check_cancelled``. A callback that is None is inherited from the enclosing block. Raises ``InputError``
-    if ``cancel`` is not callable (for example, if it is an event rather than its ``is_set``).
+    if a callback is not callable (for example, if ``cancel`` is an event rather than its ``is_set``).
     """
     kinds = {
         "cancel": "a function, such as the is_set of an event",

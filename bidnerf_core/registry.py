@@ -1,5 +1,4 @@
-"""Registration of third-party parts by name: backends, readers, methods, features, faults, writers, importers,
-exporters and protocols of the service.
+"""Plugins by name: backends, readers, methods, features, faults, writers, importers, exporters and service protocols.
 
 A distribution provides an object through an entry point of the group ``bidnerf.GROUP``, as bidnerf itself does
 for the bundled objects. A script or a notebook adds an object with ``register``. Listing reads only metadata (and
@@ -127,9 +126,10 @@ def require_registered(names: Iterable[tuple[str, str]]) -> None:
 
 
 def list_plugins(group: str) -> list[PluginInfo]:
-    """Return all plugins of a group, sorted by name, without importing any.
+    """Return all plugins of a group, sorted by name; nothing is imported except tables (see ``TABLE``).
 
-    A name declared by two distributions is listed twice, with a fault: neither can be loaded.
+    A name that two distributions declare is listed twice, with a fault: neither plugin can be loaded. Raises
+    ``InputError`` for an unknown group.
     """
     if group not in GROUPS:
         raise unknown_name("group of plugins", group, GROUPS)
@@ -212,7 +212,7 @@ def _described(error: BaseException) -> str:
 
 
 class Plugins(Mapping[str, Plugin], Generic[Plugin]):
-    """Mapping from name to plugin for a group. Iteration imports no plugins; each is imported and checked on look-up."""
+    """Mapping from name to plugin for a group. Iteration only lists names; a plugin is imported and checked on look-up."""
 
     def __init__(self, group: str, defects: Defects, first: Sequence[str] = ()) -> None:
         """``first``: names to list first, in this order, before the other bundled plugins and then the rest."""
@@ -271,7 +271,7 @@ def interface_defects(
         method = plugin if name == "__call__" else getattr(plugin, name)
         try:
             inspect.signature(method).bind(*[None] * len(parameters))
-        except TypeError:  # it does not take them, or is no function
+        except TypeError:  # it does not take these parameters, or is not callable
             yield f"{'it' if name == '__call__' else name} does not take ({', '.join(parameters)})"
         except ValueError:  # compiled code may have no signature
             pass

@@ -175,9 +175,7 @@ def query(
     box = constant((*bounds.centre, 2 / bounds.side, 1 / bounds.side), values)
     inputs = len(levels) * features
     index = count = torch.empty(0, dtype=torch.long, device=values.device)
-    if (
-        wanted is not None
-    ):  # the wanted points' indices in order, without making the host wait for their number
+    if wanted is not None:  # the wanted points' numbers in order; the host does not wait to count them
         place = wanted.long().cumsum(0)
         index, count = place.new_empty(n + 1), place[-1:]
         index.scatter_(0, torch.where(wanted, place - 1, n), torch.arange(n, device=place.device))

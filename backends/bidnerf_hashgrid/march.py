@@ -110,7 +110,7 @@ def march_kernel(
 
 @triton.jit
 def _interval(middles, at, count, near, far, leave, grid, MOST: tl.constexpr, CONTRACTED: tl.constexpr):
-    """Return the interval of one step around each of a ray's steps ``at`` (metres along the ray), clipped to the ray."""
+    """Return start and end (metres along the ray) of the one-step intervals around a ray's steps ``at``, and which exist."""
     step, radius = tl.load(grid + 4), tl.load(grid + 3)
     there = (at >= 0) & (at < count)
     place = tl.load(middles + at, mask=there, other=0.0)
@@ -122,7 +122,7 @@ def _interval(middles, at, count, near, far, leave, grid, MOST: tl.constexpr, CO
 
 @triton.jit
 def _joined(middles, at, count, near, far, leave, grid, MOST: tl.constexpr, CONTRACTED: tl.constexpr):
-    """Return the intervals without overlaps from rounding, see ``gathered``."""
+    """Return the result of ``_interval`` without the overlaps that rounding causes, see ``gathered``."""
     start, end, there = _interval(middles, at, count, near, far, leave, grid, MOST, CONTRACTED)
     following, _end, more = _interval(middles, at + 1, count, near, far, leave, grid, MOST, CONTRACTED)
     end = tl.where(more, tl.minimum(end, following), end)

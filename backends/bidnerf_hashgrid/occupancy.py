@@ -173,7 +173,7 @@ class OccupancyGrid(nn.Module):
     ) -> tuple[Float[Tensor, "r s"], Bool[Tensor, "r s"]]:  # fmt: skip
         """Return each ray's first steps in occupied cells in the form of ``_all_steps``, without waiting for the device."""
         box = self.grid.rays(rays.origins, rays.directions)
-        # Steps are counted from ``near``, as everywhere, and those before the grid are skipped; contracted space has none.
+        # Steps are counted from ``near``, as everywhere. Those before the grid are skipped; a contracted grid has none.
         skipped = ((box.near - near) / self.step).floor().clamp(min=0) * (not self.bounds.contracted)
         steps, most = torch.arange(self._steps, dtype=near.dtype, device=near.device), self._most
         place = near[:, None] + (skipped[:, None] + steps + offset[:, None]) * self.step
@@ -231,7 +231,7 @@ def _at(
 ) -> Float[Tensor, "b s 3"]:
     """Return the positions at distances along the rays, or along the rays with the indices ``ray``.
 
-    Each coordinate of the positions is contiguous in memory: sums over rows of three numbers take ten times as long.
+    Each coordinate of the positions is contiguous in memory, since sums over rows of three numbers take ten times as long.
     """
     origins, directions = (part.t().contiguous() for part in (rays.origins, rays.directions))
     if ray is not None:

@@ -165,7 +165,7 @@ def _update(
     grid: OccupancyGrid, rays: Rays, samples: RaySamples, density: Float[Tensor, "r s"], step: int, config: HashGridConfig
 ) -> None:  # fmt: skip
     """Update the occupancy grid with the densities of one step's samples, and their rendering weights."""
-    # Weights as if samples were one grid step long: concentrated samples are longer or shorter.
+    # The weights are scaled to samples of one grid step, since concentrated samples are longer or shorter.
     place = grid.bounds.spacing(rays).place
     weights = (
         rendering_weights(density, samples)

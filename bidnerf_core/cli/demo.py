@@ -32,7 +32,7 @@ class Trial(NamedTuple):
     view: View
     start: SE3
     auto: Localization  # without the start
-    bid: Localization  # from it
+    bid: Localization  # from the start
 
     def errors(self, poses: SE3) -> PoseError:
         """Return the errors of poses relative to the true pose of the frame."""

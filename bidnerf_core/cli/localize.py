@@ -250,7 +250,7 @@ class Run:
         try:
             yield
             is_whole = True
-        finally:  # whatever ended it: also Ctrl-C, SIGTERM, a closed pipe, a full disk
+        finally:  # however the run ended: also by Ctrl-C, SIGTERM, a closed pipe or a full disk
             with uninterrupted():
                 if is_whole and total > 1:
                     scene = answers.scene

@@ -130,7 +130,7 @@ def run_scale(
     if out is not None:
         check_folder(out, (map,), may_be_map=overwrite)
     load_info(map)  # raises if there is no map
-    # The map is locked before it is read, so that nobody changes it meanwhile.
+    # The map is locked before it is read, so that no other program changes it meanwhile.
     with map_folder(out or map, overwrite or out is None):
         scene = load_map(map)
         if poses is not None:

@@ -98,7 +98,7 @@ def refuse(options: Mapping[str, object], reason: str, expected: str | None = No
 
 @contextlib.contextmanager
 def wrong_usage() -> Iterator[None]:
-    """Convert ``InputError`` to ``UsageError``, for arguments that are wrong regardless of the contents of files."""
+    """Convert an ``InputError`` in the block to ``UsageError``, for arguments that are wrong whatever files contain."""
     try:
         yield
     except InputError as error:

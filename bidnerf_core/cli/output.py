@@ -60,7 +60,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], wide: str
 
 
 def check_output(out: Path, inputs: Iterable[Path | str | None]) -> None:
-    """Raise, before any work is done, if the file ``out`` cannot be written or would replace an input.
+    """Raise an error, before any work is done, if the file ``out`` cannot be written or would replace an input.
 
     Inputs are the files of any map, the ``inputs``, and the files in folders among the ``inputs``. Raises
     ``UsageError`` if ``out`` would replace an input, and ``InputError`` if ``out`` is a folder, or if its folder does

@@ -134,7 +134,7 @@ def _loaded(command: str, target: Callable[..., Any], words: Sequence[str]) -> d
 def _walk(
     target: Any, loaded: Mapping[str, Any], default: Any = None, left_out: frozenset[str] = frozenset()
 ) -> Iterator[tuple[Parameter, Any]]:
-    """Yield the parameters of ``target`` and of nested dataclasses; a parameter that is a dataclass comes with its default instance."""
+    """Yield each parameter of ``target`` and of nested dataclasses, with its default instance if it is a dataclass, else None."""
     for parameter in parameters_of(target):
         if parameter.name in left_out:
             continue

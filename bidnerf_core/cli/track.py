@@ -162,7 +162,7 @@ def run_track(
                 tracker, recorded, every=frames.every, depth=frames.depth, answers=path,
                 each=None if video is None else video.add,
             )  # fmt: skip
-    finally:  # whatever ended it: the frames so far are written
+    finally:  # however tracking ended, the frames so far are written
         with uninterrupted():
             if path.given:
                 try:
@@ -274,7 +274,7 @@ def _arriving(folder: Path) -> Iterator[FrameRequest]:
         photos, others = photos_in(folder)
         waiting = [photo for photo in photos if photo not in given]
         for photo in waiting:
-            # Files of other kinds hold something else about the photo, such as NAME.json.
+            # Other files of the photo's name, such as NAME.json, are not depth.
             depths = [
                 file for file in others
                 if file.name.startswith(f"{photo.stem}.") and file.suffix.lower() in (".npy", *IMAGE_SUFFIXES)

@@ -48,11 +48,12 @@ class ServiceClient:
     ) -> dict[str, Any]:
         """Localize a photo and return the same JSON as ``bidnerf localize``.
 
-        ``photo`` is a file, its bytes, or a uint8 array (h, w) or (h, w, 3). ``map`` names the map to search, by
-        default whichever map the photo shows. ``depth`` is a file, its bytes, or an array (h, w) of planar z.
-        ``camera`` is a camera file or its content, and ``start`` is T_world_camera as 4x4 rows. ``known`` takes
-        further values by keyword: ``name`` (of the frame in the answer), ``focal`` (pixels of the stored image),
-        ``hfov`` (degrees), ``depth_unit`` (metres per step of the depth image) and ``seed``.
+            ``photo`` is a file, its bytes, or a uint8 array (h, w) or (h, w, 3). ``map`` names the map to search, by
+            default whichever map the photo shows. ``depth`` is a file, its bytes, or an array (h, w) of planar z: floats
+        in metres or integers in millimetres, unless ``depth_unit`` is given.
+            ``camera`` is a camera file or its content, and ``start`` is T_world_camera as 4x4 rows. ``known`` takes
+            further values by keyword: ``name`` (of the frame in the answer), ``focal`` (pixels of the stored image),
+            ``hfov`` (degrees), ``depth_unit`` (metres per step of the depth image) and ``seed``.
         """
         edge = uuid.uuid4().hex
         rows = getattr(start, "tolist", lambda: start)()

@@ -245,7 +245,7 @@ async def _greeting(
 ) -> tuple[dict[str, Any], asyncio.StreamReader, asyncio.StreamWriter]:
     """Return the first message of a new process, and streams that accept messages of up to 16 MiB.
 
-    Raises ``InputError`` if the process reports an error, and one of ``LOST`` if it died or does not answer in time.
+    Raises ``InputError`` if the process reports an error, and one of ``LOST`` if it dies or does not answer in time.
     """
     reader, writer = await asyncio.open_connection(sock=connection, limit=2**24)
     try:

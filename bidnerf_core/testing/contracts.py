@@ -169,7 +169,7 @@ SHIFT = 6
 
 
 class FeaturesContract(Named):
-    """Tests of a keypoint detector; to use them, derive a class whose name begins with ``Test`` and set its registered ``name``.
+    """Tests of a keypoint detector; to use them, derive a class whose name begins with ``Test`` and set the detector's ``name``.
 
     ``repeated`` is the minimum repeatability: the fraction of keypoints that must be detected again, and
     matched by their descriptors, in an image shifted by a few pixels.
@@ -275,7 +275,7 @@ def _blank() -> Float[Tensor, "h w 3"]:
 
 
 class FaultContract(Named):
-    """Tests of a fault; to use them, derive a class whose name begins with ``Test`` and set its registered ``name``."""
+    """Tests of a fault; to use them, derive a class whose name begins with ``Test``, and set ``name`` to that of the fault."""
 
     kind = "fault"
 

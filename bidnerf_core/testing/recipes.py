@@ -25,7 +25,7 @@ EXPOSURE = 0.06
 
 
 class Recorder:
-    """A ``Report`` that records progress and saved states, which go through safetensors, as in a map on disk."""
+    """A ``Report`` that records progress and saved states; the states pass through safetensors, as in a map on disk."""
 
     def __init__(
         self, due: Collection[int] = (), stop: int | None = None, state: TrainingState | None = None
@@ -59,7 +59,7 @@ def stored(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 class Training(NamedTuple):
-    """A training on RGB-D views whose report requested the state after the first, middle and last of ``config.steps`` steps."""
+    """A training run on RGB-D views whose report requested states after the first, middle and last of ``config.steps`` steps."""
 
     field: Any
     before: dict[str, Tensor]  # the field's state
@@ -126,7 +126,7 @@ def check_exposure(backend: Backend, config: Any) -> None:
 
 
 def check_reports(backend: Backend, total: int, training: Training) -> None:
-    """Check that all ``total`` steps were reported in order, and that states, which hold the field, were saved exactly when due."""
+    """Check that all ``total`` steps were reported in order and states saved exactly when due, the last with the trained field."""
     due, report, who = sorted({1, total // 2, total}), training.report, f"{type(backend).__name__}.train"
     steps = [(progress.step, progress.total) for progress in report.steps]
     odd = [p for p in report.steps if not (math.isfinite(p.loss) and math.isfinite(p.psnr))]
@@ -152,7 +152,7 @@ def check_reports(backend: Backend, total: int, training: Training) -> None:
 
 
 def check_resuming(backend: Backend, make: Callable[[], Any], config: Any, whole: Training) -> None:
-    """Check that training that stops midway with ``TrainingStopped`` and is resumed gives a bitwise identical result."""
+    """Check that training stopped midway, by ``TrainingStopped``, and then resumed gives a bitwise identical result."""
     who, middle = f"{type(backend).__name__}.train", config.steps // 2
     second, third = make(), make()
     for field in (second, third):  # another test checks whether builds differ

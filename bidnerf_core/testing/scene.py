@@ -43,7 +43,7 @@ def rgb_views() -> tuple[View, ...]:
 
 
 def exposed_views(log_gain: float) -> tuple[View, ...]:
-    """Return the views without depth, dimmed and then alternately brighter and darker by a factor of ``exp(log_gain)``."""
+    """Return the RGB views, dimmed and then made alternately brighter and darker by the factor ``exp(log_gain)``."""
     gains = [DIMMED * math.exp(log_gain * (-1) ** number) for number in range(len(rgb_views()))]
     return tuple(
         replace(v, frame=replace(v.frame, rgb=g * v.frame.rgb))
@@ -98,7 +98,7 @@ def awkward_rays() -> dict[str, Rays]:
 
 
 def picked(rays: Rays, index: Tensor) -> Rays:
-    """Return the rays at ``index``, in its shape."""
+    """Return the rays at the indices ``index``, arranged in the shape of ``index``."""
     return Rays(rays.origins[index], rays.directions[index], rays.near[index], rays.far[index])
 
 

@@ -106,7 +106,7 @@ def shown_answer(
     advice = ADVICE.get(found.outcome)
     other = None if record is None or not finite else _runner_up(scene, found, record, frame, quick)
     answer, summary = last_answer(record), ""
-    with contextlib.suppress(PluginError):  # it is not installed here
+    with contextlib.suppress(PluginError):  # the method may not be installed here
         summary = METHODS.load(found.method).summary
     places = found.poses.translation.detach().cpu().double()
     return {

@@ -36,7 +36,7 @@ def last_answer(record: SearchRecord | None) -> LandmarkAnswer | None:
 
 
 def contests(found: Localization, record: SearchRecord | None) -> tuple[Json, ...]:
-    """Return up to three comparisons: of poses by landmarks and the mirror image, of the pose with its rivals, and of cameras."""
+    """Return up to three comparisons: between poses by landmarks, of the pose with other explanations, and between cameras."""
     shown, answer, support = list[Json](), last_answer(record), found.diagnostics
     if answer is not None and len(answer.modes) > 1:
         shown.append(_of_modes(found, answer))

@@ -76,9 +76,11 @@ def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Flo
     place = T_world_camera.translation.detach().cpu().double()
     if scene.surface is not None and len(scene.surface.surfels):
         away = (scene.surface.surfels.positions.cpu().double() - place).norm(dim=-1).min()
-        bounds = replace(bounds, near=min(bounds.near, float(away) / 2))  # the nearest matter is seen
+        bounds = replace(
+            bounds, near=min(bounds.near, float(away) / 2)
+        )  # so that the nearest surface is seen
     distance = float((place - torch.tensor(bounds.centre, dtype=torch.float64)).norm())
-    # Farther from the centre than this, there is no more matter.
+    # There is no matter farther from the centre than this.
     beyond = bounds.far if bounds.contracted else math.hypot(*bounds.size) / 2
     bounds = replace(bounds, far=max(bounds.far, distance + beyond))
     if not has_field(scene.field):

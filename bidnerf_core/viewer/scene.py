@@ -43,8 +43,8 @@ MOST_POINTS = 120_000
 def shown_map(scene: Map, thumbnails: int = 60) -> Json:
     """Return the JSON values of a map; ``thumbnails`` is the maximum number of cameras with a rendered thumbnail.
 
-    ``unit`` is the symbol of the unit of length, ``up_source`` states how the upward direction was found, and
-    ``extent`` (in the unit of the map) is the size of the region that the initial view should show.
+    ``unit`` is the symbol of the unit of length, ``up_source`` states how the upward direction ``up`` was found, and
+    ``centre`` and ``extent`` (in the unit of the map) are those of the region that the initial view should show.
     """
     up = scene.up
     centre, extent = _framing(scene)
