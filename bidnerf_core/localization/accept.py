@@ -88,7 +88,7 @@ LANDMARK_BOUNDS = (
 
 
 def judge(evidence: Evidence, log_odds: float = 0.0) -> Verdict:
-    """Return the verdict of the first violated bound or, if all bounds hold, of the logistic model.
+    """Return the verdict on a landmark-based pose: that of the first violated bound or, if all bounds hold, that of the logistic model.
 
     ``log_odds`` are the prior log odds of the pose, relative to those of an image that may have been taken anywhere.
     """
@@ -138,7 +138,7 @@ class LogisticModel:
 
 @lru_cache(maxsize=1)
 def stored() -> dict[str, dict[str, object]]:
-    """Return the model and the calibrated risks, fitted by ``benchmarks/confidence.py`` and ``benchmarks/risk.py``."""
+    """Return the parameters of the model and the calibrated risks, fitted by ``benchmarks/confidence.py`` and ``benchmarks/risk.py``."""
     found: dict[str, dict[str, object]] = json.loads((files(__package__) / "acceptance.json").read_text())
     return found
 
@@ -152,9 +152,8 @@ def model() -> LogisticModel:
 def least_confidence(risk: float) -> float:
     """Return the minimum confidence of accepted answers for a tolerated fraction ``risk`` of wrong ones.
 
-    It is the confidence calibrated for the largest risk that does not exceed ``risk``.
-
-    Raises ``InputError`` for a risk outside the calibrated range.
+    It is the confidence calibrated for the largest risk that does not exceed ``risk``. Raises ``InputError`` for a risk outside the
+    calibrated range.
     """
     levels: list[tuple[float, float]] = stored()["risk"]["least_confidence"]  # type: ignore[assignment]
     calibrated = Range(levels[0][0], levels[-1][0])
@@ -268,7 +267,7 @@ def support(
 
 
 def log_odds(rivals: Float[Tensor, "h n"], here: Float[Tensor, "n"]) -> Float[Tensor, "h"]:
-    """Return the log odds of the pose against each rival, from the costs of each measurement at both; 0 where not finite."""
+    """Return the log odds of the pose against each rival, from each measurement's cost at the rivals and ``here``; 0 where not finite."""
     difference = rivals - here
     error = difference.std(-1) * difference.shape[-1] ** 0.5
     # Half a unit of log odds per standard error of the difference: independent measurements would justify more, but the errors of

@@ -336,8 +336,6 @@ def nearest_piece(problem: Problem) -> Occluder | None:
     """Return the nearest large segment of a single depth image as a possible occluder.
 
     Returns None if there is no such segment or hardly any depth outside it, or if there are several images or another depth sensor.
-
-    Returns None if there is no such segment, if nothing else was measured, or if there are several images or another depth sensor.
     """
     view = problem.views[-1]
     if len(problem.views) != 1 or problem.depth_rays is not None or view.frame.depth is None:

@@ -17,11 +17,11 @@ from bidnerf_core.localization.result import Localization
 class Corrector:
     """Localizes frames in a background thread and maintains ``T_world_odom``, which corrects odometry drift.
 
-    A loop passes frames to ``give``, which never blocks: a localization takes longer than a frame, so a frame is dropped if
-    another is already waiting. Each accepted pose gives a new correction, computed with the odometry of the localized frame, so
-    the correction remains valid even if it arrives late. From then on, localizations start from the corrected odometry. An error of
-    the localizer is raised once, by the next ``give`` or ``close``; the thread continues with later frames. All methods may be called
-    from any thread. Use the corrector as a context manager, or call ``close``.
+    A loop passes frames to ``give``, which never blocks: since a localization takes longer than a frame interval, a frame is dropped if
+    another one is already waiting. Each accepted pose gives a new correction, computed with the odometry of the localized frame, so the
+    correction remains valid even if it arrives late. From then on, localizations start from the corrected odometry. An error of the
+    localizer is raised once, by the next ``give`` or ``close``; the thread continues with later frames. All methods may be called from any
+    thread. Use the corrector as a context manager, or call ``close``.
     """
 
     def __init__(self, localizer: Localizer) -> None:

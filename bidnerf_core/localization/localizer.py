@@ -67,11 +67,10 @@ class Localizer:
     ) -> None:
         """Prepare the map ``scene``, or the map in that folder, for ``method``.
 
-        ``config`` holds the method's settings: an instance of their type (``METHODS[method].config_type``), or a dictionary of
-        the settings that differ from the defaults or from ``preset``, the name of a set of settings (``METHODS[method].presets``).
-        The field, the surface and the landmarks are used on ``device``, by default where they are; parts of the map on another
-        device are copied.
-        ``warm_up``: initialize now, so that the first call is not delayed. Raises ``InputError`` for unsuitable arguments.
+        ``config`` holds the method's settings: an instance of their type (``METHODS[method].config_type``), or a dictionary of the settings
+        that differ from the defaults or from ``preset``, the name of a set of settings (``METHODS[method].presets``). The field, the
+        surface and the landmarks are used on ``device``, by default where they are; parts of the map on another device are copied. If
+        ``warm_up`` is true, lazy initialization is done now rather than in the first call. Raises ``InputError`` for unsuitable arguments.
         """
         scene = checked_map(scene, "Localizer")
         self.method = method
@@ -105,11 +104,11 @@ class Localizer:
     ) -> Localization:
         """Estimate T_world_camera of a frame, or of the last of several views.
 
-        ``query`` is a frame, the file of a photo (whose camera is from its EXIF or the map), or views with known relative
-        poses (``T_ref_camera`` in any common frame): a rig, or a window of a sequence. ``start`` is a guess at T_world_camera
-        of the last view, which some methods do not need. ``depth_rays`` are distances measured by another sensor, such as a
-        lidar, in the frame of the last camera; methods that use colour alone reject them. Raises ``InputError`` for a query
-        that cannot be localized at all; a doubtful pose is returned with an ``outcome`` other than ``CONVERGED``.
+        ``query`` is a frame, the path of a photo (whose camera is taken from its EXIF data or the map), or views with known relative poses
+        (``T_ref_camera`` in any common frame): a rig, or a window of a sequence. ``start`` is a guess at T_world_camera of the last view,
+        which some methods do not need. ``depth_rays`` are distances measured by another sensor, such as a lidar, in the frame of the last
+        camera; methods that use colour alone reject them. Raises ``InputError`` for a query that cannot be localized at all; a doubtful
+        pose is returned with an ``outcome`` other than ``CONVERGED``.
         """
         if depth_rays is not None:
             require_use_of_depth(self.method)
@@ -247,7 +246,7 @@ class Localizer:
 def checked_map(given: object, where: str) -> SceneMap:
     """Return ``given`` if it is a map, or the map in the folder ``given``.
 
-    Raises ``InputError``, prefixed with ``where``, for anything else, and as ``load_map`` does.
+    Raises ``InputError`` as ``load_map`` does, and, prefixed with ``where``, if ``given`` is neither a map nor a path.
     """
     if LOADERS and isinstance(given, str | Path):
         return LOADERS[0](Path(given))
@@ -281,7 +280,7 @@ def _views(query: Any) -> list[View]:
 
 
 def start_pose(start: Start, what: str = "start") -> SE3:
-    """Convert a pose in any form to a rigid transform in float64.
+    """Convert a pose in any form (see ``Start``) to a rigid transform in float64, on the CPU.
 
     Raises ``InputError``, prefixed with ``what``, for anything that is not a single pose.
     """

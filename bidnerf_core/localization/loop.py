@@ -177,14 +177,14 @@ class Loop:
         return self._fused(modes, states, term, given, searched)
 
     def nearest(self, strongest: int) -> Nearest:
-        """Return the landmarks most similar to the strongest keypoints of each image."""
+        """Return the landmarks most similar to up to ``strongest`` keypoints, the strongest ones, of each image."""
         count = min(strongest, max(len(image.keypoints) for image in self.query.images))
         if count not in self._nearest:
             self._nearest[count] = Nearest.of(self.query, self.matcher, count)
         return self._nearest[count]
 
     def _proposals(self) -> Iterator[tuple[Proposal, Nearest, float]]:
-        """Yield poses to refine, cheapest first: by sample consensus on the strongest keypoints, then on all keypoints; then the start."""
+        """Yield proposals with their matches and log10 false alarms: by consensus on the strongest keypoints, then on all; then the start."""
         most = max(len(image.keypoints) for image in self.query.images)
         nearest, record = self.nearest(STRONGEST), current_record()
         for count in dict.fromkeys((min(STRONGEST, most), most)):
@@ -409,7 +409,7 @@ class Loop:
         return replace(answer, fused=tuple(fused))
 
     def _log10_nfa(self, mode: Mode, state: States) -> float:
-        """Return log10 of the false alarms of the matches by descriptors that agree with a state of a mode."""
+        """Return log10 of the number of false alarms of the matches by descriptors that agree with a state of a mode."""
         agreeing = int(inliers(mode.query, self.landmarks, mode.by_descriptors, state).sum())
         return log10_nfa(len(mode.by_descriptors), agreeing, mode.query.by_chance)
 

@@ -134,7 +134,7 @@ def cells(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Int[Tensor, "m"]:
 
 @lru_cache(maxsize=1)
 def mirrored_sift() -> Int[Tensor, "128"]:
-    """Return the channels of the SIFT descriptor of a mirrored patch: the rows (across the orientation) and the angles are reversed."""
+    """Return the permutation of channels that mirrors a SIFT descriptor: rows (across the orientation) and angles are reversed."""
     row, column, angle = torch.meshgrid(torch.arange(4), torch.arange(4), torch.arange(8), indexing="ij")
     return (((3 - row) * 4 + column) * 8 + (-angle) % 8).flatten()
 

@@ -124,7 +124,8 @@ class Posterior:
     def mass(self, distance: float, shared: Float[Tensor, "6 6"], credible: Bool[Tensor, "h"]) -> float:
         """Return the probability that the pose is right and its explanation is ``credible``.
 
-        ``distance`` (metres) is the distance of the scene; ``shared`` is a covariance added to the covariances of all explanations.
+        A pose is right within ``TOLERANCE`` of ``distance`` (metres), the distance of the scene, and within 0.05 rad. ``shared`` is a
+        covariance added to the covariances of all explanations.
         """
         weight = self.probability * credible
         return mass_within(weight, self.update - self.mean, self.covariance + shared, distance)
@@ -229,7 +230,7 @@ def most_probable(states: States, term: Landmarks) -> States:
 
 
 def graduate(states: States, term: Landmarks) -> States:
-    """Refine the states in several fits, whose noise decreases to the largest noise of keypoints that match."""
+    """Refine the states in several fits, lowering the noise from 16 times the largest noise of matched keypoints to that noise."""
     for factor in (16.0, 8.0, 4.0, 2.0, 1.0):
         states = replace(states, noise=torch.full_like(states.noise, factor * term.most_noise))
         states, _ = descend(states, [term], 4)
@@ -242,7 +243,7 @@ def refine(states: States, term: Landmarks) -> States:
 
 
 def weigh(states: States, term: Landmarks) -> tuple[States, Landmarks]:
-    """Return the states with their noise, and the term with its number of independent matches, estimated from the residuals."""
+    """Return the states with their noise, and the term with its number of independent matches, both estimated from the residuals."""
     states = term.with_noise(states)
     return states, term.weighted_for(states)
 

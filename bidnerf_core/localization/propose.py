@@ -62,9 +62,9 @@ def consensus(
     camera: Float[Tensor, "6"],
     name: str = "landmarks",
 ) -> tuple[Proposal, float] | None:
-    """Return the pose with the most inliers under a given camera, and log10 of its false alarms; None if too few matches agree.
+    """Return the pose with the most inliers under a given camera, and log10 of its number of false alarms; None if too few matches agree.
 
-    The solvers are poselib's in LO-RANSAC with progressive sampling: P3P for each image (Persson and Nordberg 2018) and, for a rig,
+    The solvers are those of poselib, in LO-RANSAC with progressive sampling: P3P for each image (Persson and Nordberg 2018) and, for a rig,
     also the generalized P3P (Kukelova et al. 2016), which alone is unstable if the camera centres almost coincide.
     """
     still = States.known(SE3.identity(), camera)

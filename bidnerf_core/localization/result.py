@@ -265,7 +265,7 @@ _RECORD: ContextVar[SearchRecord | None] = ContextVar("record", default=None)
 
 @contextmanager
 def recorded() -> Iterator[SearchRecord]:
-    """Yield a record, to which this thread's localizations within the block add."""
+    """Yield a record that collects the steps and answers of this thread's localizations within the block."""
     token = _RECORD.set(record := SearchRecord())
     try:
         yield record

@@ -49,7 +49,7 @@ class Stage:
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """The remaining poses of a search, and how much better the best one is than any different one; on the CPU."""
+    """The remaining poses of a search, and how much better the best one is than the best different one; on the CPU."""
 
     states: States  # (h), best first
     scores: Float[Tensor, "h"]

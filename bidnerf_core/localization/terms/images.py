@@ -74,9 +74,9 @@ background, of where rays pass closest to the scene."""
 
 
 def surface_renderer(surface: SurfaceMap, background: tuple[float, float, float] | None) -> Renderer:
-    """Return a renderer of the colours of surfels.
+    """Return a renderer of the colours of a surface's surfels.
 
-    Without a ``background``, a ray that hits nothing passes through a hole in the map.
+    Without a ``background``, a ray that hits nothing counts as passing through a hole in the map.
     """
 
     def rendered(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -32,10 +32,10 @@ Derivatives = tuple[Float[Tensor, "r c"], Float[Tensor, "r c 3"], Float[Tensor, 
 
 
 def channels(rendering: Rendering, measured: Float[Tensor, "r"] | None, miss: float) -> Float[Tensor, "r c"]:
-    """Return rendered colours and, with ``measured`` distances (metres; 0: none), ``sum_i w_i (t_i - d) + (1 - sum_i w_i) miss``.
+    """Return rendered colours and, with ``measured`` distances d (metres; 0: none), also ``sum_i w_i (t_i - d) + (1 - sum_i w_i) miss``.
 
-    The fraction of a ray that passes through the scene counts as if it hit something ``miss`` too far away: a rendered
-    distance of 0 would jump at silhouettes, where its derivative is of no use.
+    The fraction of a ray that passes through the scene counts as if it hit something ``miss`` metres beyond d: a rendered distance of 0
+    would jump at silhouettes, where its derivative is of no use.
     """
     if measured is None:
         return rendering.rgb

@@ -55,7 +55,7 @@ LEAST_SECONDS = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """The pose measured from one image. Its covariance, of a right update with the translation (metres) first, has two parts."""
+    """The pose measured from one image. Its covariance, of a right update (translation in metres, rotation in radians), has two parts."""
 
     T_world_camera: SE3  # float64
     noise: Float[Tensor, "6 6"]  # independent of other frames'
@@ -89,7 +89,7 @@ class Motion:
 
     @property
     def covariance(self) -> Float[Tensor, "6 6"]:
-        """Covariance of the pose as a right update."""
+        """Covariance of the pose as a right update (translation in metres, rotation in radians)."""
         return self.noise[:6, :6] + self.bias
 
     def predicted(self, seconds: float, stamped: bool = True) -> Motion:
@@ -203,7 +203,7 @@ class Motion:
 
 
 def pixel_radius(covariance: Float[Tensor, "6 6"], focal: float, distance: float) -> float:
-    """Return the standard deviation (pixels) of the projection of a point at ``distance`` (metres) for an uncertain pose."""
+    """Return the standard deviation (pixels) of the projection of a point at ``distance`` (metres), given the pose's ``covariance``."""
     translation, rotation = covariance.diagonal().split(3)
     return focal * math.sqrt(float(translation.mean()) / distance**2 + float(rotation.mean()))
 

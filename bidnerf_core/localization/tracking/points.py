@@ -129,7 +129,7 @@ class Fit:
 
     @staticmethod
     def of(points: Points, camera: Intrinsics, start: SE3, correlation: float) -> Fit:
-        """Fit a pose near ``start`` to points, of which every ``correlation`` points count as one independent point."""
+        """Fit a pose near ``start`` to points; ``correlation`` is the number of points that count as one because of correlated errors."""
         focal, count = (camera.fx * camera.fy) ** 0.5, len(points)
         threshold = inlier_threshold(camera)
         image = camera.unproject(points.pixels.double())[:, :2]

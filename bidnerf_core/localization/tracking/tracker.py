@@ -43,7 +43,10 @@ class Tracker:
     def __init__(
         self, localizer: Localizer, config: TrackerConfig | None = None, start: Start | None = None
     ) -> None:
-        """Track in the map of ``localizer``, which must have distances. ``start`` is a guess at the first T_world_camera."""
+        """Track in the map of ``localizer``; ``start`` is a guess at the first T_world_camera.
+
+        Raises ``InputError`` if ``localizer`` is not a ``Localizer``, or if its map has no distances.
+        """
         if not isinstance(localizer, Localizer):
             raise InputError(
                 f"got a {type(localizer).__name__}", where="Tracker",
@@ -101,11 +104,11 @@ class Tracker:
         ).translated(self._origin)  # fmt: skip
 
     def save(self, path: str | Path) -> None:
-        """Write the tracker's state to a file, from which ``restore`` continues exactly."""
+        """Write the tracker's state to a file, from which ``restore`` resumes tracking exactly."""
         save_state(Path(path), self._state, self._key)
 
     def restore(self, path: str | Path) -> None:
-        """Continue from a saved state. Raises ``InputError`` for a damaged file or one for another map."""
+        """Continue from a saved state. Raises ``InputError`` for a damaged file, or for the state of a tracker in another map."""
         self._state = load_tracker_state(Path(path), self._key)
 
     def _step(

@@ -45,7 +45,7 @@ class Adjustment:
 
     T_world_camera: SE3  # (v), of the middle rows
     points: Float[Tensor, "n 3"]  # metres, world
-    motion: Float[Tensor, "v 6"]  # from the first row to the last
+    motion: Float[Tensor, "v 6"]  # from the first row to the last: metres, then radians
     cost: float = 0.0
 
 

@@ -195,11 +195,11 @@ class TrackedViews:
 
     @property
     def motion(self) -> Float[Tensor, "v 6"]:
-        """The motion of each image's camera during its readout."""
+        """The motion of each image's camera from its first row to its last (metres, then radians)."""
         return self.observations.motion
 
     def at(self, T_world_camera: SE3, motion: Float[Tensor, "v 6"] | None = None) -> TrackedViews:
-        """Return the tracks with the images' poses (v) replaced, and their motions too if ``motion`` is given."""
+        """Return the tracks with the images' poses (v) replaced, and also their motions (metres, then radians) if ``motion`` is given."""
         motion = self.motion if motion is None else motion
         images = [
             replace(p, T_ref_camera=T_world_camera[i], motion=motion[i])

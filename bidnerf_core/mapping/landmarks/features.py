@@ -165,7 +165,7 @@ def strongest(features: Features, count: int) -> Features:
 class FoundOnce:
     """A detector that caches the keypoints of each image during one query.
 
-    ``known`` are images whose keypoints are already known. Threads may share the detector.
+    ``known`` holds images with keypoints that are already known. Threads may share the detector.
     """
 
     def __init__(self, features: Features, known: Iterable[tuple[Tensor, Keypoints]] = ()) -> None:
@@ -244,7 +244,7 @@ class ImageKeypoints:
     depth: Float[Tensor, "n"]  # metres, 0 where none was measured
     intrinsics: Intrinsics
     T_ref_camera: SE3  # float64; of the middle row
-    motion: Float[Tensor, "6"] = AT_REST  # during the readout; epipolar lines ignore it
+    motion: Float[Tensor, "6"] = AT_REST  # during the readout: metres, then radians; epipolar lines ignore it
     hidden: Bool[Tensor, "h w"] | None = None  # pixels of objects that are not in the map, see ``Frame``
 
     @property
@@ -254,12 +254,12 @@ class ImageKeypoints:
 
     @property
     def exposure_times(self) -> Float[Tensor, "n"]:
-        """The exposure times of the keypoints, float64; see ``rolling_shutter``."""
+        """The exposure times of the keypoints, as fractions of the readout (-0.5 to 0.5), float64; see the function ``exposure_times``."""
         return exposure_times(self.keypoints.pixels, self.intrinsics)
 
 
 def image_keypoints(view: View, features: Features) -> ImageKeypoints:
-    """Detect the keypoints of ``view`` outside of its hidden pixels."""
+    """Detect the keypoints of ``view`` whose neighbourhoods contain no hidden pixel."""
     frame = view.frame
     hidden = None if frame.hidden is None else frame.hidden.cpu()
     keypoints = detected(features, frame.rgb)

@@ -27,7 +27,7 @@ FEW = 20_000
 
 @dataclass(frozen=True)
 class HeldOutTrial:
-    """Accuracy with which images of the map were localized by landmarks built without them."""
+    """Accuracy with which images of the map were localized by landmarks that were built without these images."""
 
     images: int = 0
     found: int = 0  # number of these images whose pose was found
@@ -59,7 +59,7 @@ class Tracks:
 
 @dataclass(frozen=True, eq=False)
 class LandmarkCells:
-    """Leaves of a k-d tree over landmarks, each with its bounding ball and the cone of viewing directions."""
+    """Leaves of a k-d tree over landmarks, each with a bounding ball of its landmarks and a cone of their viewing directions."""
 
     order: Int[Tensor, "n"]  # indices of the landmarks, cell by cell
     first: Int[Tensor, "c"]  # position of a cell's first landmark in ``order``
@@ -133,7 +133,7 @@ def _leaves(node: object) -> Iterator[tuple[int, int]]:
 
 @dataclass(frozen=True, eq=False)
 class LandmarkMap:
-    """Points in the world frame (metres) with descriptors."""
+    """The landmarks of a map: points in the world frame (metres) with descriptors."""
 
     positions: Float[Tensor, "n 3"]
     deviations: Float[Tensor, "n 2"]  # metres: standard deviation across and along ``directions``

@@ -225,7 +225,7 @@ class TrackedKeypoints:
 
     @property
     def motion(self) -> Float[Tensor, "v 6"]:
-        """The motion of each image's camera during its readout."""
+        """The motion of each image's camera from its first row to its last (metres, then radians)."""
         return torch.stack([p.motion for p in self.images])
 
     @cached_property
@@ -356,7 +356,7 @@ def depth_ratio(observations: TrackedKeypoints, points: Float[Tensor, "n 3"]) ->
 def placed(
     observations: TrackedKeypoints, relative: float, pixel_noise: float
 ) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """Return the inliers, the weighted mean of each track's back-projected points (metres, world), and its covariance.
+    """Back-project keypoints; return the inliers, the weighted mean point of each track (metres, world), and its covariance.
 
     ``relative`` is the relative noise of the depth, and ``pixel_noise`` the noise of the keypoints (pixels). Tracks without a
     majority of inliers are dropped.

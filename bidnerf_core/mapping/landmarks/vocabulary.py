@@ -57,7 +57,7 @@ class Vocabulary:
 
     @staticmethod
     def of(descriptors: Sequence[UInt8[Tensor, "n d"]], seed: int = 0) -> Vocabulary:
-        """Build a vocabulary of 32 words from 20,000 descriptors, an equal number from each map."""
+        """Build a vocabulary of at most 32 words from about 20,000 ``descriptors``, equally many from each map."""
         generator = torch.Generator().manual_seed(seed)
         share = -(-20_000 // len(descriptors))
         some = torch.cat([one[torch.randperm(len(one), generator=generator)[:share]] for one in descriptors])

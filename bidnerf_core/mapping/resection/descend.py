@@ -66,8 +66,8 @@ def descend(
 ) -> tuple[States, Normal]:
     """Minimize the sum of ``terms`` and the prior from each state; a step that does not lower the sum is not taken.
 
-    Steps are damped as updates that rotate about ``pivot`` (metres, the rig's frame), by default the rig's origin. A pivot in
-    the middle of the visible scene decouples rotation and translation. Poses and costs before each step are added to ``path``.
+    Steps are damped as updates that rotate about ``pivot`` (metres, the rig's frame), by default the rig's origin. A pivot in the middle of
+    the visible scene decouples rotation and translation. Poses and costs before each step are appended to ``path``.
     """
     here = total(states, terms)
     damping = torch.full_like(here.cost, 1e-3)
@@ -123,7 +123,7 @@ class Quadratic:
         return Quadratic(self.here, *(torch.cat([own[:1] + more, own[1:]]) for own, more in joined))
 
     def minimum(self, states: States) -> tuple[States, Normal]:
-        """Minimize the sum of the model and each state's prior; the second step accounts for the curvature of rotations."""
+        """Minimize the sum of the models and the prior from each state; of two steps, the second accounts for the curvature of rotations."""
         for _ in range(2):
             normal = total(states, [self])
             states = states.retract(-damped_solution(normal, torch.zeros_like(normal.cost)))

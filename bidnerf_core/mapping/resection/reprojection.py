@@ -76,7 +76,7 @@ class Landmarks:
     def _weighted(
         self, states: States
     ) -> tuple[Float[Tensor, "h"], Float[Tensor, "h P r"], Float[Tensor, "h r"]]:
-        """Return the cost, and the weighted rows (transposed) and residuals of its least-squares problem."""
+        """Return the term's cost, and the weighted rows (transposed) and residuals of its least-squares problem."""
         own = self._of(states)
         seen = project(states, own.points, own.sights)
         squared, off, variance = own._residuals(states, seen)
@@ -120,7 +120,8 @@ class Landmarks:
     def weighted_for(self, best: States) -> Landmarks:
         """Return the term with the number of independent matches estimated from the residuals at ``best`` (g).
 
-        The efficiency is the ratio of the information of an M-estimator to its reweighted Hessian (Huber 1981, 6.3).
+        The weight of a match is proportional to an efficiency: the ratio of the information of an M-estimator to its reweighted Hessian
+        (Huber 1981, 6.3).
         """
         squared, valid = self.residuals(best)[0], self.valid[best.mode]
         weight = 1 / (1 + squared / SCALE**2)

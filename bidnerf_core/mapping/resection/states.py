@@ -144,7 +144,7 @@ class Projections:
 
 
 def project(states: States, points: Float[Tensor, "*h m 3"], sights: Sights) -> Projections:
-    """Project world points."""
+    """Project points (metres, world) into the images of a rig in each state."""
     local = (points - states.T.translation[:, None]) @ states.T.rotation
     if not sights.single:
         local = (sights.rotation @ local[..., None])[..., 0] + sights.translation
@@ -152,7 +152,7 @@ def project(states: States, points: Float[Tensor, "*h m 3"], sights: Sights) -> 
 
 
 def imaged(states: States, local: Float[Tensor, "h m 3"], times: Float[Tensor, "*h m"]) -> Projections:
-    """Project points that are given in the frame of the camera at the middle row."""
+    """Project points given in the frame (metres) that the camera has at the middle row."""
     nuisances, times = states.nuisances[:, None], times[..., None]
     w = nuisances[..., 9:12]
     speed = torch.linalg.cross(w, local) + nuisances[..., 6:9]
@@ -236,7 +236,7 @@ def linear(states: States) -> Float[Tensor, "h 2 2"]:
 
 
 def true_intrinsics(stated: Intrinsics, camera: Float[Tensor, "6"]) -> Intrinsics:
-    """Return the intrinsics of a camera with these nuisances; they cannot express a skew, which is ignored."""
+    """Return ``stated`` intrinsics with the corrections ``camera`` (see ``NUISANCES``), except for skew, which intrinsics cannot express."""
     log_focal, cx, cy, k1, log_aspect, _ = camera.tolist()
     bent, *others = stated.distortion or (0.0, 0.0, 0.0, 0.0)
     return replace(

@@ -38,7 +38,7 @@ Camera = tuple[Intrinsics, SE3]
 
 
 def rendered_views(field: RadianceField, bounds: SceneBounds, cameras: Sequence[Camera]) -> list[View]:
-    """Render images with depth of ``field`` from up to 100 of ``cameras``, at regular intervals, for a map without photos."""
+    """Render colour and depth of ``field`` at up to 100 of ``cameras``, at regular intervals, for a map without photos."""
     chosen = cameras[:: max(1, math.ceil(len(cameras) / 100))]
     views, count = list[View](), counter("rendering", "views")
     for number, (intrinsics, T) in enumerate(chosen):

@@ -127,7 +127,7 @@ def agreed(
 
 
 def witnesses(number: int, images: Sequence[PosedDepthImage]) -> list[int]:
-    """Return the images with the most similar poses, which are the most likely to show the same points."""
+    """Return the numbers of the images whose poses are most similar to that of image ``number``: the likeliest to show the same points."""
     here = images[number].T_world_camera
     centres = torch.stack([s.T_world_camera.translation for s in images])
     axes = torch.stack([s.T_world_camera.rotation[:, 2] for s in images])
@@ -184,7 +184,7 @@ def _spread(
     opacity: float,
     beyond: Callable[[PosedDepthImage, Float[Tensor, "p 3"]], Float[Tensor, "p"]],
 ) -> float:
-    """Return the robust deviation of the differences at up to 400 points of each of 40 images.
+    """Return the robust deviation of the differences at a few hundred points of each of up to 40 images.
 
     Differences of more than five times the median are occlusions or gross errors. The result is at most two standard deviations
     of an unknown sensor, since images that differ by more are inconsistent.
