@@ -177,7 +177,7 @@ class Loop:
         return self._fused(modes, states, term, given, searched)
 
     def nearest(self, strongest: int) -> Nearest:
-        """Return the landmarks most similar to up to ``strongest`` keypoints, the strongest ones, of each image."""
+        """Return the landmarks most similar to each image's strongest keypoints, of which at most ``strongest`` are used."""
         count = min(strongest, max(len(image.keypoints) for image in self.query.images))
         if count not in self._nearest:
             self._nearest[count] = Nearest.of(self.query, self.matcher, count)

@@ -131,7 +131,7 @@ def require_start(method: str, given: bool) -> None:
 
 
 def _names_of(wanted: Callable[[Method], bool]) -> str:
-    """Return the names of the methods for which ``wanted`` is true, as text, except those of methods that cannot be loaded."""
+    """Return, as text, the names of the methods for which ``wanted`` is true, leaving out methods that cannot be loaded."""
     found = []
     for name in METHODS:
         with contextlib.suppress(PluginError):

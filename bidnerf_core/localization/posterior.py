@@ -249,7 +249,7 @@ def weigh(states: States, term: Landmarks) -> tuple[States, Landmarks]:
 
 
 Minima = tuple[Quadratic, States, Normal]
-"""The model of all terms about the state of each mode, and its minimum under each explanation of the mode."""
+"""The quadratic model of all terms about each mode's state, and the states and normal equations at its minima under each explanation."""
 
 
 def fit(best: States, terms: Sequence[CostTerm], given: Explanations, steps: int) -> tuple[States, Minima]:

@@ -68,9 +68,9 @@ def slopes(image: Float[Tensor, "*b h w"], camera: Intrinsics) -> Float[Tensor, 
 
 
 Renderer = Callable[[Float[Tensor, "r 3"], Float[Tensor, "r 3"]], tuple[Tensor, Tensor, Tensor]]
-"""Renders rays, given their origins and unit directions (world). Returns their colours (r 3), premultiplied by the second part,
-which is 0 where the map has nothing along the ray, else 1 (r); and the distances (r), metres, of the visible points or, for the
-background, of where rays pass closest to the scene."""
+"""Renders rays, given their origins and unit directions (world). Returns their colours (r 3); a mask (r), 1 where the map renders the ray
+and 0 where it has nothing, by which the colours are multiplied; and the distances (r, metres) of the visible points or, for the background,
+of the points where rays pass closest to the scene."""
 
 
 def surface_renderer(surface: SurfaceMap, background: tuple[float, float, float] | None) -> Renderer:

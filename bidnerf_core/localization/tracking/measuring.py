@@ -64,7 +64,7 @@ LEAST_CORNERS, SIGNIFICANT_NFA = 20, -6.0
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """The motion after a frame was measured, the verdict on it, and the state for the next frame."""
+    """The result of measuring a frame: the motion, the verdict on it, and the state for the next frame."""
 
     motion: Motion  # fused with the prediction
     verdict: Verdict

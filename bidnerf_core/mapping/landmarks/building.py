@@ -53,7 +53,7 @@ from bidnerf_core.settings import Above, Range, Settings
 LEAST_VISIBLE_POINTS = 20
 """Minimum number of points from which the pose of an image is estimated."""
 ENOUGH_IMAGES = 8
-"""Minimum number of images from which the 6x6 covariance is estimated."""
+"""Minimum number of images from which the covariance of pose updates is estimated."""
 _Item = TypeVar("_Item")
 Result = TypeVar("Result")
 
@@ -195,7 +195,7 @@ class TrackedViews:
 
     @property
     def motion(self) -> Float[Tensor, "v 6"]:
-        """The motion of each image's camera from its first row to its last (metres, then radians)."""
+        """The motion of each image's camera from the first row to the last (metres, then radians)."""
         return self.observations.motion
 
     def at(self, T_world_camera: SE3, motion: Float[Tensor, "v 6"] | None = None) -> TrackedViews:

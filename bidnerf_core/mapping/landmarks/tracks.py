@@ -225,7 +225,7 @@ class TrackedKeypoints:
 
     @property
     def motion(self) -> Float[Tensor, "v 6"]:
-        """The motion of each image's camera from its first row to its last (metres, then radians)."""
+        """The motion of each image's camera from the first row to the last (metres, then radians)."""
         return torch.stack([p.motion for p in self.images])
 
     @cached_property

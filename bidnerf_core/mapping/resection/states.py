@@ -36,7 +36,7 @@ CAMERA, MOTION, DEPTH = slice(0, 6), slice(6, 12), 12
 _twists = torch.zeros(6, 4, 4)
 _twists[:3, :3, 3], _twists[3:, :3, :3] = torch.eye(3), skew(torch.eye(3))
 TWISTS = tuple(_twists.flatten().tolist())
-"""The 4x4 matrices of a unit translation along, and of a unit rotation about each axis."""
+"""The 4x4 matrices, flattened, of a unit translation along each axis and of a unit rotation about each axis."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -127,7 +127,7 @@ def agreed(
 
 
 def witnesses(number: int, images: Sequence[PosedDepthImage]) -> list[int]:
-    """Return the numbers of the images whose poses are most similar to that of image ``number``: the likeliest to show the same points."""
+    """Return the numbers of the images most likely to show the same points as image ``number``: those with the most similar poses."""
     here = images[number].T_world_camera
     centres = torch.stack([s.T_world_camera.translation for s in images])
     axes = torch.stack([s.T_world_camera.rotation[:, 2] for s in images])
