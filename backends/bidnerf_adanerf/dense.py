@@ -55,6 +55,6 @@ def render_softly(
 
 
 def opacity(values: FieldValues, samples: RaySamples, which: Bool[Tensor, "r n"]) -> Float[Tensor, ""]:
-    """Return the mean of ``1 - exp(-sigma dt)`` over the bins ``which``, without scores."""
+    """Return the mean opacity, ``1 - exp(-sigma dt)``, of the bins in the mask ``which``, without scores."""
     absorbed = torch.where(which, values.density * (samples.ends - samples.starts), 0)
     return -torch.expm1(-absorbed).sum() / which.sum().clamp(min=1)

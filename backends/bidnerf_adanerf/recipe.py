@@ -48,7 +48,7 @@ def phase_at(step: int, config: AdaNerfConfig) -> Phase:
 
 
 def sparsity(step: int, config: AdaNerfConfig) -> float:
-    """Return the weight of the mean score in the loss: 0 before the soft phase, then increasing until halfway through that phase."""
+    """Return the weight of the mean score in the loss: 0 before the soft phase, then increasing linearly until that is half over."""
     begin, length = config.dense_part * config.steps, config.soft_part * config.steps
     return config.sparsity_weight * min(1.0, max(0.0, (step - begin) / max(1.0, length / 2)))
 

@@ -143,7 +143,10 @@ class HashGridField(nn.Module):
         self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"], wanted: Bool[Tensor, "p"] | None,
         active: int | None,
     ) -> FieldDerivatives:  # fmt: skip
-        """Return the values of ``query_levels`` and their derivatives by position and direction; see ``fused.query`` for ``wanted``."""
+        """Return the values of ``query_levels`` and their derivatives by position and direction.
+
+        Where a kernel is used, all of these are 0 at points that are not ``wanted``.
+        """
         with torch.no_grad():
             kernel = self._kernel(active)
             if kernel is None:

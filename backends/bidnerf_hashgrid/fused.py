@@ -1,7 +1,7 @@
-"""The encoding, the whole field and its sampler as one kernel each, used where Triton is installed and the field is on a GPU.
+"""Launches of kernels for the encoding, the whole field and its sampler, where Triton is installed and the field is on a GPU.
 
-Kernels are imported where they are launched, since Triton may be missing.
-Triton launches on the current device, which may differ from the field's device.
+Kernels are imported where they are launched, since Triton may be missing. Triton launches on the current device, which
+may differ from the field's device.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ DESCENT = {"rays": 768, "max_steps": 150, "decay_steps": 60}  # faster than the 
 
 
 class Trial(NamedTuple):
-    """An unseen frame, a start pose far from its pose, and the answers of two methods."""
+    """An unseen frame, a start far from its true pose, and the answers of two methods."""
 
     view: View
     start: SE3

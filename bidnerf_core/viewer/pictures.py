@@ -76,9 +76,7 @@ def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Flo
     place = T_world_camera.translation.detach().cpu().double()
     if scene.surface is not None and len(scene.surface.surfels):
         away = (scene.surface.surfels.positions.cpu().double() - place).norm(dim=-1).min()
-        bounds = replace(
-            bounds, near=min(bounds.near, float(away) / 2)
-        )  # so that the nearest surface is seen
+        bounds = replace(bounds, near=min(bounds.near, float(away) / 2))  # to show the nearest surface
     distance = float((place - torch.tensor(bounds.centre, dtype=torch.float64)).norm())
     # There is no matter farther from the centre than this.
     beyond = bounds.far if bounds.contracted else math.hypot(*bounds.size) / 2
