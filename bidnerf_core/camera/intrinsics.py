@@ -35,7 +35,7 @@ rational models reach several hundred."""
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Focal lengths, principal point and size in pixels; distortion as OpenCV orders it (k1, k2, p1, p2[, k3 ...])."""
+    """Focal lengths, principal point and size in pixels; distortion in OpenCV's order (k1, k2, p1, p2[, k3 ...])."""
 
     fx: float
     fy: float
@@ -80,7 +80,7 @@ class Intrinsics:
 
     @staticmethod
     def from_hfov(degrees: float, width: int, height: int) -> Intrinsics:
-        """Return an undistorted camera with a horizontal field of view of ``degrees``, as ``from_focal`` does."""
+        """Return an undistorted camera with a horizontal field of view of ``degrees``; see ``from_focal``."""
         expected = "degrees between 0 and 180 (both excluded)"
         check_number("horizontal field of view", degrees, Real, 1e-9, math.nextafter(180, 0), expected)
         check_number("width", width, *LIMITS["size"])
@@ -202,7 +202,7 @@ class Intrinsics:
         )  # fmt: skip
 
     def upright(self, orientation: Orientation) -> Intrinsics:
-        """Return the camera of the upright image; this one describes the image as stored.
+        """Return the camera of the upright image, where this camera describes the image as stored.
 
         Raises ``InputError`` if an image with a tilted sensor (14 distortion coefficients) would be
         transposed.
@@ -244,7 +244,7 @@ class CameraBatch:
         )
 
     def unproject(self, pixels: Float[Tensor, "p 2"], camera: Int[Tensor, "p"]) -> Float[Tensor, "p 3"]:
-        """Return the points on the plane z = 1 that appear at ``pixels`` (u, v) of the cameras with these indices."""
+        """Return the points on the plane z = 1 that appear at ``pixels`` (u, v); ``camera`` holds the index of each pixel's camera."""
         matrix, exact = self.matrices[camera], pixels.double()
         if self.distortion.shape[1]:
             exact = undistort_points(exact[:, None], matrix, self.distortion[camera], num_iters=20)[:, 0]

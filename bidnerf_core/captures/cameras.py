@@ -36,7 +36,7 @@ class StoredCamera:
     intrinsics: Intrinsics
     T_world_camera: MatrixRows
     given_T_world_camera: MatrixRows | None = None  # the dataset's pose, if training refined it
-    moved_pixels: float | None = None  # median shift (pixels) of the image's points due to the refinement
+    moved_pixels: float | None = None  # median shift (pixels) of the image's points by the refinement
     # camera motion from the first row to the last, if refinement estimated it
     motion: RowMotion | None = None
     file: str | None = None  # image file, relative to the folder of its dataset, if known

@@ -1,4 +1,4 @@
-"""The coverage of a capture: the viewing directions that it covers, those that are missing, and the upward direction.
+"""Coverage of a capture: the viewing directions that it covers or lacks, and the upward direction of the scene.
 
 People hold cameras level but point them down at desks and objects, so the mean of the cameras' upward axes is
 tilted as much as the cameras are. Two cues do not suffer from this tilt: the horizontal image axes of level

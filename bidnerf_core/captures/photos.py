@@ -63,7 +63,7 @@ def _measured(frame: Frame) -> tuple[float, float, float]:
 
 
 def sharpness(grey: np.ndarray, hidden: Bool[Tensor, "h w"] | None = None) -> float:
-    """Return log2 of the ratio of fine-scale to coarse-scale energy, in which contrast cancels out.
+    """Return log2 of the ratio of fine-scale to coarse-scale energy, which does not depend on contrast.
 
     The minimum over four directions is returned, since motion blur affects mainly one of them. Pixels affected by ``hidden``
     pixels are ignored, unless hardly any others remain.
@@ -128,7 +128,7 @@ def excess(values: Float[Tensor, "v"], near: Nearby) -> Float[Tensor, "v"]:
 def exposures(views: Sequence[View], seen: TrackedKeypoints) -> Float[Tensor, "v"]:
     """Return the exposure of each photo (stops) relative to the median of all; NaN if it shows fewer than ten landmarks.
 
-    The brightness of a landmark in a photo is modelled as a brightness of the landmark times the photo's exposure.
+    The brightness of a landmark in a photo is modelled as the landmark's intrinsic brightness times the photo's exposure.
     The two are estimated alternately, as medians.
     """
     image, point, count = seen.image, seen.point, len(views)

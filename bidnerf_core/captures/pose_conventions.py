@@ -131,7 +131,7 @@ class MatchedPair:
     pixel: float  # size of a pixel on the plane z = 1, scaled up in large images (see ``USUAL_FOCAL``)
 
     def agreeing(self, T: SE3) -> Bool[Tensor, "h"]:
-        """Return which pose hypotheses T_world_camera (h n) put matches near their epipolar lines and in front of both cameras.
+        """Return for which hypotheses of T_world_camera (h n) the matches lie near their epipolar lines and in front of both cameras.
 
         Only points with enough parallax reveal whether they are in front of the cameras. Their depths solve
         ``a seen = b rays + moved`` in the least-squares sense along the common normal of both rays.

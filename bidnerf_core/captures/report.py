@@ -17,8 +17,8 @@ PhotoProblem = Literal["mirrored", "turned", "badly posed", "apart", "isolated",
 linked photos, such as photos of a second place.
 """
 Arrangement = Literal["around", "inside", "one side", "one place", "unknown"]
-"""How the cameras are arranged: around what they look at, inside it, all on one side of it, or all at about
-the same position."""
+"""How the cameras are arranged: around what they look at, inside it, all on one side of it, all at about
+the same position, or unknown."""
 
 SUMMARY_LINES = 5
 """Largest number of lines of a summary."""

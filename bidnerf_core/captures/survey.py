@@ -51,8 +51,8 @@ def surveyed(
     """Return a report on the photos ``views``, whose keypoints are matched in ``tracked`` in the same order.
 
     If the other photos do not support the pose of a photo, their landmarks are used to localize it, both as it is
-    and mirrored; this distinguishes a wrong pose from a photo of something else. ``trial``
-    holds the errors of held-out photos, and ``up`` is the upward direction of the scene, if known.
+    and mirrored; this distinguishes a wrong pose from a photo of something else. ``trial`` holds the errors of
+    held-out photos, and ``up`` is the upward direction of the scene, if known.
     """
     seen, positions = tracked.triangulated(config)
     links = linked(seen)
@@ -210,7 +210,7 @@ def suspects(seen: TrackedKeypoints, links: csr_array) -> list[int]:
 def _has_support(images: Sequence[ImageKeypoints], links: csr_array, number: int) -> bool:
     """Return whether a photo's given pose agrees with enough linked photos to form a group with it.
 
-    Matches are found without using the poses, so that a wrong pose agrees with none of the linked photos.
+    Matches are found without using the poses, so a wrong pose agrees with none of the linked photos.
     """
     poses, needed = SE3.stack([image.T_ref_camera for image in images]), LEAST_GROUP - 1
     for other in links.indices[links.indptr[number] : links.indptr[number + 1]].tolist():

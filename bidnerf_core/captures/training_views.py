@@ -258,7 +258,7 @@ def adjusted_poses(
     image, 0 without points; and how well the given and the adjusted poses fit the keypoints.
 
     The errors of the given poses are assumed to be independent, and as large as resection of the images
-    suggests. This prior alone fixes the gauge (position, orientation and scale of the whole), so the mean
+    suggests. This prior alone fixes the gauge (position, orientation and scale), so the mean
     motion of the images is about zero. If the keypoints show a rolling shutter, the motions of the cameras
     during readout are estimated too. Otherwise, if the first adjustment finds an inconsistency of less than
     ``least`` pixels, its poses are returned at once.

@@ -152,7 +152,8 @@ def _calibration_scatter(
 ) -> Float[Tensor, "4"]:
     """Return the standard deviations of the corrections estimated for intrinsics that are in fact correct.
 
-    The part explained by the uncertainty of each fit is subtracted.
+    They are those of the logarithm of the focal length, the principal point (u, v; in focal lengths) and the radial
+    distortion. The part explained by the uncertainty of each fit is subtracted.
     """
     widest = [found.posterior.camera_of(found.explanations.widest) for found in answers]
     apparent, noise = (torch.stack([camera[part][:4] for camera in widest]) for part in (0, 1))

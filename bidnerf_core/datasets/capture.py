@@ -248,7 +248,7 @@ class Capture:
 
     @property
     def times(self) -> list[float | None]:
-        """The frames' timestamps, seconds; None where unknown."""
+        """The frames' timestamps (seconds); None where unknown."""
         return [shot.time for shot in self.shots]
 
     def __len__(self) -> int:
@@ -363,7 +363,7 @@ class Capture:
         ]
 
     def require_poses(self) -> Capture:
-        """Return the capture, and count frames without a pose in a remark. Raises ``InputError`` if no frame has a pose."""
+        """Return the capture; a remark counts the frames without a pose. Raises ``InputError`` if no frame has a pose."""
         posed = sum(shot.T_world_camera is not None for shot in self.shots)
         where, images = self.pose_file or self.path, amount(len(self), "image")
         if not posed:
@@ -402,7 +402,7 @@ def unique_names(paths: Sequence[tuple[str, ...]]) -> list[str]:
 
 
 def in_other_split(name: str, splits: Mapping[str, Sequence[str]]) -> str | None:
-    """Return an error clause that names the one of the ``splits`` that contains the frame, or None if none does."""
+    """Return an error clause that names the split that contains frame ``name``, or None if no split contains it."""
     found = next((split for split, names in splits.items() if name in names), None)
     return found and f"no frame {name!r}, which is in split {found!r}; choose that split"
 

@@ -26,7 +26,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.io import decode
 
 LARGEST_SIDE = 640
-"""Default limit of the pixels on a photo's longer side."""
+"""Default limit on a photo's longer side (pixels)."""
 HIGH_CONFIDENCE = 2
 FRAMES_PER_SECOND = 5.0
 """Largest frame rate of a dataset."""

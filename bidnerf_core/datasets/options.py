@@ -85,7 +85,7 @@ class DatasetOptions:
     def open_sequence(self, path: str | Path, readers: Sequence[Reader] | None = None) -> Capture:
         """Open the frames of a dataset, a folder of images or a video in chronological order; nothing is decoded yet.
 
-        Images without a camera take it from their EXIF; images without a focal length, and videos, use one of the
+        Unless a camera is given, photos take it from EXIF; photos without a focal length, and videos, use one of the
         assumed cameras of a ``CameraSource``. Raises ``InputError`` if nothing is found, if a metadata file is invalid,
         and for a missing or superfluous camera.
         """

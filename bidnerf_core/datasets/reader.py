@@ -219,7 +219,7 @@ READERS: Plugins[Reader] = Plugins("readers", _defects, first=ORDER)
 
 
 def find_reader(folder: Path) -> Reader | None:
-    """Return the reader that recognizes a folder: the first bundled reader, else the only third-party one, else None.
+    """Return the reader that recognizes a folder: the first bundled reader, else the only third-party reader, else None.
 
     A reader that cannot be loaded or fails is reported by an ``InputWarning``. Raises ``InputError`` if
     several third-party readers recognize the folder.

@@ -169,7 +169,7 @@ class Frame:
         is an image whose black pixels are ignored: they become ``hidden``. ``read`` also accepts a background, masks of the other
         polarity, and cameras to assume.
 
-        Raises ``InputError`` if a file cannot be read or exceeds 100 megapixels, if the camera is unknown or
+        Raises ``InputError`` if a file cannot be read or is too large, if the camera is unknown or
         given twice, and if the camera or the depth has another aspect ratio than the image.
         """
         given, hides = CameraSource(camera, focal, hfov), None if mask is None else MaskFile(Path(mask))

@@ -36,7 +36,7 @@ class MaskFile:
 
 
 class WhollyHidden(InputError):
-    """A mask hides its entire image, which leaves nothing to use."""
+    """Raised if a mask hides its entire image, which leaves nothing to use."""
 
 
 def read_mask(

@@ -83,7 +83,7 @@ def draw(
     dtype: torch.dtype = torch.float32,
     device: torch.device | str | None = None,
 ) -> Observations:
-    """Draw ``count`` pixels, the same number from each view; every tensor has leading axes (views, pixels per view).
+    """Draw about ``count`` pixels, the same number from each view; every tensor has leading axes (views, pixels per view).
 
     Images may be on any device; the result is on ``device``, by default that of the images.
     """

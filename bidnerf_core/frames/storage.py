@@ -128,7 +128,7 @@ class ImagePixels:
         return ImagePixels(flat, block, start, channels, default)
 
     def at(self, image: Int[Tensor, "p"], pixel: Int[Tensor, "p"]) -> Float[Tensor, "p c"]:
-        """Return the values of one pixel per row from the image with that index; bytes become floats in [0, 1]."""
+        """Return the values of ``pixel[i]`` in ``image[i]`` for each i; bytes become floats in [0, 1]."""
         block = self.block[image][:, None]
         first = self.start[image] + pixel * self.channels
         index = first[:, None] + torch.arange(self.channels, device=first.device)

@@ -2,7 +2,8 @@
 
 All but ``l1`` equal ``r^2 / 2`` for residuals that are small relative to their scale, so one may replace
 another without a change of weights; ``l1`` has the slope of ``huber`` at large residuals. Names and shapes
-follow Barron 2019, "A general and adaptive robust loss function" (eqs. 7, 13 to 16), times the squared scale.
+follow Barron 2019, "A general and adaptive robust loss function" (eqs. 7, 13 to 16), but losses are multiplied
+by the squared scale.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ class Robust:
 
 
 def chi_squared_quantile(probability: float, count: int) -> float:
-    """Return the quantile of the chi-squared distribution with ``count`` degrees of freedom."""
+    """Return the quantile at ``probability`` of the chi-squared distribution with ``count`` degrees of freedom."""
     from scipy.special import (
         gammaincinv,  # scipy.stats has the same function, but takes a tenth of the total import time
     )

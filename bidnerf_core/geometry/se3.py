@@ -21,7 +21,7 @@ from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
 
 QuaternionOrder = Literal["wxyz", "xyzw"]
-"""The position of a quaternion's scalar part w."""
+"""Order of a quaternion's components: the scalar part w comes first or last."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ class SE3:
     def retract_linearly(self, tangent: Float[Tensor, "*c 6"]) -> SE3:
         """Approximate ``retract`` to first order in ``tangent``.
 
-        This is cheaper and has the same value and derivative at 0, but elsewhere the result is not rigid.
+        The approximation is cheaper and has the same value and derivative at 0, but elsewhere it is not rigid.
         """
         rho, phi = tangent[..., :3], tangent[..., 3:]
         return SE3(self.rotation + self.rotation @ skew(phi), self.translation + _matvec(self.rotation, rho))
@@ -221,7 +221,7 @@ def skew(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 def _guarded_angle(phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the squared angle, whether the angle is small, and the angle (1 if small).
 
-    Neither branch of a ``where`` may divide by 0. For small angles, below 0.01 rad, series are used, since sin and cos cancel.
+    Neither branch of a ``where`` may divide by 0. Below 0.01 rad, series are used, since sines and cosines cancel.
     """
     squared = (phi * phi).sum(-1)
     small = squared < 1e-4
@@ -243,7 +243,7 @@ def pose_from_matrix(matrix: Float[Tensor, "..."], what: str, where: object = No
     """Convert a row-major homogeneous 4x4 matrix to T_world_camera.
 
     Raises ``InputError``, whose message begins with ``where`` (if given) and ``what``, unless the matrix is 4x4,
-    ends in 0 0 0 1 and has an orthonormal rotation.
+    has the last row 0 0 0 1, and has an orthonormal rotation.
     """
     if matrix.shape != (4, 4):
         raise InputError(

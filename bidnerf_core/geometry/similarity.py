@@ -19,7 +19,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
 
 LengthUnit = Literal["metres", "units"]
-"""``"units"`` if the length of the poses' unit is unknown, as after structure from motion."""
+"""Unit of length of poses: ``"units"`` if its size in metres is unknown, as after structure from motion."""
 CovarianceConvention = Literal["bidnerf", "gtsam", "ros"]
 """Order and frame of the rows of a covariance.
 
@@ -28,7 +28,7 @@ CovarianceConvention = Literal["bidnerf", "gtsam", "ros"]
 - ``"ros"``: ``geometry_msgs/PoseWithCovariance``: x, y, z, then the rotations about the fixed x, y and z axes of the world.
 """
 RIGID_TO = 5e-3
-"""Largest entry of R^T R - 1 that is attributed to rounding (matrices printed with three decimals reach 2e-3)."""
+"""Largest entry of R^T R - I that is attributed to rounding (matrices printed with three decimals reach 2e-3)."""
 FARTHEST_CAMERA = 1e12
 """Largest coordinate of a camera; squares of larger coordinates lose all precision."""
 

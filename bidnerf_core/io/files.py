@@ -133,7 +133,7 @@ def write_file(path: Path, content: bytes) -> None:
 
 
 class FileInUse(InputError):
-    """Another process is writing to the file or folder."""
+    """Raised if another process is writing to the file or folder."""
 
 
 @contextlib.contextmanager
@@ -174,7 +174,7 @@ def take_lock(number: int) -> bool:
 
 
 def available_memory() -> int:
-    """Return the available memory in bytes: the machine's, or the rest of the container's limit if that is less."""
+    """Return the available memory in bytes: that of the machine, or what is left of the container's limit if that is less."""
     import psutil  # imported here, since few commands need it
 
     available: int = psutil.virtual_memory().available

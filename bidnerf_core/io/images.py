@@ -25,13 +25,13 @@ Background: TypeAlias = str | Sequence[float]
 """A background as users give it: "white", "black" or an rgb triple in [0, 1]."""
 
 ImageSource: TypeAlias = Path | PackedFile
-"""An image file, or one inside an archive."""
+"""An image file, or an image inside an archive."""
 
 LARGEST_IMAGE = 178_000_000
 """Largest number of pixels: the most that Pillow opens, and more than the 108 megapixels of phones. A small file can describe
 an image of any size, so the size is checked before memory is allocated."""
 STRIP = 2**21
-"""Number of pixels converted at a time: a conversion takes many times as much memory as the bytes of the image."""
+"""Number of pixels converted at a time: conversion takes many times as much memory as the image's bytes."""
 FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "AVIF", "HEIF")
 """The formats that are decoded, whatever a file's name. Pillow supports more, and reads EPS by starting
 another program."""
@@ -124,7 +124,7 @@ def split_alpha(values: Float[Tensor, "h w c"]) -> tuple[Float[Tensor, "h w 3"],
 def pixel_array(pixels: np.ndarray | Tensor, what: str, white: int | None = None) -> Float[Tensor, "h w c"]:
     """Scale a pixel array, grey (h, w) or with 1 to 4 channels in the last axis, to [0, 1].
 
-    Accepts uint8 in [0, 255], uint16 in [0, 65535], bool, and floats in [0, 1]; ``white`` is the value of white in integers, by
+    Accepts uint8 in [0, 255], uint16 in [0, 65535], bool, and floats in [0, 1]; ``white`` is the integer value of white, by
     default the largest of the type. Raises ``InputError``, whose message begins with ``what``, for other types and shapes, for
     NaN, and for floats outside [0, 1].
     """

@@ -1,6 +1,6 @@
 """Captures of LLFF (https://github.com/Fyusion/LLFF), as NeRF's and Mip-NeRF 360's scenes are distributed: ``poses_bounds.npy``.
 
-Each of its rows has 17 numbers for one image of ``images`` in the order of names: a 3x5 matrix, row by row,
+Each row of this file has 17 numbers for one image of ``images`` in the order of names: a 3x5 matrix, row by row,
 and the nearest and farthest depth. The first four columns of the matrix are the camera-to-world pose whose
 axes point down, to the right and backwards; the fifth holds the height, the width and the focal length in
 pixels. The principal point is the image centre. Where ``images`` is missing, its reduced copies

@@ -1,7 +1,7 @@
 """Folders of images, and videos, without poses.
 
-Images are ordered by timestamp if every name is one (``12.345.png``), else in natural name order. The depth of ``NAME.png``, if
-any, is ``NAME.depth.png``, as written by ``bidnerf render``. Unlike the images of datasets, photos are turned upright
+Images are ordered by time if every name is a timestamp (``12.345.png``), else in natural name order. The depth of ``NAME.png``,
+if any, is ``NAME.depth.png``, as written by ``bidnerf render``. Unlike the images of datasets, photos are turned upright
 according to their EXIF orientation, and their camera is read from EXIF unless the user gives one, as in ``Frame.open``.
 
 A video is turned by the rotation in its metadata, so its camera is that of the upright image. Videos do not record a focal

@@ -29,7 +29,7 @@ POSE = [[f"t_{row}{column}" for column in range(4)] for row in range(3)]
 
 
 def _read(path: Path, cameras: Path, options: DatasetOptions) -> Capture:
-    """Read the cameras. Raises ``InputError`` if one is invalid, and if no photo has one."""
+    """Read the cameras. Raises ``InputError`` if one is invalid."""
     images = cameras.with_name(cameras.name.replace("cameras", "images"))
     corrected = cameras.name != "cameras"
     if not corrected:

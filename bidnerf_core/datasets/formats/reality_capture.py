@@ -29,7 +29,7 @@ POSE = ("x", "y", "alt", "heading", "pitch", "roll")
 
 
 def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
-    """Read the list. Raises ``InputError`` if a row is invalid, and if no photo exists."""
+    """Read the list. Raises ``InputError`` if a row is invalid."""
     columns = "the columns of the export 'Internal/External camera parameters', which has focal lengths (f)"
     names = FileNames(path, path / "images", path / "input")
     rows = read_table(file, "a list of cameras", columns, {"name", "f", *POSE})

@@ -1,7 +1,7 @@
 """Scans of ScanNet (http://www.scan-net.org), as its ``SensReader`` exports them.
 
 ``color/0.jpg`` is an image, ``depth/0.png`` its depth (16-bit planar z in millimetres, of the depth
-camera), ``pose/0.txt`` its pose (4x4, camera to world, OpenCV axes, metres; -inf if tracking failed).
+camera), and ``pose/0.txt`` its pose (4x4, camera to world, OpenCV axes, metres; -inf if tracking failed).
 ``intrinsic/intrinsic_color.txt`` and ``intrinsic_depth.txt`` are the 4x4 matrices of the two cameras, whose
 principal points are relative to the centre of the upper left pixel, so half a pixel is added. Depth is
 registered to the colour camera using these intrinsics, as in 12-Scenes.

@@ -54,7 +54,7 @@ T_COLOUR_DEPTH = SE3(
         [-2.5558943178152542e-02, 1.0109636268061706e-04, 2.0318321729487039e-03], dtype=torch.float64
     ),
 ).normalized()
-"""Pose of the depth camera in the colour camera's frame, of another Kinect, as used by ACE's ``setup_7scenes.py``:
+"""Pose of another Kinect's depth camera in its colour camera's frame, as used by ACE's ``setup_7scenes.py``:
 https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html."""
 
 SEQUENCE = re.compile(r"seq(?:uence)?-?0*(\d+)", re.IGNORECASE)

@@ -1,7 +1,7 @@
 """Recordings of the iOS app Stray Scanner (https://github.com/strayrobots/scanner, docs/format.md).
 
-``rgb.mp4`` is a video, ``odometry.csv`` has ``timestamp, frame, x, y, z, qx, qy, qz, qw`` of its frames
-(seconds, metres; camera to world with OpenCV axes) and in newer recordings ``fx, fy, cx, cy``,
+``rgb.mp4`` is a video; ``odometry.csv`` has ``timestamp, frame, x, y, z, qx, qy, qz, qw`` of its frames
+(seconds, metres; camera to world with OpenCV axes) and in newer recordings ``fx, fy, cx, cy``;
 ``camera_matrix.csv`` is the 3x3 camera matrix of all frames. ``depth/000000.png`` (16-bit planar z in
 millimetres, 256x192) and ``confidence/000000.png`` (0, 1, 2) belong to the frame with that number; some may
 be missing. See ``lidar`` for how depth and photos are read. Reading the video needs the extra ``video``.

@@ -42,7 +42,7 @@ from bidnerf_core.io import background_colour, is_file, read_header
 
 
 def _read(path: Path, found: list[Path], options: DatasetOptions) -> Capture:
-    """Read the frames and find their files. Raises ``InputError`` if no image is found."""
+    """Read the frames and find their files. Raises ``InputError`` if a file is invalid."""
     listed, names = read_splits(path), FileNames(path)
     images = [names.path(frame.file_path, IMAGE_ENDINGS, moved=True) for frame, _ in listed]
     _check_images(path, [frame for frame, _ in listed], images)

@@ -21,7 +21,7 @@ from bidnerf_core.io import IMAGE_SUFFIXES, Record, read_record
 METRES_PER_DEPTH_UNIT = 0.001
 SPLIT_FILES = {split: f"transforms_{split}.json" for split in SPLITS}
 UNIT_KEYS = {"depth_file_path": "depth_unit_scale_factor", "depth_path": "integer_depth_scale"}
-"""The key of the metres per step for each key of a depth image: nerfstudio's, then instant-ngp's and NeRFCapture's."""
+"""For each key of a depth image, the key of its metres per step: nerfstudio's, then instant-ngp's and NeRFCapture's."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 ``rgb.txt`` and ``depth.txt`` list images with their time stamps (seconds), ``groundtruth.txt`` the poses of
 the colour camera in the motion-capture frame: ``timestamp tx ty tz qx qy qz qw``, camera to world, OpenCV
-axes. The three are sampled at different times and rates. A colour image is paired with the depth image
+axes. The three files have different times and rates. A colour image is paired with the depth image
 nearest in time if they are mutual nearest neighbours at most 20 ms apart, and with the pose interpolated
 between the samples before and after it. A frame outside the time span of the ground truth, or in a gap of
 more than 0.1 s, has no pose: it is in the sequence but not in the dataset, and a remark counts it. The
@@ -13,7 +13,7 @@ Depth is 16-bit planar z in steps of 1/5000 m, 0 where nothing was measured, reg
 The published images already include the depth scale correction. Depth of other recordings in this layout is
 registered if a sensor is given.
 
-The camera is, in this order: the given one, as a file or as ``freiburg1``, 2 or 3; the one in the folder's
+The camera is the first of these that exists: the given one, as a file or as ``freiburg1``, 2 or 3; the one in the folder's
 ``camera.json`` or ``cameras.txt`` (in the formats of ``bidnerf localize --camera``); the published one of
 freiburg1, 2 or 3, according to the folder's name. Published principal points are relative to the centre of
 the upper left pixel, so half a pixel is added here. Colour images of freiburg1 and freiburg2 are distorted;
