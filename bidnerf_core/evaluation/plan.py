@@ -361,7 +361,7 @@ def parse_settings(method: str, config: str) -> Any:
 
 
 def planned(plan: Plan, map: str, data: str, dataset: Capture) -> list[Trial]:
-    """Return all trials of a plan in the order of the results; ``map`` and ``data`` name the map and ``dataset``.
+    """Return the trials of a plan, or of its shard, in the order of the results; ``map`` and ``data`` name the map and ``dataset``.
 
     Raises ``InputError`` for a plan that cannot be carried out.
     """

@@ -245,14 +245,14 @@ def _opened(
 
 @lru_cache(maxsize=4)
 def opened_points(folder: str, stored: Map) -> SparsePoints:
-    """Return the points of the COLMAP model in ``folder``, scaled to the map with the poses of its training cameras."""
+    """Return the points of the COLMAP model in ``folder``, scaled to the map by means of the poses of the map's training images."""
     if not stored.info.cameras:
         raise InputError("the map has no training cameras to determine the scale from", where=folder)
     return SparsePoints(Path(folder), places_of(stored.info), SparseChoice())
 
 
 def places_of(info: MapInfo) -> list[tuple[str, SE3]]:
-    """Return the name and T_world_camera (float64) of each training image."""
+    """Return the name and T_world_camera (float64, relative to the map's origin) of each training image."""
     return [(stored.name, T) for stored, (_, T) in zip(info.cameras, cameras_of(info), strict=True)]
 
 

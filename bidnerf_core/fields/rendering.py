@@ -167,9 +167,9 @@ class RenderedImage:
 def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> FieldValues:
     """Return the field's values at the samples (*r s), with density 0 at invalid samples.
 
-    Invalid samples are skipped. If the host must not wait for the device to count them (see ``may_wait``), the
-    field is queried at the origin instead, and the result is discarded; but if gradients are
-    needed for the rays and not for the field's parameters, the field's own derivatives are used where it offers them.
+    Invalid samples are skipped. If the host must not wait for the device to count them (see ``may_wait``), the field
+    is queried at the origin instead, and the result is discarded. In that case, if gradients are needed for the rays
+    but not for the field's parameters, a ``DifferentiatedField`` provides the derivatives.
     """
     valid = samples.valid
     waiting = may_wait(valid.device)

@@ -62,7 +62,7 @@ DEPTH_RESIDUALS: dict[str, DepthResidual] = {
     "truncated": truncated_depth_residual,
     "first-surface": first_surface_residual,
 }
-"""Depth residuals by the names that the setting ``depth_residual`` accepts; add your own."""
+"""Depth residuals by the names that the setting ``depth_residual`` accepts. Users may add others."""
 
 
 def free_space(rendering: Rendering, distance: Float[Tensor, "*p"], margin: float) -> Float[Tensor, "*p"]:

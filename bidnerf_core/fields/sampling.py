@@ -367,5 +367,5 @@ class NoField(nn.Module):
 
 
 def has_field(field: RadianceField) -> bool:
-    """Return whether there is a real field, rather than ``NoField``."""
+    """Return whether ``field`` is a real field rather than ``NoField``."""
     return not isinstance(trained_field(field), NoField)

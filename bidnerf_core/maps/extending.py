@@ -108,7 +108,7 @@ def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> li
     """Localize frames in a map, and return those that are new to it as views, with names that the map does not use yet.
 
     ``unread`` lists the photos that could not be read; they count as left out. Raises ``InputError`` if the map
-    has no landmarks, and if hardly any frame is localized.
+    has no landmarks, and if fewer than a quarter of the frames are localized.
     """
     where = scene.name
     if scene.landmarks is None:

@@ -368,7 +368,7 @@ def build_field(info: MapInfo, where: str) -> RadianceField:
 
 
 def content_digest(field: RadianceField, surface: SurfaceMap | None, landmarks: LandmarkMap | None) -> str:
-    """Return a hexadecimal digest of a map's content."""
+    """Return a hexadecimal digest of the content of a map: the weights of its field, its surface and its landmarks."""
     trained, hashed = trained_field(field), hashlib.blake2b(digest_size=8)
     if isinstance(field, ScaledField):
         hashed.update(repr(field.scale).encode())

@@ -306,8 +306,8 @@ def resume(
 def interrupted(folder: Path, baking: bool = True) -> MapInfo:
     """Check that the map in ``folder`` has work left to resume, and return its description.
 
-    Work is left if training or, with ``baking``, the surface or the capture record is incomplete. Raises
-    ``InputError`` if nothing is left to do.
+    Work is left if training is incomplete or, with ``baking``, if the surface or the capture record is
+    missing. Raises ``InputError`` if nothing is left to do.
     """
     try:
         info = load_info(folder)

@@ -275,10 +275,10 @@ class TrajectoryErrors:
 
 
 def alignment_errors(found: SE3, true: SE3) -> Float[Tensor, "n"] | None:
-    """Return the absolute trajectory error of each pose: its distance (metres) from the truth after a rigid alignment.
+    """Return the absolute trajectory error of each pose: its distance from the true position after a rigid alignment.
 
-    The alignment minimizes the squared distances between the estimated and the true camera centres, without scaling. Returns
-    None if the camera did not move, since the rotation is then undetermined.
+    The alignment minimizes the squared distances between the estimated and the true camera centres, without scaling. The
+    errors are in the unit of the poses. Returns None if the camera did not move, since the rotation is then undetermined.
     """
     source, target = found.translation.double(), true.translation.double()
     try:

@@ -92,7 +92,7 @@ class ClosedFormScene:
 
 
 def views(scene: ClosedFormScene, intrinsics: Intrinsics, poses: Sequence[SE3]) -> list[View]:
-    """Render the scene from each pose (``T_world_camera``); frames are named 0000, 0001 ..."""
+    """Return views of a scene rendered from ``poses`` (``T_world_camera``); the frames are named 0000, 0001 and so on."""
     return [View(scene.render(intrinsics, T, f"{i:04d}"), T) for i, T in enumerate(poses)]
 
 
@@ -114,7 +114,7 @@ def orbit(
     elevation: tuple[float, float] = (5.0, 80.0),
     seed: int = 0,
 ) -> list[SE3]:
-    """Return poses (``T_world_camera``) spread evenly over a sphere (Fibonacci) around ``centre``, which they look at.
+    """Return poses (``T_world_camera``) that look at ``centre``, spread evenly over a sphere around it (Fibonacci lattice).
 
     ``radius`` is in metres. ``elevation`` is the range in degrees above the horizon; (-90, 90) is the whole sphere. ``seed``
     rotates the spiral, so that orbits with different seeds share no position.

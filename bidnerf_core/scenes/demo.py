@@ -37,7 +37,7 @@ C = SimpleNamespace(
 
 
 def demo_object() -> ClosedFormScene:
-    """Return a toy lorry, nose towards +x, within the cube from -1 to 1, in front of a white background."""
+    """Return a toy lorry within the cube from -1 to 1, with its nose towards +x, in front of a white background."""
     bounds = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 12.0, (1.0, 1.0, 1.0))
     return ClosedFormScene(_lorry(), bounds, "demo_object")
 
@@ -89,7 +89,7 @@ def _lorry() -> list[Primitive]:
 
 
 def _furniture() -> list[Primitive]:
-    """Return the walls, table, sofa, the shelf (against the wall at -x) with its books, and decoration."""
+    """Return the walls, a table, a sofa, a shelf with books (against the wall at -x), and decoration."""
     walls = Faces(
         (
             stripes(C.sky, C.cream, (0, 1, 0.25), 0.6),

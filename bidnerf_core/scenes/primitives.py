@@ -53,7 +53,7 @@ class Waves:
 
 @dataclass(frozen=True)
 class Faces:
-    """A texture for each side (+x, -x, +y, -y, +z, -z); a point gets the texture of the axis nearest to its normal."""
+    """A texture for each side (+x, -x, +y, -y, +z, -z); a point gets the texture of the side that its normal faces."""
 
     sides: tuple[Texture, Texture, Texture, Texture, Texture, Texture]
 
@@ -68,21 +68,21 @@ class Faces:
 
 
 def checker(first: Colour, second: Colour, period: float | Vector, phase: float = 0.7) -> Waves:
-    """Return soft cubes of alternating colour; ``period`` (metres) is twice the side of a cube, for all axes or per axis."""
+    """Return a texture of soft cubes of alternating colour; ``period`` (metres) is twice the side of a cube, for all axes or per axis."""
     px, py, pz = period if isinstance(period, tuple) else (period,) * 3
     waves = ((2 * math.pi / px, 0.0, 0.0), (0.0, 2 * math.pi / py, 0.0), (0.0, 0.0, 2 * math.pi / pz))
     return Waves(first, second, waves, (phase, phase + 0.5, phase + 0.9), hardness=5.0)
 
 
 def stripes(first: Colour, second: Colour, across: Vector, period: float, phase: float = 0.0) -> Waves:
-    """Return soft bands that repeat every ``period`` metres in the direction ``across``."""
+    """Return a texture of soft bands that repeat every ``period`` metres in the direction ``across``."""
     length = math.hypot(*across)
     x, y, z = (2 * math.pi / period * a / length for a in across)
     return Waves(first, second, ((x, y, z),), (phase,), hardness=4.0)
 
 
 def blotches(first: Colour, second: Colour, period: float, seed: int) -> Waves:
-    """Return spots about half a ``period`` (metres) wide that do not visibly repeat."""
+    """Return a texture of spots about half a ``period`` (metres) wide, which do not visibly repeat."""
     generator = torch.Generator().manual_seed(seed)
     directions = torch.nn.functional.normalize(torch.randn((7, 3), generator=generator), dim=-1)
     lengths = 2 * math.pi / period * torch.linspace(0.7, 1.5, 7)[:, None]

@@ -148,7 +148,7 @@ def _around_a_pixel(frame: Frame, size: int, generator: Generator) -> list[Bool[
 
 
 def restated(frame: Frame, **changes: Any) -> Frame:
-    """Change the stated camera; the image is unchanged."""
+    """Change parameters of the stated camera; the image is unchanged."""
     return frame.replace(intrinsics=replace(frame.intrinsics, **changes))
 
 

@@ -28,7 +28,7 @@ SWITCH = WholeNumbers(0, 1)
 
 @dataclass(frozen=True)
 class Fault:
-    """A kind of fault. Its random choices depend on the seed and the frame, not on the size, so sizes are comparable."""
+    """A kind of fault. Its random choices depend on the seed and the frame, not on the size, so results of different sizes are comparable."""
 
     unit: str  # of the size, in words
     allowed: Range
