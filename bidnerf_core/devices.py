@@ -77,7 +77,7 @@ def may_wait(device: torch.device) -> bool:
 # keep their values from the capture.
 
 _capturing = Lock()
-"""Allows one capture at a time: a capture begins by waiting for the device, which is forbidden during another."""
+"""Lock that allows one capture at a time: a capture begins by waiting for the device, which is forbidden while another runs."""
 _sharing = Lock()
 _free: dict[torch.device, list[_Lane]] = {}
 """The lanes of each device that no thread is using, with the most recently used lane at the end."""

@@ -31,14 +31,13 @@ GROUPS: Mapping[str, str] = {
     "exporters": "exporter",
     "services": "protocol",
 }
-"""The groups of plugins, with the noun for an object of each. The name of the entry-point group is that of the group
-with the prefix ``bidnerf.``."""
+"""The groups of plugins, each with the noun for one of its objects. The entry-point group is named ``bidnerf.GROUP``."""
 
 USUAL_BACKEND, USUAL_METHOD, USUAL_FEATURES = "hashgrid", "auto", "sift"
 """The backend, method and keypoint detector that are used by default."""
 
 TABLE = "*"
-"""The name of an entry point whose object is a mapping of plugins by name. Listing its group imports it."""
+"""The name of an entry point whose object is a mapping from name to plugin. Listing the group imports the mapping."""
 
 Defects: TypeAlias = Callable[[Any], Iterator[str]]
 """A function that yields the reasons why an object is not a valid plugin of its kind, the most informative one first."""

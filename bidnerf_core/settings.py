@@ -1,8 +1,8 @@
 """Settings as frozen dataclasses: the range of each field, and the flat names by which users set the fields.
 
-A method's settings are nested dataclasses with `Annotated` fields, small groups that several methods share. On
-the command line and in JSON, every field has a flat name, as in ``{"rays": 512, "depth_weight": 3}``: a name is
-unique within a method, whichever group it belongs to.
+A method's settings are composed of small nested dataclasses with `Annotated` fields, which several methods share.
+On the command line and in JSON, every field has a flat name, as in ``{"rays": 512, "depth_weight": 3}``: a name
+is unique within a method, whichever dataclass declares it.
 """
 
 from __future__ import annotations

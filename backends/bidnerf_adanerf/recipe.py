@@ -41,7 +41,7 @@ class Phase(Enum):
 
 
 def phase_at(step: int, config: AdaNerfConfig) -> Phase:
-    """Return the phase of a step."""
+    """Return the phase of training to which a step belongs."""
     soft = round(config.dense_part * config.steps)
     sparse = round((config.dense_part + config.soft_part) * config.steps)
     return Phase.DENSE if step < soft else Phase.SOFT if step < sparse else Phase.SPARSE

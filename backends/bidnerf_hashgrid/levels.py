@@ -17,7 +17,7 @@ PRIMES = (1, 2654435761 - 2**32, 805459861)
 
 @dataclass(frozen=True)
 class Level:
-    """A grid of vertices, whose features are stored in a table of ``entries``."""
+    """One level: a grid of vertices whose features are stored in a table with ``entries`` rows."""
 
     resolution: int  # cells along a side
     entries: int
@@ -25,7 +25,7 @@ class Level:
     hashed: bool
 
     def vertices(self, points: Float[Tensor, "3 m"]) -> tuple[Int[Tensor, "3 2 m"], Float[Tensor, "3 m"]]:
-        """Return the terms of the corner indices for the lower and upper vertex of each axis, and the position in the cell."""
+        """Return the index terms of a cell's lower and upper vertices along each axis, and the points' positions in the cell."""
         scaled = points * self.resolution
         # A coordinate of exactly 1 belongs to the last cell, whose upper vertices exist.
         lower = scaled.to(torch.int32).clamp_(0, self.resolution - 1)

@@ -62,7 +62,7 @@ def _limits(rays, grid, ray, n, CONTRACTED: tl.constexpr):
 
 @triton.jit
 def _cell_at(x, y, z, grid, CONTRACTED: tl.constexpr):
-    """Return the index of the cell that holds each point (world), or of the nearest one, and whether it is inside the grid."""
+    """Return the index of the cell at (or nearest to) each point (world), and whether the point is inside the grid."""
     half, count = tl.load(grid + 3), tl.load(grid + 5)
     x, y, z = (x - tl.load(grid)) / half, (y - tl.load(grid + 1)) / half, (z - tl.load(grid + 2)) / half
     if CONTRACTED:

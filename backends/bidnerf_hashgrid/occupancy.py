@@ -126,7 +126,7 @@ class OccupancyGrid(nn.Module):
         )
 
     def by_kernel(self, rays: Rays, count: int, jitter: Generator | None) -> RaySamples | None:
-        """Return up to ``count`` intervals per ray in occupied cells, concentrated if there are more; None where no kernel is used."""
+        """Return up to ``count`` intervals per ray in occupied cells, concentrated if there are more; None if no kernel is used."""
         device = rays.near.device
         if may_wait(device) or not fused.available(device) or count > MOST:
             return None

@@ -262,7 +262,7 @@ def frozen(field: Any) -> Any:
 
 
 def precise(field: RadianceField) -> tuple[RadianceField, torch.dtype]:
-    """Return a copy of the field in float64 if it supports that, else the field itself in float32, and the dtype."""
+    """Return a float64 copy of the field if it supports that dtype, else the field itself, and the dtype to use."""
     try:
         doubled: Any = copy.deepcopy(field)
         # A level need not be a module itself; then the modules that it holds are converted.

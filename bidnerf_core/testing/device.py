@@ -246,10 +246,10 @@ def _waiting(name: str, args: Any, flat: list[Any], there: bool, wanted: str | N
 
 
 def _generator_of(kind: Any) -> Any:
-    """Return a stand-in for the class of generators ``kind``, which PyTorch cannot create on ``DEVICE``.
+    """Return a stand-in for the generator class ``kind``, whose instances PyTorch cannot create on ``DEVICE``.
 
-    For ``DEVICE``, it creates a generator on the CPU that reports ``DEVICE`` as its device; for any other device, an instance
-    of ``kind`` itself.
+    For ``DEVICE``, the stand-in creates a generator on the CPU that reports ``DEVICE`` as its device; for any other device, it
+    creates an instance of ``kind``.
     """
 
     class SimulatedGenerator(kind):

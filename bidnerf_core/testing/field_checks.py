@@ -283,7 +283,7 @@ def check_intervals(field: RadianceField) -> None:
 
 
 def _arrangements() -> Iterator[Rays]:
-    """Yield rays with various numbers of axes, some of them without any ray."""
+    """Yield batches of rays with various shapes, some of them without any rays."""
     for shape in ((), (1,), (2, 3), (0,), (2, 0)):
         index = torch.arange(torch.Size(shape).numel()).reshape(shape)
         yield picked(awkward_rays()["rays from outside"], index)

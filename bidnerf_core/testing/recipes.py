@@ -68,7 +68,7 @@ class Training(NamedTuple):
 
 
 def copied(field: Any) -> dict[str, Tensor]:
-    """Return a copy of a field's state, empty if the field is not a module, which another test reports."""
+    """Return a copy of a field's state, or an empty one if the field is not a module; another test reports this."""
     state = field.state_dict() if isinstance(field, nn.Module) else {}
     return {name: value.detach().clone() for name, value in state.items()}
 

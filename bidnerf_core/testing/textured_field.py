@@ -96,7 +96,7 @@ def textured_map(surface: bool = False) -> MapWithLandmarks:
 
 @dataclass(frozen=True, eq=False)
 class MovedField:
-    """A field expressed in another world frame."""
+    """The textured ground expressed in another world frame."""
 
     field: TexturedGround
     T_new_old: SE3

@@ -42,7 +42,7 @@ from bidnerf_core.viewer.pictures import Json, drawing, packed, photograph, quic
 from bidnerf_core.viewer.scene import frustum, rows_of
 
 MOST_STEPS = 200
-"""Maximum number of steps of a descent that are shown; more are subsampled at a regular stride."""
+"""Maximum number of steps of a descent that are shown; longer descents are subsampled at a regular stride."""
 
 
 def no_answer(name: str, outcome: str, reason: str) -> Json:
