@@ -161,7 +161,7 @@ class MatchedPair:
 def _pairs(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
     """Return pairs of images that probably overlap.
 
-    The images of a pair are neighbours according to the poses, which may be wrong, or in the given order.
+    The images of a pair are neighbours according to the poses, which may be wrong, or in the order of ``images``.
     """
     count = len(images)
     pairs = {(i, i + step) for step in (1, 3) for i in range(count - step)}

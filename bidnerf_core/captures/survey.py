@@ -234,7 +234,7 @@ def relocated(
         return {}
     try:
         matcher = LandmarkMatcher(tracked.without(numbers).landmarks(config))
-    except InputError:  # the rest has no overlap
+    except InputError:  # the other photos do not overlap
         return {}
     answers: dict[int, Relocation] = {}
     for number in numbers:

@@ -35,7 +35,7 @@ UP = (0.0, 1.0, 0.0)
 
 
 class LidarDepth:
-    """Reads lidar depth of high confidence only, and remarks once if an image loses all of its depth.
+    """Reads lidar depth of high confidence only, and issues one remark if an image loses all of its depth.
 
     ``scales`` holds the values that may denote high confidence, for apps that do not keep ARKit's values.
     """

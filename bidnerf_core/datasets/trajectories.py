@@ -233,7 +233,7 @@ def pose_numbers(where: str, numbers: Sequence[float], order: str = "xyzw") -> l
     quaternion, length = dict(zip(order, numbers[3:], strict=True)), math.hypot(*numbers[3:])
     if length == 0 or not all(map(math.isfinite, numbers)):
         return None
-    if abs(length - 1) > 0.01:  # more than rounding, for example to four decimals, explains
+    if abs(length - 1) > 0.01:  # more than rounding explains, for example to four decimals
         names = " ".join(f"q{letter}" for letter in order)
         raise InputError(f"the quaternion has length {length:.3g}", where=where, expected=f"1 ({names})")
     return [*numbers[:3], *(quaternion[letter] for letter in "xyzw")]

@@ -115,7 +115,7 @@ def _absent(values: np.ndarray, metres: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _at_limit(values: np.ndarray, metres: np.ndarray, unmeasured: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the mask of the pixels at the sensor's limit, by its name in messages; empty if there are none."""
+    """Return the mask of the pixels at the sensor's limit, by its name in messages; empty if there are no such pixels."""
     measured = metres[~unmeasured]
     if not measured.size:
         return {}

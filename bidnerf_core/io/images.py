@@ -354,6 +354,6 @@ def reason(error: Exception) -> str:
 
 def png_bytes(pixels: Shaped[np.ndarray, "h w *channels"]) -> bytes:
     """Encode an 8-bit image, or a 16-bit grey one, as the content of a PNG file."""
-    import imageio.v3 as iio  # imported here, since reading does without it
+    import imageio.v3 as iio  # imported here, since reading does not need it
 
     return bytes(iio.imwrite("<bytes>", pixels, extension=".png"))

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
-LARGEST_NUMBER = sys.float_info.max  # JSON can hold NaN, 1e999 and integers that no float can
-LARGEST_INTEGER = 2**63 - 1  # the largest that tensors and files can hold
+LARGEST_NUMBER = sys.float_info.max  # JSON can hold NaN, 1e999 and integers too large for a float
+LARGEST_INTEGER = 2**63 - 1  # the largest integer that tensors and files can hold
 EXPECTED = {
     "bool_type": "bool", "int_type": "int", "float_type": "float", "finite_number": "float", "string_type": "str",
     "dict_type": "an object", "list_type": "a list", "tuple_type": "a list", "missing": "a longer list",

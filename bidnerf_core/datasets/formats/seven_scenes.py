@@ -12,7 +12,7 @@ are those of the depth camera (focal length 585 px); the colour camera has 525 p
 By default, poses and depth are handled as in the literature (ACE, CVPR 2023, and the pseudo ground truth
 of Brachmann et al., ICCV 2021): poses are transformed to the colour camera and depth is registered to it,
 using the calibration of another Kinect or a given one. Without registration, images, depth and poses are used
-as they are, with the 585 px stated on the dataset's page for both, as in KinectFusion and its successors;
+as they are, with the 585 px stated on the dataset's page for both cameras, as in KinectFusion and others;
 near the image border, colours are then some 30 px away from their depth.
 
 Cameras are scaled to images of other sizes. A camera that is given, or found in the folder's ``camera.json``

@@ -106,7 +106,7 @@ def _find(path: Path) -> Path | None:
 
 
 def _published(name: str, whole: bool = False) -> Intrinsics | None:
-    """Return the benchmark's calibration of the sensor that a name is or contains, such as ``freiburg1``, or None."""
+    """Return the benchmark's calibration of the sensor that ``name`` contains (or is, with ``whole``), or None."""
     sensor = re.compile(r"(?:freiburg|fr)_?([123])(?!\d)", re.IGNORECASE)
     found = sensor.fullmatch(name) if whole else sensor.search(name)
     return CAMERAS[found[1]] if found else None
