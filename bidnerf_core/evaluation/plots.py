@@ -241,7 +241,7 @@ def _wrapped(text: str, width: float, lines: int = 4) -> str:
 
 
 def comparison_figure(folder: Path, comparison: Comparison) -> Path:
-    """Draw errors, times and costs of each map as ``compare.png`` and ``compare.svg``, and return the path of the latter.
+    """Draw errors, times and costs of each map as ``compare.png`` and ``compare.svg``, and return the path of the SVG.
 
     Raises ``InputError`` if matplotlib, which is optional, is missing.
     """

@@ -284,8 +284,8 @@ def executor_of(workers: Workers, trials: int, on_cpu: bool) -> Iterator[tuple[E
     """Yield an executor for ``trials`` trials, the number of trials to run on it at once, and its description.
 
     If the work fails, the local processes are ended along with their trials. Workers of a cluster need this
-    package, the same backends, and the maps and data under the same paths. Peak memory is measured per process:
-    it is that of a single trial only if the worker has one thread (``dask worker --nthreads 1``).
+    package, the same backends, and the maps and data under the same paths. Peak memory is measured per process,
+    and therefore per trial only if each worker has one thread (``dask worker --nthreads 1``).
 
     Raises ``InputError`` for a number below 1, if dask is missing, and if no scheduler or worker responds.
     """

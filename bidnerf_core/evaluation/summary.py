@@ -160,7 +160,7 @@ class Summary:
     """Statistics of a group of trials. A median is None if the middle value is unknown."""
 
     trials: int
-    frames: int  # number of distinct ones; this, not the number of trials, limits the precision of the rates
+    frames: int  # number of distinct frames, which limits the precision of the rates
     unit: LengthUnit  # of the errors
     success: dict[str, Success | None]  # by criterion; None if it does not apply
     translation: float | None  # median of the final errors

@@ -116,7 +116,7 @@ def _position(place: SE3 | Position) -> Float[Tensor, "3"]:
 
 
 def _camera_of(scene: Map, name: str) -> StoredCamera | None:
-    """Return the camera called ``name``, or the only camera whose name ends with it; None if there is none.
+    """Return the camera called ``name``, or the only camera whose name ends with ``name``; None if there is no such camera.
 
     ``name`` may include the extension of an image file.
     """

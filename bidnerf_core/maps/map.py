@@ -143,8 +143,8 @@ class Map:
     def up(self) -> UpDirection | None:
         """The up direction in the world frame, with its source; None without measured gravity and without cameras.
 
-        The direction is that of measured gravity if the capture recorded it, and is otherwise estimated from
-        planes of the surface and from the cameras.
+        The direction is taken from gravity if the capture measured it, and is otherwise estimated from planes
+        of the surface and from the cameras.
         """
         if self.info.gravity_up is not None:
             return given_up(self.info.gravity_up)
@@ -155,7 +155,7 @@ class Map:
 
     @property
     def colour_noise(self) -> float | None:
-        """Root mean square error of the field's colours (in [0, 1]) on its own training images; None if unknown."""
+        """Root mean square error of the field's colours (in [0, 1]) on the map's training images; None if unknown."""
         return self.info.colour_noise
 
     @cached_property
@@ -290,8 +290,8 @@ class Map:
 
     def check_alike(self, views: Sequence[View], where: str) -> None:
         """Raise ``InputError`` if photos differ too much from the field's renderings, whether or not the map was built from them."""
-        # The difference (RMS) between rendered and photographed colours indicates another scene if it is large relative to that of
-        # the photos the map was built from, or in itself if that is unknown, as in a map that was never baked.
+        # The difference (RMS) between rendered and photographed colours indicates another scene if it is much larger than for the
+        # photos from which the map was built or, in a map that was never baked, if it is large in itself.
         off, usual = colour_noise(self.field, self.bounds, views), self.colour_noise
         if off > (0.3 if usual is None else max(0.2, 2 * usual)):
             raise InputError(

@@ -54,7 +54,7 @@ class Answer:
 
     name: str
     number: int  # index in the run or sequence, from 0
-    intrinsics: Intrinsics  # of the upright image; corrected ones if the localization used such
+    intrinsics: Intrinsics  # of the upright image; corrected if the localization corrected them
     found: Localization
     truth: SE3 | None = None  # T_world_camera
     time: float | None = None  # seconds

@@ -40,7 +40,7 @@ class FoundPoses:
     source: str  # name of the folder of photos, or of the video
     photos: int  # including those that cannot be read
     placed: int  # photos with a pose
-    models: tuple[int, ...]  # number of photos of each model, largest first; only this one is in the dataset
+    models: tuple[int, ...]  # number of photos of each model, largest first; only the first is in the dataset
     left_out: tuple[LeftOut, ...]
     points: int  # triangulated points of the largest model
     reprojection_error: float  # mean, in pixels of photos downscaled to at most 1600 pixels

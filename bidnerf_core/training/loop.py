@@ -52,7 +52,7 @@ class Report(Protocol):
         ...
 
     def due(self, step: int) -> bool:
-        """Return whether ``save`` is to be called after this step."""
+        """Return whether ``save`` should be called after this step."""
         ...
 
     def save(self, state: TrainingState) -> None:
