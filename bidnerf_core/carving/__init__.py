@@ -1,5 +1,6 @@
-"""Carving: which space may be occupied according to the views alone, before any field is trained. When in doubt,
-space counts as occupied.
+"""Carving: the space that may be occupied, found from the views alone, before any field is trained.
+
+When in doubt, space counts as occupied.
 """
 
 from lazy_loader import attach_stub

@@ -1,9 +1,8 @@
-"""Carving: the cells of a box that no views see through, and the free space of a view, up to which its pixels see no matter.
+"""Carving: the cells of a box that no views see through, and the free space of a view: the depth up to which its pixels see no matter.
 
 A cell is represented by its circumscribed sphere, which must lie entirely within the free space of a view.
 
-When in doubt, space counts as occupied: where nothing was measured, and beyond the depth that
-any neighbouring pixel sees.
+When in doubt, space counts as occupied: where nothing was measured, and beyond the depth that any neighbouring pixel sees.
 """
 
 from __future__ import annotations

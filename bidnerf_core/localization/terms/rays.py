@@ -133,7 +133,7 @@ class RenderedRays:
         return (self._robust(value)[0] / self.noise**2)[0].cpu()
 
     def fitted(self, states: States) -> RenderedRays:
-        """Return the term with the noise that follows from the scatter of the rays' gradients at the first state."""
+        """Return the term with its noise estimated from the scatter of the rays' gradients at the first state."""
         return replace(self, noise=self.at(moved(states[:1], self.rgb.device)).fitted_noise())
 
     @property
@@ -280,7 +280,7 @@ class ComparedRays:
         return (total / coloured.sum().clamp(min=1)).sqrt()
 
     def fitted_noise(self) -> Float[Tensor, ""]:
-        """Return the noise that follows from the scatter of the rays' gradients at the first state."""
+        """Return the noise, estimated from the scatter of the rays' gradients at the first state."""
         weight = self.term._robust(self.value)[1][0, :, :, None]
         rows = self.rows[0, :, :, :6]
         hessian = (weight * rows).flatten(0, 1).mT @ rows.flatten(0, 1)

@@ -118,7 +118,7 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The pose of a static camera that observes points."""
+    """The pose of a static camera, fitted to points that it observes."""
 
     points: Points
     camera: Intrinsics

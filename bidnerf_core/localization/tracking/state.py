@@ -76,7 +76,7 @@ class TrackerState:
     doubt: Float[Tensor, "6 6"] = _zeros(6, 6)  # covariance of the pose due to errors of the intrinsics
 
     def corrected(self, frame: Frame) -> Frame:
-        """Return a frame with its camera corrected, or unchanged if its focal length is of the other kind (exact or approximate)."""
+        """Return a frame with its camera corrected; unchanged if the correction suits only exact, or only approximate, focal lengths."""
         if frame.focal_is_approximate != self.is_approximate or not bool(self.camera.any()):
             return frame
         return frame.replace(intrinsics=true_intrinsics(frame.intrinsics, self.camera))
@@ -100,7 +100,7 @@ def save_state(path: Path, state: TrackerState, key: str) -> None:
 
 
 def load_tracker_state(path: Path, key: str) -> TrackerState:
-    """Read a state. Raises ``InputError`` for any other file, another version, or a map other than ``key``."""
+    """Read a state. Raises ``InputError`` for any other file, for another version, and for the state of a map other than ``key``."""
     expected = "a file written by Tracker.save"
     tensors, metadata = read_tensors_and_metadata(path, expected)
     found = parse_json(metadata.get("bidnerf", "null"), str(path), expected)

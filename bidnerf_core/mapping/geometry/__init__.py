@@ -1,1 +1,1 @@
-"""Unknown points that images see: triangulation, and bundle adjustment of the points together with the poses."""
+"""Estimation of the points that images observe: triangulation, and bundle adjustment of points and poses together."""

@@ -162,7 +162,7 @@ def linearized(
 def _prior_term(
     state: Adjustment, prior: PosePrior
 ) -> tuple[float, Float[Tensor, "v k"], Float[Tensor, "v k"]]:
-    """Return cost, gradient and precision of the prior, in standard deviations.
+    """Return the cost, the gradient and the diagonal of the precision of the prior.
 
     Deviations from the given poses have a Cauchy loss, and motions a quadratic one.
     """

@@ -224,7 +224,7 @@ class TrackedViews:
         )
 
     def without(self, images: Sequence[int]) -> TrackedViews:
-        """Return the tracks without the keypoints of ``images``, and without known positions of points, which may come from these images."""
+        """Return the tracks without the keypoints of ``images``, and without known points, whose positions may come from these images."""
         left = ~torch.isin(self.observations.image, torch.tensor(images))
         return replace(self, observations=self.observations[left], points=None)
 

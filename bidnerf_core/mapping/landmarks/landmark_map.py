@@ -101,9 +101,8 @@ class LandmarkCells:
     ) -> Int[Tensor, "m"]:
         """Return the indices of the landmarks in all cells that may be visible in an image, in no particular order.
 
-        A landmark is visible if ``|x| <= slopes[0] z`` and ``|y| <= slopes[1] z`` in the camera's frame, the camera is at
-        most ``oblique`` (radians) outside the cone of the landmark's viewing directions, and the landmark is not smaller than
-        ``size`` z.
+        A landmark is visible if ``|x| <= slopes[0] z`` and ``|y| <= slopes[1] z`` in the camera's frame, the camera is at most ``oblique``
+        (radians) outside the cone of the landmark's viewing directions, and the landmark's size is at least ``size`` times z.
         """
         local = T_world_camera.inverse().to(torch.float32).apply(self.centres)
         beyond = (local[:, :2].abs() - slopes * local[:, 2:]) / (1 + slopes.square()).sqrt()
@@ -215,7 +214,7 @@ class LandmarkMap:
 
     @cached_property
     def cells(self) -> LandmarkCells | None:
-        """The cells of the landmarks, on the CPU (a second for a million landmarks); None for few landmarks."""
+        """The cells of the landmarks, on the CPU (computing them takes a second for a million landmarks); None for few landmarks."""
         return (
             LandmarkCells.of(self.positions, self.directions, self.cones, self.sizes)
             if len(self) > FEW

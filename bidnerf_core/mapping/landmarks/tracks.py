@@ -266,7 +266,7 @@ def fused_landmarks(
     covariance: Float[Tensor, "n 3 3"],
     noise: float,
 ) -> LandmarkMap:
-    """Return landmarks at ``positions`` (metres, world) with this covariance; each landmark needs at least one observation.
+    """Return landmarks at ``positions`` (metres, world) with ``covariance`` (square metres); each needs at least one observation.
 
     ``noise`` is the noise of a keypoint (pixels). The images' poses are taken as exact: ``pose_covariance`` is 0.
     """

@@ -1,4 +1,4 @@
-"""Depth images with known poses: their consistency, and the cells of a surface that they and a memory limit allow."""
+"""Depth images with known poses: their consistency, and the cell size that they and a memory limit allow for a surface."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class PosedDepthImage:
         return self.T_world_camera.to(torch.float32).apply(rays * self.image.depth[pixels][:, None])
 
     def beyond(self, points: Float[Tensor, "p 3"]) -> Float[Tensor, "p"]:
-        """Return how far beyond each point (metres, world) its line of sight ends (metres of depth); NaN outside the image."""
+        """Return the image's depth minus that of each point (metres, world); infinite for background, NaN if unknown or outside the image."""
         local = self.T_world_camera.to(torch.float32).inverse().apply(points)
         u, v = self.intrinsics.project(local).unbind(-1)
         height, width = self.image.depth.shape

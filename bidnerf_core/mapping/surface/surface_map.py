@@ -211,7 +211,7 @@ def cast(
 def trace(
     surface: SurfaceMap, origins: Float[Tensor, "*r 3"], directions: Float[Tensor, "*r 3"], steps: int = 48
 ) -> Float[Tensor, "*r"]:
-    """Return the distance (metres) at which each ray comes within a cell of the surface inside the grid.
+    """Return the distance (metres) at which each ray comes within one cell size of the surface inside the grid.
 
     It is infinite if the ray never does. ``directions`` are unit vectors.
     """
