@@ -84,7 +84,7 @@ def _rays_to_matter(views: Sequence[View]) -> tuple[Float[Tensor, "n 3"], Float[
     origins, directions = [], []
     for view in views:
         alpha, hidden = view.frame.alpha, view.frame.hidden
-        assert alpha is not None  # it has an outline
+        assert alpha is not None  # every view has an outline
         ray, _ = rays_of(view, alpha > 0.5 if hidden is None else (alpha > 0.5) & ~hidden, 500)
         directions.append(view.T_ref_camera.to(torch.float64).rotate(ray))
         origins.append(view.T_ref_camera.translation.double().expand_as(ray))
@@ -188,7 +188,7 @@ def measured_points(view: View, share: int) -> tuple[Float[Tensor, "n 3"], Float
 def _guessed_box(views: Sequence[View], places: Float[Tensor, "v 3"]) -> AxisBox:
     """Return the box suggested by the cameras alone, see ``estimate_bounds``."""
     corners = torch.stack([_corner_rays(view) for view in views])
-    # The tangent of the farthest corner's angle
+    # The tangent of the farthest corner's angle to the optical axis
     tangents = torch.linalg.vector_norm(corners[..., :2], dim=-1).amax(dim=-1)
     # The point nearest to all optical axes (least squares) counts if most cameras see it, and from different sides: the mean
     # squared sine of the angles between the axes and their mean is at least that of about 6 degrees.

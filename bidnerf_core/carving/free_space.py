@@ -168,7 +168,7 @@ def occupied_cells(
     needed = 1 if len(views) < 2 else 2
     undecided = torch.ones(len(votes), dtype=torch.bool, device=device)
     at_once = 128 if device.type == "cpu" else max(1, len(votes))  # so few blocks stay in the cache
-    with threads_at_most(1):  # the operations are short
+    with threads_at_most(1):  # more threads would slow down such short operations
         for view in (view for view in views if view.frame.has_depth or view.frame.alpha is not None):
             space = moved(FreeSpace.seen_by(view, tolerance, footprint), device)
             # In double precision, since the world's origin may be far away.

@@ -38,7 +38,7 @@ a third of the answers to which the model was fitted had falsified cameras. No s
 class Evidence:
     """The evidence for accepting a landmark-based pose; no value depends on the unit of length or the image size."""
 
-    # false alarms of the matches by descriptors alone; 0 if the pose was found by other means
+    # log10 of the number of false alarms of the matches by descriptors alone; 0 if the pose was found by other means
     log10_nfa: float
     inliers: int  # matches by projection within three standard deviations
     by_chance: float  # number of such matches expected at a wrong pose

@@ -184,7 +184,7 @@ class Loop:
         return self._nearest[count]
 
     def _proposals(self) -> Iterator[tuple[Proposal, Nearest, float]]:
-        """Yield proposals with their matches and log10 false alarms: by consensus on the strongest keypoints, then on all; then the start."""
+        """Yield proposals, their matches and log10 false alarms: by consensus on the strongest keypoints, then on all; then the start."""
         most = max(len(image.keypoints) for image in self.query.images)
         nearest, record = self.nearest(STRONGEST), current_record()
         for count in dict.fromkeys((min(STRONGEST, most), most)):
@@ -337,7 +337,7 @@ class Loop:
         # Another place has at least three tenths as many inliers as the first.
         if len(others.keypoint.unique()) >= max(LEAST_AGREEING, 0.3 * int(agreeing.sum())):
             modes.append(("another place", query, others))
-        # A pose with fewer false alarms than 1e-150 is unmistakable, so that no mirror image is tried.
+        # A pose with fewer than 1e-150 false alarms is unmistakable, so no mirror image is tried.
         if nfa > -150.0 and self.landmarks.features == "sift" and len(query.images) == 1:
             mirrored = query.mirrored
             modes.append((MIRROR, mirrored, Nearest.of(mirrored, self.matcher, STRONGEST).best))
@@ -362,7 +362,7 @@ class Loop:
         points, fused = None, list[str]()
         others: dict[str, float | None] = {}
         if problem is not None and problem.surface is not None and problem.has_depth:
-            where = "cpu" if problem.surface.device == self.device else None  # ``run_on`` sends them
+            where = "cpu" if problem.surface.device == self.device else None  # ``run_on`` moves them
             points = Surface.of(problem.views, problem.depth_rays, problem.surface, self.seed, device=where)
         if points is not None:
             noise, near, _ = run_on(self.device, fit_noise, points, found.chosen)
@@ -417,7 +417,7 @@ class Loop:
         quadratic, states, normal = minima
         log_odds = torch.zeros(len(quadratic.here), dtype=torch.float64)
         if self.problem is not None and (start := self.problem.start) is not None:
-            # Of two places that look the same, the one nearer to the start is the likelier.
+            # Of two places that look the same, the one nearer to the start is likelier.
             update = (start.inverse() @ quadratic.here.T).log()
             away = update[:, :3].norm(dim=-1) + self._distance(start) * update[:, 3:].norm(dim=-1)
             # In six dimensions, the density of a normal distribution of unknown width falls with the sixth power of the distance.

@@ -343,7 +343,7 @@ class Nearest:
     def best(self) -> Matches:
         """The unambiguous matches, supplemented by ambiguous ones if there are few."""
         order = self.ambiguity.argsort(stable=True)
-        # Ambiguous matches are added up to 60.
+        # Ambiguous matches are added until there are 60.
         count = max(60, int((self.ambiguity <= AMBIGUITY).sum()))  # host
         return Matches(self.keypoint[order[:count]], self.landmark[order[:count], 0])
 
@@ -370,7 +370,7 @@ class Projected:
     ) -> None:
         """Project landmarks up to ``margin`` pixels beyond the image edges, optionally only ``among`` those visible from a nearby pose."""
         self.query, self.landmarks, self.visible = query, landmarks, 0
-        # Of each view: its keypoints, the landmarks, its focal length, their expected sizes in pixels, and a tree of their projections.
+        # For each view: its keypoints, the landmarks, its focal length, their expected sizes in pixels, and a tree of their projections.
         self._parts: list[tuple[Tensor, Tensor, float, Tensor, cKDTree | None]] = []
         nuisances = state.nuisances[0]
         zoom = float(nuisances[0].exp())  # host

@@ -86,7 +86,7 @@ class Method:
     uses_depth: bool = True  # whether it uses measured depth
     presets: Mapping[str, Any] = field(default_factory=dict)  # alternatives to the default settings, by name
     uses_landmarks: bool = False  # whether the map's landmarks are prepared for it, as ``Problem.matcher``
-    # returns those of its settings that matter elsewhere too
+    # returns those of its settings that other parts of the package use
     shared: Callable[[Any], SharedSettings] = lambda config: SharedSettings()
     summary: str = field(kw_only=True)  # one line
 

@@ -69,8 +69,8 @@ class Posterior:
         log = log_evidence(states, normal)
         member = states.mode[None] == torch.arange(len(terms.here))[:, None]
         norm = torch.where(member, log[None], -torch.inf).logsumexp(-1)
-        # Log odds of places do not grow in proportion to the number of matches, since the right place rarely has fewer than two
-        # thirds as many as another: a factor e of the evidence adds ten. Below an evidence of 50, places are not compared, since
+        # The log odds between places do not grow in proportion to the number of matches, since the right place rarely has fewer than
+        # two thirds as many as another: a factor of e in the evidence adds ten. Below an evidence of 50, places are not compared, since
         # a few chance matches are no evidence against even fewer.
         log = log + (log_odds + 10.0 * by_mode.clamp(min=50.0).log() - norm)[states.mode]
         probability = log.nan_to_num(-torch.inf).softmax(0)

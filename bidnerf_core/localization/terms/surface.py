@@ -61,7 +61,7 @@ class Surface:
     coloured: Float[Tensor, "n"]  # 1 where a colour was measured, else 0
     noise: float | Float[Tensor, ""]  # metres
     colour_weight: float = 0.0  # of colours, relative to distances
-    independent: float = 10.0  # largest number of independent measurements among the points
+    independent: float = 10.0  # maximum number of independent measurements among the points
 
     @staticmethod
     def of(

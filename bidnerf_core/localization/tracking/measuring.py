@@ -87,7 +87,7 @@ class Determined:
         points = self.term.points.cpu()
         middle = points.median(0).values
         size = float((points - middle).square().sum(-1).mean().sqrt())
-        # Motion of the points' middle, and rotation times their size, by an update of the camera.
+        # Converts a camera update to the motion of the points' middle, and the rotation times the points' size.
         at_middle = torch.eye(P, dtype=torch.float64)
         at_middle[:3, 3:6] = -skew(middle)
         at_middle[3:6] *= size
@@ -126,7 +126,7 @@ class Measurer:
         if len(known) >= LEAST_AGREEING:
             correlation = landmarks.correlation_of(len(known))
             fit = Fit.of(known, frame.intrinsics, predicted.T_world_camera, correlation)
-            # Landmarks are recognised anew every 20 frames, and once fewer than half of them are left, unless these are many.
+            # Landmarks are recognised anew every 20 frames, and once fewer than half of them are left, unless many are.
             enough = max(ENOUGH_LANDMARKS, min(0.5 * state.sought, 125))
             if int(fit.is_inlier.sum()) >= enough and state.age < 20:
                 tracked = self._by_landmarks(landmarks, frame, state, fit, predicted)
@@ -173,13 +173,13 @@ class Measurer:
         # Around an accurate pose, this radius of matching by projection suffices.
         tight = 1.5 * query.threshold
         if radius > 2 * tight:
-            # Matching by projection would compare a keypoint with the few landmarks nearest to it: compare it with all in view.
+            # Matching by projection would compare a keypoint only with the few landmarks nearest to it; compare it with all in view.
             if len(landmarks) < 2 or len(query.view) < 4:
                 return None
             matches = Nearest.of(query, LandmarkMatcher(landmarks), len(query.view)).best
             points = points_of(matches)
             off = camera.project(T.inverse().apply(points.positions)) - points.pixels
-            some = (off.norm(dim=-1) <= radius).nonzero()[:, 0]  # false for NaN, behind the camera
+            some = (off.norm(dim=-1) <= radius).nonzero()[:, 0]  # NaN (behind the camera) is false
             found = consensus(query, landmarks, matches[some], still)
             if found is None:
                 return None
@@ -338,10 +338,10 @@ class Measurer:
             words = f"{share:.0%} of the rays have the rendered colours"
         else:
             points = replace(points, colour_weight=float(image is not None))
-            # The robust loss begins three times as wide as suits the residuals. The start is close, so that few steps suffice.
+            # At first, the robust loss is three times as wide as suits the residuals. The start is close, so that few steps suffice.
             for wider in (3.0, 1.0):
                 fitted = replace(points, noise=max(points.noise, off)).fitted_noise(states)
-                # The same information from a wider basin.
+                # This widens the basin of convergence and keeps the information.
                 fitted = replace(
                     fitted, noise=wider * fitted.noise, independent=points.independent * wider**2
                 )
@@ -402,7 +402,7 @@ def search_radius(frame: Frame, predicted: Motion) -> float | None:
     """Return the radius (pixels) within which landmarks very likely project; None if this would cover most of the image."""
     camera = frame.intrinsics
     radius = INLIER * pixel_radius(predicted.covariance, camera.fx, predicted.reach)
-    # A search within more than 0.4 of the diagonal would be one of most of the image.
+    # A radius of more than 0.4 of the diagonal would cover most of the image.
     return radius if radius <= 0.4 * math.hypot(camera.width, camera.height) else None
 
 

@@ -128,7 +128,8 @@ class Motion:
         delta = gain @ off
         rest = torch.eye(12, dtype=torch.float64)
         rest[:, :6] -= gain
-        noise = rest @ self.noise @ rest.T + gain @ measured.noise @ gain.T  # Joseph's form stays positive
+        # Joseph's form stays positive semidefinite.
+        noise = rest @ self.noise @ rest.T + gain @ measured.noise @ gain.T
         shared = rest[:6, :6] @ _root(self.bias) + gain[:6] @ _root(measured.bias)
         return Motion(
             retracted(self.T_world_camera, delta[:6]).polished(),

@@ -125,7 +125,7 @@ class Fit:
     states: States  # (1)
     term: Landmarks
     keypoints: int = 0  # in the image, if the points were recognised in it
-    by_chance: int | None = None  # points that would be recognised at a wrong pose; None if they were tracked
+    by_chance: int | None = None  # number of points that would be recognised at a wrong pose; None if tracked
 
     @staticmethod
     def of(points: Points, camera: Intrinsics, start: SE3, correlation: float) -> Fit:

@@ -61,18 +61,18 @@ class TrackerState:
     """The complete state of a tracker between frames."""
 
     clock: Clock
-    motion: Motion | None = None  # None before the first pose was found
+    motion: Motion | None = None  # None until a first pose is found
     frames: int = 0  # number of frames so far
     lost: int = 0  # consecutive frames without an accepted pose, up to the last one
-    searchable: int = 0  # of these, the searchable frames
+    searchable: int = 0  # number of these frames for which the map could be searched
     points: Points = field(default_factory=Points.none)
     image: UInt8[Tensor, "h w"] | None = None  # the last one, grey, in which the points were observed
     sought: int = 0  # number of landmarks when they were last recognised
     age: int = 0  # frames since then
     moves: bool = False  # whether the camera moved during the readout of the last image
-    # Corrections of the stated camera (see ``NUISANCES``) that a search has found, for frames whose focal length is as approximate.
+    # Corrections of the stated camera (see ``NUISANCES``) that a search found, for frames whose focal length is of the same kind.
     camera: Float[Tensor, "6"] = _zeros(6)
-    is_approximate: bool = False
+    is_approximate: bool = False  # whether that kind is an approximate focal length
     doubt: Float[Tensor, "6 6"] = _zeros(6, 6)  # covariance of the pose due to errors of the intrinsics
 
     def corrected(self, frame: Frame) -> Frame:

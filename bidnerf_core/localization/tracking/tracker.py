@@ -221,7 +221,7 @@ class Tracker:
     def _corners(self, frame: Frame, image: Grey | None, points: Points, T_world_camera: SE3) -> Points:
         """Return the corners among ``points``, or new corners at the pose of this frame if few are left."""
         points = points.fresh
-        # New corners are detected once fewer than half of them are left.
+        # New corners are detected once fewer than half of ``POINTS`` are left.
         if image is None or not frame.has_depth or len(points) >= 0.5 * POINTS:
             return points
         return Points.measured(frame, image, T_world_camera, POINTS, self.localizer.depth_sensor.noise)
@@ -238,7 +238,7 @@ class Tracker:
         lost = max(state.searchable, min(state.lost, 1)) if has_begun else state.searchable
         if image is None or (not shows_shape(frame) and is_blank(frame)):
             return None
-        # The whole surface is searched after so many lost frames, and again each time that their number has doubled.
+        # The whole surface is searched after this many lost frames, and again whenever their number has doubled.
         first = 4 if self._landmarks is not None else 1
         is_due = lost == 0 or (lost % first == 0 and (lost // first).bit_count() == 1)
         if self._landmarks is None and not is_due:

@@ -167,7 +167,7 @@ def _prior_term(
     Deviations from the given poses have a Cauchy loss, and motions a quadratic one.
     """
     given, T = prior.T_world_camera, state.T_world_camera
-    away = (T.rotation.mT @ (T.translation - given.translation)[..., None])[..., 0]  # camera
+    away = (T.rotation.mT @ (T.translation - given.translation)[..., None])[..., 0]  # in the camera's frame
     turned = SE3(given.rotation.mT @ T.rotation, torch.zeros_like(away)).log()[:, 3:]
     off = torch.cat([away, turned], dim=-1)
     deviations = torch.tensor([prior.translation] * 3 + [prior.rotation] * 3, dtype=off.dtype)

@@ -144,8 +144,8 @@ class LandmarkMap:
     sizes: Float[Tensor, "n"]  # metres: diameter of the keypoint, measured at its distance
     views: Int[Tensor, "n"]  # number of images that observed it, int32
     noise: float  # pixels: standard deviation of a keypoint along each axis, in the images of the map
-    # Covariance of the right updates (translation in metres first) from the given poses of the map's images to those by
-    # resection, including pose refinement in training: the error of the pose source.
+    # Covariance of the right updates (metres, then radians) from the given poses of the map's images to those by resection,
+    # including those of pose refinement in training: the error of the pose source.
     pose_covariance: Float[Tensor, "6 6"]  # float64
     # Number of keypoints that count as one measurement, because their errors are correlated, in an image with
     # ``usual_matches`` of them; see ``correlation_of``.

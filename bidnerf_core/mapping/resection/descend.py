@@ -123,7 +123,7 @@ class Quadratic:
         return Quadratic(self.here, *(torch.cat([own[:1] + more, own[1:]]) for own, more in joined))
 
     def minimum(self, states: States) -> tuple[States, Normal]:
-        """Minimize the sum of the models and the prior from each state; of two steps, the second accounts for the curvature of rotations."""
+        """Minimize the sum of the models and the prior from each state; the second step accounts for the curvature of rotations."""
         for _ in range(2):
             normal = total(states, [self])
             states = states.retract(-damped_solution(normal, torch.zeros_like(normal.cost)))
@@ -144,7 +144,7 @@ def damped_solution(
     if about is not None:
         gradient, hessian = gradient @ about, about.mT @ hessian @ about
     diagonal = hessian.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12)
-    # Scaled to a unit diagonal, whatever the units; along directions of no information the step is 0.
+    # Scaled to a unit diagonal, whatever the units; along directions without information the step is 0.
     unit = diagonal.rsqrt()
     scaled = unit[..., None] * hessian * unit[..., None, :]
     scaled.diagonal(dim1=-2, dim2=-1).add_(damping[:, None] + 1e-9)

@@ -42,7 +42,7 @@ class Landmarks:
         Tensor, "g"
     ]  # weight of a match's log likelihood, so that the inverse Hessian is the estimate's covariance
     area: float  # of the image, square pixels, over which outliers are spread
-    most_noise: float  # pixels: of keypoints that match
+    most_noise: float  # pixels: largest noise of keypoints that match
 
     def __call__(self, states: States) -> Normal:
         cost, rows, pull = self._weighted(states)
@@ -212,7 +212,7 @@ def resections(
         some = images[start : start + BATCH]
         b, m = len(some), int(count[some].max())
         number = torch.arange(m)
-        own = order[(first[some, None] + number).clamp(max=len(order) - 1)]  # ends with those of other images
+        own = order[(first[some, None] + number).clamp(max=len(order) - 1)]  # padded from other images
         valid = (number < count[some, None]).double()
         rotation = torch.eye(3, dtype=torch.float64).expand(b, m, 3, 3)
         times = sightings.exposure_times[own]

@@ -173,11 +173,11 @@ def jacobian(states: States, seen: Projections, sights: Sights) -> Float[Tensor,
     """
     flat, A = seen.flat, seen.linear.mT
     lens = flat.mT[..., None] * (2 * states.nuisances[:, None, 3:4] * flat)[:, None]
-    lens.diagonal(dim1=1, dim2=3).add_(seen.bend)  # of bend flat, by flat (h 2 m 2)
+    lens.diagonal(dim1=1, dim2=3).add_(seen.bend)  # ``bend flat`` by ``flat`` (h 2 m 2)
     radial = flat * (2 - 3 * seen.bend)
     by_point = torch.cat([lens, radial[:, None]], 1) / seen.depth[:, None, :, None]
     by_point = (by_point.flatten(1, 2) @ A).view(by_point.shape)
-    by_row = _by_update(by_point, seen.local)  # of the camera of the row
+    by_row = _by_update(by_point, seen.local)  # with respect to the camera at the row's exposure
     by_pose = by_row
     if not sights.single:
         back = sights.rotation.mT
@@ -236,7 +236,7 @@ def linear(states: States) -> Float[Tensor, "h 2 2"]:
 
 
 def true_intrinsics(stated: Intrinsics, camera: Float[Tensor, "6"]) -> Intrinsics:
-    """Return ``stated`` intrinsics with the corrections ``camera`` (see ``NUISANCES``), except for skew, which intrinsics cannot express."""
+    """Return ``stated`` intrinsics corrected by ``camera`` (see ``NUISANCES``), except for skew, which intrinsics cannot express."""
     log_focal, cx, cy, k1, log_aspect, _ = camera.tolist()
     bent, *others = stated.distortion or (0.0, 0.0, 0.0, 0.0)
     return replace(

@@ -127,7 +127,7 @@ class SurfaceMap(Resident):
         It is 0.7 times the 90th percentile of the surfels' distances to their fourth neighbours: large enough to leave
         few holes between them, small enough to preserve edges.
         """
-        points = self.surfels.positions.cpu().numpy()  # scipy's tree is the host's
+        points = self.surfels.positions.cpu().numpy()  # scipy's tree runs on the host
         neighbour = min(5, len(points))  # the point itself and its four neighbours
         away, _ = cKDTree(points).query(points[:: max(1, len(points) // 5000)], k=neighbour)
         fourth = np.asarray(away).reshape(-1, neighbour)[:, -1]
