@@ -107,19 +107,18 @@ OUTLIERS = 1e-3
 def estimate_bounds(
     views: Sequence[View], background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> SceneBounds:
-    """Estimate the box of the scene that ``views`` (poses in the world) show, its range of distances from
-    their cameras, and how finely they resolve it.
+    """Estimate the box of the scene that ``views`` show, its range of distances from their cameras, and how finely they resolve it.
 
-    With depth (dense in half of the views, or any if there are no silhouettes) the box holds the middle 99.8
-    % of the measured points along each axis. With silhouettes (alpha) it is the box of the visual hull. With
-    colour only, it holds the middle 90 % of the landmarks that the views see. Without landmarks it is a
-    guess: for cameras that look inward, a cube around the point they look at, as large as the visible region
-    there; otherwise (a room), the box of the cameras and of everything they see within four times the
-    extent of their positions. Unless half of the views have dense depth or silhouettes, there may be matter
-    beyond the box, and the scene is contracted. Images from a single position do not determine a scale; the
-    extent of their positions is then taken to be one. The footprint of a pixel refers to the median
-    distance of the data that gave the box: measured depth, landmarks, or else the box's middle, for which at
-    least half the longest side is assumed. Raises ``InputError`` if there are no views.
+    The poses of ``views`` are T_world_camera. With depth (dense in half of the views, or any if there are no silhouettes), the box holds
+    the middle 99.8 % of the measured points along each axis. With silhouettes (alpha), it is the box of the visual hull. With colour only,
+    it holds the middle 90 % of the landmarks that the views see. Without landmarks, it is a guess: for cameras that look inward, a cube
+    around the point they look at, as large as the visible region there; otherwise (in a room), the box of the cameras and of everything
+    they see within four times the extent of their positions.
+
+    Unless half of the views have dense depth or silhouettes, there may be matter beyond the box, and the scene is contracted. Images from a
+    single position do not determine a scale; the extent of their positions is then taken to be one. The footprint of a pixel refers to the
+    median distance of the data that gave the box: measured depth, landmarks, or else the box's middle, for which at least half the longest
+    side is assumed. Raises ``InputError`` if there are no views.
     """
     if not views:
         raise InputError("no views to estimate them from", where="scene bounds")

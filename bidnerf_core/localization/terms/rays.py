@@ -153,7 +153,7 @@ class RenderedRays:
         return cost, weight
 
     def _sent(self, states: States) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return the sights on the plane z = 1, their lengths and rig-frame directions, and the rays' world origins and directions (h n)."""
+        """Return the sights on the plane z = 1, their lengths and rig-frame directions, and the rays' origins and directions (world)."""
         rays, sights = rays_through(states, self.sights.image), self.sights
         length = rays.norm(dim=-1, keepdim=True)
         sight, times = rays / length, sights.times[:, None]

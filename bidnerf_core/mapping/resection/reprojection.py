@@ -51,8 +51,10 @@ class Landmarks:
     def sandwich(
         self, states: States
     ) -> tuple[Float[Tensor, "h P P"], Float[Tensor, "h P P"], Float[Tensor, "h P P"]]:
-        """Return the reweighted Hessian, the curvature, and the scatter of the matches' gradients: the covariance of an M-estimator is
-        curvature^-1 scatter curvature^-1 (Huber 1981, 6.3). Matches with more influence often have larger errors than the others.
+        """Return the reweighted Hessian, the curvature, and the scatter of the matches' gradients.
+
+        The covariance of an M-estimator is curvature^-1 scatter curvature^-1 (Huber 1981, 6.3). Matches with more influence often have
+        larger errors than the others.
 
         The scatter of few matches is far too small in some directions, so it is shrunk to that of identically distributed residuals
         (Ledoit and Wolf 2004).

@@ -51,7 +51,7 @@ class PosedDepthImage:
         return self.T_world_camera.to(torch.float32).apply(rays * self.image.depth[pixels][:, None])
 
     def beyond(self, points: Float[Tensor, "p 3"]) -> Float[Tensor, "p"]:
-        """Return the image's depth minus that of each point (metres, world); infinite for background, NaN if unknown or outside the image."""
+        """Return the image's depth minus that of each point (metres, world): infinite for background, NaN if unknown or out of view."""
         local = self.T_world_camera.to(torch.float32).inverse().apply(points)
         u, v = self.intrinsics.project(local).unbind(-1)
         height, width = self.image.depth.shape

@@ -173,8 +173,9 @@ def cast(
     steps: int = 36,
     radius: float | None = None,
 ) -> Cast:
-    """Trace rays (metres, world; unit directions) until they are within ``radius`` (metres; by default the surfels' radius)
-    of a surfel. A step is as long as the clearance, but at least a cell.
+    """Trace rays (metres, world; unit directions) until they come within ``radius`` of a surfel.
+
+    The radius is in metres, by default that of the surfels. A step is as long as the clearance, but at least a cell.
 
     For a ray that misses the grid, the closest point is that nearest to the grid's centre. Rays must be on the surface's
     device. Where the host must not wait for the device, finished rays keep being traced, without effect.
