@@ -1,7 +1,7 @@
 """Rolling shutters: the rows of an image are exposed one after another, while the camera moves.
 
 The motion is the right update (metres, then radians, in the camera's frame) of the camera's pose from the first row to the
-last, at a constant velocity; the pose itself is that of the middle row (Hedborg et al., Rolling shutter bundle adjustment,
+last, at a constant velocity; the pose itself refers to the middle row (Hedborg et al., Rolling shutter bundle adjustment,
 CVPR 2012).
 """
 
@@ -56,6 +56,6 @@ def exposure_times(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Te
 def poses_of_rows(times: Float[Tensor, "m"], motion: Float[Tensor, "*m 6"]) -> SE3:
     """Return T_middle_row: the camera's pose at each time, relative to the camera at the middle row.
 
-    ``motion`` (metres, then radians) is that of a single image, or has one row per time.
+    ``motion`` (metres, then radians) is for a single image, or has one row per time.
     """
     return SE3.exp(times[:, None] * motion.to(times))

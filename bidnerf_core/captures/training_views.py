@@ -222,7 +222,7 @@ def training_poses(
 ) -> TrainingPoses:
     """Return the poses with which to train on ``views``, whose keypoints are ``tracked``.
 
-    If no group of photos supports the given pose of a photo, the pose is replaced with the one found from the
+    If no group of photos supports the given pose of a photo, that pose is replaced with the pose found from the
     landmarks of the other photos. All poses are refined if errors of the given poses add at least ``least`` pixels to the
     standard deviation of the keypoints; otherwise they are kept.
     """

@@ -152,7 +152,7 @@ def _calibration_scatter(
 ) -> Float[Tensor, "4"]:
     """Return the standard deviations of the corrections estimated for intrinsics that are in fact correct.
 
-    They are those of the logarithm of the focal length, the principal point (u, v; in focal lengths) and the radial
+    They refer to the logarithm of the focal length, the principal point (u, v; in focal lengths) and the radial
     distortion. The part explained by the uncertainty of each fit is subtracted.
     """
     widest = [found.posterior.camera_of(found.explanations.widest) for found in answers]

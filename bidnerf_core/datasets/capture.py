@@ -408,7 +408,7 @@ def in_other_split(name: str, splits: Mapping[str, Sequence[str]]) -> str | None
 
 
 def _named(shots: Sequence[Shot], one_split: bool = False) -> list[Shot]:
-    """Return the shots with unique names, which include the split only where needed to tell shots apart."""
+    """Return the shots with unique names; a name includes the split only where needed to make it unique."""
     mixed = not one_split and len({shot.splits[:1] for shot in shots}) > 1
     paths = [(*(shot.splits[:1] or ("",) if mixed else ()), *shot.parts) for shot in shots]
     return [replace(shot, name=name) for shot, name in zip(shots, unique_names(paths), strict=True)]

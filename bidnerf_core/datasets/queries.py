@@ -177,7 +177,7 @@ class Photos:
 class DatasetFrames:
     """Dataset frames as queries: one rig of the frames ``names``, or each frame of a split with the ``window - 1`` frames before it.
 
-    The last frame of each rig is the one to be localized.
+    The last frame of each rig is to be localized.
     """
 
     def __init__(

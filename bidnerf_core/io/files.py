@@ -102,7 +102,7 @@ def temporary(path: Path) -> Path:
 
 
 def is_temporary(name: str) -> bool:
-    """Return whether ``name`` is that of a temporary file, such as a process leaves if it is killed while writing."""
+    """Return whether ``name`` was made by ``temporary``; such a file remains if its process is killed while writing."""
     return re.fullmatch(r"\..+\.[0-9a-f]{8}", name) is not None
 
 

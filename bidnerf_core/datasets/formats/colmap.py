@@ -9,7 +9,7 @@ and photos that are not registered are left out and counted.
 In a dense workspace (``images``, ``sparse``, ``stereo/depth_maps``) the depth maps provide the images' depth:
 the geometrically filtered ones, or else the photometric ones.
 
-The world is that of the model, whose unit of length is arbitrary: poses and maps use that unit, not metres.
+The world frame is the model's, and its unit of length is arbitrary: poses and maps use that unit, not metres.
 Images are used as stored, as in COLMAP, whose pixel centres are at +0.5 like ours. The camera of an image
 that was resized after the reconstruction is scaled. COLMAP records no times: a sequence is in name order.
 """

@@ -4,7 +4,7 @@ Images are ordered by time if every name is a timestamp (``12.345.png``), else i
 if any, is ``NAME.depth.png``, as written by ``bidnerf render``. Unlike the images of datasets, photos are turned upright
 according to their EXIF orientation, and their camera is read from EXIF unless the user gives one, as in ``Frame.open``.
 
-A video is turned by the rotation in its metadata, so its camera is that of the upright image. Videos do not record a focal
+A video is turned by the rotation in its metadata, so its camera describes the upright image. Videos do not record a focal
 length, so the camera has to be given or assumed.
 """
 
@@ -26,7 +26,7 @@ from bidnerf_core.frames import BLACK, DEPTH_STEM, Frame, photos_in
 class PhotoShot(Shot):
     """A photo, optionally with a depth image in steps of ``depth_unit`` metres that is registered from ``sensor``.
 
-    If it ``awaits_background``, the colour behind transparent pixels is that of the map in which the photo is localized.
+    If it ``awaits_background``, transparent pixels get the background of the map in which the photo is localized.
     """
 
     image: Path

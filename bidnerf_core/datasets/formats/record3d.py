@@ -5,8 +5,8 @@ A ``.r3d`` file is a zip archive. ``metadata`` is JSON: ``w h`` (of the photos) 
 ``poses`` (``qx qy qz qw tx ty tz``, camera to world, OpenGL axes), ``frameTimestamps`` (seconds) or ``fps``.
 Frame N has ``rgbd/N.jpg``, ``rgbd/N.depth`` (32-bit floats in metres, row by row, compressed with LZFSE) and,
 from a lidar, ``rgbd/N.conf`` (one byte of confidence per pixel, compressed too). Reading depth needs the
-package ``lzfse``, which the extra ``record3d`` installs. The world is that of the recording, usually the
-camera frame of its first frame, so none of its axes is vertical. See ``lidar`` for how depth and photos
+package ``lzfse``, which the extra ``record3d`` installs. The world frame is the recording's, usually
+the camera frame of the first image, so none of its axes is vertical. See ``lidar`` for how depth and photos
 are read.
 
 Members of the archive are read one at a time and within limits.

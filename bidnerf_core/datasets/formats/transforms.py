@@ -15,7 +15,7 @@ its white pixels are not used.
 The images of fisheye and division lenses (``camera_model`` as in COLMAP, or ``is_fisheye``, with ``k1`` to ``k4``) are undistorted
 on reading; a panorama (EQUIRECTANGULAR) becomes six frames, see ``PANORAMA_FACES``. Frames whose image is missing are left out,
 and so are missing depth images, with a remark that counts them. ``applied_transform`` and ``applied_scale`` record
-transformations that were already applied to the poses. They are not undone, so the world is that of the file. A sequence is
+transformations that were already applied to the poses. They are not undone, so the world frame is the file's. A sequence is
 ordered by ``time`` or ``timestamp`` of the frames (seconds), or by the number that names the file in ``source``; if a frame
 lacks all of them, by name. Other keys are ignored.
 
@@ -105,7 +105,7 @@ def _check_images(folder: Path, frames: Sequence[FrameRecord], images: Sequence[
 
 
 def _camera(frame: FrameRecord, size: tuple[int, int] | None) -> Camera | CameraSource:
-    """Return the camera of a frame; a camera without a size is that of the first image, since all images share the lens."""
+    """Return the camera of a frame; without a size in the file, the first image's size is used, since all images share the lens."""
     width, height = frame.camera.width or (size and size[0]), frame.camera.height or (size and size[1])
     if width is None or height is None:  # no image is readable, which is an error when one is read
         return CameraSource()
