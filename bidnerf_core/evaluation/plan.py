@@ -89,7 +89,10 @@ def draw_starts(
 
 
 def parallel_cases(frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
-    """Return the frame index and the seed of each trial; the 25 seeds begin at 1234."""
+    """Return the frame index and seed of the first ``trials`` of the 25 published trials, whose seeds are 1234 to 1258.
+
+    Raises ``InputError`` for more trials, or if ``seed`` is not 1234, since the list is fixed.
+    """
     if seed != PARALLEL_SEED or trials > PARALLEL_TRIALS:
         raise InputError(
             f"{trials} trials from seed {seed}",

@@ -1,7 +1,7 @@
-"""The figures of an evaluation: errors, times and convergence; maps side by side.
+"""Figures of an evaluation: errors, times and convergence, and the comparison of several maps.
 
-A figure is a grid of equally large panels, so that all figures of a page have the same font size. A condition
-has the same colour in all figures.
+All figures have the same width, so that their font sizes match on a page. A condition has the same colour in all
+figures.
 """
 
 from __future__ import annotations

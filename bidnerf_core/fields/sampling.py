@@ -339,7 +339,7 @@ def shrunk(rays: Rays, scale: float) -> Rays:
 
 @dataclass(frozen=True)
 class ScaledSampler:
-    """A sampler for rays in a world that is ``scale`` times as large."""
+    """Wraps a sampler for rays in a world that is ``scale`` times as large as that of the wrapped sampler."""
 
     sampler: RaySampler
     scale: float

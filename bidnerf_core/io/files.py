@@ -199,9 +199,9 @@ def output_folder(
     is_leftover: Callable[[Path], bool] = lambda file: False,
     described: Callable[[Path], str | None] = lambda folder: None,
 ) -> Iterator[None]:
-    """Create a folder, and check before hours of work that it is writable and that no other process writes to it.
+    """Create a folder for results and hold its lock within the context, after checking that it is writable.
 
-    A folder that is not empty is rejected unless ``overwrite`` is set; temporary files, and those that
+    Both are checked before hours of work. A folder that is not empty is rejected unless ``overwrite`` is set; temporary files, and those that
     ``is_leftover`` recognizes, do not count. ``described`` returns a description of a folder's content, for the message. If
     the work fails before anything is in the folder, the folder is removed again, with the parents that were
     created for it. Raises ``InputError`` if a check fails.

@@ -107,7 +107,7 @@ def export_clouds(scene: Map, out: Path) -> list[Path]:
 
 
 def export_colmap(scene: Map, out: Path) -> list[Path]:
-    """A text model of COLMAP: the cameras, with the landmarks as its points, and the keypoints that they were built from."""
+    """A COLMAP text model: the cameras, the landmarks as 3D points, and as their tracks the keypoints they were built from."""
     images, landmarks = _needed_images(scene, "colmap"), scene.landmarks
     folder = os.path.commonpath([os.path.dirname(image.name) for image in images])
     upright = [replace(image, name=os.path.relpath(image.name, folder or ".")) for image in images]

@@ -79,7 +79,7 @@ INDEXED = ("index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_inde
 
 
 class DeviceFault(AssertionError):
-    """Raised if code waits for the device, copies from or to it, or mixes its tensors with those on the CPU."""
+    """Raised if an operation mixes tensors on the device with those on the CPU and, in strict use, if code waits for the device."""
 
 
 class _There(torch.Tensor):

@@ -26,9 +26,10 @@ LENS = ("fx", "fy", "cx", "cy")
 
 
 def _read(path: Path, odometry: Path, options: DatasetOptions) -> Capture:
-    """Read the odometry. Raises ``InputError`` if a file is invalid, and if the extra ``video`` is missing.
+    """Read a recording: its odometry, its camera matrix, and references to its video frames and depth images.
 
-    The app leaves cells empty where a pose or the intrinsics are unknown; distortion cells, also left empty, are not read.
+    The app leaves cells empty where a pose or the intrinsics are unknown; distortion columns are ignored. Raises ``InputError``
+    if a file is invalid, and if the extra ``video`` is missing.
     """
     video, read, shots = Video(path / "rgb.mp4"), lidar.LidarDepth(), list[Shot]()
     columns = "timestamp, frame, x, y, z, qx, qy, qz, qw"

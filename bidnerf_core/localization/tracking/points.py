@@ -62,7 +62,10 @@ class Points:
 
     @staticmethod
     def measured(frame: Frame, image: Grey, T_world_camera: SE3, count: int, noise: DepthNoise) -> Points:
-        """Return up to ``count`` corners of a frame with depth of the given ``noise``, taken at a known pose."""
+        """Detect up to ``count`` corners in the grey ``image`` of a frame with a known pose, and back-project those with measured depth.
+
+        ``noise`` is the noise model of the depth.
+        """
         pixels = corners(image, count, 0.7 * (image.shape[0] * image.shape[1] / count) ** 0.5)
         pixels = pixels[visible_at(frame, pixels)]
         depth = measured_depth(frame, pixels)

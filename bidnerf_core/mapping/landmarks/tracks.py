@@ -347,7 +347,7 @@ def keypoint_depth_noise(observations: TrackedKeypoints, points: Float[Tensor, "
 
 
 def depth_ratio(observations: TrackedKeypoints, points: Float[Tensor, "n 3"]) -> float | None:
-    """Return the median ratio of measured depth to the depth of triangulated points; None if there are too few such points."""
+    """Return the median ratio of measured to triangulated depth over the keypoints that have both; None if there are too few."""
     z, depth = observations.sightings.in_camera(points)[:, 2], observations.depth
     known = (depth > 0) & (z > 0)
     return float((depth[known] / z[known]).median()) if int(known.sum()) >= ENOUGH_DEPTHS else None
