@@ -34,7 +34,7 @@ COMMANDS = {
     "view": "view a map, and localizations in it, on a web page",
     "serve": "serve localization over HTTP: photos in, poses out",
     "compare": "compare several maps from the same starts: success, steps, time, memory",
-    "report": "make one page of tables, figures and tests from an evaluation",
+    "report": "make one page of tables and figures from an evaluation",
 }
 
 MODULES = {
@@ -101,8 +101,10 @@ def _dispatch(given: list[str]) -> int:
     from bidnerf_core.cli.parser import parse  # imported here for the sake of a quick --version
 
     module = importlib.import_module(f"bidnerf_core.cli.{MODULES.get(given[0], given[0])}")
-    with contextlib.suppress(SystemExit):
+    try:
         parse(given[0], getattr(module, f"run_{given[0]}"), given[1:])
+    except SystemExit as stopped:  # after help, or from a plugin
+        return stopped.code if isinstance(stopped.code, int) else DONE if stopped.code is None else BAD_INPUT
     return DONE
 
 

@@ -230,7 +230,7 @@ class FrameRequest:
         """Parse a line such as ``{"image": path, "depth": path, "time": s}``; only the image is required."""
         from bidnerf_core.io import from_plain, parse_json
 
-        return from_plain(FrameRequest, parse_json(line.encode(), "request", "a JSON object"), "request")
+        return from_plain(FrameRequest, parse_json(line, "request", "a JSON object"), "request")
 
     def read(self, images: DatasetOptions, sensor: DepthCamera | None) -> Frame:
         """Read the image, depth and mask. Raises ``InputError`` if one cannot be read or the camera is unknown."""

@@ -306,11 +306,8 @@ def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path
         # Products of larger weights would overflow in float32; trained weights are far smaller.
         largest = 1e9 if name in trained else math.inf
         if found.is_floating_point() and not bool((found.abs() <= largest).all()):
-            raise InputError(
-                f"tensor {name!r} holds NaN or numbers above {largest:g}",
-                where=path,
-                expected="trained weights",
-            )
+            above = f" or numbers above {largest:g}" if name in trained else ""
+            raise InputError(f"tensor {name!r} holds NaN{above}", where=path, expected="trained weights")
     if surplus := sorted(tensors.keys() - expected.keys()):
         raise InputError(
             f"tensor {surplus[0]!r} is not part of the field that map.json describes", where=path

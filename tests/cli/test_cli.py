@@ -710,6 +710,17 @@ PROGRAM = [sys.executable, "-c", "import sys; from bidnerf_core.cli import main;
 ALONE = {**os.environ, "OMP_NUM_THREADS": "1"}
 
 
+@pytest.mark.parametrize(("code", "status"), [(None, 0), (3, 3), ("no licence", 1)])
+def test_a_plugin_that_exits_ends_the_command_with_its_status(
+    bidnerf: Run, monkeypatch: pytest.MonkeyPatch, code: object, status: int
+) -> None:
+    def leave() -> None:
+        raise SystemExit(code)
+
+    monkeypatch.setattr("bidnerf_core.cli.plugins.run_backends", leave)
+    assert bidnerf("backends").status == status
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_reader_that_goes_away_and_an_output_that_is_full() -> None:
     reading, gone = os.pipe()

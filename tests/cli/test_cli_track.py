@@ -231,6 +231,10 @@ def test_lines_that_are_no_requests(line: str, message: str) -> None:
         FrameRequest.parse(line)
 
 
+def test_a_line_may_name_a_file_by_bytes_that_are_not_utf_8() -> None:
+    assert FrameRequest.parse('{"image": "a\udcff.png"}').image == "a\udcff.png"
+
+
 def test_a_folder_is_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An image is given once, when its size no longer changes, in the order of names, with the depth of its name."""
     monkeypatch.setattr(following, "POLL", 0.0)

@@ -164,6 +164,13 @@ def test_a_given_unit_of_depth_replaces_that_of_the_file(capture: Path) -> None:
             open_dataset(capture, depth_unit=unit)
 
 
+@pytest.mark.parametrize("unit", [["metres"], {"length": "metres"}, "feet", 3])
+def test_a_unit_of_length_that_is_none_is_ignored(capture: Path, unit: object) -> None:
+    usual = open_dataset(capture).unit
+    edit_keys(capture / "transforms.json", unit=unit)
+    assert open_dataset(capture).unit == usual
+
+
 @pytest.mark.filterwarnings("ignore::bidnerf_core.errors.InputWarning")
 def test_missing_images_are_left_out_and_counted(capture: Path) -> None:
     for number in (2, 3, 4):

@@ -47,7 +47,7 @@ def _read(path: Path, found: list[Path], options: DatasetOptions) -> Capture:
     images = [names.path(frame.file_path, IMAGE_ENDINGS, moved=True) for frame, _ in listed]
     _check_images(path, [frame for frame, _ in listed], images)
     steps = {frame.depth_unit for frame, _ in listed if frame.depth_path}
-    units = {frame.record.value("unit") for frame, _ in listed}  # which bidnerf's own files state
+    units = {str(frame.record.value("unit")) for frame, _ in listed}  # which bidnerf's own files state
     read_depth, size = DepthReader(), _first_size([frame for frame, _ in listed], images)
     shots, first = list[Shot](), dict[tuple[str, ...], Path]()
     for (frame, splits), image in zip(listed, images, strict=True):

@@ -299,6 +299,9 @@ def test_gltf(tmp_path: Path, some: Some) -> None:
     for change, message in (
         ({"scale": [1, 2, 1]}, "stretches or mirrors"),
         ({"scale": [-1, 1, 1]}, "stretches or mirrors"),
+        ({"rotation": [0, 0, 0, 0]}, r"a\.glb: is damaged .*length 0"),
+        ({"rotation": [0, 0, 1]}, r"a\.glb: is damaged"),
+        ({"translation": [1, 0]}, r"a\.glb: is damaged"),
     ):
         path.write_bytes(glb(some(3), **change))
         with pytest.raises(InputError, match=message):

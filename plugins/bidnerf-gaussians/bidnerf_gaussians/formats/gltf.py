@@ -115,8 +115,8 @@ def read(path: Path) -> Gaussians:
                 expected=f"at most {MOST_COPIES} times as many",
             )
         found = [_placed(part, matrix, path) for number, matrix in shown for part in meshes[number]]
-    except (KeyError, TypeError, IndexError, ValueError, AttributeError) as error:
-        if isinstance(error, InputError):
+    except (KeyError, TypeError, IndexError, ValueError, AttributeError, RuntimeError) as error:
+        if isinstance(error, InputError) and error.where:
             raise
         raise InputError(
             f"is damaged ({type(error).__name__}: {error})", where=path, expected=EXPECTED
