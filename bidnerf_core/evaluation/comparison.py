@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from bidnerf_core.errors import InputError, printable
+from bidnerf_core.errors import InputError, amount, printable
 from bidnerf_core.evaluation.plan import Plan, Trial, parse_settings, planned
 from bidnerf_core.evaluation.results import aligned, as_line
 from bidnerf_core.evaluation.run import (
@@ -121,8 +121,8 @@ class Comparison:
     def title(self) -> str:
         """The setup in words."""
         size = ":".join(f"{x:g}" for x in self.size)
-        trials = f"{self.trials} trials" if self.protocol == "none" else f"{self.trials} starts of"
-        start = "without a start" if self.protocol == "none" else f"{self.protocol} {size}".rstrip()
+        trials = amount(self.trials, "trial" if self.protocol == "none" else "start")
+        start = "without a start" if self.protocol == "none" else f"of {self.protocol} {size}".rstrip()
         return f"{trials} {start} on {self.data}/{self.split}, method {self.method}"
 
     def __str__(self) -> str:

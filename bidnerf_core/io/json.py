@@ -30,7 +30,7 @@ LARGEST_NUMBER = sys.float_info.max  # JSON can hold NaN, 1e999 and integers too
 LARGEST_INTEGER = 2**63 - 1  # the largest integer that tensors and files can hold
 EXPECTED = {
     "bool_type": "bool", "int_type": "int", "float_type": "float", "finite_number": "float", "string_type": "str",
-    "dict_type": "an object", "list_type": "a list", "tuple_type": "a list", "missing": "a longer list",
+    "dict_type": "an object", "dataclass_type": "an object", "list_type": "a list", "tuple_type": "a list", "missing": "a longer list",
     "greater_than_equal": "an integer of at most 64 bits", "less_than_equal": "an integer of at most 64 bits",
 }  # fmt: skip
 """What messages state as expected, by pydantic's error type; other types use pydantic's own text."""

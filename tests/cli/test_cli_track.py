@@ -218,7 +218,7 @@ def test_lines_of_stdin_are_answered_one_by_one(
     ("line", "message"),
     [
         ("{", "not JSON"),
-        ("[1]", "dictionary"),
+        ("[1]", "an object"),
         ('{"image": 3}', "image"),
         ('{"image": "a", "depth": 1}', "depth"),
         ('{"image": "a", "time": "now"}', "time"),

@@ -151,6 +151,13 @@ def test_speed_is_that_of_the_trials_that_succeeded() -> None:
     assert success_of([lost], "10%").milliseconds is None
 
 
+def test_a_title_counts_trials_and_starts() -> None:
+    found = Comparison("room", "test", "none", (), "auto", {}, 0, 1, (), ())
+    assert found.title == "1 trial without a start on room/test, method auto"
+    found = replace(found, protocol="bid", size=(0.5,), trials=2)
+    assert found.title == "2 starts of bid 0.5 on room/test, method auto"
+
+
 def test_a_median_error_counts_lost_poses_as_worst() -> None:
     good, gone = result(0.1, [1.0, 0.1]), replace(result(0.1, [1.0, 0.1]), error=None)
     assert MapRow.of("a", 0, [good, good, gone], [1.0] * 3).translation == pytest.approx(0.01)

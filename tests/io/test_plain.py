@@ -76,7 +76,7 @@ def test_missing_keys_take_their_defaults_and_whole_numbers_serve_as_floats() ->
     ("given", "where", "found", "expected"),
     [
         ({}, "here: need", "missing", None),
-        ([], "here", "found []", "a dictionary or an instance of Outer"),
+        ([], "here", "found []", "an object"),
         ({"need": 1, "raet": 2}, "here", "no field 'raet', did you mean 'rate'?", None),
         ({"need": 1, "derived": 2}, "here", "no field 'derived'", None),
         ({"need": 1.5}, "here: need", "found 1.5", "int"),
@@ -94,7 +94,7 @@ def test_missing_keys_take_their_defaults_and_whole_numbers_serve_as_floats() ->
         ({"need": 1, "maybe": "x"}, "here: maybe", "found 'x'", "int"),
         ({"need": 1, "pair": [1.0]}, "here: pair", "found [1.0]", "a longer list"),
         ({"need": 1, "pair": [1.0, 2]}, "here: pair", "found 2", "str"),
-        ({"need": 1, "inner": 3}, "here: inner", "found 3", "a dictionary or an instance of Inner"),
+        ({"need": 1, "inner": 3}, "here: inner", "found 3", "an object"),
         ({"need": 1, "inner": {"name": "!"}}, "here: inner", "name is !", "no exclamation"),
         ({"need": 1, "many": [{"sizes": ["x"]}]}, "here: many: sizes", "found 'x'", "int"),
         ({"need": 1, "table": {"k": [1.5]}}, "here: table: k", "found 1.5", "int"),
