@@ -34,6 +34,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping.landmarks import tracks
 from bidnerf_core.maps import TrainOptions, read_views
 from bidnerf_core.maps import views as views_of_map
+from bidnerf_core.testing import DEVICE, Elsewhere
 from bidnerf_core.training import RayBank, ray_bank
 from photo_files import noise
 
@@ -74,6 +75,15 @@ def test_a_frame_of_bytes_is_one_of_floats_to_whoever_reads_it() -> None:
         frame.replace(brightness=1)
     with pytest.raises(InputError, match="camera expects"):
         frame.replace(intrinsics=replace(CAMERA, width=20))
+
+
+def test_pixels_on_a_device_are_those_of_their_own_images() -> None:
+    images = [torch.from_numpy(noise(4, 6, seed=seed)) for seed in range(3)]
+    image, pixel = torch.tensor([0, 1, 2, 1]), torch.tensor([5, 0, 23, 17])
+    expected = ImagePixels.of(images, 3).at(image, pixel)
+    with Elsewhere():
+        there = ImagePixels.of(images, 3, device=DEVICE)
+        assert torch.equal(there.at(image.to(DEVICE), pixel.to(DEVICE)).cpu(), expected)
 
 
 def test_reducing_a_frame_keeps_colours_rays_and_what_is_hidden() -> None:
