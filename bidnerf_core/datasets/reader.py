@@ -11,9 +11,10 @@ from typing import Any, Generic, Literal, Protocol, TypeVar, runtime_checkable
 from bidnerf_core.camera import Camera, CameraSource, Intrinsics
 from bidnerf_core.datasets.capture import Capture, hold_out, remark, with_files
 from bidnerf_core.datasets.options import DatasetOptions as DatasetOptions
+from bidnerf_core.datasets.options import DepthRegistration
 from bidnerf_core.depth import DepthCamera as DepthCamera  # for authors of readers
 from bidnerf_core.errors import InputError, InputWarning, amount, enumeration
-from bidnerf_core.frames import photos_in
+from bidnerf_core.frames import MaskFolder, photos_in
 from bidnerf_core.io import IMAGE_SUFFIXES, is_file
 from bidnerf_core.io import Background as Background  # for authors of readers
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
@@ -111,9 +112,12 @@ def open_dataset(
     path: str | Path,
     background: Background | None = None,
     readers: Sequence[Reader] | None = None,
-    **options: Any,
+    camera: Camera | str | Path | None = None,
+    register_depth: DepthRegistration | None = None,
+    depth_unit: float | None = None,
+    masks: str | Path | MaskFolder | None = None,
 ) -> Capture:
-    """Open the dataset in the folder ``path``, see ``DatasetOptions.open``; further ``options`` are those of ``DatasetOptions``.
+    """Open the dataset in the folder ``path``, see ``DatasetOptions.open``.
 
     ``background`` ("white", "black" or an rgb triple in [0, 1]) lies behind images with an alpha channel. It
     defaults to white if the images have one, following NeRF-Synthetic, and to black otherwise. ``camera``
@@ -122,7 +126,10 @@ def open_dataset(
     the format. ``depth_unit`` (metres per step of depth images) overrides the unit of the format. ``masks``
     is a folder of images whose black pixels are ignored (see ``MaskFolder``).
     """
-    return DatasetOptions(background=background, **options).open(path, readers)
+    options = DatasetOptions(
+        camera, register_depth=register_depth, depth_unit=depth_unit, masks=masks, background=background
+    )
+    return options.open(path, readers)
 
 
 def open_sequence(

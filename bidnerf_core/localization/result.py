@@ -92,7 +92,7 @@ class Localization:
     # Probability that the pose is right: by landmarks, from a learned model of the diagnostics, otherwise by comparison with
     # rivals. None if unknown, and if the pose is rejected for a reason that the model or the comparison ignores.
     confidence: float | None = None
-    diagnostics: Any = None  # the measures by which the pose was accepted or rejected, a dataclass of numbers
+    diagnostics: Any = None  # the measures by which the pose was accepted or rejected, a dataclass
     intrinsics: Intrinsics | None = None  # of the last image, if other than the given ones were used
     unit: LengthUnit = "units"  # of the position and its covariance: that of the map
     shown: Callable[[Localization], str] | None = None  # returns the picture for a notebook; not stored
