@@ -41,9 +41,9 @@ from paper_tables import test_frames
 from bidnerf_core import Localizer, View
 from bidnerf_core.backend import SceneBounds, load_backend
 from bidnerf_core.devices import captured, moved, without_waiting
-from bidnerf_core.evaluation import opened, perturb
+from bidnerf_core.evaluation import opened
 from bidnerf_core.fields import RadianceField, derivatives_of, levels, render_image, trained_field
-from bidnerf_core.geometry import SE3
+from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.io import from_plain
 from bidnerf_core.localization import (
     METHODS,

@@ -42,9 +42,9 @@ from map_quality import judge
 
 from bidnerf_core import Localizer
 from bidnerf_core.backend import load_backend
-from bidnerf_core.evaluation import perturb
 from bidnerf_core.fields import render
 from bidnerf_core.frames import View
+from bidnerf_core.geometry import perturb
 from bidnerf_core.io import from_plain
 from bidnerf_core.localization import settings_of
 from bidnerf_core.training import Supervision

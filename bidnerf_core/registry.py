@@ -1,4 +1,4 @@
-"""Plugins by name: backends, readers, methods, features, faults, writers, importers, exporters and service protocols.
+"""Plugins by name: backends, readers, posers, methods, features, faults, writers, importers, exporters and service protocols.
 
 A distribution provides an object through an entry point of the group ``bidnerf.GROUP``, as bidnerf itself does
 for the bundled objects. A script or a notebook adds an object with ``register``. Listing reads only metadata (and
@@ -23,6 +23,7 @@ from bidnerf_core.errors import InputError, spelling_hint, unknown_name
 GROUPS: Mapping[str, str] = {
     "backends": "backend",
     "readers": "reader",
+    "posers": "poser",
     "methods": "method",
     "features": "detector",
     "faults": "fault",
@@ -33,8 +34,8 @@ GROUPS: Mapping[str, str] = {
 }
 """The groups of plugins, each with the noun for one of its objects. The entry-point group is named ``bidnerf.GROUP``."""
 
-USUAL_BACKEND, USUAL_METHOD, USUAL_FEATURES = "hashgrid", "auto", "sift"
-"""The backend, method and keypoint detector that are used by default."""
+USUAL_BACKEND, USUAL_METHOD, USUAL_FEATURES, USUAL_POSER = "hashgrid", "auto", "sift", "colmap"
+"""The backend, method, keypoint detector and poser that are used by default."""
 
 TABLE = "*"
 """The name of an entry point whose object is a mapping from name to plugin. Listing the group imports the mapping."""

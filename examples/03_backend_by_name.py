@@ -10,7 +10,7 @@ import sys
 import tempfile
 
 import bidnerf_core as bn
-from bidnerf_core.evaluation import perturb
+from bidnerf_core.geometry import perturb
 from bidnerf_core.registry import list_plugins
 from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import closed_form_data

@@ -12,7 +12,7 @@ import torch
 
 import bidnerf_core as bn
 from bidnerf_core.backend import DEPTH_RESIDUALS
-from bidnerf_core.evaluation import perturb
+from bidnerf_core.geometry import perturb
 from bidnerf_core.localization import settings_of
 from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import closed_form_data, closed_form_map

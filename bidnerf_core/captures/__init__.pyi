@@ -17,8 +17,6 @@ from .coverage import UpDirection as UpDirection
 from .coverage import given_up as given_up
 from .coverage import horizontal_axes as horizontal_axes
 from .coverage import up_direction as up_direction
-from .photos import detail_kept as detail_kept
-from .photos import sharpness as sharpness
 from .pose_conventions import pose_contradiction as pose_contradiction
 from .report import CaptureReport as CaptureReport
 from .report import CoverageRecord as CoverageRecord

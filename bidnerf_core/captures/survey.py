@@ -18,7 +18,6 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from bidnerf_core.captures.coverage import UpDirection, coverage
-from bidnerf_core.captures.photos import blurred, excess, exposures, nearby, photo_measures, standing_out
 from bidnerf_core.captures.pose_conventions import matched_pair
 from bidnerf_core.captures.report import CaptureReport, PhotoProblem, PhotoRecord
 from bidnerf_core.errors import InputError
@@ -36,6 +35,7 @@ from bidnerf_core.mapping import (
     pose_updates,
     robust_covariance,
 )
+from bidnerf_core.training import blurred, excess, exposures, nearby, photo_measures, standing_out
 
 LEAST_GROUP = 3
 """Smallest number of linked photos that form a group."""

@@ -59,8 +59,7 @@ def run_demo(
     from bidnerf_core.backend import load_backend, quick_config
     from bidnerf_core.camera import Intrinsics
     from bidnerf_core.datasets import DatasetOptions, write_transforms
-    from bidnerf_core.evaluation import perturb
-    from bidnerf_core.geometry import symbol
+    from bidnerf_core.geometry import perturb, symbol
     from bidnerf_core.io import output_folder
     from bidnerf_core.localization import Localizer, settings_of
     from bidnerf_core.maps import TrainOptions, train

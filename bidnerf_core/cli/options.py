@@ -185,14 +185,14 @@ class QueryOptions:
             find_reader,
             photo_files,
         )
-        from bidnerf_core.evaluation import places_of
         from bidnerf_core.io import IMAGE_SUFFIXES
+        from bidnerf_core.maps import named_poses
 
         points = None
         if self.depth_points is not None and scene is not None:
             points = DepthPoints(self.depth_points, None)
             if self.depth_points.is_dir():
-                sparse = SparsePoints(self.depth_points, places_of(scene.info), self.model_points)
+                sparse = SparsePoints(self.depth_points, named_poses(scene.info), self.model_points)
                 say(sparse.summary)
                 points = DepthPoints(self.depth_points, sparse)
         background = None if scene is None else scene.bounds.background

@@ -150,10 +150,10 @@ def run_train(
     poses, and 2 to 4 minutes of CPU time with --quick. If --out holds a map of landmarks alone, as 'bidnerf import' makes
     of a COLMAP model, it gets a field and a surface.
     """
+    from bidnerf_core.datasets import lacks_poses
     from bidnerf_core.devices import working_device
     from bidnerf_core.io import background_colour
     from bidnerf_core.maps import DESCRIPTION, OtherSettings, TrainOptions, resume, train
-    from bidnerf_core.structure import lacks_poses
 
     resumes, bake = training.resume or training.finish, not target.no_bake
     if resumes and (target.overwrite or training.quick):

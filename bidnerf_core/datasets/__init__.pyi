@@ -39,6 +39,10 @@ from .reader import no_dataset as no_dataset
 from .reader import open_dataset as open_dataset
 from .reader import open_sequence as open_sequence
 from .trajectories import read_trajectory as read_trajectory
+from .unposed import POSERS as POSERS
+from .unposed import Poser as Poser
+from .unposed import lacks_poses as lacks_poses
+from .unposed import photos_below as photos_below
 from .video import VIDEO_SUFFIXES as VIDEO_SUFFIXES
 from .video import Video as Video
 from .video import is_video as is_video

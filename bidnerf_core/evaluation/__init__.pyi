@@ -6,7 +6,6 @@ from .faults import Fault as Fault
 from .faults import expand_faults as expand_faults
 from .faults import faulty as faulty
 from .faults import parse_faults as parse_faults
-from .faults import random_units as random_units
 from .faults.changes import rolling_shutter as rolling_shutter
 from .faults.changes import texture as texture
 from .faults.changes import warped as warped
@@ -18,7 +17,6 @@ from .plan import bid_start as bid_start
 from .plan import changed_settings as changed_settings
 from .plan import find_protocol as find_protocol
 from .plan import parse_settings as parse_settings
-from .plan import perturb as perturb
 from .plan import planned as planned
 from .plots import comparison_figure as comparison_figure
 from .report import chosen_criterion as chosen_criterion
@@ -48,6 +46,5 @@ from .trial import TrialResult as TrialResult
 from .trial import forget_peak_memory as forget_peak_memory
 from .trial import opened as opened
 from .trial import peak_memory_bytes as peak_memory_bytes
-from .trial import places_of as places_of
 from .trial import run_trial as run_trial
 from .trial import views_digest as views_digest

@@ -18,9 +18,9 @@ from jaxtyping import Float, Int
 
 from bidnerf_core.datasets import Capture, DatasetOptions, in_other_split
 from bidnerf_core.errors import InputError, InputWarning, amount, refuse_text, unknown_name
-from bidnerf_core.evaluation.faults import NO_FAULT, check_depth, expand_faults, random_units
+from bidnerf_core.evaluation.faults import NO_FAULT, check_depth, expand_faults
 from bidnerf_core.frames import INVERTED, HiddenColour
-from bidnerf_core.geometry import SE3, turned_about
+from bidnerf_core.geometry import SE3, perturb, random_units, turned_about
 from bidnerf_core.io import parse_record
 from bidnerf_core.localization import find_method, settings_of
 from bidnerf_core.scenes import ClosedFormData, is_closed_form
@@ -39,19 +39,6 @@ def bid_start(T_true: SE3, size: float, seed: int, widest: float = math.pi / 4) 
     u1, u2 = random_units(2, torch.Generator().manual_seed(seed))
     e_r = max(0.0, 0.2 + (size - 0.5) / (3.4 - 0.5) * (widest - 0.2))
     return T_true.to(dtype=torch.float64).retract(torch.cat([size * u1, e_r * u2]))
-
-
-def perturb(T_true: SE3, translation: float, rotation_deg: float, seed: int) -> SE3:
-    """Return a start whose error is exactly ``translation`` (metres) and ``rotation_deg``, in random directions."""
-    if not (0 <= translation < math.inf and 0 <= rotation_deg < math.inf):
-        raise InputError(
-            f"is {translation} and {rotation_deg} degrees",
-            where="perturbation",
-            expected="finite numbers, 0 or more",
-        )
-    u1, u2 = random_units(2, torch.Generator().manual_seed(seed))
-    turn = SE3.exp(torch.cat([torch.zeros_like(u2), math.radians(rotation_deg) * u2])).rotation
-    return T_true.to(dtype=torch.float64) @ SE3(turn, translation * u1)
 
 
 def inerf_start(T_true: SE3, seed: int) -> SE3:

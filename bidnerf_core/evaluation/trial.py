@@ -29,10 +29,10 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.faults import faulty, parse_faults
 from bidnerf_core.evaluation.plan import Setup, Trial, find_protocol, parse_settings
 from bidnerf_core.frames import View
-from bidnerf_core.geometry import SE3, LengthUnit
+from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.localization import Localizer
-from bidnerf_core.maps import DESCRIPTION, Map, MapInfo, cameras_of, load_map
+from bidnerf_core.maps import DESCRIPTION, Map, load_map, named_poses
 from bidnerf_core.registry import registered_names, require_registered
 from bidnerf_core.results import PoseError, plain_localization, pose_error
 from bidnerf_core.scenes import closed_form_data, closed_form_map, is_closed_form
@@ -248,12 +248,7 @@ def opened_points(folder: str, stored: Map) -> SparsePoints:
     """Return the points of the COLMAP model in ``folder``, scaled to the map by means of the poses of the map's training images."""
     if not stored.info.cameras:
         raise InputError("the map has no training cameras to determine the scale from", where=folder)
-    return SparsePoints(Path(folder), places_of(stored.info), SparseChoice())
-
-
-def places_of(info: MapInfo) -> list[tuple[str, SE3]]:
-    """Return the name and T_world_camera (float64, relative to the map's origin) of each training image."""
-    return [(stored.name, T) for stored, (_, T) in zip(info.cameras, cameras_of(info), strict=True)]
+    return SparsePoints(Path(folder), named_poses(stored.info), SparseChoice())
 
 
 def views_digest(views: Sequence[View]) -> str:

@@ -11,7 +11,9 @@ from .robust import mad_deviation as mad_deviation
 from .rotations import retracted as retracted
 from .rotations import update_between as update_between
 from .se3 import SE3 as SE3
+from .se3 import perturb as perturb
 from .se3 import pose_from_matrix as pose_from_matrix
+from .se3 import random_units as random_units
 from .se3 import skew as skew
 from .similarity import RIGID_TO as RIGID_TO
 from .similarity import CovarianceConvention as CovarianceConvention

@@ -8,6 +8,7 @@ written in the local frame of the camera (Sola et al. 2018, "A micro Lie theory"
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -15,7 +16,7 @@ from typing import Any, Literal, get_args
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle, rotation_matrix_to_quaternion
-from torch import Tensor
+from torch import Generator, Tensor
 
 from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
@@ -266,3 +267,22 @@ def pose_from_matrix(matrix: Float[Tensor, "..."], what: str, where: object = No
 
 def _is_last_row(numbers: Sequence[float]) -> bool:
     return max(abs(a - b) for a, b in zip(numbers, (0.0, 0.0, 0.0, 1.0), strict=True)) <= 1e-6
+
+
+def random_units(count: int, generator: Generator) -> Float[Tensor, "n 3"]:
+    """Return ``count`` unit vectors, uniformly distributed on the sphere (float64)."""
+    normal = torch.randn((count, 3), generator=generator, dtype=torch.float64)
+    return torch.nn.functional.normalize(normal, dim=-1)
+
+
+def perturb(T_true: SE3, translation: float, rotation_deg: float, seed: int) -> SE3:
+    """Return a start whose error is exactly ``translation`` (metres) and ``rotation_deg``, in random directions."""
+    if not (0 <= translation < math.inf and 0 <= rotation_deg < math.inf):
+        raise InputError(
+            f"is {translation} and {rotation_deg} degrees",
+            where="perturbation",
+            expected="finite numbers, 0 or more",
+        )
+    u1, u2 = random_units(2, torch.Generator().manual_seed(seed))
+    turn = SE3.exp(torch.cat([torch.zeros_like(u2), math.radians(rotation_deg) * u2])).rotation
+    return T_true.to(dtype=torch.float64) @ SE3(turn, translation * u1)

@@ -15,11 +15,10 @@ from .by_surface import is_blank as is_blank
 from .corrector import Corrector as Corrector
 from .explanations import CAMERAS as CAMERAS
 from .explanations import MOVING as MOVING
-from .localizer import LOADERS as LOADERS
 from .localizer import Localizer as Localizer
 from .localizer import Start as Start
-from .localizer import checked_map as checked_map
 from .localizer import picture_at as picture_at
+from .localizer import scene_of as scene_of
 from .localizer import start_pose as start_pose
 from .loop import HEAVY_TAILS as HEAVY_TAILS
 from .loop import MIRROR as MIRROR

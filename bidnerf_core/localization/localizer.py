@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -43,8 +44,6 @@ from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.progress import counter, current_job, job_context
 
 NO_DISTANCES = "the map's photos are from one place and show no distances"
-LOADERS: list[Callable[[Path], SceneMap]] = []
-"""Functions that load the map in a folder. The package of stored maps, which builds on this one, registers its function here."""
 Start = SE3 | Float[Tensor, "4 4"] | np.ndarray | Sequence[Sequence[float]]
 """A pose T_world_camera: an ``SE3``, or a 4x4 matrix as a tensor, an array or rows of numbers."""
 
@@ -72,7 +71,7 @@ class Localizer:
         surface and the landmarks are used on ``device``, by default where they are; parts of the map on another device are copied. If
         ``warm_up`` is true, lazy initialization is done now rather than in the first call. Raises ``InputError`` for unsuitable arguments.
         """
-        scene = checked_map(scene, "Localizer")
+        scene = scene_of(scene, "Localizer")
         self.method = method
         self.scene: SceneMap = scene if device is None else on_device(scene, device)
         self._method = find_method(method)
@@ -243,13 +242,12 @@ class Localizer:
             self.scene.surface.warm_up()
 
 
-def checked_map(given: object, where: str) -> SceneMap:
-    """Return ``given`` if it is a map, or the map in the folder ``given``.
+@functools.singledispatch
+def scene_of(given: object, where: str) -> SceneMap:
+    """Return the map ``given``, or the map that ``given`` refers to, such as the folder that stores it.
 
-    Raises ``InputError`` as ``load_map`` does, and, prefixed with ``where``, if ``given`` is neither a map nor a path.
+    ``bidnerf_core.maps`` registers how paths are opened. Raises ``InputError``, prefixed with ``where``, for anything else.
     """
-    if LOADERS and isinstance(given, str | Path):
-        return LOADERS[0](Path(given))
     if isinstance(given, SceneMap):
         return given
     raise InputError(f"got a {type(given).__name__}", where=where, expected="a Map, or the folder of one")

@@ -41,8 +41,8 @@ from bidnerf_core.fields import (
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import locked
-from bidnerf_core.localization import LOADERS, on_device, origin_of
 from bidnerf_core.localization import Localizer as Localizer  # from the door, with maps to load
+from bidnerf_core.localization import on_device, origin_of, scene_of
 from bidnerf_core.mapping import (
     BakeConfig,
     HeldOutTrial,
@@ -494,4 +494,5 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     return Map(info, frozen_field(info, weights, folder), surface, landmarks, folder).to(device)
 
 
-LOADERS.append(load_map)  # a Localizer opens a folder
+for kind in (str, Path):  # a Localizer opens a folder
+    scene_of.register(kind, lambda folder, where: load_map(folder))

@@ -26,7 +26,7 @@ from bidnerf_core.captures import (
     stored_cameras,
 )
 from bidnerf_core.carving import estimate_bounds
-from bidnerf_core.datasets import HOLD_OUT_EVERY, DatasetOptions, SparseChoice
+from bidnerf_core.datasets import HOLD_OUT_EVERY, POSERS, DatasetOptions, SparseChoice, lacks_poses
 from bidnerf_core.devices import moved, working_device
 from bidnerf_core.errors import Cancelled, InputError, amount, enumeration
 from bidnerf_core.fields import NoField, device_of, trained_field
@@ -59,9 +59,8 @@ from bidnerf_core.progress import (
     duration_text,
     job_context,
 )
-from bidnerf_core.registry import USUAL_BACKEND, PluginError
+from bidnerf_core.registry import USUAL_BACKEND, USUAL_POSER, PluginError
 from bidnerf_core.settings import NotNegative, Settings
-from bidnerf_core.structure import lacks_poses
 from bidnerf_core.training import TrainingState, TrainingStopped
 
 log = logging.getLogger("bidnerf")
@@ -341,8 +340,6 @@ def posed_images(
     if not isinstance(data, str | Path) or not lacks_poses(data):
         yield data, options
         return
-    from bidnerf_core.structure import find_poses
-
     camera = options.camera
     if not (camera is None or isinstance(camera, Intrinsics | str | Path)):
         raise InputError(
@@ -351,7 +348,7 @@ def posed_images(
     with (
         tempfile.TemporaryDirectory() if out is None else contextlib.nullcontext(poses_folder(out)) as folder
     ):
-        found = find_poses(data, folder, camera, overwrite, reuse=True)
+        found = POSERS.load(USUAL_POSER, str(data))(data, folder, camera, overwrite, reuse=True)
         if options.split == "train":
             tested = len(range(0, found.placed, HOLD_OUT_EVERY))
             log.info(

@@ -19,7 +19,7 @@ from bidnerf_core.fields import render_picture
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import reduced, write_file
-from bidnerf_core.localization import Localization, SceneMap, Start, checked_map, origin_of, start_pose
+from bidnerf_core.localization import Localization, SceneMap, Start, origin_of, scene_of, start_pose
 from bidnerf_core.results.answers import Answer
 
 SIDE = 240
@@ -37,7 +37,7 @@ def overlay(
     downscaled to at most 640 pixels a side, since each rendered pixel takes time. Raises ``InputError`` for arguments
     that are not a map, a frame or a pose.
     """
-    scene = checked_map(scene, "overlay")
+    scene = scene_of(scene, "overlay")
     if not isinstance(frame, Frame):
         raise InputError(
             f"frame is a {type(frame).__name__}", where="overlay", expected="a Frame, such as that of a View"

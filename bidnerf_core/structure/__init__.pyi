@@ -1,5 +1,4 @@
 from .poses import find_poses as find_poses
 from .record import FoundPoses as FoundPoses
-from .sources import lacks_poses as lacks_poses
 from .sources import photos_of as photos_of
 from .sources import refuse_panoramas as refuse_panoramas

@@ -8,9 +8,7 @@ camera rests, many while it turns.
 
 from __future__ import annotations
 
-import contextlib
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -20,20 +18,18 @@ import numpy as np
 from PIL import Image
 
 from bidnerf_core.camera import reduced_size
-from bidnerf_core.captures import sharpness
 from bidnerf_core.datasets import (
     VIDEO_SUFFIXES,
     Video,
     find_reader,
-    is_video,
     no_dataset,
-    remark,
+    photos_below,
     unique_names,
 )
-from bidnerf_core.errors import InputError, enumeration
-from bidnerf_core.frames import natural_order, photos_in
-from bidnerf_core.io import open_binary, read_header
+from bidnerf_core.errors import InputError
+from bidnerf_core.io import open_binary
 from bidnerf_core.progress import counter
+from bidnerf_core.training import sharpness
 
 STEP = 0.04
 """Image motion between chosen frames, as a fraction of the image diagonal."""
@@ -51,14 +47,6 @@ class SourceImage:
     name: str  # unique among the images: the stem, prefixed with as many folders as needed
     file: Path
     time: float | None = None  # seconds, of a frame of a video
-
-
-def lacks_poses(path: str | Path) -> bool:
-    """Return whether a path is a video, or a folder of photos that no dataset reader recognizes."""
-    place = Path(path)
-    if find_reader(place) is not None:
-        return False
-    return bool(_listed(place, None)) if place.is_dir() else is_video(place)
 
 
 def photos_of(folder: Path, out: Path | None = None) -> list[SourceImage]:
@@ -80,46 +68,11 @@ def photos_of(folder: Path, out: Path | None = None) -> list[SourceImage]:
             " the folder of the photos to find their poses again",
             where=folder,
         )
-    files = _listed(folder, out)
+    files = photos_below(folder, out)
     if not files:
         raise no_dataset(folder)
     names = unique_names([(*file.relative_to(folder).parts[:-1], file.stem) for file in files])
     return [SourceImage(name, file) for name, file in zip(names, files, strict=True)]
-
-
-def _listed(folder: Path, out: Path | None) -> list[Path]:
-    own, _ = photos_in(folder)
-    if own:
-        return own
-    found = _without_copies(folder, list(_below(folder, out)))
-    return sorted(found, key=lambda file: natural_order(file.relative_to(folder).as_posix()))
-
-
-def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
-    """Return the photos without smaller copies of others, as in ``images_2`` and ``images_4`` beside ``images``.
-
-    A folder holds copies if a folder beside it has larger photos of the same names and aspect ratio; a remark names
-    such folders.
-    """
-    groups: dict[Path, list[Path]] = {}
-    for photo in photos:
-        groups.setdefault(photo.parent, []).append(photo)
-    copies, alike = list[Path](), dict[tuple[Path, frozenset[str]], list[tuple[int, int, Path]]]()
-    for place, group in groups.items():
-        with contextlib.suppress(InputError):  # raised again when that photo is read
-            header = read_header(group[0])
-            key = place.parent, frozenset(photo.stem for photo in group)
-            alike.setdefault(key, []).append((header.width, header.height, place))
-    for sized in alike.values():
-        whole_width, whole_height, _ = max(sized)
-        for width, height, place in sized:
-            # Sizes are rounded.
-            if width < whole_width and abs(height - width * whole_height / whole_width) <= 1:
-                copies.append(place)
-    if copies:
-        names = enumeration([str(place.relative_to(folder)) for place in copies])
-        remark(folder, f"{names}: smaller copies of the photos beside them, which are left out")
-    return [photo for photo in photos if photo.parent not in copies]
 
 
 def refuse_panoramas(photos: Sequence[SourceImage]) -> None:
@@ -137,23 +90,6 @@ def refuse_panoramas(photos: Sequence[SourceImage]) -> None:
                 "poses with camera_model EQUIRECTANGULAR in transforms.json, or pinhole views cut from it"
             )
             raise InputError("is a panorama (equirectangular)", where=photo.file, expected=expected)
-
-
-def _below(folder: Path, out: Path | None) -> Iterator[Path]:
-    """Yield the photos in subfolders of ``folder`` at any depth, except those of datasets."""
-    for place, inside, _ in os.walk(folder):
-        inside[:] = sorted(
-            name
-            for name in inside
-            if not name.startswith(".")
-            and name.lower() not in ("depth", "depths", "mask", "masks", "confidence", "conf", "thumbnails")
-            and not (out is not None and out.exists() and Path(place, name).samefile(out))
-        )
-        if Path(place) != folder:
-            if find_reader(Path(place)) is not None:
-                inside.clear()
-                continue
-            yield from photos_in(place)[0]
 
 
 def measured(video: Path) -> list[Measure]:

@@ -11,6 +11,14 @@ from .loss import ColourTransforms as ColourTransforms
 from .loss import fitted_colours as fitted_colours
 from .loss import ray_termination as ray_termination
 from .loss import supervised_loss as supervised_loss
+from .photos import blurred as blurred
+from .photos import detail_kept as detail_kept
+from .photos import excess as excess
+from .photos import exposures as exposures
+from .photos import nearby as nearby
+from .photos import photo_measures as photo_measures
+from .photos import sharpness as sharpness
+from .photos import standing_out as standing_out
 from .ray_bank import RayBank as RayBank
 from .ray_bank import TrainingBatch as TrainingBatch
 from .supervision import Supervision as Supervision

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
-from bidnerf_core.captures import detail_kept
 from bidnerf_core.fields import RadianceField, Rendering, SceneBounds, render
 from bidnerf_core.frames import View
 from bidnerf_core.settings import NotNegative, Settings
 from bidnerf_core.training.loop import Replayable, Report, StepOutcome, cosine, fit
 from bidnerf_core.training.loss import ColourTransforms, distortion, supervised_loss
+from bidnerf_core.training.photos import detail_kept
 from bidnerf_core.training.ray_bank import RayBank, TrainingBatch
 
 

@@ -22,7 +22,6 @@ from bidnerf_core.captures import (
     summary,
     surveyed,
 )
-from bidnerf_core.captures.photos import photo_measures
 
 # Inside: the measures of single photos and pairs, of which a report gives only the remarks
 from bidnerf_core.captures.report import SUMMARY_LINES
@@ -33,6 +32,7 @@ from bidnerf_core.mapping import tracked_views
 from bidnerf_core.results import draw_capture
 from bidnerf_core.scenes import demo_object, orbit, views
 from bidnerf_core.testing import BOUNDS, TexturedGround
+from bidnerf_core.training import photo_measures
 from landmark_scene import Points, looking_in, ring
 from refusals import refused
 

@@ -12,17 +12,9 @@ import torch
 from scipy.ndimage import label
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.evaluation import (
-    FAULTS,
-    NO_FAULT,
-    expand_faults,
-    faulty,
-    parse_faults,
-    random_units,
-    rolling_shutter,
-)
+from bidnerf_core.evaluation import FAULTS, NO_FAULT, expand_faults, faulty, parse_faults, rolling_shutter
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.geometry import SE3, look_at
+from bidnerf_core.geometry import SE3, look_at, random_units
 from bidnerf_core.scenes import demo_object, demo_room, orbit
 from bidnerf_core.scenes import views as seen_from
 from refusals import refused

@@ -6,10 +6,9 @@ import pytest
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.evaluation import perturb
 from bidnerf_core.fields import Objective, Observations, SceneBounds, colour_term, depth_term, render, widened
 from bidnerf_core.frames import Frame, View, draw, uniform
-from bidnerf_core.geometry import SE3, Robust, look_at
+from bidnerf_core.geometry import SE3, Robust, look_at, perturb
 from bidnerf_core.localization import Problem, rig
 from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import GaussianBlobs, orbit

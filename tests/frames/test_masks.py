@@ -15,9 +15,6 @@ import torch
 
 from bidnerf_core import Frame, InputError, InputWarning, Intrinsics, View, open_dataset, open_sequence
 from bidnerf_core.camera import Orientation, Raster
-
-# Inside: each quantity computed from pixels, which is equal whatever a mask hides
-from bidnerf_core.captures.photos import photo_measures
 from bidnerf_core.carving import FreeSpace
 from bidnerf_core.fields import RenderedImage
 from bidnerf_core.frames import DRAWERS, DrawerName, MaskFolder, WhollyHidden, masks_sentence, read_mask
@@ -27,7 +24,9 @@ from bidnerf_core.localization.terms.rays import averaged
 from bidnerf_core.mapping import SIFT, image_keypoints, tracked_views
 from bidnerf_core.maps import rendering_scores
 from bidnerf_core.scenes import demo_object
-from bidnerf_core.training import RayBank
+
+# Inside: each quantity computed from pixels, which is equal whatever a mask hides
+from bidnerf_core.training import RayBank, photo_measures
 from commands import Run
 from photo_files import write_photo
 from refusals import refused

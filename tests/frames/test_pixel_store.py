@@ -15,9 +15,6 @@ from PIL import Image
 
 import tiny
 from bidnerf_core.camera import CameraBatch, Intrinsics, checked_side
-
-# Inside: blocks are made so small that the images of a test fill several
-from bidnerf_core.captures.photos import excess, nearby
 from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds
@@ -35,7 +32,9 @@ from bidnerf_core.mapping.landmarks import tracks
 from bidnerf_core.maps import TrainOptions, read_views
 from bidnerf_core.maps import views as views_of_map
 from bidnerf_core.testing import DEVICE, Elsewhere
-from bidnerf_core.training import RayBank, ray_bank
+
+# Inside: blocks are made so small that the images of a test fill several
+from bidnerf_core.training import RayBank, excess, nearby, ray_bank
 from photo_files import noise
 
 CAMERA = Intrinsics(30.0, 31.0, 12.3, 8.1, 24, 16)

@@ -13,10 +13,10 @@ import baked
 import blob_images
 import module_fields
 from bidnerf_core import Localizer
-from bidnerf_core.evaluation import faulty, perturb
+from bidnerf_core.evaluation import faulty
 from bidnerf_core.fields import Observations
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.geometry import SE3
+from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.localization import AutoConfig, Localization, Outcome, Problem, rig, settings_of
 from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import demo_room

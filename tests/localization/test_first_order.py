@@ -11,10 +11,9 @@ import pytest
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.evaluation import perturb
 from bidnerf_core.fields import FieldValues, RaySampler, SceneBounds, Stratified, render_image
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.geometry import SE3
+from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.localization import (
     METHODS,
     AdamSettings,

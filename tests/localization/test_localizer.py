@@ -21,8 +21,7 @@ import torch
 import bidnerf_core as bn
 import tiny
 from bidnerf_core import Cancelled, InputError, Localization, Localizer, View
-from bidnerf_core.evaluation import perturb
-from bidnerf_core.geometry import SE3
+from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.localization import METHODS, AutoConfig, settings_of
 from bidnerf_core.progress import Progress, job_context
 from bidnerf_core.testing import DEVICE, Elsewhere, textured_map, training_views, unseen

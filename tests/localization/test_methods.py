@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, Frame, Localization, Localizer, Outcome, View
-from bidnerf_core.evaluation import perturb
+from bidnerf_core.geometry import perturb
 from bidnerf_core.localization import METHODS, settings_of
 from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.results import pose_error

@@ -10,10 +10,9 @@ import numpy as np
 import torch
 
 from bidnerf_core.datasets import read_depth_points
-from bidnerf_core.evaluation import perturb
 from bidnerf_core.fields import Observations, render
 from bidnerf_core.frames import View
-from bidnerf_core.geometry import SE3
+from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.localization import (
     ColourSettings,
     DepthSettings,

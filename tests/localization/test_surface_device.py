@@ -15,10 +15,9 @@ from torch import Generator, Tensor
 import baked
 import module_fields
 from bidnerf_core.devices import moved, without_waiting
-from bidnerf_core.evaluation import perturb
 from bidnerf_core.fields import RadianceField
 from bidnerf_core.frames import View
-from bidnerf_core.geometry import SE3
+from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.localization import ColourSettings, DepthLossSettings, Images, RayTerms, rig, states_at
 from bidnerf_core.localization.terms.images import Thumbnail, surface_renderer
 from bidnerf_core.mapping import CostTerm, SurfaceMap, Surfels, cast, descend, trace

@@ -16,7 +16,7 @@ from torch import nn
 import bidnerf_core as bn
 import tiny
 from bidnerf_core.backend import load_backend, quick_config
-from bidnerf_core.evaluation import perturb
+from bidnerf_core.geometry import perturb
 from bidnerf_core.io import FileInUse, to_plain
 from bidnerf_core.localization import settings_of
 from bidnerf_core.mapping import BakeConfig

@@ -25,9 +25,8 @@ import docs_workspace
 import tiny
 from bidnerf_core import Localization, Localizer, Map, Outcome
 from bidnerf_core.cli import COMMANDS, main
-from bidnerf_core.evaluation import perturb
 from bidnerf_core.fields import DEPTH_RESIDUALS
-from bidnerf_core.geometry import SE3
+from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.localization import ADVICE, METHODS, AutoConfig, Problem, settings_of
 from bidnerf_core.maps import MapInfo
 from bidnerf_core.registry import registered

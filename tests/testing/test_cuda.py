@@ -17,8 +17,8 @@ from bidnerf_core import Localization, Localizer, devices
 from bidnerf_core.backend import load_backend, quick_config
 from bidnerf_core.cli import main
 from bidnerf_core.devices import captured, constant
-from bidnerf_core.evaluation import perturb
 from bidnerf_core.fields import FieldValues, SceneBounds, device_of, levels, render_image
+from bidnerf_core.geometry import perturb
 from bidnerf_core.localization import settings_of
 from bidnerf_core.maps import load_map
 from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS

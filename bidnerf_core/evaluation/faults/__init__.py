@@ -12,7 +12,6 @@ from bidnerf_core.evaluation.faults.fault import (
     expand_faults,
     faulty,
     parse_faults,
-    random_units,
 )
 
 __all__ = [
@@ -24,5 +23,4 @@ __all__ = [
     "expand_faults",
     "faulty",
     "parse_faults",
-    "random_units",
 ]

@@ -62,12 +62,6 @@ def depth_of(frame: Frame) -> Float[Tensor, "h w"]:
     return frame.depth
 
 
-def random_units(count: int, generator: Generator) -> Float[Tensor, "n 3"]:
-    """Return ``count`` unit vectors, uniformly distributed on the sphere (float64)."""
-    normal = torch.randn((count, 3), generator=generator, dtype=torch.float64)
-    return torch.nn.functional.normalize(normal, dim=-1)
-
-
 # Faults as text, alone or composed.
 
 NO_FAULT = "none"
