@@ -16,7 +16,7 @@ import cv2
 import torch
 from scipy.stats import chi2
 
-from bidnerf_core import Localization, Map, View, load_map
+from bidnerf import Localization, Map, View, load_map
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.evaluation import provenance, script_command
 from bidnerf_core.io import FileInUse, take_lock, to_plain, write_file

@@ -15,7 +15,7 @@ from typing import Any
 
 from _lab import Scene, errors_of, one_thread, without_depth
 
-from bidnerf_core import SE3, Localization, Localizer, Tracker, View, open_sequence
+from bidnerf import SE3, Localization, Localizer, Tracker, View, open_sequence
 from bidnerf_core.datasets import open_dataset
 
 

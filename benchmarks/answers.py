@@ -62,7 +62,7 @@ from scipy.stats import binomtest
 from torch import Generator, Tensor
 from torch.nn.functional import interpolate
 
-from bidnerf_core import Localizer
+from bidnerf import Localizer
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import faulty, provenance, warped

@@ -27,7 +27,7 @@ from _lab import (
     record,
 )
 
-from bidnerf_core import Localizer
+from bidnerf import Localizer
 from bidnerf_core.localization import settings_of
 
 SLOW = "surface alone"

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bidnerf_core import SE3, Frame, View
+from bidnerf import SE3, Frame, View
 from bidnerf_core.frames import observe
 from bidnerf_core.mapping import SurfaceMap, trace
 from bidnerf_core.results import CRITERIA, pose_error

@@ -40,7 +40,7 @@ from _lab import (
 )
 from query_conditions import resized
 
-from bidnerf_core import SE3, Frame, View
+from bidnerf import SE3, Frame, View
 from bidnerf_core.captures import tried_landmarks
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.localization import LandmarkMatcher, Loop

@@ -24,8 +24,8 @@ import pycolmap
 import torch
 from scipy.spatial import cKDTree
 
-import bidnerf_core as bn
-from bidnerf_core import SE3
+import bidnerf as bn
+from bidnerf import SE3
 from bidnerf_core.geometry import Similarity, fit_similarity
 from bidnerf_core.results import Answer, Answers
 

@@ -45,7 +45,7 @@ from _lab import (
 )
 from _lab import answer as timed_answer
 
-from bidnerf_core import Localization, Localizer, Map, load_map
+from bidnerf import Localization, Localizer, Map, load_map
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import (

@@ -38,7 +38,7 @@ import torch
 from _lab import RowStore
 from paper_tables import test_frames
 
-from bidnerf_core import Localizer, View
+from bidnerf import Localizer, View
 from bidnerf_core.backend import SceneBounds, load_backend
 from bidnerf_core.devices import captured, moved, without_waiting
 from bidnerf_core.evaluation import opened

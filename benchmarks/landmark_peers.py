@@ -79,7 +79,7 @@ from clouds import (
 from scipy.stats import binomtest
 from sift import FEWEST_INLIERS, SiftMatcher, colmap_pnp, opencv_pnp, sift_points
 
-from bidnerf_core import Localizer, View
+from bidnerf import Localizer, View
 from bidnerf_core.evaluation import bid_start, views_digest
 from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.results import pose_error

@@ -24,7 +24,7 @@ from typing import Any
 import torch
 from _lab import LIMITS, RESULTS, Scene, one_thread, parser, record, without_depth
 
-import bidnerf_core as bn
+import bidnerf as bn
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import build_landmarks

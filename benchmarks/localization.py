@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from _lab import BOUND, RESULTS, held_out, parser, record
 
-from bidnerf_core import SE3
+from bidnerf import SE3
 from bidnerf_core.evaluation import (
     Plan,
     ResultsFile,

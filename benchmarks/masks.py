@@ -24,7 +24,7 @@ import _lab
 import torch
 from torch import Tensor
 
-from bidnerf_core import InputError, Localizer, Map, TrainOptions, View, load_map, open_dataset, resume, train
+from bidnerf import InputError, Localizer, Map, TrainOptions, View, load_map, open_dataset, resume, train
 from bidnerf_core.backend import render_image
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, tracked_views

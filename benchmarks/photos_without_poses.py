@@ -26,8 +26,8 @@ import numpy as np
 import torch
 from _lab import Row
 
-import bidnerf_core as bn
-from bidnerf_core import SE3, Frame, Map, View
+import bidnerf as bn
+from bidnerf import SE3, Frame, Map, View
 from bidnerf_core.datasets import TimedFrame
 from bidnerf_core.geometry import Similarity, fit_similarity
 from bidnerf_core.io import to_plain

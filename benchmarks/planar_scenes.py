@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
-from bidnerf_core import Localizer
+from bidnerf import Localizer
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import texture

@@ -24,7 +24,7 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bidnerf_core import SE3, open_dataset
+from bidnerf import SE3, open_dataset
 from bidnerf_core.captures import pose_contradiction
 from bidnerf_core.mapping import SIFT, ImageKeypoints, posed_keypoints
 

@@ -36,7 +36,7 @@ from _lab import (
     without_depth,
 )
 
-from bidnerf_core import SE3, Frame, Localization, Localizer, View
+from bidnerf import SE3, Frame, Localization, Localizer, View
 from bidnerf_core.evaluation import faulty
 
 WRONG_FOCAL = 1.1

@@ -22,7 +22,7 @@ from _lab import RESULTS, Row
 from answer_maps import folder_of
 from answers import answers_of, read_rows, summary
 
-import bidnerf_core as bn
+import bidnerf as bn
 from bidnerf_core.progress import Progress
 
 CONDITION = "as it is"

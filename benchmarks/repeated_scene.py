@@ -20,7 +20,7 @@ import torch
 from _lab import Scene, answer, one_thread, parser, record, within, without_depth
 from torch import Generator, Tensor, nn
 
-from bidnerf_core import Localizer, Map
+from bidnerf import Localizer, Map
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import FieldValues, RadianceField, Rays, RaySamples, SceneBounds
 from bidnerf_core.frames import View

@@ -34,7 +34,7 @@ from _lab import (
     record,
 )
 
-from bidnerf_core import ImportOptions, Localizer, Map, export_map, import_map, load_map
+from bidnerf import ImportOptions, Localizer, Map, export_map, import_map, load_map
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.results import read_pose

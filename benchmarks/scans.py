@@ -26,7 +26,7 @@ from _lab import RESULTS, Row, RowStore, cpu_seconds, held_out, judgement, one_t
 from clouds import Gicp, KissMatcher, Open3d, Points, Ransac, Refine, SmallGicp, measured_points
 from landmark_peers import Answer, Peer, answer, auto, kiss_gicp, open3d
 
-from bidnerf_core import ImportOptions, Localizer, View, import_map, load_map
+from bidnerf import ImportOptions, Localizer, View, import_map, load_map
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.errors import InputError
 

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bidnerf_core import Frame, Intrinsics, View
+from bidnerf import Frame, Intrinsics, View
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import views_digest
 from bidnerf_core.io import write_file

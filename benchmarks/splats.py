@@ -40,7 +40,7 @@ from _lab import (
 )
 from map_quality import judge
 
-from bidnerf_core import Localizer
+from bidnerf import Localizer
 from bidnerf_core.backend import load_backend
 from bidnerf_core.fields import render
 from bidnerf_core.frames import View

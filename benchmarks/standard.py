@@ -45,7 +45,7 @@ from _lab import (
     within,
 )
 
-from bidnerf_core import SE3, Intrinsics, Localizer, load_map
+from bidnerf import SE3, Intrinsics, Localizer, load_map
 from bidnerf_core.datasets import Capture, Shot, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import views_digest

@@ -38,7 +38,7 @@ import torch.nn.functional as F
 from _lab import RESULTS, RowStore, one_thread, parser, record
 from answer_maps import folder_of, map_folder
 
-from bidnerf_core import SE3, Frame, Localization, Localizer, Map, Outcome, Tracker, load_map
+from bidnerf import SE3, Frame, Localization, Localizer, Map, Outcome, Tracker, load_map
 from bidnerf_core.datasets import TimedFrame, open_sequence
 from bidnerf_core.results import TrajectoryErrors, pose_error, spans, within
 

@@ -24,7 +24,7 @@ import imageio.v3 as iio
 from _lab import Row, Scene, one_thread, parser, record
 from playwright.sync_api import sync_playwright
 
-from bidnerf_core import Localizer
+from bidnerf import Localizer
 from bidnerf_core.viewer import LiveView, serve_view
 
 ARGUMENTS = [

@@ -1,7 +1,7 @@
 """MkDocs hook: what the documentation takes from the code and the README, so that it cannot contradict them.
 
 The first page of the site is the README, and the page of all measurements is that of ``benchmarks/results``. In a page, ``<!-- settings of METHOD -->`` becomes the table of that method's settings,
-and ``<!-- names of bidnerf_core -->`` the reference of all names that can be imported from ``bidnerf_core`` itself.
+and ``<!-- names of bidnerf -->`` the reference of all names that can be imported from ``bidnerf`` itself.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from typing import Any
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
+import bidnerf
 import bidnerf_core
 from bidnerf_core.localization import METHODS
 from bidnerf_core.settings import EXPERT, Above, OneOf, Range
 
 SETTINGS = re.compile(r"^<!-- settings of ([a-z-]+) -->$", re.MULTILINE)
-NAMES = "<!-- names of bidnerf_core -->"
+NAMES = "<!-- names of bidnerf -->"
 HEAD = "| setting | default | values | meaning |\n| --- | --- | --- | --- |\n"
 ROOT = Path(__file__).parents[1]
 LINK = re.compile(r"\[([^\]]+)\]\((?!https?:)([^)]+)\)")
@@ -59,15 +60,15 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def public_homes() -> dict[str, str]:
-    """Return the package or module that offers each public name, as the stub of ``bidnerf_core`` and ``backend`` state it."""
-    found = {"RecipeBackend": "backend", "load_backend": "backend"}
+    """Return the package or module that offers each public name, as the stub of ``bidnerf`` and ``backend`` state it."""
+    found = {"RecipeBackend": "bidnerf_core.backend", "load_backend": "bidnerf_core.backend"}
     for stub in (
-        Path(bidnerf_core.__file__).with_suffix(".pyi"),
+        Path(bidnerf.__file__).with_suffix(".pyi"),
         Path(bidnerf_core.__file__).with_name("backend.py"),
     ):
         for node in ast.parse(stub.read_text(encoding="utf-8")).body:
             if isinstance(node, ast.ImportFrom):
-                package = str(node.module).removeprefix("bidnerf_core.")
+                package = str(node.module)
                 found |= {name.name: package for name in node.names if name.asname == name.name}
     return found
 
@@ -76,9 +77,9 @@ def public_names() -> str:
     """Return the directives that document the public names, under the package that defines them."""
     by_package: dict[str, list[str]] = {}
     for name, package in public_homes().items():
-        by_package.setdefault(package, []).append(f"::: bidnerf_core.{package}.{name}\n")
+        by_package.setdefault(package, []).append(f"::: {package}.{name}\n")
     return "\n".join(
-        f"### {package.capitalize()}\n\n" + "\n".join(directives)
+        f"### {package.rpartition('.')[2].capitalize()}\n\n" + "\n".join(directives)
         for package, directives in sorted(by_package.items())
     )
 

@@ -9,7 +9,7 @@ import argparse
 import sys
 import tempfile
 
-import bidnerf_core as bn
+import bidnerf as bn
 from bidnerf_core.geometry import perturb
 from bidnerf_core.registry import list_plugins
 from bidnerf_core.results import pose_error

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch.nn.functional import grid_sample, softplus
 
-import bidnerf_core as bn
+import bidnerf as bn
 from bidnerf_core.backend import FieldValues, RecipeBackend, Stratified, Supervision, SupervisionConfig
 from bidnerf_core.scenes import closed_form_data
 

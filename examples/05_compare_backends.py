@@ -8,7 +8,7 @@ Without maps, each backend is trained briefly, in memory, on a scene in closed f
 
 import argparse
 
-import bidnerf_core as bn
+import bidnerf as bn
 from bidnerf_core.registry import list_plugins
 from bidnerf_core.scenes import closed_form_data
 

@@ -10,7 +10,7 @@ import argparse
 
 import torch
 
-import bidnerf_core as bn
+import bidnerf as bn
 from bidnerf_core.backend import DEPTH_RESIDUALS
 from bidnerf_core.geometry import perturb
 from bidnerf_core.localization import settings_of

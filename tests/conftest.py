@@ -22,7 +22,8 @@ SHAPES = "BIDNERF_SHAPES"
 if os.environ.get(SHAPES) == "1":
     # Before the first import of the project: only modules that are imported afterwards are checked.
     install_import_hook(
-        ["bidnerf_core", "bidnerf_adanerf", "bidnerf_hashgrid", "bidnerf_vanilla"], "shape_checks.checked"
+        ["bidnerf", "bidnerf_core", "bidnerf_adanerf", "bidnerf_hashgrid", "bidnerf_vanilla"],
+        "shape_checks.checked",
     )
 
 import pytest

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
-from bidnerf_core import datasets, mapping  # their parts are loaded when they are used
+from bidnerf_core import datasets, mapping
 from bidnerf_core.cli.output import say
 from bidnerf_core.cli.parser import FLAG, Option, Settings
 from bidnerf_core.datasets import DatasetOptions

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from bidnerf_core import localization  # its parts are loaded when they are used
+from bidnerf_core import localization
 from bidnerf_core.cli.options import CameraOptions, MapFolder, refuse
 from bidnerf_core.cli.output import check_output, print_json, print_table, say
 from bidnerf_core.cli.parser import Flag, Option, Settings, Without

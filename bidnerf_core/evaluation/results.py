@@ -295,7 +295,7 @@ class Provenance:
 def provenance(command: str, workers: str) -> Provenance:
     """Return the provenance of a run that begins now; ``workers`` describes what runs it."""
     # Uncommitted changes in these folders make a run irreproducible from its commit.
-    sources = ("bidnerf_core", "backends", "plugins", "benchmarks", ":!benchmarks/results")
+    sources = ("bidnerf", "bidnerf_core", "backends", "plugins", "benchmarks", ":!benchmarks/results")
     return Provenance(
         date=datetime.now(UTC).isoformat(timespec="seconds"),
         command=command,

@@ -30,7 +30,7 @@ _Map = TypeVar("_Map", bound="SceneMap")
 
 @runtime_checkable
 class SceneMap(Protocol):
-    """The parts of a map that localization uses, some of which may be absent; ``bidnerf_core.Map`` implements this protocol."""
+    """The parts of a map that localization uses, some of which may be absent; ``bidnerf.Map`` implements this protocol."""
 
     @property
     def field(self) -> RadianceField: ...

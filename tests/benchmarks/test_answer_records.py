@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import pytest
 import torch
 
-from bidnerf_core import SE3, Frame, View
+from bidnerf import SE3, Frame, View
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import faulty

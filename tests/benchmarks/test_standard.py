@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core import SE3, Intrinsics, View
+from bidnerf import SE3, Intrinsics, View
 from bidnerf_core.errors import InputError
 from bidnerf_core.results import as_picture
 from bidnerf_core.scenes import demo_object, orbit, views

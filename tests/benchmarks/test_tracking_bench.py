@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from bidnerf_core import Frame, Intrinsics
+from bidnerf import Frame, Intrinsics
 from bidnerf_core.datasets import TimedFrame
 
 CAMERA = Intrinsics(8.0, 8.0, 4.0, 3.0, 8, 6)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidnerf_core import Intrinsics
+from bidnerf import Intrinsics
 from bidnerf_core.camera import Orientation, cameras_at_size
 
 LANDSCAPE = Intrinsics(520.0, 521.0, 310.0, 245.0, 640, 480, (0.05, -0.01, 0.001, 0.002))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from bidnerf_core import SE3, View
+from bidnerf import SE3, View
 
 # Inside: the refinement of poses is tested without a training around it
 from bidnerf_core.captures import TrainingPoses

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core import SE3, Frame, Intrinsics, View
+from bidnerf import SE3, Frame, Intrinsics, View
 from bidnerf_core.captures import (
     CaptureReport,
     CoverageRecord,

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidnerf_core import SE3, View
+from bidnerf import SE3, View
 from bidnerf_core.captures import TrainingPoses, pose_contradiction, surveyed
 
 # Inside: the choice of poses is tested without a training around it

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidnerf_core import SE3, Frame, View
+from bidnerf import SE3, Frame, View
 from bidnerf_core.camera import STILL
 
 # Inside: the evidence of a common motion, of which a capture only shows the decision

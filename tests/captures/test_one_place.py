@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core import SE3, Localizer, Outcome, Tracker, View, load_map, train
+from bidnerf import SE3, Localizer, Outcome, Tracker, View, load_map, train
 
 # Inside: whether photos show distances, before a map of them is trained
 from bidnerf_core.captures.coverage import shows_distances

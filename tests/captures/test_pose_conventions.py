@@ -10,7 +10,7 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_matrix_to_quaternion
 from torch import Tensor
 
-from bidnerf_core import SE3, register
+from bidnerf import SE3, register
 from bidnerf_core.captures import pose_contradiction, prepared
 
 # Inside: every reading of poses is applied and taken back, also those that no message proposes

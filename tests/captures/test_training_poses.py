@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidnerf_core import SE3, Frame, Intrinsics, View
+from bidnerf import SE3, Frame, Intrinsics, View
 from bidnerf_core.captures import (
     PoseRefinement,
     TrainingPoses,

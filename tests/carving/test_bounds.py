@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core import SE3, Frame, Intrinsics, View
+from bidnerf import SE3, Frame, Intrinsics, View
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import LandmarkConfig, tracked_views

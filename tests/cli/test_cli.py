@@ -25,7 +25,8 @@ import torch
 from safetensors.torch import load_file, save_file
 
 import tiny
-from bidnerf_core import Intrinsics, scenes
+from bidnerf import Intrinsics
+from bidnerf_core import scenes
 from bidnerf_core.backend import load_backend
 from bidnerf_core.cli import COMMANDS, main
 

@@ -16,7 +16,7 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core import train
+from bidnerf import train
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import located
 from bidnerf_core.cli import main

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core import Localizer
+from bidnerf import Localizer
 from bidnerf_core.datasets import Photos, Query, open_dataset
 from bidnerf_core.errors import printable
 from bidnerf_core.localization import Outcome

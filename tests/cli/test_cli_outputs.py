@@ -22,7 +22,7 @@ import pytest
 import torch
 
 # Inside: signals within sections that a command passes in microseconds, and paths that it must refuse
-from bidnerf_core import SE3, Frame, InputError, Intrinsics, Localization, Localizer, Outcome, Tracker
+from bidnerf import SE3, Frame, InputError, Intrinsics, Localization, Localizer, Outcome, Tracker
 from bidnerf_core.cli import main
 from bidnerf_core.cli.output import check_folder, check_output
 from bidnerf_core.cli.running import Interrupted, interruptions, uninterrupted

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core import SE3, View
+from bidnerf import SE3, View
 from bidnerf_core.captures import PoseRefinement, TrainingPoses, as_given, stored_cameras
 from bidnerf_core.captures import prepared as prepared_for_training
 from bidnerf_core.cli import main

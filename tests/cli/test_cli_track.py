@@ -17,7 +17,7 @@ import pytest
 
 # Inside: single lines of standard input, and a watched folder without waiting
 import bidnerf_core.cli.track as following
-from bidnerf_core import InputError, View
+from bidnerf import InputError, View
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.cli.track import FrameRequest, requests
 from bidnerf_core.datasets import open_dataset, read_trajectory, write_transforms

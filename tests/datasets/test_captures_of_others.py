@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bidnerf_core import Frame, open_dataset, open_sequence
+from bidnerf import Frame, open_dataset, open_sequence
 from refusals import refused
 from scan_layouts import (
     SMALL,

@@ -11,7 +11,7 @@ import torch
 from torch import Generator
 
 import baked
-from bidnerf_core import Intrinsics, Localizer
+from bidnerf import Intrinsics, Localizer
 from bidnerf_core.depth import (
     DEPTH_SENSORS,
     UNKNOWN,

@@ -20,7 +20,7 @@ import imageio.v3 as iio
 import pytest
 import torch
 
-import bidnerf_core as bn
+import bidnerf as bn
 from bidnerf_core.cli import main
 from bidnerf_core.evaluation import (
     Plan,
@@ -195,7 +195,7 @@ class Calls:
         self.count, self.last = 0, last
 
     def __call__(self, frame: FrameType, event: str, _: object) -> None:
-        self.count += event == "call" and f"{os.sep}bidnerf_core{os.sep}" in frame.f_code.co_filename
+        self.count += event == "call" and f"{os.sep}bidnerf" in frame.f_code.co_filename
         if self.count == self.last:
             os.kill(os.getpid(), signal.SIGKILL)
 

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 
-import bidnerf_core as bn
+import bidnerf as bn
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core import Frame, InputError, InputWarning, Intrinsics, View, open_dataset, open_sequence
+from bidnerf import Frame, InputError, InputWarning, Intrinsics, View, open_dataset, open_sequence
 from bidnerf_core.camera import Orientation, Raster
 from bidnerf_core.carving import FreeSpace
 from bidnerf_core.fields import RenderedImage

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image, ImageOps
 
-from bidnerf_core import Frame, InputWarning, Intrinsics
+from bidnerf import Frame, InputWarning, Intrinsics
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.frames import photos_in

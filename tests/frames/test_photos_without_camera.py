@@ -11,7 +11,7 @@ import imageio.v3 as iio
 import pytest
 import torch
 
-from bidnerf_core import Frame, Intrinsics, Localizer
+from bidnerf import Frame, Intrinsics, Localizer
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.evaluation import faulty
 from bidnerf_core.geometry import SE3

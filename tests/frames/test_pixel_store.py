@@ -208,7 +208,7 @@ def test_large_images_are_read_at_the_size_that_is_of_use(
 
 
 def test_a_map_of_reduced_images_is_resumed_at_their_size(tmp_path: Path) -> None:
-    from bidnerf_core import resume, train
+    from bidnerf import resume, train
     from bidnerf_core.maps import load_info, longest_side
 
     data, out = tiny.write_dataset(tmp_path / "data"), tmp_path / "map"

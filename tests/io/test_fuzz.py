@@ -22,7 +22,7 @@ from safetensors.torch import save
 
 import sparse_model
 import tiny
-from bidnerf_core import Frame, load_map
+from bidnerf import Frame, load_map
 from bidnerf_core.camera import read_camera
 from bidnerf_core.datasets import open_dataset, read_depth_points, read_model
 from bidnerf_core.depth import read_depth_image

@@ -12,7 +12,7 @@ import torch
 import baked
 import blob_images
 import module_fields
-from bidnerf_core import Localizer
+from bidnerf import Localizer
 from bidnerf_core.evaluation import faulty
 from bidnerf_core.fields import Observations
 from bidnerf_core.frames import Frame, View

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from bidnerf_core import SE3, Corrector, Frame, InputError, Intrinsics, Localization, Outcome
+from bidnerf import SE3, Corrector, Frame, InputError, Intrinsics, Localization, Outcome
 from refusals import refused
 
 CAMERA = Intrinsics(width=4, height=3, fx=4.0, fy=4.0, cx=2.0, cy=1.5)

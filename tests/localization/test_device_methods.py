@@ -12,7 +12,7 @@ import torch
 
 import baked
 import module_fields
-from bidnerf_core import SE3, Frame, Localization, Localizer, Tracker
+from bidnerf import SE3, Frame, Localization, Localizer, Tracker
 from bidnerf_core.localization import AutoConfig, settings_of
 from bidnerf_core.results import pose_error
 from bidnerf_core.testing import DEVICE, Elsewhere, MapWithLandmarks, textured_map, unseen

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidnerf_core import SE3, Frame, Intrinsics, View
+from bidnerf import SE3, Frame, Intrinsics, View
 from bidnerf_core.localization import MOVING
 
 # Inside: the prior of each explanation, of which answers show the most probable one

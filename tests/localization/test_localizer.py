@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 import torch
 
-import bidnerf_core as bn
+import bidnerf as bn
 import tiny
-from bidnerf_core import Cancelled, InputError, Localization, Localizer, View
+from bidnerf import Cancelled, InputError, Localization, Localizer, View
 from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.localization import METHODS, AutoConfig, settings_of
 from bidnerf_core.progress import Progress, job_context

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 
-from bidnerf_core import SE3, Intrinsics, Localization, Localizer, Outcome, View
+from bidnerf import SE3, Intrinsics, Localization, Localizer, Outcome, View
 from bidnerf_core.evaluation import faulty
 from bidnerf_core.fields import FieldValues
 from bidnerf_core.localization import AutoConfig, LandmarkAnswer, LandmarkMatcher, LogisticModel, Loop, rig

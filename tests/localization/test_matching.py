@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidnerf_core import SE3, Frame, Intrinsics, View
+from bidnerf import SE3, Frame, Intrinsics, View
 from bidnerf_core.devices import moved
 from bidnerf_core.localization import LandmarkMatcher
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from bidnerf_core import SE3, Frame, Localization, Localizer, Outcome, View
+from bidnerf import SE3, Frame, Localization, Localizer, Outcome, View
 from bidnerf_core.geometry import perturb
 from bidnerf_core.localization import METHODS, settings_of
 from bidnerf_core.mapping import BakeConfig, bake

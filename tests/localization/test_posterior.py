@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
-from bidnerf_core import SE3
+from bidnerf import SE3
 from bidnerf_core.localization import Posterior
 
 # Inside: the tolerance, relative to which the distances of the scene are varied

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 import blob_images
-from bidnerf_core import SE3, Intrinsics, View
+from bidnerf import SE3, Intrinsics, View
 
 # Inside: the terms of the loop one by one
 from bidnerf_core.localization.terms.rays import RenderedRays

@@ -16,7 +16,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from bidnerf_core import Localizer, Outcome, Tracker
+from bidnerf import Localizer, Outcome, Tracker
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import read_tensors_and_metadata

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidnerf_core import SE3
+from bidnerf import SE3
 from bidnerf_core.geometry import retracted, update_between
 
 # Inside: predictions and covariances of the filter, which show in no answer by themselves

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidnerf_core import SE3
+from bidnerf import SE3
 from bidnerf_core.camera import STILL, MotionPrior, poses_of_rows
 from bidnerf_core.mapping import Adjustment, PosePrior, Sightings, adjusted
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core import InputError
+from bidnerf import InputError
 from bidnerf_core.mapping import (
     FoundOnce,
     Keypoints,

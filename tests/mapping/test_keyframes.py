@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidnerf_core import SE3, View
+from bidnerf import SE3, View
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import SceneBounds, Stratified
 from bidnerf_core.localization import LandmarkMatcher, Loop

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
+from bidnerf import SE3, Frame, InputError, Intrinsics, View
 from bidnerf_core.mapping import (
     LandmarkConfig,
     LandmarkMap,

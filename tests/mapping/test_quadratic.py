@@ -12,7 +12,7 @@ import torch
 from scipy.stats import multivariate_normal
 from torch import Tensor
 
-from bidnerf_core import SE3
+from bidnerf import SE3
 from bidnerf_core.mapping import NUISANCES, Normal, Quadratic, States, descend, log_det, log_evidence, total
 
 P = 6 + len(NUISANCES)

@@ -7,7 +7,7 @@ import torch
 from scipy.stats import chi2
 from torch import Tensor
 
-from bidnerf_core import SE3, Intrinsics
+from bidnerf import SE3, Intrinsics
 from bidnerf_core.camera import AT_REST, STILL, MotionPrior, exposure_times
 from bidnerf_core.mapping import (
     CAMERA,

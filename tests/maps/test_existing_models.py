@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 import torch
 
-import bidnerf_core as bn
+import bidnerf as bn
 import tiny
-from bidnerf_core import SE3, Frame, View
+from bidnerf import SE3, Frame, View
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import read_posed_images, stored_keypoints
 from bidnerf_core.errors import InputError

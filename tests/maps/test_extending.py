@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-import bidnerf_core as bn
+import bidnerf as bn
 import tiny
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.datasets import write_transforms

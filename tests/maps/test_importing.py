@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 import tiny
-from bidnerf_core import import_map, load_map
+from bidnerf import import_map, load_map
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import write_transforms

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-import bidnerf_core as bn
+import bidnerf as bn
 from bidnerf_core.captures import write_inria_cameras
 from bidnerf_core.evaluation import (
     Comparison,

@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import nn
 
-import bidnerf_core as bn
+import bidnerf as bn
 import tiny
 from bidnerf_core.backend import load_backend, quick_config
 from bidnerf_core.geometry import perturb

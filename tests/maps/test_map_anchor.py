@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 import tiny
-from bidnerf_core import InputError, resume, train
+from bidnerf import InputError, resume, train
 from bidnerf_core.captures import CaptureReport, CoverageRecord
 from bidnerf_core.fields import SceneBounds
 

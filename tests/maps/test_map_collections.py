@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-import bidnerf_core as bn
+import bidnerf as bn
 
 # Inside: the share of landmarks in view, and a worker of the service without its processes
 import bidnerf_core.maps.collection as collections_module

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-import bidnerf_core as bn
+import bidnerf as bn
 import tiny
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.fields import levels

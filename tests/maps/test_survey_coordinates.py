@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core import (
+from bidnerf import (
     SE3,
     Frame,
     Localization,

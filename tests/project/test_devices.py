@@ -14,7 +14,7 @@ from torch import Tensor, nn
 import baked
 import module_fields
 import tiny
-from bidnerf_core import Localizer, Map
+from bidnerf import Localizer, Map
 from bidnerf_core.backend import load_backend
 from bidnerf_core.devices import Resident, may_wait, moved, run_on
 from bidnerf_core.io import to_plain

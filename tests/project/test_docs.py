@@ -20,10 +20,10 @@ from unittest.mock import patch
 
 import pytest
 
-import bidnerf_core
+import bidnerf
 import docs_workspace
 import tiny
-from bidnerf_core import Localization, Localizer, Map, Outcome
+from bidnerf import Localization, Localizer, Map, Outcome
 from bidnerf_core.cli import COMMANDS, main
 from bidnerf_core.fields import DEPTH_RESIDUALS
 from bidnerf_core.geometry import SE3, perturb
@@ -43,9 +43,9 @@ FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 NOT_RUN: dict[tuple[str, str], str] = {
     (
         "embedding.md",
-        "from bidnerf_core import ServiceClient",
+        "from bidnerf import ServiceClient",
     ): "asks a running service; tests/service/test_service.py does",
-    ("maps.md", "from bidnerf_core import find_poses"): "needs photos that overlap, and seconds for each",
+    ("maps.md", "from bidnerf import find_poses"): "needs photos that overlap, and seconds for each",
 }
 """Python blocks that are not executed, by page and first line, each with the reason."""
 TOO_SLOW = {
@@ -351,5 +351,5 @@ def test_site_builds_strictly_and_needs_no_network(
     assert "<!-- settings of" not in methods
     assert "<code>fused_rays</code>" in methods
     reference = (tmp_path / "site" / "reference.html").read_text()
-    described = set(re.findall(r'id="bidnerf_core\.\w+\.(\w+)"', reference))
-    assert sorted(set(bidnerf_core.__all__) - described) == []
+    described = set(re.findall(r'id="bidnerf(?:_core)?\.\w+\.(\w+)"', reference))
+    assert sorted(set(bidnerf.__all__) - described) == []

@@ -58,6 +58,6 @@ def test_what_is_shortened_is_there() -> None:
 def test_examples_are_short_and_import_the_door_and_faces_alone() -> None:
     texts = {example.name: example.read_text() for example in EXAMPLES}
     assert {name: len(text.splitlines()) for name, text in texts.items() if len(text.splitlines()) > 45} == {}
-    assert [name for name, text in texts.items() if "import bidnerf_core as bn" not in text] == []
-    deep = re.compile(r"bidnerf_core\.\w+\.|import bidnerf_core\.")
+    assert [name for name, text in texts.items() if "import bidnerf as bn" not in text] == []
+    deep = re.compile(r"bidnerf(_core)?\.\w+\.|import bidnerf(_core)?\.")
     assert [name for name, text in texts.items() if deep.search(text)] == []

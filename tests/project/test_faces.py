@@ -12,8 +12,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-CORE = ROOT / "bidnerf_core"
-PACKAGES = sorted(face.parent.name for face in CORE.glob("*/__init__.py"))
+STOREYS = ("bidnerf_core", "bidnerf")
+PACKAGES = sorted(
+    f"{name}.{face.parent.name}" for name in STOREYS for face in (ROOT / name).glob("*/__init__.py")
+)
 OUTSIDE = ("backends", "plugins", "benchmarks", "examples", "docs", "tests")
 REASON = re.compile(r"^ *# Inside: .{10,}", re.MULTILINE)
 """How a test file says why it needs parts that its package does not offer."""
@@ -32,7 +34,7 @@ EXCEPTIONS = {
 
 
 def sources() -> Iterator[Path]:
-    for folder in ("bidnerf_core", *OUTSIDE):
+    for folder in (*STOREYS, *OUTSIDE):
         for file in sorted((ROOT / folder).rglob("*.py")):
             if not any(part.startswith(".") for part in file.relative_to(ROOT).parts):
                 yield file
@@ -62,8 +64,8 @@ def deep_imports(file: Path) -> set[tuple[str, str]]:
         if isinstance(node, ast.Import):
             names = [name.name for name in node.names]
         for name in names:
-            _, package, *inner = [*name.split("."), ""]
-            if name.startswith("bidnerf_core.") and package in PACKAGES and any(inner):
+            storey, package, *inner = [*name.split("."), "", ""]
+            if f"{storey}.{package}" in PACKAGES and any(inner):
                 found.add((package, name))
     return found
 
@@ -83,7 +85,7 @@ def test_other_packages_plugins_and_tests_import_from_faces() -> None:
     found = {}
     for file in sources():
         name = file.relative_to(ROOT).as_posix()
-        own = name.split("/")[1] if name.startswith(("bidnerf_core/", "tests/")) else None
+        own = name.split("/")[1] if name.startswith(("bidnerf/", "bidnerf_core/", "tests/")) else None
         deep = sorted({module for package, module in deep_imports(file) if package != own})
         if deep and name not in EXCEPTIONS:
             found[name] = deep
@@ -103,9 +105,9 @@ def test_exceptions_are_needed() -> None:
     assert [name for name in EXCEPTIONS if not deep_imports(ROOT / name)] == []
 
 
-@pytest.mark.parametrize("package", [*(name for name in PACKAGES if name != "cli"), ""])
+@pytest.mark.parametrize("package", [*(name for name in PACKAGES if not name.endswith(".cli")), "bidnerf"])
 def test_what_a_face_names_is_there(package: str) -> None:
-    face = importlib.import_module(".".join(filter(None, ["bidnerf_core", package])))
+    face = importlib.import_module(package)
     assert [name for name in face.__all__ if not hasattr(face, name)] == []
     assert set(face.__all__) == _offered(face.__name__)
     with pytest.raises(AttributeError, match="missing"):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-import bidnerf_core as bn
+import bidnerf as bn
 import tiny
 from bidnerf_core.camera import Orientation
 from bidnerf_core.captures import stored_cameras

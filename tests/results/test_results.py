@@ -19,9 +19,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import bidnerf_core as bn
+import bidnerf as bn
 import drawn
-from bidnerf_core import SE3, Frame, InputError, InputWarning, Localization, Localizer, Outcome
+from bidnerf import SE3, Frame, InputError, InputWarning, Localization, Localizer, Outcome
 from bidnerf_core.datasets import Capture, DatasetOptions, Photos, Shot, write_transforms
 from bidnerf_core.frames import BLACK, View
 from bidnerf_core.progress import Progress

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core import SE3
+from bidnerf import SE3
 from bidnerf_core.results import TrajectoryErrors, spans
 
 # Inside: errors after each alignment, compared with evo's, and the paths that are drawn

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bidnerf_core import Frame
+from bidnerf import Frame
 from damage import zeros_png
 from harness import (
     AUTO,

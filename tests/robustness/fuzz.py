@@ -22,7 +22,7 @@ import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from bidnerf_core import SE3, Frame, Intrinsics, Localizer, load_map
+from bidnerf import SE3, Frame, Intrinsics, Localizer, load_map
 from bidnerf_core.localization import settings_of
 from damage import (
     NUMBERS,

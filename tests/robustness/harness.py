@@ -30,7 +30,7 @@ import numpy as np
 import torch
 from safetensors import safe_open
 
-from bidnerf_core import SE3, Frame, InputError, Intrinsics, Localizer, Tracker, load_map
+from bidnerf import SE3, Frame, InputError, Intrinsics, Localizer, Tracker, load_map
 
 # Inside: the modules of the commands are imported before a process is forked for each case
 from bidnerf_core.cli import evaluate, localize, main, maps, track, train  # noqa: F401  (before a fork)

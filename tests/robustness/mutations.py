@@ -188,7 +188,7 @@ def draw(root: Path) -> list[Fault]:
     for count, packages in STRATA:
         pool: dict[str, list[Fault]] = defaultdict(list)
         for package in packages.split():
-            for path in sorted((root / "bidnerf_core" / package).rglob("*.py")):
+            for path in sorted(root.glob(f"bidnerf*/{package}/**/*.py")):
                 for fault, _ in candidates(root, path):
                     pool[fault.kind].append(fault)
         kinds = chance.sample(sorted(pool), len(pool))
@@ -268,7 +268,7 @@ class Measurement:
     def __init__(self, root: Path, copy: Path, rows: IO[str]) -> None:
         ignored = shutil.ignore_patterns(".*", "__pycache__", "out", "site", "dist", "build")
         shutil.copytree(root, copy, ignore=ignored)
-        compileall.compile_dir(copy / "bidnerf_core", quiet=2)
+        [compileall.compile_dir(copy / name, quiet=2) for name in ("bidnerf", "bidnerf_core")]
         self.copy, self.rows = copy, rows
         # Of the sound code (None), and of each fault by its number.
         self.runs: dict[int | None, dict[Unit, Row]] = defaultdict(dict)

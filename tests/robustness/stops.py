@@ -25,7 +25,7 @@ from typing import Any
 
 import torch
 
-from bidnerf_core import Localizer, load_map
+from bidnerf import Localizer, load_map
 from bidnerf_core.localization import settings_of
 from harness import (
     BAKED,

@@ -33,7 +33,7 @@ import pytest
 pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
 pytest.importorskip("uvicorn", reason="the extra 'serve' is not installed")
 
-from bidnerf_core import InputError, ServiceClient, open_dataset, serve
+from bidnerf import InputError, ServiceClient, open_dataset, serve
 from bidnerf_core.camera import WAYS, WAYS_OF_PHOTO
 from bidnerf_core.localization import settings_of
 from bidnerf_core.registry import _declared

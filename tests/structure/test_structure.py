@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-import bidnerf_core as bn
+import bidnerf as bn
 import tiny
 from bidnerf_core.datasets import lacks_poses, write_transforms
 from bidnerf_core.geometry import fit_similarity

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from bidnerf_core import SE3, Intrinsics, View
+from bidnerf import SE3, Intrinsics, View
 from bidnerf_core.evaluation import faulty
 from bidnerf_core.localization import settings_of
 from bidnerf_core.mapping import Features, Keypoints, LandmarkMap, Sift, build_landmarks

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import torch
 
-from bidnerf_core import SE3, Frame, Localization, Localizer, Tracker
+from bidnerf import SE3, Frame, Localization, Localizer, Tracker
 from bidnerf_core.geometry import look_at
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.results import pose_error

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from bidnerf_core import SE3, Frame, Intrinsics, View
+from bidnerf import SE3, Frame, Intrinsics, View
 from bidnerf_core.camera import exposure_times, poses_of_rows
 from bidnerf_core.mapping import Keypoints, quantized
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from bidnerf_core import SE3, Intrinsics
+from bidnerf import SE3, Intrinsics
 
 CAMERA = Intrinsics(230.0, 230.0, 128.0, 96.0, 256, 192)
 HALF = 2.0  # metres: from the middle of the room to each wall

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from bidnerf_core import SE3, Frame, TrainOptions, View, train
+from bidnerf import SE3, Frame, TrainOptions, View, train
 from bidnerf_core.datasets import Query
 from bidnerf_core.mapping import BakeConfig
 from photo_room import CAMERA, HALF, photograph

@@ -15,7 +15,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import viewed
-from bidnerf_core import Localizer, Map
+from bidnerf import Localizer, Map
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import DatasetOptions, Photos
 from bidnerf_core.service import ServiceLimits

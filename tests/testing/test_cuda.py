@@ -13,7 +13,8 @@ from torch import Tensor
 import baked
 import module_fields
 import tiny
-from bidnerf_core import Localization, Localizer, devices
+from bidnerf import Localization, Localizer
+from bidnerf_core import devices
 from bidnerf_core.backend import load_backend, quick_config
 from bidnerf_core.cli import main
 from bidnerf_core.devices import captured, constant

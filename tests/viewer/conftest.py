@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import viewed
-from bidnerf_core import Map, load_map
+from bidnerf import Map, load_map
 from once import made_once
 
 

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 import viewed
-from bidnerf_core import SE3, InputError, Intrinsics, Localization, Localizer, Map, View, view
+from bidnerf import SE3, InputError, Intrinsics, Localization, Localizer, Map, View, view
 from bidnerf_core.datasets import Query
 from bidnerf_core.errors import Cancelled
 from bidnerf_core.fields import render_image

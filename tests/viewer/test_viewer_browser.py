@@ -22,7 +22,7 @@ pytest.importorskip("playwright", reason="Playwright is not installed")
 from playwright.sync_api import sync_playwright
 
 import viewed
-from bidnerf_core import SE3, Localizer, Map
+from bidnerf import SE3, Localizer, Map
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.viewer import page_of, shown_trajectory
 

@@ -21,7 +21,7 @@ pytest.importorskip("uvicorn", reason="the extra 'viewer' is not installed")
 from PIL import Image
 
 import viewed
-from bidnerf_core import Localizer, Map
+from bidnerf import Localizer, Map
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.localization import settings_of
 

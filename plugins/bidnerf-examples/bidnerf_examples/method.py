@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import torch
 
-from bidnerf_core import InputError, Localization
+from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import Loop, Method, Outcome, Problem
+from bidnerf_core.localization import Localization, Loop, Method, Outcome, Problem
 from bidnerf_core.settings import Settings
 
 

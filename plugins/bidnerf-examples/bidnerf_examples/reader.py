@@ -14,10 +14,11 @@ from pathlib import Path
 
 import torch
 
-from bidnerf_core import SE3, InputError
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import Capture, DatasetOptions, DepthFile, Reader, Shot
 from bidnerf_core.depth import read_depth_image
+from bidnerf_core.errors import InputError
+from bidnerf_core.geometry import SE3
 
 TABLE, CAMERA = "poses.csv", "camera.json"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bidnerf_core import load_map
+from bidnerf import load_map
 from bidnerf_core.cli import main
 
 

@@ -10,11 +10,11 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from bidnerf_core import Map
 from bidnerf_core.captures import write_inria_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import ScaledField
 from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.maps import Map
 from bidnerf_gaussians.field import GaussiansField
 from bidnerf_gaussians.formats import write_gaussians
 from bidnerf_gaussians.gaussians import Gaussians

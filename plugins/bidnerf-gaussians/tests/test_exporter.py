@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from bidnerf_core import Map, export_map, import_map
+from bidnerf import Map, export_map, import_map
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import StoredCamera, stored_cameras
 from bidnerf_core.errors import InputError

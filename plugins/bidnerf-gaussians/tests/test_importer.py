@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from bidnerf_core import ImportOptions, import_map, load_map
+from bidnerf import ImportOptions, import_map, load_map
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import StoredCamera
 from bidnerf_core.errors import InputWarning

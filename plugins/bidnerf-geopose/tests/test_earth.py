@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bidnerf_core import SE3
+from bidnerf import SE3
 from bidnerf_core.maps import Anchor
 from bidnerf_geopose.earth import GeographicPose
 from bidnerf_geopose.wgs84 import Geodetic, geodetic

@@ -14,7 +14,7 @@ import pytest
 import torch
 from PIL import Image
 
-from bidnerf_core import SE3, InputError, Intrinsics, Localization, Outcome
+from bidnerf import SE3, InputError, Intrinsics, Localization, Outcome
 from bidnerf_core.maps import Anchor
 from bidnerf_core.registry import registered
 from bidnerf_core.results import Answer

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from bidnerf_core import ImportOptions, import_map
+from bidnerf import ImportOptions, import_map
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.maps import importer_of

@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from bidnerf_core import Map
+from bidnerf import Map
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import FieldValues, levels, render
 from bidnerf_core.geometry import SE3

@@ -21,9 +21,10 @@ from typing import Any
 from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.typesys import Stores, get_typestore
 
-from bidnerf_core import Frame, InputError, Intrinsics
-from bidnerf_core.camera import same_aspect
+from bidnerf_core.camera import Intrinsics, same_aspect
 from bidnerf_core.datasets import BreaksOff, Capture, DatasetOptions, Reader, Shot
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import Frame
 from bidnerf_ros2.conversions import seconds
 from bidnerf_ros2.messages import frame_of, intrinsics, is_depth
 

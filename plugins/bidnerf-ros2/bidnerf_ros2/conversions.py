@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core import SE3
+from bidnerf_core.geometry import SE3
 
 R_BODY_OPTICAL = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
 """REP 103: an optical frame's z is forward, its x is right, its y is down."""

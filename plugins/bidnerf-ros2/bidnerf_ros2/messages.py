@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from bidnerf_core import Frame, InputError, Intrinsics
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import Frame
 from bidnerf_core.io import PackedFile, open_image
 
 COLOURS = {

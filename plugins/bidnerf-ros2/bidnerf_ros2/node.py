@@ -10,7 +10,8 @@ from typing import Any
 
 import torch
 
-from bidnerf_core import InputError, Localizer, load_map
+from bidnerf_core.errors import InputError
+from bidnerf_core.maps import Localizer, load_map
 from bidnerf_ros2.bridge import ERROR, Bridge, Estimate, diagnosis, fill_pose
 from bidnerf_ros2.conversions import fill, transform_of
 

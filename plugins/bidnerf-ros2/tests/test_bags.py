@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 import bags
-from bidnerf_core import InputError, open_dataset, open_sequence
+from bidnerf import InputError, open_dataset, open_sequence
 from bidnerf_ros2.messages import colour_image, depth_image, intrinsics, is_depth
 
 CAMERA = (30.0, 31.0, 15.5, 11.5)

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import bags
-from bidnerf_core import SE3, Localization, Outcome
+from bidnerf import SE3, Localization, Outcome
 from bidnerf_ros2 import node as nodes
 from bidnerf_ros2.bridge import OK, WARN, Bridge, Estimate, diagnosis, fill_pose
 from bidnerf_ros2.conversions import transform_of

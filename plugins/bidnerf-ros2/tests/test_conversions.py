@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core import SE3
+from bidnerf import SE3
 from bidnerf_core.geometry import covariance_in
 from bidnerf_ros2.conversions import (
     R_BODY_OPTICAL,

@@ -12,7 +12,7 @@ import pytest
 import torch
 import trimesh
 
-from bidnerf_core import ImportOptions, Map, export_map, import_map
+from bidnerf import ImportOptions, Map, export_map, import_map
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.errors import InputError

@@ -12,7 +12,7 @@ import pytest
 import torch
 import trimesh
 
-from bidnerf_core import ImportOptions, import_map, load_map
+from bidnerf import ImportOptions, import_map, load_map
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.fields import render_image

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core import Localizer, import_map, open_dataset
+from bidnerf import Localizer, import_map, open_dataset
 from bidnerf_core.frames import draw, uniform
 from bidnerf_core.results import pose_error
 from bidnerf_scan.pieces import thinned

