@@ -160,7 +160,7 @@ def measured(command: Sequence[str], work: Path) -> dict[str, Any]:
     program = [
         sys.executable,
         "-c",
-        "import sys; from bidnerf_core.cli import main; sys.exit(main(sys.argv[1:]))",
+        "import sys; from bidnerf.cli import main; sys.exit(main(sys.argv[1:]))",
     ]
     with (work / "output.txt").open("w") as output:
         child = subprocess.Popen([*program, *command], stdout=output, stderr=output)

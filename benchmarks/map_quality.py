@@ -49,7 +49,7 @@ LEAST_LANDMARKS = 30
 
 def train(data: Path, out: Path, options: list[str]) -> dict[str, float]:
     """Return wall seconds, CPU seconds and peak resident memory (GiB) of the training process."""
-    command = [sys.executable, "-c", "import sys; from bidnerf_core.cli import main; sys.exit(main())"]
+    command = [sys.executable, "-c", "import sys; from bidnerf.cli import main; sys.exit(main())"]
     began = time.perf_counter()
     subprocess.run([*command, "train", str(data), "--out", str(out), "--overwrite", *options], check=True)
     used = resource.getrusage(resource.RUSAGE_CHILDREN)

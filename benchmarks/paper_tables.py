@@ -32,7 +32,7 @@ from typing import Any
 import _lab
 from scipy.stats import fisher_exact, mannwhitneyu
 
-from bidnerf_core.cli.running import displayed
+from bidnerf.cli.running import displayed
 from bidnerf_core.errors import Cancelled
 from bidnerf_core.evaluation import (
     NEVER,

@@ -65,7 +65,7 @@ class Server:
     """A running ``bidnerf serve``."""
 
     def __init__(self, folder: Path, *options: str) -> None:
-        program = "import sys; from bidnerf_core.cli import main; sys.exit(main())"
+        program = "import sys; from bidnerf.cli import main; sys.exit(main())"
         command = [sys.executable, "-c", program, "serve", str(folder), "--port", "0", *options]
         self.process = subprocess.Popen(
             command, stderr=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}
@@ -146,7 +146,7 @@ def photos(folder: Path, data: Path, count: int) -> list[Photo]:
     depth = [data / frame["depth_file_path"] for frame in frames]
     with TemporaryDirectory() as place:
         (Path(place) / "camera.json").write_text(camera)
-        program = "import sys; from bidnerf_core.cli import main; sys.exit(main())"
+        program = "import sys; from bidnerf.cli import main; sys.exit(main())"
         words = [
             "localize",
             folder,

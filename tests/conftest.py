@@ -93,7 +93,7 @@ def generator() -> torch.Generator:
 @pytest.fixture
 def bidnerf(capsys: pytest.CaptureFixture[str]) -> Run:
     """Runs a command in this process."""
-    from bidnerf_core.cli import main
+    from bidnerf.cli import main
 
     def run(*words: object) -> CommandResult:
         capsys.readouterr()
@@ -108,7 +108,7 @@ def bidnerf(capsys: pytest.CaptureFixture[str]) -> Run:
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tiny dataset, ``data``, and the map ``map`` that was trained of it; tests change copies of them only."""
     import tiny
-    from bidnerf_core.cli import main
+    from bidnerf.cli import main
 
     def make(folder: Path) -> None:
         tiny.write_dataset(folder / "data")

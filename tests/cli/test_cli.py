@@ -26,12 +26,12 @@ from safetensors.torch import load_file, save_file
 
 import tiny
 from bidnerf import Intrinsics
-from bidnerf_core import scenes
-from bidnerf_core.backend import load_backend
-from bidnerf_core.cli import COMMANDS, main
+from bidnerf.cli import COMMANDS, main
 
 # Inside: a line of progress, without a training that takes as long as the line says
-from bidnerf_core.cli.running import displayed
+from bidnerf.cli.running import displayed
+from bidnerf_core import scenes
+from bidnerf_core.backend import load_backend
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import Localizer
@@ -707,7 +707,7 @@ def test_a_diverging_training_is_told_and_leaves_nothing(
 
 # Processes of their own.
 
-PROGRAM = [sys.executable, "-c", "import sys; from bidnerf_core.cli import main; sys.exit(main())"]
+PROGRAM = [sys.executable, "-c", "import sys; from bidnerf.cli import main; sys.exit(main())"]
 ALONE = {**os.environ, "OMP_NUM_THREADS": "1"}
 
 
@@ -718,7 +718,7 @@ def test_a_plugin_that_exits_ends_the_command_with_its_status(
     def leave() -> None:
         raise SystemExit(code)
 
-    monkeypatch.setattr("bidnerf_core.cli.plugins.run_backends", leave)
+    monkeypatch.setattr("bidnerf.cli.plugins.run_backends", leave)
     assert bidnerf("backends").status == status
 
 
@@ -775,7 +775,7 @@ def test_the_demo_leaves_a_map_and_the_data_that_it_was_made_from(
         scenes, "views", lambda scene, camera, poses, seen=scenes.views: seen(scene, small, poses)
     )
     for name, less in (("TRAINING_VIEWS", 12), ("ANIMATED", 2), ("DESCENT", {"rays": 64, "max_steps": 5})):
-        monkeypatch.setattr(f"bidnerf_core.cli.demo.{name}", less)
+        monkeypatch.setattr(f"bidnerf.cli.demo.{name}", less)
     monkeypatch.setattr("bidnerf_core.maps.training.USUAL_BAKE", BakeConfig(cells=20_000))
     out = tmp_path / "out"
     assert bidnerf("demo", "--steps", 5, "--frames", 1, "--out", out).status == 0
@@ -790,11 +790,11 @@ def test_the_demo_leaves_a_map_and_the_data_that_it_was_made_from(
 # for each line on stdin with a file for what a command prints, one for what it complains of, and its words, the child's process id
 # and how it ended.
 FORKING = """
-import os, sys, bidnerf_core as bn, bidnerf_core.cli.localize
+import os, sys, bidnerf_core as bn, bidnerf.cli.localize
 bn.Localizer, bn.load_map
 print(*sys.modules, flush=True)
-import torch._dynamo, bidnerf_core.cli.train, bidnerf_core.backend
-from bidnerf_core.cli import main
+import torch._dynamo, bidnerf.cli.train, bidnerf_core.backend
+from bidnerf.cli import main
 bn.open_dataset(sys.argv[1]).views("train")
 bidnerf_core.backend.load_backend("hashgrid")
 for line in sys.stdin:

@@ -17,9 +17,9 @@ import torch
 
 import tiny
 from bidnerf import train
+from bidnerf.cli import main
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import located
-from bidnerf_core.cli import main
 from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, TrackedViews, tracked_views

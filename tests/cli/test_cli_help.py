@@ -13,8 +13,8 @@ from typing import Annotated, Any
 import pytest
 
 # Inside: the parser alone, and the options of all commands by name
-from bidnerf_core.cli import COMMANDS, main, parser
-from bidnerf_core.cli.parser import FLAG, Option, Without, parse
+from bidnerf.cli import COMMANDS, main, parser
+from bidnerf.cli.parser import FLAG, Option, Without, parse
 from bidnerf_core.errors import UsageError
 from bidnerf_core.localization import METHODS
 from bidnerf_core.registry import list_plugins
@@ -95,7 +95,7 @@ def test_help_ends_in_a_narrow_terminal(bidnerf: Run, monkeypatch: pytest.Monkey
 
 
 def test_no_help_page_waits_for_torch() -> None:
-    run = "import sys; from bidnerf_core.cli import COMMANDS, main\nfor name in COMMANDS: main([name, '--help'])"
+    run = "import sys; from bidnerf.cli import COMMANDS, main\nfor name in COMMANDS: main([name, '--help'])"
     program = f"{run}\nmain(['--version']), main(['frobnicate'])\nprint(*{{'torch', 'kornia', 'scipy', 'cv2', 'pydantic'}} & {{*sys.modules}}, file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stderr.splitlines()[-1].split() == []

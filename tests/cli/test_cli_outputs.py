@@ -23,9 +23,9 @@ import torch
 
 # Inside: signals within sections that a command passes in microseconds, and paths that it must refuse
 from bidnerf import SE3, Frame, InputError, Intrinsics, Localization, Localizer, Outcome, Tracker
-from bidnerf_core.cli import main
-from bidnerf_core.cli.output import check_folder, check_output
-from bidnerf_core.cli.running import Interrupted, interruptions, uninterrupted
+from bidnerf.cli import main
+from bidnerf.cli.output import check_folder, check_output
+from bidnerf.cli.running import Interrupted, interruptions, uninterrupted
 from bidnerf_core.datasets import DatasetFrames, Query, read_trajectory
 from bidnerf_core.errors import UsageError
 from bidnerf_core.results import Answers

@@ -14,9 +14,9 @@ import torch
 
 import tiny
 from bidnerf import SE3, View
+from bidnerf.cli import main
 from bidnerf_core.captures import PoseRefinement, TrainingPoses, as_given, stored_cameras
 from bidnerf_core.captures import prepared as prepared_for_training
-from bidnerf_core.cli import main
 from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import TrackedViews, tracked_views

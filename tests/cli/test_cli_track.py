@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 # Inside: single lines of standard input, and a watched folder without waiting
-import bidnerf_core.cli.track as following
+import bidnerf.cli.track as following
 from bidnerf import InputError, View
+from bidnerf.cli.track import FrameRequest, requests
 from bidnerf_core.captures import stored_cameras
-from bidnerf_core.cli.track import FrameRequest, requests
 from bidnerf_core.datasets import open_dataset, read_trajectory, write_transforms
 from bidnerf_core.testing import CAMERA
 from commands import Run, assert_refused

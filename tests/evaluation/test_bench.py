@@ -21,7 +21,7 @@ import pytest
 import torch
 
 import bidnerf as bn
-from bidnerf_core.cli import main
+from bidnerf.cli import main
 from bidnerf_core.evaluation import (
     Plan,
     ResultsFile,

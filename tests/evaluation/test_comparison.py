@@ -15,7 +15,7 @@ import imageio.v3 as iio
 import pytest
 
 import tiny
-from bidnerf_core.cli import main
+from bidnerf.cli import main
 from bidnerf_core.datasets import open_dataset
 
 # Inside: rows and costs of single trials, from which a comparison is put together

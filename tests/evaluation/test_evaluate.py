@@ -21,7 +21,7 @@ import torch
 
 import bidnerf as bn
 import tiny
-from bidnerf_core.cli import main
+from bidnerf.cli import main
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.evaluation import (
     Comparison,

@@ -14,7 +14,7 @@ import torch
 from scipy.stats import chi2
 
 import tiny
-from bidnerf_core.cli import main
+from bidnerf.cli import main
 from bidnerf_core.evaluation import (
     FAULTS,
     NO_FAULT,

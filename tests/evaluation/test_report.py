@@ -17,7 +17,7 @@ import imageio.v3 as iio
 import pytest
 
 import tiny
-from bidnerf_core.cli import main
+from bidnerf.cli import main
 from bidnerf_core.datasets import write_transforms
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import (

@@ -20,7 +20,7 @@ import torch
 import bidnerf as bn
 import tiny
 from bidnerf import SE3, Frame, View
-from bidnerf_core.cli import main
+from bidnerf.cli import main
 from bidnerf_core.datasets import read_posed_images, stored_keypoints
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, Keypoints, tracked_views

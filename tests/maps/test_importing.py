@@ -13,8 +13,8 @@ from torch import Tensor
 
 import tiny
 from bidnerf import import_map, load_map
+from bidnerf.cli import main
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.cli import main
 from bidnerf_core.datasets import write_transforms
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.fields import FieldValues, RayHits, Rays, SceneBounds, Stratified

@@ -24,7 +24,7 @@ import bidnerf
 import docs_workspace
 import tiny
 from bidnerf import Localization, Localizer, Map, Outcome
-from bidnerf_core.cli import COMMANDS, main
+from bidnerf.cli import COMMANDS, main
 from bidnerf_core.fields import DEPTH_RESIDUALS
 from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.localization import ADVICE, METHODS, AutoConfig, Problem, settings_of
@@ -186,7 +186,7 @@ def test_bidnerf_commands_work(page: Path, inside: Path, monkeypatch: pytest.Mon
         if program == "bidnerf":
             with monkeypatch.context() as patch:
                 if arguments[0] in TOO_SLOW:
-                    parser = importlib.import_module("bidnerf_core.cli.parser")
+                    parser = importlib.import_module("bidnerf.cli.parser")
                     patch.setattr(parser, "parse", parsed_only(parser.parse))
                 for command in (FIRST.get(tuple(arguments)), arguments):
                     assert command is None or main([*command]) == 0, shlex.join([program, *command])

@@ -47,7 +47,7 @@ def declared(source: Path) -> set[tuple[str, str]]:
 
 def offered(environment: dict[str, str]) -> dict[tuple[str, str], str]:
     """Return the distribution of every plugin that is found and has no fault, by group and name."""
-    program = "from bidnerf_core.cli import main; main(['plugins', '--json'])"
+    program = "from bidnerf.cli import main; main(['plugins', '--json'])"
     listed = json.loads(quietly([sys.executable, "-c", program], env=environment))
     return {(e["group"], e["name"]): e["distribution"] for e in listed if e["fault"] is None}
 

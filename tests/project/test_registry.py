@@ -15,8 +15,8 @@ from typing import Any
 
 import pytest
 
+from bidnerf.cli import _warnings_as_lines
 from bidnerf_core.backend import Backend, load_backend
-from bidnerf_core.cli import _warnings_as_lines
 from bidnerf_core.datasets import Capture, DatasetOptions, Reader, find_reader, open_dataset, open_sequence
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.localization import find_method

@@ -33,7 +33,7 @@ from safetensors import safe_open
 from bidnerf import SE3, Frame, InputError, Intrinsics, Localizer, Tracker, load_map
 
 # Inside: the modules of the commands are imported before a process is forked for each case
-from bidnerf_core.cli import evaluate, localize, main, maps, track, train  # noqa: F401  (before a fork)
+from bidnerf.cli import evaluate, localize, main, maps, track, train  # noqa: F401  (before a fork)
 from bidnerf_core.datasets import open_dataset, write_transforms
 from bidnerf_core.localization import settings_of
 from bidnerf_core.scenes import demo_object, orbit

@@ -337,7 +337,7 @@ def replaced_while_read(sound: Path, work: Path, seconds: float) -> Checks:
     words = ["train", sound / "data", *SMALL_FIELD, "--no-bake", "--overwrite", "--steps"]
 
     def replace() -> None:
-        from bidnerf_core.cli import main
+        from bidnerf.cli import main
 
         for step in range(1_000_000):
             main([str(word) for word in (*words, 2 + step % 2, "--out", folder / "map")])

@@ -697,7 +697,7 @@ def test_a_token_that_is_given_is_not_shown(
     def announced(maps: Any, *, token: str | None, ready: Any, **more: Any) -> None:
         ready("http://localhost:1", token or "made-up-0123456789")
 
-    monkeypatch.setattr("bidnerf_core.cli.view.serve_maps", announced)
+    monkeypatch.setattr("bidnerf.cli.view.serve_maps", announced)
     (tmp_path / "token").write_text("secret-0123456789")
     given = bidnerf("serve", tmp_path, "--token-file", tmp_path / "token")
     assert "Bearer" in given.out + given.err

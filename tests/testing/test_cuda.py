@@ -14,9 +14,9 @@ import baked
 import module_fields
 import tiny
 from bidnerf import Localization, Localizer
+from bidnerf.cli import main
 from bidnerf_core import devices
 from bidnerf_core.backend import load_backend, quick_config
-from bidnerf_core.cli import main
 from bidnerf_core.devices import captured, constant
 from bidnerf_core.fields import FieldValues, SceneBounds, device_of, levels, render_image
 from bidnerf_core.geometry import perturb

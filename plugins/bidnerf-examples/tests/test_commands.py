@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from bidnerf import load_map
-from bidnerf_core.cli import main
+from bidnerf.cli import main
 
 
 @pytest.fixture(scope="module")

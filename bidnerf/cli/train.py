@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from bidnerf_core.cli.options import (
+from bidnerf.cli.options import (
     Json,
     MapOptions,
     PointChoice,
     refuse,
     wrong_usage,
 )
-from bidnerf_core.cli.output import check_folder, print_json
-from bidnerf_core.cli.parser import Flag, Option, Settings
-from bidnerf_core.cli.running import working
+from bidnerf.cli.output import check_folder, print_json
+from bidnerf.cli.parser import Flag, Option, Settings
+from bidnerf.cli.running import working
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.registry import USUAL_BACKEND, USUAL_FEATURES

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 from urllib.parse import quote
 
-from bidnerf_core.cli.options import TEST_IMAGES, Device, Json, MethodOptions, Names, wrong_usage
-from bidnerf_core.cli.output import check_folder, console, print_json, require_outside_maps, say, show
-from bidnerf_core.cli.parser import Flag, Option, Without
-from bidnerf_core.cli.running import displayed, working
+from bidnerf.cli.options import TEST_IMAGES, Device, Json, MethodOptions, Names, wrong_usage
+from bidnerf.cli.output import check_folder, console, print_json, require_outside_maps, say, show
+from bidnerf.cli.parser import Flag, Option, Without
+from bidnerf.cli.running import displayed, working
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.settings import WholeNumbers

@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from bidnerf.cli.options import CameraOptions, MapFolder, refuse
+from bidnerf.cli.output import check_output, print_json, print_table, say
+from bidnerf.cli.parser import Flag, Option, Settings, Without
+from bidnerf.cli.running import displayed, uninterrupted
 from bidnerf_core import localization
-from bidnerf_core.cli.options import CameraOptions, MapFolder, refuse
-from bidnerf_core.cli.output import check_output, print_json, print_table, say
-from bidnerf_core.cli.parser import Flag, Option, Settings, Without
-from bidnerf_core.cli.running import displayed, uninterrupted
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.registry import USUAL_METHOD

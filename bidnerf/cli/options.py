@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
+from bidnerf.cli.output import say
+from bidnerf.cli.parser import FLAG, Option, Settings
 from bidnerf_core import datasets, mapping
-from bidnerf_core.cli.output import say
-from bidnerf_core.cli.parser import FLAG, Option, Settings
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.registry import USUAL_FEATURES, USUAL_METHOD

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from bidnerf_core.cli.options import (
+from bidnerf.cli.options import (
     TEST_IMAGES,
     Json,
     MapFolder,
@@ -19,9 +19,9 @@ from bidnerf_core.cli.options import (
     refuse,
     require_one,
 )
-from bidnerf_core.cli.output import check_folder, check_output, print_json, say, show
-from bidnerf_core.cli.parser import Option, Without
-from bidnerf_core.cli.running import displayed, uninterrupted
+from bidnerf.cli.output import check_folder, check_output, print_json, say, show
+from bidnerf.cli.parser import Option, Without
+from bidnerf.cli.running import displayed, uninterrupted
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount, enumeration
 

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, TextIO
 
-from bidnerf_core.cli.running import Interrupted, interruptions
+from bidnerf.cli.running import Interrupted, interruptions
 from bidnerf_core.errors import Cancelled, InputError, InputWarning, UsageError, printable, spelling_hint
 
 COMMANDS = {
@@ -98,9 +98,9 @@ def _dispatch(given: list[str]) -> int:
         return _failed("bidnerf", unknown, WRONG_USAGE, f"\n{usage}")
     if any("\0" in word for word in given):
         raise UsageError("an argument holds a NUL character", expected="text")
-    from bidnerf_core.cli.parser import parse  # imported here for the sake of a quick --version
+    from bidnerf.cli.parser import parse  # imported here for the sake of a quick --version
 
-    module = importlib.import_module(f"bidnerf_core.cli.{MODULES.get(given[0], given[0])}")
+    module = importlib.import_module(f"bidnerf.cli.{MODULES.get(given[0], given[0])}")
     try:
         parse(given[0], getattr(module, f"run_{given[0]}"), given[1:])
     except SystemExit as stopped:  # after help, or from a plugin
@@ -146,7 +146,7 @@ def _remarks_as_lines() -> Iterator[None]:
 class _Lines(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         # Imported here because importing rich takes longer than --help should.
-        from bidnerf_core.cli.output import say
+        from bidnerf.cli.output import say
 
         say(record.getMessage())
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from bidnerf_core.cli.options import (
+from bidnerf.cli.options import (
     TEST_IMAGES,
     BakeSettings,
     Device,
@@ -20,9 +20,9 @@ from bidnerf_core.cli.options import (
     require_one,
     wrong_usage,
 )
-from bidnerf_core.cli.output import check_folder, check_output, print_json, say, show
-from bidnerf_core.cli.parser import Flag, Option, Settings, Without
-from bidnerf_core.cli.running import displayed, working
+from bidnerf.cli.output import check_folder, check_output, print_json, say, show
+from bidnerf.cli.parser import Flag, Option, Settings, Without
+from bidnerf.cli.running import displayed, working
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.progress import counter

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from bidnerf_core import service, viewer
-from bidnerf_core.cli.options import (
+from bidnerf.cli.options import (
     TEST_IMAGES,
     Device,
     Host,
@@ -19,9 +18,10 @@ from bidnerf_core.cli.options import (
     Port,
     QueryOptions,
 )
-from bidnerf_core.cli.output import check_output, console, say, show
-from bidnerf_core.cli.parser import Option, Without
-from bidnerf_core.cli.running import displayed
+from bidnerf.cli.output import check_output, console, say, show
+from bidnerf.cli.parser import Option, Without
+from bidnerf.cli.running import displayed
+from bidnerf_core import service, viewer
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, spelling_hint
 from bidnerf_core.io import read_file

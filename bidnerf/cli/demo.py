@@ -6,10 +6,10 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
-from bidnerf_core.cli.options import Seed
-from bidnerf_core.cli.output import console, print_table, say, show
-from bidnerf_core.cli.parser import Flag, Option
-from bidnerf_core.cli.running import working
+from bidnerf.cli.options import Seed
+from bidnerf.cli.output import console, print_table, say, show
+from bidnerf.cli.parser import Flag, Option
+from bidnerf.cli.running import working
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.registry import USUAL_BACKEND
 from bidnerf_core.settings import WholeNumbers

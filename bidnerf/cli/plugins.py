@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from bidnerf_core.cli.options import Json
-from bidnerf_core.cli.output import print_json, print_table
-from bidnerf_core.cli.parser import Option
+from bidnerf.cli.options import Json
+from bidnerf.cli.output import print_json, print_table
+from bidnerf.cli.parser import Option
 from bidnerf_core.registry import GROUPS, PluginInfo, list_plugins
 
 

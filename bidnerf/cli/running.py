@@ -21,7 +21,7 @@ from rich.progress import (
 )
 from rich.progress import Progress as Bar
 
-from bidnerf_core.cli.output import console, say
+from bidnerf.cli.output import console, say
 from bidnerf_core.errors import Cancelled
 from bidnerf_core.progress import Progress, duration_text, job_context
 
