@@ -9,6 +9,8 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
+from bidnerf.testing import SCENE_BOUNDS as BOUNDS
+from bidnerf.testing import BackendContract, Recorder, awkward_rays, colour_error, rgbd_views
 from bidnerf_adanerf import AdaNerfConfig, AdaNerfField, backend
 from bidnerf_adanerf.bins import Bins, chosen
 from bidnerf_adanerf.dense import dense_samples, render_softly, soft_weights
@@ -20,8 +22,6 @@ from bidnerf_core.fields import FieldValues, Rays, RaySamples, query_samples, re
 from bidnerf_core.frames import View
 from bidnerf_core.scenes import demo_room, look_around
 from bidnerf_core.scenes import views as seen_from
-from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
-from bidnerf_core.testing import BackendContract, Recorder, awkward_rays, colour_error, rgbd_views
 from bidnerf_core.training import RayBank, TrainingBatch
 from tiny import black_batch
 

@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import nn
 
+from bidnerf.testing import SCENE_BOUNDS as BOUNDS
+from bidnerf.testing import awkward_rays, points
 from bidnerf_adanerf import backend as adanerf
 from bidnerf_core.backend import Backend, RecipeBackend, quick_config
 from bidnerf_core.fields import Rays, SceneBounds, render
-from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
-from bidnerf_core.testing import awkward_rays, points
 from bidnerf_core.training import Silent
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid import backend as hashgrid

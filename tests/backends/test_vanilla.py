@@ -9,6 +9,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from bidnerf.testing import SCENE_BOUNDS as BOUNDS
+from bidnerf.testing import SIDE, BackendContract, Recorder, rgb_views, rgbd_views
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import (
@@ -22,8 +24,6 @@ from bidnerf_core.fields import (
     render,
 )
 from bidnerf_core.frames import View
-from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
-from bidnerf_core.testing import SIDE, BackendContract, Recorder, rgb_views, rgbd_views
 from bidnerf_core.training import RayBank, Supervision, ray_termination, supervised_loss
 from bidnerf_vanilla import VanillaConfig, VanillaField, backend
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from bidnerf import SE3, Frame, View
+from bidnerf.testing import BOUNDS, CAMERA, ground, unseen
 from bidnerf_core.camera import STILL
 
 # Inside: the evidence of a common motion, of which a capture only shows the decision
@@ -38,7 +39,6 @@ from bidnerf_core.mapping import (
     pose_updates,
     tracked_views,
 )
-from bidnerf_core.testing import BOUNDS, CAMERA, ground, unseen
 from bidnerf_core.training import RayBank
 from inaccurate_captures import VIEWS, capture, turned, updates
 from landmark_scene import PINHOLE, Points, looking_in

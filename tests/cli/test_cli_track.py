@@ -19,9 +19,9 @@ import pytest
 import bidnerf.cli.track as following
 from bidnerf import InputError, View
 from bidnerf.cli.track import FrameRequest, requests
+from bidnerf.testing import CAMERA
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.datasets import open_dataset, read_trajectory, write_transforms
-from bidnerf_core.testing import CAMERA
 from commands import Run, assert_refused
 from flights import covered, flight
 from stored_ground import open_ground, write_flight

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from bidnerf.testing import training_views
 from bidnerf_core.datasets import (
     Capture,
     DatasetOptions,
@@ -25,7 +26,6 @@ from bidnerf_core.datasets import (
 from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.testing import training_views
 from refusals import refused
 from scan_layouts import (
     LAYOUTS,

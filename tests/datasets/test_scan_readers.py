@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from bidnerf.testing import ReaderContract, training_views
+
 # Inside: a limit of size that small images reach, and pictures that are no files
 from bidnerf_core.datasets import (
     READERS,
@@ -25,7 +27,6 @@ from bidnerf_core.datasets.capture import with_files
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.maps import read_views
-from bidnerf_core.testing import ReaderContract, training_views
 from scan_layouts import LAYOUTS, PERIOD, message, read_all, small_views
 
 COUNT = 10

@@ -8,9 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidnerf_core.fields import RadianceField, Rays, SceneBounds, render
-from bidnerf_core.scenes import GaussianBlobs, HomogeneousBall, Sphere, orbit
-from bidnerf_core.testing import (
+from bidnerf.testing import (
     check_background,
     check_intervals,
     check_levels,
@@ -20,6 +18,8 @@ from bidnerf_core.testing import (
     check_repeatable,
     check_shapes,
 )
+from bidnerf_core.fields import RadianceField, Rays, SceneBounds, render
+from bidnerf_core.scenes import GaussianBlobs, HomogeneousBall, Sphere, orbit
 
 BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 8.0)
 

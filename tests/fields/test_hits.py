@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from bidnerf.testing import check_hits
 from bidnerf_core.fields import (
     FieldValues,
     HitField,
@@ -18,7 +19,6 @@ from bidnerf_core.fields import (
     Stratified,
     render,
 )
-from bidnerf_core.testing import check_hits
 
 SOFT = 0.01  # metres: standard deviation of the density about a sheet
 HEIGHTS = (0.4, -0.3)  # metres

@@ -11,12 +11,12 @@ from torch import Tensor
 import bidnerf_adanerf
 import bidnerf_vanilla
 import tiny
+from bidnerf.testing import SCENE_BOUNDS as BOUNDS
+from bidnerf.testing import check_intervals, check_repeatable, rgb_views
 from bidnerf_core.backend import Backend
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.fields import RadianceField, Rays, VoxelGrid, levels, render
 from bidnerf_core.frames import View
-from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
-from bidnerf_core.testing import check_intervals, check_repeatable, rgb_views
 from bidnerf_core.training import Silent
 from bidnerf_hashgrid import backend as hashgrid
 from bidnerf_hashgrid.occupancy import OccupancyGrid

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from bidnerf.testing import unseen
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame, observe
 from bidnerf_core.geometry import SE3
-from bidnerf_core.testing import unseen
 from refusals import refused
 
 LENS = Intrinsics(20, 20, 12, 8, 24, 16)

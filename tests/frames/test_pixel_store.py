@@ -14,6 +14,7 @@ import torch
 from PIL import Image
 
 import tiny
+from bidnerf.testing import DEVICE, Elsewhere
 from bidnerf_core.camera import CameraBatch, Intrinsics, checked_side
 from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.errors import InputError
@@ -31,7 +32,6 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping.landmarks import tracks
 from bidnerf_core.maps import TrainOptions, read_views
 from bidnerf_core.maps import views as views_of_map
-from bidnerf_core.testing import DEVICE, Elsewhere
 
 # Inside: blocks are made so small that the images of a test fill several
 from bidnerf_core.training import RayBank, excess, nearby, ray_bank

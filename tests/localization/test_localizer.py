@@ -21,10 +21,10 @@ import torch
 import bidnerf as bn
 import tiny
 from bidnerf import Cancelled, InputError, Localization, Localizer, View
+from bidnerf.testing import DEVICE, Elsewhere, textured_map, training_views, unseen
 from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.localization import METHODS, AutoConfig, settings_of
 from bidnerf_core.progress import Progress, job_context
-from bidnerf_core.testing import DEVICE, Elsewhere, textured_map, training_views, unseen
 from bidnerf_hashgrid import backend as hashgrid
 from blob_images import BOUNDS, FIELD, FRAME, POSES, TRUTH, photograph
 from conditions import NOT_RENDERED

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from bidnerf import SE3, Frame, Intrinsics, View
+from bidnerf.testing import DEVICE, Elsewhere, unseen
 from bidnerf_core.devices import moved
 from bidnerf_core.localization import LandmarkMatcher
 
@@ -21,7 +22,6 @@ from bidnerf_core.localization.matching import (
     log10_nfa,
 )
 from bidnerf_core.mapping import LandmarkMap, Sift, States, build_landmarks, squared_distances
-from bidnerf_core.testing import DEVICE, Elsewhere, unseen
 from conditions import COPY, PINHOLE, point_landmarks, point_view, points, twice
 from landmark_scene import Points, looking_in, ring
 from refusals import refused

@@ -13,6 +13,7 @@ from torch import Tensor
 
 import blob_images
 from bidnerf import SE3, Intrinsics, View
+from bidnerf.testing import textured_map, training_views, unseen
 
 # Inside: the terms of the loop one by one
 from bidnerf_core.localization.terms.rays import RenderedRays
@@ -29,7 +30,6 @@ from bidnerf_core.mapping import (
     project,
     rays_through,
 )
-from bidnerf_core.testing import textured_map, training_views, unseen
 
 CAMERA = Intrinsics(310.0, 290.0, 190.0, 160.0, 400, 300, (0.05, -0.02, 0.001, 0.002))
 LENGTHS = {"vx": 0.02, "vy": 0.02, "vz": 0.02, "wx": 0.01, "wy": 0.01, "wz": 0.01}

@@ -14,6 +14,7 @@ from torch import Generator, Tensor
 
 import baked
 import module_fields
+from bidnerf.testing import DEVICE, DeviceFault, Elsewhere
 from bidnerf_core.devices import moved, without_waiting
 from bidnerf_core.fields import RadianceField
 from bidnerf_core.frames import View
@@ -21,7 +22,6 @@ from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.localization import ColourSettings, DepthLossSettings, Images, RayTerms, rig, states_at
 from bidnerf_core.localization.terms.images import Thumbnail, surface_renderer
 from bidnerf_core.mapping import CostTerm, SurfaceMap, Surfels, cast, descend, trace
-from bidnerf_core.testing import DEVICE, DeviceFault, Elsewhere
 from problems import FieldMap
 
 

@@ -9,6 +9,7 @@ import pytest
 
 import bidnerf as bn
 import tiny
+from bidnerf.testing import training_views, view
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.datasets import write_transforms
 from bidnerf_core.errors import Cancelled
@@ -17,7 +18,6 @@ from bidnerf_core.mapping import BakeConfig
 # Inside: the location of new photos alone, without the training that follows
 from bidnerf_core.maps.extending import locate
 from bidnerf_core.progress import job_context
-from bidnerf_core.testing import training_views, view
 from commands import Run
 from photo_files import write_photo
 from refusals import refused

@@ -15,6 +15,7 @@ from torch import nn
 
 import bidnerf as bn
 import tiny
+from bidnerf.testing import training_views, unseen
 from bidnerf_core.backend import load_backend, quick_config
 from bidnerf_core.geometry import perturb
 from bidnerf_core.io import FileInUse, to_plain
@@ -23,7 +24,6 @@ from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps import load_info, rendering_scores
 from bidnerf_core.progress import Progress
 from bidnerf_core.registry import PluginError
-from bidnerf_core.testing import training_views, unseen
 from bidnerf_hashgrid import backend as hashgrid
 from refusals import refused
 

@@ -15,6 +15,7 @@ import bidnerf as bn
 
 # Inside: the share of landmarks in view, and a worker of the service without its processes
 import bidnerf_core.maps.collection as collections_module
+from bidnerf.testing import BOUNDS, CAMERA, POSES, ground, view
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.fields import NoField
@@ -24,7 +25,6 @@ from bidnerf_core.maps import Map, MapInfo, maps_in
 from bidnerf_core.scenes import orbit
 from bidnerf_core.service import Upload
 from bidnerf_core.service.worker import Worker
-from bidnerf_core.testing import BOUNDS, CAMERA, POSES, ground, view
 from commands import Run
 from refusals import refused
 

@@ -12,13 +12,13 @@ import torch
 
 import bidnerf as bn
 import tiny
+from bidnerf.testing import BOUNDS, textured_map, training_views
 from bidnerf_core.camera import Orientation
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.datasets import read_frames
 from bidnerf_core.io import read_record
 from bidnerf_core.maps import Map, MapInfo
 from bidnerf_core.registry import PluginError, registered
-from bidnerf_core.testing import BOUNDS, textured_map, training_views
 from refusals import refused
 
 

@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 import bidnerf as bn
 import drawn
 from bidnerf import SE3, Frame, InputError, InputWarning, Localization, Localizer, Outcome
+from bidnerf.testing import textured_map
 from bidnerf_core.datasets import Capture, DatasetOptions, Photos, Shot, write_transforms
 from bidnerf_core.frames import BLACK, View
 from bidnerf_core.progress import Progress
@@ -36,7 +37,6 @@ from bidnerf_core.results import (
     read_pose,
     within,
 )
-from bidnerf_core.testing import textured_map
 from drawn import record
 from flights import covered, flight
 from refusals import refused

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from bidnerf import SE3, Intrinsics, View
+from bidnerf.testing import CAMERA, MapWithLandmarks, textured_map
+from bidnerf.testing import POSES as GROUND_POSES
+from bidnerf.testing import view as view_of_ground
 from bidnerf_core.evaluation import faulty
 from bidnerf_core.localization import settings_of
 from bidnerf_core.mapping import Features, Keypoints, LandmarkMap, Sift, build_landmarks
-from bidnerf_core.testing import CAMERA, MapWithLandmarks, textured_map
-from bidnerf_core.testing import POSES as GROUND_POSES
-from bidnerf_core.testing import view as view_of_ground
 from landmark_scene import PINHOLE, Points, looking_in, ring
 from localizations import colour_only
 

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from bidnerf import SE3, Frame, Intrinsics, View
+from bidnerf.testing import MapWithLandmarks, textured_map
 from bidnerf_core import evaluation
 from bidnerf_core.captures import StoredCamera
 from bidnerf_core.datasets import write_transforms
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.maps import MapInfo
-from bidnerf_core.testing import MapWithLandmarks, textured_map
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ from torch import Generator, Tensor, nn
 
 import bidnerf_core
 import tiny
+from bidnerf.testing import BackendContract
 from bidnerf_core.fields import (
     FieldDerivatives,
     FieldValues,
@@ -29,7 +30,6 @@ from bidnerf_core.fields import (
     render,
 )
 from bidnerf_core.frames import View
-from bidnerf_core.testing import BackendContract
 from bidnerf_core.training import (
     RayBank,
     Report,

@@ -11,14 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.datasets import READERS, Capture, DatasetOptions, Reader, of_views, write_transforms
-from bidnerf_core.evaluation import FAULTS
-from bidnerf_core.frames import Frame, View
-from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import AutoConfig, Localization, Outcome, Problem, find_method, settings_of
-from bidnerf_core.mapping import SIFT, Keypoints
-from bidnerf_core.registry import registered
-from bidnerf_core.testing import (
+from bidnerf.testing import (
     BOUNDS,
     FaultContract,
     FeaturesContract,
@@ -26,6 +19,13 @@ from bidnerf_core.testing import (
     ReaderContract,
     training_views,
 )
+from bidnerf_core.datasets import READERS, Capture, DatasetOptions, Reader, of_views, write_transforms
+from bidnerf_core.evaluation import FAULTS
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import AutoConfig, Localization, Outcome, Problem, find_method, settings_of
+from bidnerf_core.mapping import SIFT, Keypoints
+from bidnerf_core.registry import registered
 
 QUICK = AutoConfig(points=1000, hypotheses=64, rounds=1, refine_steps=0, fused_rays=128)
 FEW = {"poses": 8, "fine_rays": 512}

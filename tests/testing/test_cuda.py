@@ -15,6 +15,8 @@ import module_fields
 import tiny
 from bidnerf import Localization, Localizer
 from bidnerf.cli import main
+from bidnerf.testing import SCENE_BOUNDS as BOUNDS
+from bidnerf.testing import rgbd_views, textured_map, unseen
 from bidnerf_core import devices
 from bidnerf_core.backend import load_backend, quick_config
 from bidnerf_core.devices import captured, constant
@@ -22,8 +24,6 @@ from bidnerf_core.fields import FieldValues, SceneBounds, device_of, levels, ren
 from bidnerf_core.geometry import perturb
 from bidnerf_core.localization import settings_of
 from bidnerf_core.maps import load_map
-from bidnerf_core.testing import SCENE_BOUNDS as BOUNDS
-from bidnerf_core.testing import rgbd_views, textured_map, unseen
 from bidnerf_core.training import Silent, TrainingState, TrainingStep, TrainingStopped
 from problems import FieldMap
 

@@ -13,11 +13,11 @@ import pytest
 import torch
 
 import tiny
+from bidnerf.testing import DEVICE, Elsewhere
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.devices import moved
 from bidnerf_core.fields import RaySamples, query_packed, query_samples
 from bidnerf_core.frames import View
-from bidnerf_core.testing import DEVICE, Elsewhere
 from bidnerf_core.training import RayBank, TrainingStopped, ray_bank
 
 # Inside: steps without room for their samples

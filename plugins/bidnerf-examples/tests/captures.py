@@ -9,7 +9,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 
-from bidnerf_core.testing import CAMERA, training_views
+from bidnerf.testing import CAMERA, training_views
 
 
 def write_capture(folder: Path) -> Path:

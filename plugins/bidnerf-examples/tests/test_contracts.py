@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bidnerf_core.testing import FaultContract, FeaturesContract, MethodContract, ReaderContract
+from bidnerf.testing import FaultContract, FeaturesContract, MethodContract, ReaderContract
 
 
 class TestReader(ReaderContract):

@@ -11,12 +11,12 @@ import pytest
 import torch
 
 from bidnerf import Map, export_map, import_map
+from bidnerf.testing import BOUNDS, textured_map, training_views
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import StoredCamera, stored_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import render_image
 from bidnerf_core.maps import MapInfo
-from bidnerf_core.testing import BOUNDS, textured_map, training_views
 from bidnerf_gaussians import Gaussians, read_gaussians, write_gaussians
 from bidnerf_gaussians.quaternions import matrices
 from bidnerf_gaussians.spherical_harmonics import C0

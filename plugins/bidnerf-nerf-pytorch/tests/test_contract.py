@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import bidnerf_nerf_pytorch
-from bidnerf_core.testing import BackendContract
+from bidnerf.testing import BackendContract
 
 
 class TestNerfPytorch(BackendContract):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from bidnerf.testing import SCENE_BOUNDS, Recorder, rgb_views
 from bidnerf_core.backend import load_backend
 from bidnerf_core.errors import InputError
-from bidnerf_core.testing import SCENE_BOUNDS, Recorder, rgb_views
 from bidnerf_core.training import Silent
 from bidnerf_nerf_pytorch import NerfPytorchConfig, backend, read_checkpoint
 from checkpoints import SMALL, Writer

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bidnerf_core.testing import BackendContract
+from bidnerf.testing import BackendContract
 from bidnerf_nerfstudio import instant_ngp, nerfacto, vanilla
 from bidnerf_nerfstudio.networks import HashConfig
 

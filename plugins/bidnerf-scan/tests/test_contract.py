@@ -1,6 +1,6 @@
 """The contract's tests of the backend."""
 
-from bidnerf_core.testing import BackendContract
+from bidnerf.testing import BackendContract
 from bidnerf_scan import ScanConfig
 
 

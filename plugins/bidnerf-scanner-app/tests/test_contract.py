@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bidnerf_core.testing import ReaderContract
+from bidnerf.testing import ReaderContract
 
 DATA = os.environ.get("BIDNERF_DATA")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import bidnerf_template
-from bidnerf_core.testing import BackendContract
+from bidnerf.testing import BackendContract
 
 
 class TestTemplate(BackendContract):

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from bidnerf_core.testing import FeaturesContract
+from bidnerf.testing import FeaturesContract
 
 
 class TestXFeat(FeaturesContract):

@@ -2,7 +2,7 @@
 
 A complete test of a backend is::
 
-    from bidnerf_core.testing import BackendContract
+    from bidnerf.testing import BackendContract
 
     class TestMine(BackendContract):
         backend = my_package.backend

@@ -10,6 +10,27 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf.testing.faults import (
+    Named,
+    are_colours,
+    calling,
+    equal,
+    is_depth,
+    is_one_line,
+    once,
+    require,
+)
+from bidnerf.testing.textured_field import (
+    CAMERA,
+    POSES,
+    T_MOVED_WORLD,
+    MapWithLandmarks,
+    moved_map,
+    seen,
+    textured_map,
+    training_views,
+    unseen,
+)
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import FAULTS, Fault
 from bidnerf_core.frames import Frame
@@ -21,27 +42,6 @@ from bidnerf_core.mapping import (
     squared_distances,
 )
 from bidnerf_core.registry import interface_defects
-from bidnerf_core.testing.faults import (
-    Named,
-    are_colours,
-    calling,
-    equal,
-    is_depth,
-    is_one_line,
-    once,
-    require,
-)
-from bidnerf_core.testing.textured_field import (
-    CAMERA,
-    POSES,
-    T_MOVED_WORLD,
-    MapWithLandmarks,
-    moved_map,
-    seen,
-    textured_map,
-    training_views,
-    unseen,
-)
 
 # Methods.
 

@@ -9,6 +9,17 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
+from bidnerf.testing.faults import calling, query, require, sample
+from bidnerf.testing.scene import (
+    SIDE,
+    awkward_points,
+    awkward_rays,
+    camera_rays,
+    joined,
+    picked,
+    points,
+    rgbd_views,
+)
 from bidnerf_core.fields import (
     DifferentiatedField,
     FieldValues,
@@ -21,17 +32,6 @@ from bidnerf_core.fields import (
     backward_derivatives,
     render,
     rendering_weights,
-)
-from bidnerf_core.testing.faults import calling, query, require, sample
-from bidnerf_core.testing.scene import (
-    SIDE,
-    awkward_points,
-    awkward_rays,
-    camera_rays,
-    joined,
-    picked,
-    points,
-    rgbd_views,
 )
 
 # Values.

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import torch
 
+from bidnerf.testing.faults import Named, are_colours, calling, equal, is_depth, once, require
 from bidnerf_core.captures import pose_contradiction
 from bidnerf_core.datasets import READERS, Capture, DatasetOptions
 from bidnerf_core.frames import View
@@ -20,7 +21,6 @@ from bidnerf_core.mapping import (
     depth_ratio,
     tracked_views,
 )
-from bidnerf_core.testing.faults import Named, are_colours, calling, equal, is_depth, once, require
 
 ENOUGH_POINTS = 30
 """Minimum number of points on which several images must agree for their poses to be judged."""

@@ -23,6 +23,10 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from bidnerf.testing.faults import calling, require
+from bidnerf.testing.field_checks import close
+from bidnerf.testing.scene import SCENE_BOUNDS, rgbd_views
+from bidnerf.testing.textured_field import MapWithLandmarks
 from bidnerf_core import devices
 from bidnerf_core.devices import moved, without_waiting
 from bidnerf_core.fields import RadianceField, levels
@@ -43,10 +47,6 @@ from bidnerf_core.localization import (
     states_at,
 )
 from bidnerf_core.mapping import descend
-from bidnerf_core.testing.faults import calling, require
-from bidnerf_core.testing.field_checks import close
-from bidnerf_core.testing.scene import SCENE_BOUNDS, rgbd_views
-from bidnerf_core.testing.textured_field import MapWithLandmarks
 
 DEVICE = torch.device("meta")
 """The simulated device."""

@@ -11,13 +11,13 @@ from typing import Any, ClassVar, cast
 import torch
 from torch import Tensor, nn
 
+from bidnerf.testing import field_checks, recipes
+from bidnerf.testing.device import check_steps
+from bidnerf.testing.faults import calling, is_one_line, once, query, require
+from bidnerf.testing.scene import SCENE_BOUNDS, awkward_rays, joined, points, rgb_views, rgbd_views
 from bidnerf_core.backend import Backend, load_backend
 from bidnerf_core.fields import RadianceField, levels
 from bidnerf_core.io import from_plain, to_plain
-from bidnerf_core.testing import field_checks, recipes
-from bidnerf_core.testing.device import check_steps
-from bidnerf_core.testing.faults import calling, is_one_line, once, query, require
-from bidnerf_core.testing.scene import SCENE_BOUNDS, awkward_rays, joined, points, rgb_views, rgbd_views
 
 
 class BackendContract:

@@ -13,11 +13,11 @@ from safetensors.torch import load as tensors_from_bytes
 from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor, nn
 
+from bidnerf.testing.faults import calling, require
+from bidnerf.testing.scene import DIMMED_BOUNDS, SCENE_BOUNDS, camera_rays, exposed_views, rgbd_views
 from bidnerf_core.backend import Backend
 from bidnerf_core.fields import RadianceField, SceneBounds, render
 from bidnerf_core.frames import View
-from bidnerf_core.testing.faults import calling, require
-from bidnerf_core.testing.scene import DIMMED_BOUNDS, SCENE_BOUNDS, camera_rays, exposed_views, rgbd_views
 from bidnerf_core.training import TrainingState, TrainingStep, TrainingStopped
 
 EXPOSURE = 0.06
