@@ -17,8 +17,8 @@ import torch
 from scipy.stats import chi2
 
 from bidnerf import Localization, Map, View, load_map
+from bidnerf.evaluation import provenance, script_command
 from bidnerf_core.datasets import Capture, open_dataset
-from bidnerf_core.evaluation import provenance, script_command
 from bidnerf_core.io import FileInUse, take_lock, to_plain, write_file
 from bidnerf_core.results import normalized_error_squared, pose_error, success_rate
 

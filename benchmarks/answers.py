@@ -63,9 +63,9 @@ from torch import Generator, Tensor
 from torch.nn.functional import interpolate
 
 from bidnerf import Localizer
+from bidnerf.evaluation import faulty, provenance, warped
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import faulty, provenance, warped
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3, random_units
 from bidnerf_core.io import write_file

@@ -21,7 +21,7 @@ from typing import Any
 import _lab
 from paper_tables import Settings, as_record, run_part, test_frames, trials_of
 
-from bidnerf_core.evaluation import Plan
+from bidnerf.evaluation import Plan
 
 WITHOUT_REACH: Settings = {"candidates": 1, "box_weight": 0.0}
 """The paper's objective alone; the defaults of ``bid`` add to it."""

@@ -46,9 +46,7 @@ from _lab import (
 from _lab import answer as timed_answer
 
 from bidnerf import Localization, Localizer, Map, load_map
-from bidnerf_core.datasets import Capture, open_dataset
-from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import (
+from bidnerf.evaluation import (
     FAULTS,
     NO_FAULT,
     expand_faults,
@@ -58,6 +56,8 @@ from bidnerf_core.evaluation import (
     parse_settings,
     views_digest,
 )
+from bidnerf_core.datasets import Capture, open_dataset
+from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.io import to_plain
 from bidnerf_core.results import success_rate

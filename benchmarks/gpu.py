@@ -39,9 +39,9 @@ from _lab import RowStore
 from paper_tables import test_frames
 
 from bidnerf import Localizer, View
+from bidnerf.evaluation import opened
 from bidnerf_core.backend import SceneBounds, load_backend
 from bidnerf_core.devices import captured, moved, without_waiting
-from bidnerf_core.evaluation import opened
 from bidnerf_core.fields import RadianceField, derivatives_of, levels, render_image, trained_field
 from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.io import from_plain

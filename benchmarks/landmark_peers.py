@@ -80,7 +80,7 @@ from scipy.stats import binomtest
 from sift import FEWEST_INLIERS, SiftMatcher, colmap_pnp, opencv_pnp, sift_points
 
 from bidnerf import Localizer, View
-from bidnerf_core.evaluation import bid_start, views_digest
+from bidnerf.evaluation import bid_start, views_digest
 from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.results import pose_error
 

@@ -24,7 +24,7 @@ import torch
 from _lab import BOUND, RESULTS, held_out, parser, record
 
 from bidnerf import SE3
-from bidnerf_core.evaluation import (
+from bidnerf.evaluation import (
     Plan,
     ResultsFile,
     Summary,

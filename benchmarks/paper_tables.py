@@ -33,8 +33,7 @@ import _lab
 from scipy.stats import fisher_exact, mannwhitneyu
 
 from bidnerf.cli.running import displayed
-from bidnerf_core.errors import Cancelled
-from bidnerf_core.evaluation import (
+from bidnerf.evaluation import (
     NEVER,
     Group,
     Plan,
@@ -49,6 +48,7 @@ from bidnerf_core.evaluation import (
     steps_of,
     summarize,
 )
+from bidnerf_core.errors import Cancelled
 from bidnerf_core.localization import METHODS
 from bidnerf_core.progress import job_context
 

@@ -23,9 +23,9 @@ from torch import Generator, Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
 from bidnerf import Localizer
+from bidnerf.evaluation import texture
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import texture
 from bidnerf_core.fields import SceneBounds, Stratified
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3, look_at

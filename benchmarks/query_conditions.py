@@ -37,7 +37,7 @@ from _lab import (
 )
 
 from bidnerf import SE3, Frame, Localization, Localizer, View
-from bidnerf_core.evaluation import faulty
+from bidnerf.evaluation import faulty
 
 WRONG_FOCAL = 1.1
 """Factor on a focal length that is declared as approximate."""

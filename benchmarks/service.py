@@ -42,7 +42,7 @@ import numpy as np
 import psutil
 from _lab import Row, parser, record
 
-from bidnerf_core.evaluation import provenance
+from bidnerf.evaluation import provenance
 
 FORM = "multipart/form-data; boundary=boundary"
 CLIENTS = (1, 4, 16)

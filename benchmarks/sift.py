@@ -21,8 +21,8 @@ import torch
 from numpy.typing import NDArray
 
 from bidnerf import Frame, Intrinsics, View
+from bidnerf.evaluation import views_digest
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import views_digest
 from bidnerf_core.io import write_file
 from bidnerf_core.mapping import likely_pairs
 

@@ -46,9 +46,9 @@ from _lab import (
 )
 
 from bidnerf import SE3, Intrinsics, Localizer, load_map
+from bidnerf.evaluation import views_digest
 from bidnerf_core.datasets import Capture, Shot, open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import views_digest
 from bidnerf_core.io import read_header, read_lines
 from bidnerf_core.maps import train
 

@@ -1,3 +1,6 @@
+from bidnerf.evaluation import Plan as Plan
+from bidnerf.evaluation import compare as compare
+from bidnerf.evaluation import evaluate as evaluate
 from bidnerf_core.camera import Intrinsics as Intrinsics
 from bidnerf_core.datasets import DatasetOptions as DatasetOptions
 from bidnerf_core.datasets import open_dataset as open_dataset
@@ -5,9 +8,6 @@ from bidnerf_core.datasets import open_sequence as open_sequence
 from bidnerf_core.errors import Cancelled as Cancelled
 from bidnerf_core.errors import InputError as InputError
 from bidnerf_core.errors import InputWarning as InputWarning
-from bidnerf_core.evaluation import Plan as Plan
-from bidnerf_core.evaluation import compare as compare
-from bidnerf_core.evaluation import evaluate as evaluate
 from bidnerf_core.frames import Frame as Frame
 from bidnerf_core.frames import View as View
 from bidnerf_core.geometry import SE3 as SE3

@@ -14,7 +14,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from bidnerf_core.evaluation import FAULTS
+from bidnerf.evaluation import FAULTS
 from bidnerf_core.registry import list_plugins
 
 ROOT = Path(__file__).parents[1]

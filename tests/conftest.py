@@ -153,9 +153,9 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     """A comparison tries every map in this process: each of its own would spend seconds on importing PyTorch."""
     # Inside: what a process of a comparison does is done in this one
-    from bidnerf_core.evaluation.run import InThisProcess
+    from bidnerf.evaluation.run import InThisProcess
 
-    monkeypatch.setattr("bidnerf_core.evaluation.comparison.own_processes", lambda count: InThisProcess())
+    monkeypatch.setattr("bidnerf.evaluation.comparison.own_processes", lambda count: InThisProcess())
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.settings import WholeNumbers
 
 if TYPE_CHECKING:
-    from bidnerf_core.evaluation import Plan
+    from bidnerf.evaluation import Plan
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class TrialOptions:
 
     def plan(self, method: MethodOptions, dataset: DatasetOptions, **more: Any) -> Plan:
         """Return the plan of the trials; ``more`` holds the fields of the plan that these options do not set."""
-        from bidnerf_core.evaluation import Plan
+        from bidnerf.evaluation import Plan
         from bidnerf_core.localization import find_method
 
         registration = dataset.registration
@@ -127,7 +127,7 @@ def run_evaluate(
     Finished trials are always kept: the same command resumes where it stopped. 'bidnerf report' makes tables and figures from the
     results.
     """
-    from bidnerf_core.evaluation import evaluate
+    from bidnerf.evaluation import evaluate
 
     if data is None and not map.startswith("demo:"):
         raise UsageError(f"no DATA after map {map}; only closed-form maps have their own data")
@@ -171,7 +171,7 @@ def run_compare(
 
     Each map has its own process, and the maps take turns at each start.
     """
-    from bidnerf_core.evaluation import compare, comparison_figure
+    from bidnerf.evaluation import compare, comparison_figure
     from bidnerf_core.io import output_folder, to_plain
 
     if len(folders) < 2:
@@ -220,7 +220,7 @@ def run_report(
     Trials are compared by map, data, start, method and settings. A trial in several files counts once.
     """
     # Imported when a report is made, since help pages do not need it.
-    from bidnerf_core.evaluation import ResultTable, chosen_criterion, read_runs, write_report
+    from bidnerf.evaluation import ResultTable, chosen_criterion, read_runs, write_report
 
     if not results:
         raise UsageError("no results file", expected="at least one written by 'bidnerf evaluate'")

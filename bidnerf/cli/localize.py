@@ -54,7 +54,7 @@ class StartOptions:
 
         Raises ``UsageError`` if the perturbation is out of range.
         """
-        from bidnerf_core.evaluation import find_protocol
+        from bidnerf.evaluation import find_protocol
         from bidnerf_core.geometry import perturb
         from bidnerf_core.results import pose_of, read_poses
 

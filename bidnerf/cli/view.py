@@ -87,9 +87,9 @@ def run_view(
     The photos and frames of QUERY can be selected there. Photos dropped on the page take the camera given here, whose field of
     view can be changed there. With --save, QUERY is localized immediately, and the saved page shows the same without a server.
     """
+    from bidnerf.evaluation import read_results
     from bidnerf_core.camera import CameraSource
     from bidnerf_core.datasets import DatasetFrames, in_other_split
-    from bidnerf_core.evaluation import read_results
     from bidnerf_core.localization import Localizer
     from bidnerf_core.maps import load_info, load_map
     from bidnerf_core.viewer import LiveView, page_of, serve_view, shown_row, shown_trajectory

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf.evaluation import FAULTS, Fault
 from bidnerf.testing.faults import (
     Named,
     are_colours,
@@ -32,7 +33,6 @@ from bidnerf.testing.textured_field import (
     unseen,
 )
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import FAULTS, Fault
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import METHODS, Localization, Localizer

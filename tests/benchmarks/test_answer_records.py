@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from bidnerf import SE3, Frame, View
+from bidnerf.evaluation import faulty
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import faulty
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 
-from bidnerf_core.evaluation import Group, Plan, Trial, grouped, planned
+from bidnerf.evaluation import Group, Plan, Trial, grouped, planned
 from bidnerf_core.scenes import closed_form_data
 from trial_results import trial_result
 

@@ -10,12 +10,12 @@ import torch
 
 import tiny
 from bidnerf import SE3, Localizer, Outcome, Tracker, View, load_map, train
+from bidnerf.evaluation import faulty
 from bidnerf.testing import MapWithLandmarks, textured_map, unseen
 
 # Inside: whether photos show distances, before a map of them is trained
 from bidnerf_core.captures.coverage import shows_distances
 from bidnerf_core.datasets import DatasetOptions
-from bidnerf_core.evaluation import faulty
 from bidnerf_core.mapping import LandmarkConfig, tracked_views
 from bidnerf_core.maps import TrainOptions, load_info
 from landmark_scene import Points, looking_in, ring

@@ -10,8 +10,8 @@ import pytest
 
 import sparse_model
 import tiny
+from bidnerf.evaluation import grouped, read_results
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.evaluation import grouped, read_results
 from bidnerf_core.maps import load_info
 from commands import Run, assert_refused
 from trainings import stop_at

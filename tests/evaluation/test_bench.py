@@ -22,7 +22,7 @@ import torch
 
 import bidnerf as bn
 from bidnerf.cli import main
-from bidnerf_core.evaluation import (
+from bidnerf.evaluation import (
     Plan,
     ResultsFile,
     ResultTable,
@@ -36,8 +36,8 @@ from bidnerf_core.evaluation import (
 )
 
 # Inside: lines of results, and the middle of a sequence
-from bidnerf_core.evaluation.plan import arc
-from bidnerf_core.evaluation.results import as_line
+from bidnerf.evaluation.plan import arc
+from bidnerf.evaluation.results import as_line
 from bidnerf_core.geometry import look_at
 from bidnerf_core.io import to_plain
 from bidnerf_core.results import pose_error

@@ -16,10 +16,9 @@ import pytest
 
 import tiny
 from bidnerf.cli import main
-from bidnerf_core.datasets import open_dataset
 
 # Inside: rows and costs of single trials, from which a comparison is put together
-from bidnerf_core.evaluation import (
+from bidnerf.evaluation import (
     Comparison,
     Plan,
     Trial,
@@ -30,9 +29,10 @@ from bidnerf_core.evaluation import (
     run_trial,
     trial,
 )
-from bidnerf_core.evaluation.comparison import MapRow, map_bytes, measured, named_maps
-from bidnerf_core.evaluation.run import InThisProcess, ended_on_failure, own_processes
-from bidnerf_core.evaluation.summary import success_of
+from bidnerf.evaluation.comparison import MapRow, map_bytes, measured, named_maps
+from bidnerf.evaluation.run import InThisProcess, ended_on_failure, own_processes
+from bidnerf.evaluation.summary import success_of
+from bidnerf_core.datasets import open_dataset
 from bidnerf_core.io import from_plain
 from refusals import refused
 from trial_results import trial_result
@@ -78,7 +78,7 @@ def compared(
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         process = own_processes(1)
-        patch.setattr("bidnerf_core.evaluation.comparison.own_processes", lambda count: process)
+        patch.setattr("bidnerf.evaluation.comparison.own_processes", lambda count: process)
         return compare(maps, data, plan)
 
 
@@ -200,7 +200,7 @@ class Ending(InThisProcess):
 def test_a_process_that_ends_is_told_in_one_line(
     maps: list[Path], data: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bidnerf_core.evaluation.comparison.own_processes", lambda count: Ending())
+    monkeypatch.setattr("bidnerf.evaluation.comparison.own_processes", lambda count: Ending())
     with refused(where=maps[0], found="frame t_0002 ended", expected="memory"):
         compare([maps[0]], data, plan)
 

@@ -22,8 +22,7 @@ import torch
 import bidnerf as bn
 import tiny
 from bidnerf.cli import main
-from bidnerf_core.datasets import open_dataset
-from bidnerf_core.evaluation import (
+from bidnerf.evaluation import (
     Comparison,
     Plan,
     ResultTable,
@@ -37,7 +36,8 @@ from bidnerf_core.evaluation import (
 )
 
 # Inside: a map that stays in memory, and processes that outlive an evaluation
-from bidnerf_core.evaluation.run import InThisProcess
+from bidnerf.evaluation.run import InThisProcess
+from bidnerf_core.datasets import open_dataset
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.localization import find_method
@@ -169,8 +169,8 @@ def test_what_this_process_alone_has_registered_is_not_mistaken_for_what_is_inst
                 patch.setattr("bidnerf_core.registry.registered", {})
                 return super().submit(*pickle.loads(pickle.dumps((fn, *args))), **kwargs)
 
-    monkeypatch.setattr("bidnerf_core.evaluation.run.local_processes", lambda count: Elsewhere())
-    monkeypatch.setattr("bidnerf_core.evaluation.comparison.own_processes", lambda count: Elsewhere())
+    monkeypatch.setattr("bidnerf.evaluation.run.local_processes", lambda count: Elsewhere())
+    monkeypatch.setattr("bidnerf.evaluation.comparison.own_processes", lambda count: Elsewhere())
     said = "method 'bid' was registered in one process but is unknown in another"
     with refused(found=said):
         bn.evaluate(BLOBS, BLOBS, quick(trials=2), workers=2)
@@ -191,7 +191,7 @@ def test_results_say_where_a_map_in_memory_computed(monkeypatch: pytest.MonkeyPa
         raise LookupError("no trial is run")
 
     for module, name in (("run", "run_trial"), ("comparison", "measured")):
-        monkeypatch.setattr(import_module(f"bidnerf_core.evaluation.{module}"), name, stop)
+        monkeypatch.setattr(import_module(f"bidnerf.evaluation.{module}"), name, stop)
     for begin in (lambda: bn.evaluate(elsewhere, tiny.views(2), quick(trials=1)),
                   lambda: bn.compare([elsewhere], tiny.views(2), quick(trials=1)),
                   lambda: bn.compare([BLOBS], tiny.views(2), quick(trials=1))):  # fmt: skip
@@ -466,7 +466,7 @@ def test_a_scheduler_that_is_not_there_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr("bidnerf_core.evaluation.run.PATIENCE", "1s")
+    monkeypatch.setattr("bidnerf.evaluation.run.PATIENCE", "1s")
     out = tmp_path / "r.jsonl"
     assert (
         main(["evaluate", "demo:blobs", "--out", str(out), "--dask", "tcp://127.0.0.1:9", *WORDS[:-2]]) == 1

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 import tiny
 from bidnerf.cli import main
-from bidnerf_core.evaluation import (
+from bidnerf.evaluation import (
     FAULTS,
     NO_FAULT,
     Plan,
@@ -28,8 +28,8 @@ from bidnerf_core.evaluation import (
 )
 
 # Inside: the images of a trial
-from bidnerf_core.evaluation.run import InThisProcess
-from bidnerf_core.evaluation.trial import trial_views
+from bidnerf.evaluation.run import InThisProcess
+from bidnerf.evaluation.trial import trial_views
 from bidnerf_core.registry import registered
 from bidnerf_core.scenes import closed_form_data
 from refusals import refused

@@ -11,8 +11,8 @@ import pytest
 import torch
 from scipy.ndimage import label
 
+from bidnerf.evaluation import FAULTS, NO_FAULT, expand_faults, faulty, parse_faults, rolling_shutter
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.evaluation import FAULTS, NO_FAULT, expand_faults, faulty, parse_faults, rolling_shutter
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3, look_at, random_units
 from bidnerf_core.scenes import demo_object, demo_room, orbit

@@ -8,7 +8,7 @@ from pathlib import Path
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bidnerf_core.evaluation import (
+from bidnerf.evaluation import (
     Comparison,
     ResultTable,
     TrialResult,
@@ -17,7 +17,7 @@ from bidnerf_core.evaluation import (
 )
 
 # Inside: records of runs with any content, of which a script makes only its own
-from bidnerf_core.evaluation.results import Provenance
+from bidnerf.evaluation.results import Provenance
 from bidnerf_core.io import from_plain
 from drawn import record
 

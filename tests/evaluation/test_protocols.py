@@ -10,10 +10,10 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
-from bidnerf_core.evaluation import PROTOCOLS, find_protocol
+from bidnerf.evaluation import PROTOCOLS, find_protocol
 
 # Inside: distributions of many starts, which trials draw one at a time
-from bidnerf_core.evaluation.plan import draw_starts, inerf_start
+from bidnerf.evaluation.plan import draw_starts, inerf_start
 from bidnerf_core.geometry import SE3
 from bidnerf_core.results import pose_error
 from refusals import refused

@@ -18,9 +18,7 @@ import pytest
 
 import tiny
 from bidnerf.cli import main
-from bidnerf_core.datasets import write_transforms
-from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import (
+from bidnerf.evaluation import (
     ResultTable,
     ScalarPoseError,
     Trace,
@@ -35,9 +33,11 @@ from bidnerf_core.evaluation import (
 )
 
 # Inside: groups and figures before they are put on a page
-from bidnerf_core.evaluation.plots import Figures
-from bidnerf_core.evaluation.report import page
-from bidnerf_core.evaluation.summary import situation_titles, situations
+from bidnerf.evaluation.plots import Figures
+from bidnerf.evaluation.report import page
+from bidnerf.evaluation.summary import situation_titles, situations
+from bidnerf_core.datasets import write_transforms
+from bidnerf_core.errors import InputError
 from bidnerf_core.io import to_plain
 from bidnerf_core.results import success_rate_by_frame
 from trial_results import trial_result
@@ -401,7 +401,7 @@ def test_a_name_that_no_folder_can_have_is_refused(
 
 
 def test_more_than_can_be_drawn_is_in_the_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bidnerf_core.evaluation.plots.MOST_SITUATIONS", 1)
+    monkeypatch.setattr("bidnerf.evaluation.plots.MOST_SITUATIONS", 1)
     many = [result(seed, 2, protocol="none") for seed in range(8)]
     many = [dataclasses.replace(r, trial=dataclasses.replace(r.trial, map=f"map {r.seed}")) for r in many]
     table = ResultTable(tuple(many))

@@ -12,9 +12,9 @@ import pytest
 import torch
 
 from bidnerf import Frame, Intrinsics, Localizer
+from bidnerf.evaluation import faulty
 from bidnerf.testing import BOUNDS, CAMERA, textured_map, unseen
 from bidnerf_core.camera import CameraSource
-from bidnerf_core.evaluation import faulty
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.maps import Map, MapInfo

@@ -23,11 +23,11 @@ from safetensors.torch import save
 import sparse_model
 import tiny
 from bidnerf import Frame, load_map
+from bidnerf.evaluation import read_results
 from bidnerf_core.camera import read_camera
 from bidnerf_core.datasets import open_dataset, read_depth_points, read_model
 from bidnerf_core.depth import read_depth_image
 from bidnerf_core.errors import InputError, printable
-from bidnerf_core.evaluation import read_results
 from bidnerf_core.io import (
     read_archive,
     read_array,

@@ -13,7 +13,7 @@ import baked
 import blob_images
 import module_fields
 from bidnerf import Localizer
-from bidnerf_core.evaluation import faulty
+from bidnerf.evaluation import faulty
 from bidnerf_core.fields import Observations
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3, perturb

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import baked
-from bidnerf_core.evaluation import faulty
+from bidnerf.evaluation import faulty
 from bidnerf_core.frames import DRAWERS, Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import AutoConfig, Localization

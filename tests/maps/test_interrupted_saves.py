@@ -14,8 +14,7 @@ import pytest
 import torch
 
 import bidnerf as bn
-from bidnerf_core.captures import write_inria_cameras
-from bidnerf_core.evaluation import (
+from bidnerf.evaluation import (
     Comparison,
     ResultTable,
     Trial,
@@ -23,6 +22,7 @@ from bidnerf_core.evaluation import (
     provenance,
     read_runs,
 )
+from bidnerf_core.captures import write_inria_cameras
 from bidnerf_core.io import is_temporary, write_file
 
 # Inside: each writer is called by itself and stopped at each of its writes

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
-from bidnerf_core.evaluation import bid_start
+from bidnerf.evaluation import bid_start
 from bidnerf_core.geometry import SE3, perturb, random_units
 from bidnerf_core.results import (
     CRITERIA,

@@ -12,8 +12,8 @@ import torch
 from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
 
+from bidnerf.evaluation import Trace
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.evaluation import Trace
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import SE3
 

@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from bidnerf import SE3, Frame, Intrinsics, View
+from bidnerf import SE3, Frame, Intrinsics, View, evaluation
 from bidnerf.testing import MapWithLandmarks, textured_map
-from bidnerf_core import evaluation
 from bidnerf_core.captures import StoredCamera
 from bidnerf_core.datasets import write_transforms
 from bidnerf_core.geometry import LengthUnit

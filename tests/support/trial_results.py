@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from bidnerf_core.evaluation import ScalarPoseError, Trace, Trial, TrialResult
+from bidnerf.evaluation import ScalarPoseError, Trace, Trial, TrialResult
 
 
 def trial_result(

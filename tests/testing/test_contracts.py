@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
+from bidnerf.evaluation import FAULTS
 from bidnerf.testing import (
     BOUNDS,
     FaultContract,
@@ -20,7 +21,6 @@ from bidnerf.testing import (
     training_views,
 )
 from bidnerf_core.datasets import READERS, Capture, DatasetOptions, Reader, of_views, write_transforms
-from bidnerf_core.evaluation import FAULTS
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import AutoConfig, Localization, Outcome, Problem, find_method, settings_of

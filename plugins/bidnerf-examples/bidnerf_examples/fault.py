@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Generator
 
-from bidnerf_core.evaluation import Fault
+from bidnerf.evaluation import Fault
 from bidnerf_core.frames import Frame
 from bidnerf_core.settings import Range
 

@@ -16,11 +16,9 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
 
-from bidnerf_core.datasets import Capture, DatasetOptions
-from bidnerf_core.errors import InputError, printable
-from bidnerf_core.evaluation.plots import Figure, Figures
-from bidnerf_core.evaluation.results import Provenance, ResultTable
-from bidnerf_core.evaluation.summary import (
+from bidnerf.evaluation.plots import Figure, Figures
+from bidnerf.evaluation.results import Provenance, ResultTable
+from bidnerf.evaluation.summary import (
     ABSOLUTE,
     RELATIVE,
     Group,
@@ -29,7 +27,9 @@ from bidnerf_core.evaluation.summary import (
     situations,
     succeeded,
 )
-from bidnerf_core.evaluation.trial import TrialResult, open_data, trial_views
+from bidnerf.evaluation.trial import TrialResult, open_data, trial_views
+from bidnerf_core.datasets import Capture, DatasetOptions
+from bidnerf_core.errors import InputError, printable
 from bidnerf_core.io import is_temporary, output_folder, write_file
 from bidnerf_core.results import CRITERIA, CRITERION_NAMES, as_picture, require_matplotlib
 from bidnerf_core.scenes import is_closed_form

@@ -22,12 +22,12 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 
+from bidnerf.evaluation.faults import faulty, parse_faults
+from bidnerf.evaluation.plan import Setup, Trial, find_protocol, parse_settings
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import Capture, DatasetOptions, SparseChoice, SparsePoints, of_views
 from bidnerf_core.devices import threads_at_most, working_device
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.faults import faulty, parse_faults
-from bidnerf_core.evaluation.plan import Setup, Trial, find_protocol, parse_settings
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import from_plain, to_plain

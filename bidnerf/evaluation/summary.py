@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from bidnerf.evaluation.faults import NO_FAULT
+from bidnerf.evaluation.trial import TrialResult
 from bidnerf_core.errors import amount
-from bidnerf_core.evaluation.faults import NO_FAULT
-from bidnerf_core.evaluation.trial import TrialResult
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.results import CRITERIA, Rate, Reduced, steps_to_success, success_rate_by_frame
 

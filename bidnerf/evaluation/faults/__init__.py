@@ -3,7 +3,7 @@
 Faults test whether a localizer rejects its wrong answers.
 """
 
-from bidnerf_core.evaluation.faults.fault import (
+from bidnerf.evaluation.faults.fault import (
     FAULTS,
     NO_FAULT,
     AppliedFault,

@@ -24,9 +24,8 @@ import psutil
 import torch
 
 import bidnerf_core
-from bidnerf_core.errors import InputError, printable
-from bidnerf_core.evaluation.plan import Trial
-from bidnerf_core.evaluation.summary import (
+from bidnerf.evaluation.plan import Trial
+from bidnerf.evaluation.summary import (
     Group,
     Situation,
     Summary,
@@ -34,7 +33,8 @@ from bidnerf_core.evaluation.summary import (
     situation_titles,
     summarize,
 )
-from bidnerf_core.evaluation.trial import TrialResult
+from bidnerf.evaluation.trial import TrialResult
+from bidnerf_core.errors import InputError, printable
 from bidnerf_core.geometry import symbol
 from bidnerf_core.io import (
     FileInUse,

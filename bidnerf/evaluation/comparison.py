@@ -14,10 +14,9 @@ from typing import Any
 import torch
 from torch import nn
 
-from bidnerf_core.errors import InputError, amount, printable
-from bidnerf_core.evaluation.plan import Plan, Trial, parse_settings, planned
-from bidnerf_core.evaluation.results import aligned, as_line
-from bidnerf_core.evaluation.run import (
+from bidnerf.evaluation.plan import Plan, Trial, parse_settings, planned
+from bidnerf.evaluation.results import aligned, as_line
+from bidnerf.evaluation.run import (
     InThisProcess,
     Scene,
     device_name,
@@ -26,8 +25,8 @@ from bidnerf_core.evaluation.run import (
     open_both,
     own_processes,
 )
-from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, Summary, summarize
-from bidnerf_core.evaluation.trial import (
+from bidnerf.evaluation.summary import ABSOLUTE, RELATIVE, Summary, summarize
+from bidnerf.evaluation.trial import (
     Data,
     Opened,
     TrialResult,
@@ -36,6 +35,7 @@ from bidnerf_core.evaluation.trial import (
     registered_for,
     run_trial,
 )
+from bidnerf_core.errors import InputError, amount, printable
 from bidnerf_core.fields import device_of, levels
 from bidnerf_core.frames import View, draw, uniform
 from bidnerf_core.geometry import SE3, symbol

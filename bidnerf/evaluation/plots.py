@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bidnerf_core.evaluation.comparison import Comparison
-from bidnerf_core.evaluation.faults import NO_FAULT
-from bidnerf_core.evaluation.summary import (
+from bidnerf.evaluation.comparison import Comparison
+from bidnerf.evaluation.faults import NO_FAULT
+from bidnerf.evaluation.summary import (
     NEVER,
     Group,
     Situation,
@@ -30,7 +30,7 @@ from bidnerf_core.evaluation.summary import (
     succeeded,
     unit_of,
 )
-from bidnerf_core.evaluation.trial import TrialResult
+from bidnerf.evaluation.trial import TrialResult
 from bidnerf_core.results import (
     CRITERION_NAMES,
     line_look,

@@ -48,7 +48,7 @@ class Fault:
 
 def _defects(fault: Any) -> Iterator[str]:
     if not isinstance(fault, Fault):
-        yield f"it is a {type(fault).__name__}, expected a bidnerf_core.evaluation.faults.Fault"
+        yield f"it is a {type(fault).__name__}, expected a bidnerf.evaluation.faults.Fault"
 
 
 FAULTS: Plugins[Fault] = Plugins("faults", _defects)

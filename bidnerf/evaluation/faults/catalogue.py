@@ -7,8 +7,8 @@ from functools import partial
 
 import torch
 
-from bidnerf_core.evaluation.faults import changes
-from bidnerf_core.evaluation.faults.fault import SHARE, SWITCH, Fault, depth_of
+from bidnerf.evaluation.faults import changes
+from bidnerf.evaluation.faults.fault import SHARE, SWITCH, Fault, depth_of
 from bidnerf_core.geometry import SE3
 from bidnerf_core.settings import Above, Range, WholeNumbers
 

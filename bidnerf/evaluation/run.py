@@ -17,13 +17,11 @@ from typing import Any, TypeAlias
 
 import torch
 
-from bidnerf_core.datasets import Capture
-from bidnerf_core.errors import Cancelled, InputError, amount
-from bidnerf_core.evaluation.faults import NO_FAULT
-from bidnerf_core.evaluation.plan import Plan, Trial, listed, parse_settings, planned
-from bidnerf_core.evaluation.results import ResultsFile, ResultTable, note_run, provenance, script_command
-from bidnerf_core.evaluation.summary import succeeded
-from bidnerf_core.evaluation.trial import (
+from bidnerf.evaluation.faults import NO_FAULT
+from bidnerf.evaluation.plan import Plan, Trial, listed, parse_settings, planned
+from bidnerf.evaluation.results import ResultsFile, ResultTable, note_run, provenance, script_command
+from bidnerf.evaluation.summary import succeeded
+from bidnerf.evaluation.trial import (
     Data,
     Opened,
     TrialResult,
@@ -36,6 +34,8 @@ from bidnerf_core.evaluation.trial import (
     run_trial,
     trial_views,
 )
+from bidnerf_core.datasets import Capture
+from bidnerf_core.errors import Cancelled, InputError, amount
 from bidnerf_core.fields import device_of
 from bidnerf_core.io import to_plain, usable_cores
 from bidnerf_core.localization import find_method, require_use_of_depth

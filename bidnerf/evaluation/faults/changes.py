@@ -21,8 +21,8 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 from torch import Generator, Tensor
 
+from bidnerf.evaluation.faults.fault import depth_of
 from bidnerf_core.camera import Intrinsics, Orientation, exposure_times, poses_of_rows
-from bidnerf_core.evaluation.faults.fault import depth_of
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import random_units
 
