@@ -25,7 +25,7 @@ from _lab import Row, Scene, one_thread, parser, record
 from playwright.sync_api import sync_playwright
 
 from bidnerf import Localizer
-from bidnerf_core.viewer import LiveView, serve_view
+from bidnerf.viewer import LiveView, serve_view
 
 ARGUMENTS = [
     "--no-sandbox",

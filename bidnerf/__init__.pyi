@@ -1,6 +1,7 @@
 from bidnerf.evaluation import Plan as Plan
 from bidnerf.evaluation import compare as compare
 from bidnerf.evaluation import evaluate as evaluate
+from bidnerf.viewer import view as view
 from bidnerf_core.camera import Intrinsics as Intrinsics
 from bidnerf_core.datasets import DatasetOptions as DatasetOptions
 from bidnerf_core.datasets import open_dataset as open_dataset
@@ -33,4 +34,3 @@ from bidnerf_core.results import write_poses as write_poses
 from bidnerf_core.service import ServiceClient as ServiceClient
 from bidnerf_core.service import serve as serve
 from bidnerf_core.structure import find_poses as find_poses
-from bidnerf_core.viewer import view as view

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from bidnerf import viewer
 from bidnerf.cli.options import (
     TEST_IMAGES,
     Device,
@@ -21,7 +22,7 @@ from bidnerf.cli.options import (
 from bidnerf.cli.output import check_output, console, say, show
 from bidnerf.cli.parser import Option, Without
 from bidnerf.cli.running import displayed
-from bidnerf_core import service, viewer
+from bidnerf_core import service
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, spelling_hint
 from bidnerf_core.io import read_file
@@ -88,11 +89,11 @@ def run_view(
     view can be changed there. With --save, QUERY is localized immediately, and the saved page shows the same without a server.
     """
     from bidnerf.evaluation import read_results
+    from bidnerf.viewer import LiveView, page_of, serve_view, shown_row, shown_trajectory
     from bidnerf_core.camera import CameraSource
     from bidnerf_core.datasets import DatasetFrames, in_other_split
     from bidnerf_core.localization import Localizer
     from bidnerf_core.maps import load_info, load_map
-    from bidnerf_core.viewer import LiveView, page_of, serve_view, shown_row, shown_trajectory
 
     if frame and not query:
         raise UsageError("--frame names frames of a dataset", expected="the dataset as QUERY")
@@ -131,8 +132,8 @@ def run_view(
 
 def _localized(localizer: Localizer, source: QuerySource) -> tuple[dict[str, Any], ...]:
     """Localize all queries, and return the page's JSON values of each. Raises ``InputError`` if none can be read."""
+    from bidnerf.viewer import read_and_localized
     from bidnerf_core.results import BAD_INPUT
-    from bidnerf_core.viewer import read_and_localized
 
     answers, total = [], len(source.names)
     with displayed():

@@ -16,6 +16,14 @@ import torch
 
 import viewed
 from bidnerf import SE3, InputError, Intrinsics, Localization, Localizer, Map, View, view
+from bidnerf.viewer import shown_trajectory
+
+# Inside: what a page states of one answer is read from its parts, without a browser
+from bidnerf.viewer.answer import MOST_STEPS, depth_difference, ellipsoid, shown_answer
+from bidnerf.viewer.evidence import EARLIER, HERE, MEASURES, acceptance_figures, bar, contests
+from bidnerf.viewer.pages import MODULES, MapView, localized
+from bidnerf.viewer.pictures import field_image, packed_points, quick_image
+from bidnerf.viewer.scene import shown_map, towards
 from bidnerf_core.datasets import Query
 from bidnerf_core.errors import Cancelled
 from bidnerf_core.fields import render_image
@@ -34,14 +42,6 @@ from bidnerf_core.mapping import States
 from bidnerf_core.progress import job_context
 from bidnerf_core.results import PosedImage, write_poses
 from bidnerf_core.scenes import closed_form_map, orbit
-from bidnerf_core.viewer import shown_trajectory
-
-# Inside: what a page states of one answer is read from its parts, without a browser
-from bidnerf_core.viewer.answer import MOST_STEPS, depth_difference, ellipsoid, shown_answer
-from bidnerf_core.viewer.evidence import EARLIER, HERE, MEASURES, acceptance_figures, bar, contests
-from bidnerf_core.viewer.pages import MODULES, MapView, localized
-from bidnerf_core.viewer.pictures import field_image, packed_points, quick_image
-from bidnerf_core.viewer.scene import shown_map, towards
 from commands import Run, assert_refused
 
 

@@ -23,12 +23,12 @@ from playwright.sync_api import sync_playwright
 
 import viewed
 from bidnerf import SE3, Localizer, Map
-from bidnerf_core.camera import CameraSource
-from bidnerf_core.viewer import page_of, shown_trajectory
+from bidnerf.viewer import page_of, shown_trajectory
 
 # Inside: an answer whose descent is given, and the page as a saved file
-from bidnerf_core.viewer.answer import shown_answer
-from bidnerf_core.viewer.pages import localized
+from bidnerf.viewer.answer import shown_answer
+from bidnerf.viewer.pages import localized
+from bidnerf_core.camera import CameraSource
 from viewer_client import serving
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

@@ -22,11 +22,11 @@ from PIL import Image
 
 import viewed
 from bidnerf import Localizer, Map
-from bidnerf_core.camera import CameraSource
-from bidnerf_core.localization import settings_of
 
 # Inside: the queue of localizations, of which requests show only the results
-from bidnerf_core.viewer.app import PLACES, Jobs
+from bidnerf.viewer.app import PLACES, Jobs
+from bidnerf_core.camera import CameraSource
+from bidnerf_core.localization import settings_of
 from bombs import png_of
 from photo_room import CAMERA
 from viewer_client import Client, serving
@@ -134,7 +134,7 @@ def test_internal_errors_are_for_the_log_alone(
     def fail(*given: Any, **more: Any) -> Any:
         raise RuntimeError("/home/user/secret")
 
-    monkeypatch.setattr("bidnerf_core.viewer.app.localized", fail)
+    monkeypatch.setattr("bidnerf.viewer.app.localized", fail)
     with serving(room) as client:
         answer = answer_of(client, client.post("/api/query/0"))
     assert answer["outcome"] == "fault"

@@ -10,6 +10,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf.viewer.evidence import (
+    APART,
+    HERE,
+    TURNED_DEG,
+    acceptance_figures,
+    contests,
+    earlier,
+    last_answer,
+    probable_poses,
+)
+from bidnerf.viewer.pictures import Json, drawing, packed, photograph, quick_image
+from bidnerf.viewer.scene import frustum, rows_of
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import RenderedImage, has_field, render_picture
 from bidnerf_core.frames import Frame
@@ -28,18 +40,6 @@ from bidnerf_core.localization import (
 from bidnerf_core.mapping import project
 from bidnerf_core.registry import PluginError
 from bidnerf_core.results import pose_error
-from bidnerf_core.viewer.evidence import (
-    APART,
-    HERE,
-    TURNED_DEG,
-    acceptance_figures,
-    contests,
-    earlier,
-    last_answer,
-    probable_poses,
-)
-from bidnerf_core.viewer.pictures import Json, drawing, packed, photograph, quick_image
-from bidnerf_core.viewer.scene import frustum, rows_of
 
 MOST_STEPS = 200
 """Maximum number of steps of a descent that are shown; longer descents are subsampled at a regular stride."""

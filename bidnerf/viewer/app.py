@@ -21,6 +21,10 @@ from fastapi import FastAPI, Request
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import HTMLResponse, JSONResponse, Response
 
+from bidnerf.viewer.answer import no_answer
+from bidnerf.viewer.pages import MapView, localized, map_of
+from bidnerf.viewer.pictures import Json, field_image, jpeg, quick_image
+from bidnerf.viewer.scene import shown_map, thumbnail_jpeg
 from bidnerf_core.camera import CameraSource, Intrinsics
 from bidnerf_core.datasets import Query, QuerySource
 from bidnerf_core.errors import Cancelled, InputError
@@ -43,10 +47,6 @@ from bidnerf_core.service import (
     public_message,
     read_upload,
 )
-from bidnerf_core.viewer.answer import no_answer
-from bidnerf_core.viewer.pages import MapView, localized, map_of
-from bidnerf_core.viewer.pictures import Json, field_image, jpeg, quick_image
-from bidnerf_core.viewer.scene import shown_map, thumbnail_jpeg
 
 log = logging.getLogger("bidnerf.viewer")
 

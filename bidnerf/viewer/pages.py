@@ -15,6 +15,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from bidnerf.viewer.answer import no_answer, shown_answer
+from bidnerf.viewer.pictures import Json
+from bidnerf.viewer.scene import shown_map, shown_trajectory
 from bidnerf_core.datasets import Query, QuerySource
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import Frame, View
@@ -23,9 +26,6 @@ from bidnerf_core.io import to_plain, write_file
 from bidnerf_core.localization import Localization, Localizer, SearchRecord, recorded
 from bidnerf_core.maps import Map
 from bidnerf_core.results import BAD_INPUT
-from bidnerf_core.viewer.answer import no_answer, shown_answer
-from bidnerf_core.viewer.pictures import Json
-from bidnerf_core.viewer.scene import shown_map, shown_trajectory
 
 MODULES = ("data", "space", "compare", "panel", "table", "track", "live", "main")
 """The page's JavaScript modules, each after those that it imports. They share a scope, so their names must not clash."""

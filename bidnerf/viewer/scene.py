@@ -14,6 +14,15 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from bidnerf.viewer.pictures import (
+    Json,
+    jpeg,
+    packed,
+    packed_colours,
+    packed_points,
+    photograph,
+    quick_image,
+)
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import StoredCamera, poses_of
 from bidnerf_core.datasets import read_trajectory
@@ -24,15 +33,6 @@ from bidnerf_core.geometry import SE3, LengthUnit, pose_from_matrix, symbol
 from bidnerf_core.io import read_file
 from bidnerf_core.maps import Map
 from bidnerf_core.results import pose_entries, standard_deviations
-from bidnerf_core.viewer.pictures import (
-    Json,
-    jpeg,
-    packed,
-    packed_colours,
-    packed_points,
-    photograph,
-    quick_image,
-)
 
 log = logging.getLogger("bidnerf")
 

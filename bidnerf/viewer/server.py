@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from bidnerf_core.service import ServiceLimits, run_app, token_for
 
 if TYPE_CHECKING:
-    from bidnerf_core.viewer.app import LiveView
+    from bidnerf.viewer.app import LiveView
 
 PORT = 8010
 NEEDS = "the live viewer needs the extra 'viewer' (pip install 'bidnerf[viewer]'); --save writes a page without it"
@@ -32,7 +32,7 @@ def serve_view(
     ``InputError`` if the extra ``viewer`` is not installed, and if the port is taken.
     """
     token = token_for(host, token, NEEDS)
-    from bidnerf_core.viewer.app import viewer_app
+    from bidnerf.viewer.app import viewer_app
 
     def announce(address: str) -> None:
         if ready is not None:
