@@ -1,6 +1,8 @@
 from bidnerf.evaluation import Plan as Plan
 from bidnerf.evaluation import compare as compare
 from bidnerf.evaluation import evaluate as evaluate
+from bidnerf.service import ServiceClient as ServiceClient
+from bidnerf.service import serve as serve
 from bidnerf.viewer import view as view
 from bidnerf_core.camera import Intrinsics as Intrinsics
 from bidnerf_core.datasets import DatasetOptions as DatasetOptions
@@ -31,6 +33,4 @@ from bidnerf_core.results import export_map as export_map
 from bidnerf_core.results import read_poses as read_poses
 from bidnerf_core.results import track as track
 from bidnerf_core.results import write_poses as write_poses
-from bidnerf_core.service import ServiceClient as ServiceClient
-from bidnerf_core.service import serve as serve
 from bidnerf_core.structure import find_poses as find_poses

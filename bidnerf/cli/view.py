@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from bidnerf import viewer
+from bidnerf import service, viewer
 from bidnerf.cli.options import (
     TEST_IMAGES,
     Device,
@@ -22,14 +22,13 @@ from bidnerf.cli.options import (
 from bidnerf.cli.output import check_output, console, say, show
 from bidnerf.cli.parser import Option, Without
 from bidnerf.cli.running import displayed
-from bidnerf_core import service
+from bidnerf.service import LEAST_TOKEN, ServiceLimits
+from bidnerf.service import serve as serve_maps
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, spelling_hint
 from bidnerf_core.io import read_file
 from bidnerf_core.progress import counter
 from bidnerf_core.registry import USUAL_METHOD
-from bidnerf_core.service import LEAST_TOKEN, ServiceLimits
-from bidnerf_core.service import serve as serve_maps
 
 if TYPE_CHECKING:
     from bidnerf_core.datasets import Query, QuerySource

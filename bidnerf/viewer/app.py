@@ -21,19 +21,7 @@ from fastapi import FastAPI, Request
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import HTMLResponse, JSONResponse, Response
 
-from bidnerf.viewer.answer import no_answer
-from bidnerf.viewer.pages import MapView, localized, map_of
-from bidnerf.viewer.pictures import Json, field_image, jpeg, quick_image
-from bidnerf.viewer.scene import shown_map, thumbnail_jpeg
-from bidnerf_core.camera import CameraSource, Intrinsics
-from bidnerf_core.datasets import Query, QuerySource
-from bidnerf_core.errors import Cancelled, InputError
-from bidnerf_core.geometry import SE3, pose_from_matrix
-from bidnerf_core.io import parse_json, to_plain
-from bidnerf_core.localization import Localizer, SearchRecord
-from bidnerf_core.progress import job_context
-from bidnerf_core.results import BAD_INPUT
-from bidnerf_core.service import (
+from bidnerf.service import (
     Application,
     Refused,
     ServiceLimits,
@@ -47,6 +35,18 @@ from bidnerf_core.service import (
     public_message,
     read_upload,
 )
+from bidnerf.viewer.answer import no_answer
+from bidnerf.viewer.pages import MapView, localized, map_of
+from bidnerf.viewer.pictures import Json, field_image, jpeg, quick_image
+from bidnerf.viewer.scene import shown_map, thumbnail_jpeg
+from bidnerf_core.camera import CameraSource, Intrinsics
+from bidnerf_core.datasets import Query, QuerySource
+from bidnerf_core.errors import Cancelled, InputError
+from bidnerf_core.geometry import SE3, pose_from_matrix
+from bidnerf_core.io import parse_json, to_plain
+from bidnerf_core.localization import Localizer, SearchRecord
+from bidnerf_core.progress import job_context
+from bidnerf_core.results import BAD_INPUT
 
 log = logging.getLogger("bidnerf.viewer")
 

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from bidnerf_core.service import ServiceLimits, run_app, token_for
+from bidnerf.service import ServiceLimits, run_app, token_for
 
 if TYPE_CHECKING:
     from bidnerf.viewer.app import LiveView

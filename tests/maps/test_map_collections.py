@@ -15,6 +15,8 @@ import bidnerf as bn
 
 # Inside: the share of landmarks in view, and a worker of the service without its processes
 import bidnerf_core.maps.collection as collections_module
+from bidnerf.service import Upload
+from bidnerf.service.worker import Worker
 from bidnerf.testing import BOUNDS, CAMERA, POSES, ground, view
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.captures import stored_cameras
@@ -23,8 +25,6 @@ from bidnerf_core.mapping import BakeConfig, bake, build_landmarks
 from bidnerf_core.mapping.landmarks.vocabulary import visible
 from bidnerf_core.maps import Map, MapInfo, maps_in
 from bidnerf_core.scenes import orbit
-from bidnerf_core.service import Upload
-from bidnerf_core.service.worker import Worker
 from commands import Run
 from refusals import refused
 

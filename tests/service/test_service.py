@@ -34,17 +34,17 @@ pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
 pytest.importorskip("uvicorn", reason="the extra 'serve' is not installed")
 
 from bidnerf import InputError, ServiceClient, open_dataset, serve
+from bidnerf.service import ServiceError, ServiceLimits, public_message, service_app
+
+# Inside: workers are killed, and the description is compared with the parameters that are read
+from bidnerf.service.models import Localization, MapFacts, PhotoForm
+from bidnerf.service.pool import Pool
+from bidnerf.service.server import named
+from bidnerf.service.web import SAFE, Gate
+from bidnerf.service.worker import main as hold_maps
 from bidnerf_core.camera import WAYS, WAYS_OF_PHOTO
 from bidnerf_core.localization import settings_of
 from bidnerf_core.registry import _declared
-from bidnerf_core.service import ServiceError, ServiceLimits, public_message, service_app
-
-# Inside: workers are killed, and the description is compared with the parameters that are read
-from bidnerf_core.service.models import Localization, MapFacts, PhotoForm
-from bidnerf_core.service.pool import Pool
-from bidnerf_core.service.server import named
-from bidnerf_core.service.web import SAFE, Gate
-from bidnerf_core.service.worker import main as hold_maps
 from bombs import png_of
 from commands import Run, assert_refused
 
@@ -70,7 +70,7 @@ class Echo:
     media_type = "application/vnd.echo+json;version=1"
 
     def answer(self, body, scene, localize):
-        from bidnerf_core.service import Upload
+        from bidnerf.service import Upload
 
         photo = Upload({"name": "echo", "focal": 32.0, "start": body["start"]}, {"photo": base64.b64decode(body["photo"])})
         answer, plain = localize(photo)
@@ -219,7 +219,7 @@ def served(place: Place) -> Iterator[Served]:
     _declared.cache_clear()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tempfile, "tempdir", str(place.folder / "uploads"))
-        patch.setattr("bidnerf_core.service.server.service_app", kept)
+        patch.setattr("bidnerf.service.server.service_app", kept)
         running.start()
         started = ready.wait(60)
     try:
@@ -465,8 +465,8 @@ def test_a_process_with_the_maps_that_does_not_answer_is_replaced(monkeypatch: p
 
         monkeypatch.setattr(pool, "_fork", fork)
 
-    monkeypatch.setattr("bidnerf_core.service.pool.FORK_SECONDS", 0.05)
-    monkeypatch.setattr("bidnerf_core.service.pool.PAUSE", 0.0)
+    monkeypatch.setattr("bidnerf.service.pool.FORK_SECONDS", 0.05)
+    monkeypatch.setattr("bidnerf.service.pool.PAUSE", 0.0)
     monkeypatch.setattr(pool, "_maps", (silent, ours))
     monkeypatch.setattr(pool, "_load", loaded)
     with theirs:
@@ -487,7 +487,7 @@ def test_maps_are_kept_while_a_worker_cannot_begin(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(pool, "_maps", held)
     monkeypatch.setattr(pool, "_fork", fork)
-    monkeypatch.setattr("bidnerf_core.service.pool.PAUSE", 0.0)
+    monkeypatch.setattr("bidnerf.service.pool.PAUSE", 0.0)
     assert asyncio.run(pool._replacement()) is worker
     assert (tried, pool._maps) == ([0, 1, 2], held)
 
@@ -767,9 +767,9 @@ def test_a_folder_without_a_map_is_refused(
         def wait(self) -> None:
             self.thread.join()
 
-    monkeypatch.setattr("bidnerf_core.service.pool.subprocess.Popen", Threaded)
-    monkeypatch.setattr("bidnerf_core.service.worker.signal.signal", lambda *_: None)
-    monkeypatch.setattr("bidnerf_core.service.worker.os.getpgrp", os.getpid)
+    monkeypatch.setattr("bidnerf.service.pool.subprocess.Popen", Threaded)
+    monkeypatch.setattr("bidnerf.service.worker.signal.signal", lambda *_: None)
+    monkeypatch.setattr("bidnerf.service.worker.os.getpgrp", os.getpid)
     monkeypatch.setattr("cv2.setNumThreads", lambda _: None)
     with warnings.catch_warnings():
         refused = bidnerf("serve", place.folder / "data")

@@ -16,10 +16,10 @@ from urllib.parse import urlsplit
 
 import viewed
 from bidnerf import Localizer, Map
+from bidnerf.service import ServiceLimits
 from bidnerf.viewer import LiveView, serve_view
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import DatasetOptions, Photos
-from bidnerf_core.service import ServiceLimits
 from photo_room import CAMERA
 
 LIMITS = ServiceLimits(max_megabytes=1.0, max_megapixels=1.0)

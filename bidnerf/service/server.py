@@ -13,8 +13,8 @@ from dataclasses import is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from bidnerf.service.settings import ServiceLimits, checked_token
 from bidnerf_core.errors import InputError, UsageError
-from bidnerf_core.service.settings import ServiceLimits, checked_token
 from bidnerf_core.settings import to_flat
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def service_app(
     the extra ``serve`` is not installed. ASGI startup raises ``InputError`` if a map cannot be loaded.
     """
     try:
-        from bidnerf_core.service.app import application
+        from bidnerf.service.app import application
     except ImportError as error:
         raise InputError(NEEDS) from error
     if config is not None and not isinstance(config, Mapping) and not is_dataclass(config):
@@ -99,7 +99,7 @@ def token_for(host: str | None, token: str | None, needs: str) -> str | None:
     try:
         import uvicorn  # noqa: F401 (tried before the maps are read)
 
-        from bidnerf_core.service.web import is_loopback
+        from bidnerf.service.web import is_loopback
     except ImportError as error:
         raise InputError(needs) from error
     is_local = host is None or is_loopback(host)

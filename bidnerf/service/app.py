@@ -16,13 +16,11 @@ from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.types import Scope
 
-from bidnerf_core.errors import InputError
-from bidnerf_core.io import parse_json
-from bidnerf_core.service.models import Localization, MapFacts, Refused, checked
-from bidnerf_core.service.pool import Pool
-from bidnerf_core.service.protocols import PROTOCOLS, ServiceProtocol
-from bidnerf_core.service.settings import ServiceLimits
-from bidnerf_core.service.web import (
+from bidnerf.service.models import Localization, MapFacts, Refused, checked
+from bidnerf.service.pool import Pool
+from bidnerf.service.protocols import PROTOCOLS, ServiceProtocol
+from bidnerf.service.settings import ServiceLimits
+from bidnerf.service.web import (
     Application,
     answered,
     body_of,
@@ -33,6 +31,8 @@ from bidnerf_core.service.web import (
     photo_of,
     problem,
 )
+from bidnerf_core.errors import InputError
+from bidnerf_core.io import parse_json
 
 
 def application(order: dict[str, Any], limits: ServiceLimits, token: str | None) -> FastAPI:

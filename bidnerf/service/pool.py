@@ -27,9 +27,9 @@ from typing import Any
 import psutil
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
+from bidnerf.service.models import Refused
+from bidnerf.service.settings import ServiceLimits
 from bidnerf_core.errors import InputError
-from bidnerf_core.service.models import Refused
-from bidnerf_core.service.settings import ServiceLimits
 
 FORK_SECONDS = 60.0
 """Seconds within which a new worker must report; with an accelerator, it first copies the maps there."""
@@ -214,7 +214,7 @@ class Pool:
         ours, theirs = socket.socketpair()
         with theirs:
             process = subprocess.Popen(
-                [sys.executable, "-m", "bidnerf_core.service.worker", str(theirs.fileno())],
+                [sys.executable, "-m", "bidnerf.service.worker", str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,  # Ctrl-C reaches only this process, which then ends the others

@@ -25,8 +25,7 @@ from starlette.requests import ClientDisconnect, HTTPConnection
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from bidnerf_core.errors import InputError
-from bidnerf_core.service.models import (
+from bidnerf.service.models import (
     LONGEST_NAME,
     PhotoForm,
     Problem,
@@ -35,7 +34,8 @@ from bidnerf_core.service.models import (
     checked,
     short,
 )
-from bidnerf_core.service.settings import MEBIBYTE, ServiceLimits
+from bidnerf.service.settings import MEBIBYTE, ServiceLimits
+from bidnerf_core.errors import InputError
 
 log = logging.getLogger("bidnerf.service")
 
