@@ -18,9 +18,9 @@ from scipy.stats import chi2
 
 from bidnerf import Localization, Map, View, load_map
 from bidnerf.evaluation import provenance, script_command
+from bidnerf.results import normalized_error_squared, pose_error, success_rate
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.io import FileInUse, take_lock, to_plain, write_file
-from bidnerf_core.results import normalized_error_squared, pose_error, success_rate
 
 RESULTS = Path(__file__).resolve().parent / "results"
 LIMITS = {"5deg 0.05": (0.05, 5.0), "1deg 0.02": (0.02, 1.0)}

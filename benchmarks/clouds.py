@@ -19,9 +19,9 @@ import torch
 from numpy.typing import NDArray
 
 from bidnerf import SE3, Frame, View
+from bidnerf.results import CRITERIA, pose_error
 from bidnerf_core.frames import observe
 from bidnerf_core.mapping import SurfaceMap, trace
-from bidnerf_core.results import CRITERIA, pose_error
 
 WITNESSES = 24
 """Number of keyframes that vote on the outward side of surfels."""

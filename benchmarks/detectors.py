@@ -41,11 +41,11 @@ from _lab import (
 from query_conditions import resized
 
 from bidnerf import SE3, Frame, View
+from bidnerf.results import normalized_error_squared, pose_error
 from bidnerf_core.captures import tried_landmarks
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.localization import LandmarkMatcher, Loop
 from bidnerf_core.mapping import Features, find_features, tracked_views
-from bidnerf_core.results import normalized_error_squared, pose_error
 
 EVERY = (2, 4, 8, 16)
 ONE_GRID = "xfeat, one grid"

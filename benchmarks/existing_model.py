@@ -26,8 +26,8 @@ from scipy.spatial import cKDTree
 
 import bidnerf as bn
 from bidnerf import SE3
+from bidnerf.results import Answer, Answers
 from bidnerf_core.geometry import Similarity, fit_similarity
-from bidnerf_core.results import Answer, Answers
 
 SIDE, IMAGES, POINTS, TRACK = 40.0, 320, 210_000, 6
 """The size of the large project: side of its square floor, number of images and of points, and images that observe a point."""

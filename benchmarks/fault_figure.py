@@ -13,7 +13,7 @@ from typing import Any
 import _lab
 import numpy as np
 
-from bidnerf_core.results import COLOURS, new_figure, styled, success_rate
+from bidnerf.results import COLOURS, new_figure, styled, success_rate
 
 DRAWN = {
     "right": ("right", COLOURS[2]),

@@ -56,11 +56,11 @@ from bidnerf.evaluation import (
     parse_settings,
     views_digest,
 )
+from bidnerf.results import success_rate
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.io import to_plain
-from bidnerf_core.results import success_rate
 
 FOREIGN = "another-scene"
 

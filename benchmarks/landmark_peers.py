@@ -81,8 +81,8 @@ from sift import FEWEST_INLIERS, SiftMatcher, colmap_pnp, opencv_pnp, sift_point
 
 from bidnerf import Localizer, View
 from bidnerf.evaluation import bid_start, views_digest
+from bidnerf.results import pose_error
 from bidnerf_core.io import from_plain, to_plain
-from bidnerf_core.results import pose_error
 
 OURS = "auto"
 LIBRARIES = {

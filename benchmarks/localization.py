@@ -36,8 +36,8 @@ from bidnerf.evaluation import (
     run_trials,
     summarize,
 )
+from bidnerf.results import normalized_error_squared, success_rate
 from bidnerf_core.progress import job_context
-from bidnerf_core.results import normalized_error_squared, success_rate
 
 Truth = dict[str, SE3]
 """T_world_camera of each frame, by its name."""

@@ -28,11 +28,11 @@ from _lab import Row
 
 import bidnerf as bn
 from bidnerf import SE3, Frame, Map, View
+from bidnerf.results import pose_error
 from bidnerf_core.datasets import TimedFrame
 from bidnerf_core.geometry import Similarity, fit_similarity
 from bidnerf_core.io import to_plain
 from bidnerf_core.progress import Progress
-from bidnerf_core.results import pose_error
 
 RATE = 30
 """Frames per second of a video that is made of photos."""

@@ -18,7 +18,7 @@ from typing import Any
 from _lab import BOUND, parser, record, within
 from confidence import assessed
 
-from bidnerf_core.results import COLOURS, new_figure, styled
+from bidnerf.results import COLOURS, new_figure, styled
 
 CRITERIA = {
     "right": lambda row: within(row),

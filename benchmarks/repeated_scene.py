@@ -21,12 +21,12 @@ from _lab import Scene, answer, one_thread, parser, record, within, without_dept
 from torch import Generator, Tensor, nn
 
 from bidnerf import Localizer, Map
+from bidnerf.results import success_rate
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import FieldValues, RadianceField, Rays, RaySamples, SceneBounds
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import LandmarkMap
-from bidnerf_core.results import success_rate
 
 TURNS = (0.0, 90.0, 180.0)
 DESCRIPTOR_NOISE = 5.0

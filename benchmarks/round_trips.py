@@ -35,9 +35,9 @@ from _lab import (
 )
 
 from bidnerf import ImportOptions, Localizer, Map, export_map, import_map, load_map
+from bidnerf.results import read_pose
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
-from bidnerf_core.results import read_pose
 
 OWN = "map"
 """The map that the others come from."""

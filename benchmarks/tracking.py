@@ -39,8 +39,8 @@ from _lab import RESULTS, RowStore, one_thread, parser, record
 from answer_maps import folder_of, map_folder
 
 from bidnerf import SE3, Frame, Localization, Localizer, Map, Outcome, Tracker, load_map
+from bidnerf.results import TrajectoryErrors, pose_error, spans, within
 from bidnerf_core.datasets import TimedFrame, open_sequence
-from bidnerf_core.results import TrajectoryErrors, pose_error, spans, within
 
 SEQUENCES = ("tum_fr1_xyz", "iphone_corridor")
 WRONG = 0.05, 5.0

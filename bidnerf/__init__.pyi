@@ -1,6 +1,10 @@
 from bidnerf.evaluation import Plan as Plan
 from bidnerf.evaluation import compare as compare
 from bidnerf.evaluation import evaluate as evaluate
+from bidnerf.results import export_map as export_map
+from bidnerf.results import read_poses as read_poses
+from bidnerf.results import track as track
+from bidnerf.results import write_poses as write_poses
 from bidnerf.service import ServiceClient as ServiceClient
 from bidnerf.service import serve as serve
 from bidnerf.viewer import view as view
@@ -29,8 +33,4 @@ from bidnerf_core.maps import load_map as load_map
 from bidnerf_core.maps import resume as resume
 from bidnerf_core.maps import train as train
 from bidnerf_core.registry import register as register
-from bidnerf_core.results import export_map as export_map
-from bidnerf_core.results import read_poses as read_poses
-from bidnerf_core.results import track as track
-from bidnerf_core.results import write_poses as write_poses
 from bidnerf_core.structure import find_poses as find_poses

@@ -6,8 +6,8 @@ python examples/01_find_a_camera.py [--backend hashgrid] [--steps 600]
 import argparse
 
 import bidnerf as bn
+from bidnerf.results import pose_error
 from bidnerf_core.geometry import perturb
-from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import closed_form_data
 
 parser = argparse.ArgumentParser(description=__doc__)

@@ -8,8 +8,8 @@ The rays are divided among the images, so a step costs the same; the pose found 
 import argparse
 
 import bidnerf as bn
+from bidnerf.results import pose_error
 from bidnerf_core.geometry import perturb
-from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import closed_form_data
 
 parser = argparse.ArgumentParser(description=__doc__)

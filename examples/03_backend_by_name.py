@@ -10,9 +10,9 @@ import sys
 import tempfile
 
 import bidnerf as bn
+from bidnerf.results import pose_error
 from bidnerf_core.geometry import perturb
 from bidnerf_core.registry import list_plugins
-from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import closed_form_data
 
 parser = argparse.ArgumentParser(description=__doc__)

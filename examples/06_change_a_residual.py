@@ -11,10 +11,10 @@ import argparse
 import torch
 
 import bidnerf as bn
+from bidnerf.results import pose_error
 from bidnerf_core.backend import DEPTH_RESIDUALS
 from bidnerf_core.geometry import perturb
 from bidnerf_core.localization import settings_of
-from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import closed_form_data, closed_form_map
 
 

@@ -15,11 +15,11 @@ from bidnerf_core.registry import USUAL_BACKEND
 from bidnerf_core.settings import WholeNumbers
 
 if TYPE_CHECKING:
+    from bidnerf.results import PoseError
     from bidnerf_core.frames import View
     from bidnerf_core.geometry import SE3
     from bidnerf_core.localization import Localization
     from bidnerf_core.maps import Map
-    from bidnerf_core.results import PoseError
 
 TRAINING_VIEWS, ANIMATED = 60, 14
 """Number of training images, and of frames of the animation."""
@@ -36,7 +36,7 @@ class Trial(NamedTuple):
 
     def errors(self, poses: SE3) -> PoseError:
         """Return the errors of poses relative to the true pose of the frame."""
-        from bidnerf_core.results import pose_error
+        from bidnerf.results import pose_error
 
         return pose_error(poses, self.view.T_ref_camera, self.auto.unit)
 
@@ -110,8 +110,8 @@ def run_demo(
 def _draw(stored: Map, trials: list[Trial], out: Path) -> None:
     import numpy as np
 
+    from bidnerf.results import Painter, save_gif
     from bidnerf_core.io import png_bytes, write_file
-    from bidnerf_core.results import Painter, save_gif
 
     for view, start, auto, bid in trials:
         painter = Painter(stored, view.frame)

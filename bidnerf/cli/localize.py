@@ -26,11 +26,11 @@ from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount, enumeration
 
 if TYPE_CHECKING:
+    from bidnerf.results import Answer, Answers, Failure
     from bidnerf_core.datasets import Query
     from bidnerf_core.geometry import SE3
     from bidnerf_core.localization import Localizer
     from bidnerf_core.maps import MapCollection
-    from bidnerf_core.results import Answer, Answers, Failure
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ class StartOptions:
         Raises ``UsageError`` if the perturbation is out of range.
         """
         from bidnerf.evaluation import find_protocol
+        from bidnerf.results import pose_of, read_poses
         from bidnerf_core.geometry import perturb
-        from bidnerf_core.results import pose_of, read_poses
 
         start, moved = self.start, self.perturb
         if moved is not None:
@@ -93,7 +93,7 @@ class OutputOptions:
 
     def check(self, inputs: Sequence[Path]) -> None:
         """Check that the outputs can be written, before any work is done."""
-        from bidnerf_core.results import check_pose_file
+        from bidnerf.results import check_pose_file
 
         if self.out is not None:
             check_pose_file(self.out)
@@ -133,6 +133,7 @@ def run_localize(
     relative poses come from the dataset, and the pose found is that of the last one's camera. Poses are camera to world with
     OpenCV axes (x right, y down, z forward). Points are in the camera's axes, unless a .npz also holds T_camera_sensor.
     """
+    from bidnerf.results import Answers, localize_each
     from bidnerf_core.datasets import Photos
     from bidnerf_core.localization import (
         Localizer,
@@ -142,7 +143,6 @@ def run_localize(
         require_use_of_depth,
     )
     from bidnerf_core.maps import MapCollection, load_map, maps_in
-    from bidnerf_core.results import Answers, localize_each
 
     count = next((n for n, path in enumerate(query) if not _holds_maps(path)), len(query))
     maps, paths = [map, *query[:count]], query[count:]
@@ -193,7 +193,7 @@ def _holds_maps(path: Path) -> bool:
 
 def _check_for_several(output: OutputOptions, queries: QueryOptions, start: StartOptions) -> None:
     """Raise ``UsageError`` if an option is given that cannot be used with several maps."""
-    from bidnerf_core.results import pose_format
+    from bidnerf.results import pose_format
 
     given = {
         "--start": start.start, "--perturb": start.perturb, "--draw": output.draw, "--depth-points": queries.depth_points
@@ -216,9 +216,9 @@ class Run:
 
     def show(self, query: Query, answer: Answer | Failure) -> None:
         """Print an answer or a failure, and draw an answer if a folder for drawings was given."""
+        from bidnerf.results import Failure, overlay
         from bidnerf_core.io import png_bytes, write_file
         from bidnerf_core.maps import MapCollection
-        from bidnerf_core.results import Failure, overlay
 
         if isinstance(answer, Failure):
             say(f"{answer.name}: {answer.reason}")
@@ -243,8 +243,8 @@ class Run:
         If the run is stopped early, the answers so far are written. Raises ``InputError`` if the file's format takes
         only accepted poses and there are none, and if a query failed.
         """
+        from bidnerf.results import pose_format
         from bidnerf_core.maps import MapCollection
-        from bidnerf_core.results import pose_format
 
         answers, out, total = self.answers, self.output.out, self.total
         takes_all, is_whole = out is not None and pose_format(out) == ".json", False
@@ -274,8 +274,8 @@ class Run:
 
 def answer_lines(answer: Answer, full: bool) -> list[str]:
     """Return an answer as lines: the outcome, the runner-up among several maps and, if ``full``, the uncertainty and the pose."""
+    from bidnerf.results import OPENCV_AXES, standard_deviations
     from bidnerf_core.geometry import symbol
-    from bidnerf_core.results import OPENCV_AXES, standard_deviations
 
     found, error, placement = answer.found, answer.error, answer.placement
     verdict = "converged" if found.converged else f"NOT converged: {found.outcome.value}"

@@ -43,8 +43,8 @@ def run_info(
     ] = None,
 ) -> None:
     """Describe a map and the photos it was built from. The whole map is loaded, so that damage is detected."""
+    from bidnerf.results import draw_capture
     from bidnerf_core.maps import load_map
-    from bidnerf_core.results import draw_capture
 
     if draw is not None:
         if draw.suffix.lower() != ".png":
@@ -83,7 +83,7 @@ def run_export(
     overwrite: Annotated[Flag, Option(None, "write into a non-empty folder")] = False,
 ) -> None:
     """Export the surface, landmarks and cameras of a map for other software, in the map's frame and unit."""
-    from bidnerf_core.results import export_map
+    from bidnerf.results import export_map
 
     check_folder(out, (map,))
     for file in export_map(map, out, to, overwrite):
@@ -118,8 +118,8 @@ def run_scale(
     Poses, covariances and errors are then in metres, and the depth of sensors fits. One of --distance, --poses and --factor
     gives the length of a unit.
     """
+    from bidnerf.results import read_positions
     from bidnerf_core.maps import factor_of_distance, factor_of_poses, load_info, load_map, map_folder
-    from bidnerf_core.results import read_positions
 
     require_one({"--distance": distance, "--poses": poses, "--factor": factor}, required=True)
     first, second, length = distance or ("", "", "1")
@@ -384,9 +384,9 @@ def run_import(
     The points and tracks of a COLMAP model (a project folder or the model in it) become the landmarks, and answers are in its
     world; its files are not changed. Such a map localizes photos without a field, which 'bidnerf train FILE --out MAP' adds.
     """
+    from bidnerf.results import read_pose
     from bidnerf_core.devices import working_device
     from bidnerf_core.maps import ImportOptions, import_map
-    from bidnerf_core.results import read_pose
 
     check_folder(out, (file, photos), may_be_map=True)
     working_device(target.device)

@@ -21,10 +21,10 @@ from bidnerf_core.registry import USUAL_METHOD
 from bidnerf_core.settings import WholeNumbers
 
 if TYPE_CHECKING:
+    from bidnerf.results import Answers, TrackingVideo
     from bidnerf_core.depth import DepthCamera
     from bidnerf_core.frames import Frame
     from bidnerf_core.localization import Tracker
-    from bidnerf_core.results import Answers, TrackingVideo
 
 STDIN = "-"
 POLL = 0.05
@@ -52,7 +52,7 @@ class OutputOptions:
 
     def check(self, inputs: list[Path]) -> None:
         """Check that the outputs can be written, before any work is done."""
-        from bidnerf_core.results import check_pose_file, check_video, require_matplotlib
+        from bidnerf.results import check_pose_file, check_video, require_matplotlib
 
         if self.out is not None:
             check_pose_file(self.out)
@@ -129,9 +129,9 @@ def run_track(
     Each pose is predicted from those before it, refined and validated. A frame whose pose is not accepted counts as lost; the
     following ones are searched for in the whole map. If the sequence has true poses, a table shows the errors.
     """
+    from bidnerf.results import Answers, TrackingVideo, read_pose, track
     from bidnerf_core.localization import Localizer, Tracker, settings_of
     from bidnerf_core.maps import load_map
-    from bidnerf_core.results import Answers, TrackingVideo, read_pose, track
 
     if frames.follow:
         given = {"--split": frames.split, "--depth-unit": images.depth_unit, "--masks": images.masks}
@@ -182,7 +182,7 @@ def _follow(
     source: str, images: DatasetOptions, depth: bool, tracker: Tracker, path: Answers, video: TrackingVideo | None
 ) -> None:  # fmt: skip
     """Answer each frame on arrival with one line of JSON."""
-    from bidnerf_core.results import BAD_INPUT
+    from bidnerf.results import BAD_INPUT
 
     sensor = images.sensor(source)
     say(f"waiting for {'JSON lines on stdin' if source == STDIN else f'images in {source}'}; Ctrl-C ends")

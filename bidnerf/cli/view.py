@@ -131,8 +131,8 @@ def run_view(
 
 def _localized(localizer: Localizer, source: QuerySource) -> tuple[dict[str, Any], ...]:
     """Localize all queries, and return the page's JSON values of each. Raises ``InputError`` if none can be read."""
+    from bidnerf.results import BAD_INPUT
     from bidnerf.viewer import read_and_localized
-    from bidnerf_core.results import BAD_INPUT
 
     answers, total = [], len(source.names)
     with displayed():

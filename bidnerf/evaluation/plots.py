@@ -31,7 +31,7 @@ from bidnerf.evaluation.summary import (
     unit_of,
 )
 from bidnerf.evaluation.trial import TrialResult
-from bidnerf_core.results import (
+from bidnerf.results import (
     CRITERION_NAMES,
     line_look,
     new_figure,

@@ -34,6 +34,7 @@ from bidnerf.evaluation.summary import (
     summarize,
 )
 from bidnerf.evaluation.trial import TrialResult
+from bidnerf.results import CRITERIA
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.geometry import symbol
 from bidnerf_core.io import (
@@ -48,7 +49,6 @@ from bidnerf_core.io import (
     to_plain,
     write_file,
 )
-from bidnerf_core.results import CRITERIA
 
 LARGEST_FILE = 512 * 2**20
 """Largest size of a file of results in bytes. A trial takes a few kilobytes, so that a hundred thousand trials fit."""

@@ -11,9 +11,9 @@ from typing import Any
 
 from bidnerf.evaluation.faults import NO_FAULT
 from bidnerf.evaluation.trial import TrialResult
+from bidnerf.results import CRITERIA, Rate, Reduced, steps_to_success, success_rate_by_frame
 from bidnerf_core.errors import amount
 from bidnerf_core.geometry import LengthUnit
-from bidnerf_core.results import CRITERIA, Rate, Reduced, steps_to_success, success_rate_by_frame
 
 NEVER = math.inf
 """Steps to success of a trial that did not succeed."""

@@ -15,9 +15,9 @@ from bidnerf_core.registry import Plugins, interface_defects
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
+    from bidnerf.results import Answer
     from bidnerf.service.models import Upload
     from bidnerf_core.maps import Map
-    from bidnerf_core.results import Answer
 
 
 class ServiceProtocol(Protocol):

@@ -6,13 +6,13 @@ import math
 import os
 from pathlib import Path
 
+from bidnerf.results import read_pose
 from bidnerf.service.models import CAMERAS, WIDEST, Upload
 from bidnerf_core.camera import WAYS, WAYS_OF_PHOTO, CameraSource
 from bidnerf_core.datasets import DatasetOptions, Photos
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import is_heif, read_header
-from bidnerf_core.results import read_pose
 
 
 def read_upload(

@@ -19,6 +19,7 @@ from io import BufferedRWPair
 from pathlib import Path
 from typing import Any
 
+from bidnerf.results import Answer, localize_each
 from bidnerf.service.models import MapFacts, Refused, Upload
 from bidnerf.service.protocols import PROTOCOLS
 from bidnerf.service.upload import public_message, read_upload
@@ -27,7 +28,6 @@ from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import Localizer, settings_of
 from bidnerf_core.maps import Map, MapCollection, load_map
-from bidnerf_core.results import Answer, localize_each
 
 
 class Worker:

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf.results import pose_error
 from bidnerf.viewer.evidence import (
     APART,
     HERE,
@@ -39,7 +40,6 @@ from bidnerf_core.localization import (
 )
 from bidnerf_core.mapping import project
 from bidnerf_core.registry import PluginError
-from bidnerf_core.results import pose_error
 
 MOST_STEPS = 200
 """Maximum number of steps of a descent that are shown; longer descents are subsampled at a regular stride."""

@@ -21,6 +21,7 @@ from fastapi import FastAPI, Request
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import HTMLResponse, JSONResponse, Response
 
+from bidnerf.results import BAD_INPUT
 from bidnerf.service import (
     Application,
     Refused,
@@ -46,7 +47,6 @@ from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.io import parse_json, to_plain
 from bidnerf_core.localization import Localizer, SearchRecord
 from bidnerf_core.progress import job_context
-from bidnerf_core.results import BAD_INPUT
 
 log = logging.getLogger("bidnerf.viewer")
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+from bidnerf.results import pose_error
 from bidnerf.viewer.pictures import Json
 from bidnerf.viewer.scene import rows_of
 from bidnerf_core.geometry import SE3, symbol
@@ -23,7 +24,6 @@ from bidnerf_core.localization import (
     Support,
     odds,
 )
-from bidnerf_core.results import pose_error
 
 HERE, EARLIER = "the pose found", "an earlier pose by landmarks, which was given up"
 APART, TURNED_DEG = 0.1, 10.0

@@ -15,6 +15,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from bidnerf.results import BAD_INPUT
 from bidnerf.viewer.answer import no_answer, shown_answer
 from bidnerf.viewer.pictures import Json
 from bidnerf.viewer.scene import shown_map, shown_trajectory
@@ -25,7 +26,6 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import to_plain, write_file
 from bidnerf_core.localization import Localization, Localizer, SearchRecord, recorded
 from bidnerf_core.maps import Map
-from bidnerf_core.results import BAD_INPUT
 
 MODULES = ("data", "space", "compare", "panel", "table", "track", "live", "main")
 """The page's JavaScript modules, each after those that it imports. They share a scope, so their names must not clash."""

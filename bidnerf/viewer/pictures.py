@@ -14,11 +14,11 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
+from bidnerf.results import as_picture
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import has_field, render_image
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import SceneMap, picture_at, surface_renderer
-from bidnerf_core.results import as_picture
 
 Json: TypeAlias = dict[str, Any]
 """A part of the page's state, which the page's scripts read. Its entries are described by the function that returns it."""

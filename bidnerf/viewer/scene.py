@@ -14,6 +14,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from bidnerf.results import pose_entries, standard_deviations
 from bidnerf.viewer.pictures import (
     Json,
     jpeg,
@@ -32,7 +33,6 @@ from bidnerf_core.fields import SplatField
 from bidnerf_core.geometry import SE3, LengthUnit, pose_from_matrix, symbol
 from bidnerf_core.io import read_file
 from bidnerf_core.maps import Map
-from bidnerf_core.results import pose_entries, standard_deviations
 
 log = logging.getLogger("bidnerf")
 

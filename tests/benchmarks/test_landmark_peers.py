@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 
+from bidnerf.results import pose_error
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.results import pose_error
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
 Script = Callable[[str], ModuleType]

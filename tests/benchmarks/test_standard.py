@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from bidnerf import SE3, Intrinsics, View
+from bidnerf.results import as_picture
 from bidnerf_core.errors import InputError
-from bidnerf_core.results import as_picture
 from bidnerf_core.scenes import demo_object, orbit, views
 
 Script = Callable[[str], ModuleType]

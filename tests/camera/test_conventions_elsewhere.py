@@ -12,11 +12,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import bidnerf as bn
+from bidnerf.results import PosedImage, normalized_error_squared
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import Localization, Outcome
-from bidnerf_core.results import PosedImage, normalized_error_squared
 from photo_files import noise, write_photo
 
 CAMERA = Intrinsics(400.0, 410.0, 321.5, 238.0, 640, 480, (0.05, -0.02, 0.003, 0.004))

@@ -26,9 +26,9 @@ from bidnerf import SE3, Frame, InputError, Intrinsics, Localization, Localizer,
 from bidnerf.cli import main
 from bidnerf.cli.output import check_folder, check_output
 from bidnerf.cli.running import Interrupted, interruptions, uninterrupted
+from bidnerf.results import Answers
 from bidnerf_core.datasets import DatasetFrames, Query, read_trajectory
 from bidnerf_core.errors import UsageError
-from bidnerf_core.results import Answers
 from commands import Run, assert_refused
 from flights import flight
 from stored_ground import open_ground, write_flight

@@ -38,9 +38,9 @@ from bidnerf.evaluation import (
 # Inside: lines of results, and the middle of a sequence
 from bidnerf.evaluation.plan import arc
 from bidnerf.evaluation.results import as_line
+from bidnerf.results import pose_error
 from bidnerf_core.geometry import look_at
 from bidnerf_core.io import to_plain
-from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import closed_form_data, orbit
 from refusals import refused
 

@@ -14,8 +14,8 @@ from bidnerf.evaluation import PROTOCOLS, find_protocol
 
 # Inside: distributions of many starts, which trials draw one at a time
 from bidnerf.evaluation.plan import draw_starts, inerf_start
+from bidnerf.results import pose_error
 from bidnerf_core.geometry import SE3
-from bidnerf_core.results import pose_error
 from refusals import refused
 
 TRUE = SE3.exp(torch.tensor([0.3, 1.0, -2.0, 0.5, -0.2, 0.9], dtype=torch.float64))

@@ -36,10 +36,10 @@ from bidnerf.evaluation import (
 from bidnerf.evaluation.plots import Figures
 from bidnerf.evaluation.report import page
 from bidnerf.evaluation.summary import situation_titles, situations
+from bidnerf.results import success_rate_by_frame
 from bidnerf_core.datasets import write_transforms
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import to_plain
-from bidnerf_core.results import success_rate_by_frame
 from trial_results import trial_result
 
 STEPS = 10

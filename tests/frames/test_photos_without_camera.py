@@ -13,12 +13,12 @@ import torch
 
 from bidnerf import Frame, Intrinsics, Localizer
 from bidnerf.evaluation import faulty
+from bidnerf.results import pose_error
 from bidnerf.testing import BOUNDS, CAMERA, textured_map, unseen
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.maps import Map, MapInfo
-from bidnerf_core.results import pose_error
 from commands import Run
 from stored_ground import open_map
 

@@ -24,6 +24,7 @@ import sparse_model
 import tiny
 from bidnerf import Frame, load_map
 from bidnerf.evaluation import read_results
+from bidnerf.results import read_pose
 from bidnerf_core.camera import read_camera
 from bidnerf_core.datasets import open_dataset, read_depth_points, read_model
 from bidnerf_core.depth import read_depth_image
@@ -38,7 +39,6 @@ from bidnerf_core.io import (
 )
 from bidnerf_core.maps import MapInfo, write_parts
 from bidnerf_core.maps import load_map as load
-from bidnerf_core.results import read_pose
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import backend
 from commands import Run

@@ -13,9 +13,9 @@ import torch
 import baked
 import module_fields
 from bidnerf import SE3, Frame, Localization, Localizer, Tracker
+from bidnerf.results import pose_error
 from bidnerf.testing import DEVICE, Elsewhere, MapWithLandmarks, textured_map, unseen
 from bidnerf_core.localization import AutoConfig, settings_of
-from bidnerf_core.results import pose_error
 from flights import INTERVAL, flight_frame, flight_pose
 from localizations import without_depth
 from module_fields import AsModule

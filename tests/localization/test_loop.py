@@ -18,6 +18,7 @@ import torch
 
 from bidnerf import SE3, Intrinsics, Localization, Localizer, Outcome, View
 from bidnerf.evaluation import faulty
+from bidnerf.results import pose_error
 from bidnerf.testing import CAMERA as GROUND_CAMERA
 from bidnerf.testing import POSES as GROUND_POSES
 from bidnerf.testing import TexturedGround, textured_map, training_views, unseen
@@ -26,7 +27,6 @@ from bidnerf_core.fields import FieldValues
 from bidnerf_core.localization import AutoConfig, LandmarkAnswer, LandmarkMatcher, LogisticModel, Loop, rig
 from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.registry import registered
-from bidnerf_core.results import pose_error
 from conditions import (
     COPY,
     NOT_RENDERED,

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from bidnerf import SE3, Frame, Localization, Localizer, Outcome, View
+from bidnerf.results import pose_error
 from bidnerf_core.geometry import perturb
 from bidnerf_core.localization import METHODS, settings_of
 from bidnerf_core.mapping import BakeConfig, bake
-from bidnerf_core.results import pose_error
 from bidnerf_core.scenes import orbit
 from blob_images import BOUNDS, CAMERA, FIELD, FRAME, POSES, TRUTH, photograph
 from localizations import assert_near

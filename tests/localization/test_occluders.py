@@ -12,13 +12,13 @@ import torch
 
 import baked
 from bidnerf.evaluation import faulty
+from bidnerf.results import pose_error
 from bidnerf_core.frames import DRAWERS, Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import AutoConfig, Localization
 
 # Inside: which pixels are an occluder, of which an answer shows no image
 from bidnerf_core.localization.by_surface import nearest_piece
-from bidnerf_core.results import pose_error
 from problems import localize
 from refusals import refused
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import baked
+from bidnerf.results import pose_error
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import states_at
 from bidnerf_core.localization.by_surface import by_images, hypotheses
@@ -17,7 +18,6 @@ from bidnerf_core.localization.problem import middle_of_view
 # Inside: the distribution of proposals and the margin over other poses, of which an answer keeps one
 from bidnerf_core.localization.search import Stage, centred, halve, neighbours
 from bidnerf_core.mapping import Normal, P, States
-from bidnerf_core.results import pose_error
 from blob_images import BOUNDS, FIELD, FRAME, TRUTH
 from problems import single
 

@@ -17,6 +17,7 @@ import torch
 from safetensors.torch import save_file
 
 from bidnerf import Localizer, Outcome, Tracker
+from bidnerf.results import normalized_error_squared, pose_error
 from bidnerf.testing import CAMERA, textured_map, view
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
@@ -27,7 +28,6 @@ from bidnerf_core.localization.tracking.motion import Clock
 # Inside: flow, and the parts of a state that only rare sequences fill
 from bidnerf_core.localization.tracking.points import alike
 from bidnerf_core.localization.tracking.state import TrackerState, correction_of
-from bidnerf_core.results import normalized_error_squared, pose_error
 from conditions import ground_landmarks, with_landmarks
 from flights import (
     FRAMES,

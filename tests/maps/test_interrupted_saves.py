@@ -22,6 +22,8 @@ from bidnerf.evaluation import (
     provenance,
     read_runs,
 )
+from bidnerf.results import Answer, Answers, PosedImage, new_figure, save_gif, write_figure
+from bidnerf.results.pose_files import POSE_WRITERS
 from bidnerf_core.captures import write_inria_cameras
 from bidnerf_core.io import is_temporary, write_file
 
@@ -29,8 +31,6 @@ from bidnerf_core.io import is_temporary, write_file
 from bidnerf_core.localization.tracking.motion import Clock
 from bidnerf_core.localization.tracking.state import TrackerState, save_state
 from bidnerf_core.maps import load_info, load_map, write_parts
-from bidnerf_core.results import Answer, Answers, PosedImage, new_figure, save_gif, write_figure
-from bidnerf_core.results.pose_files import POSE_WRITERS
 from interruptions import FULL, Stopped, outcomes
 from test_storage import CAMERAS, PARTS, info, names, plain, save_part, state
 from trial_results import trial_result

@@ -11,6 +11,7 @@ import torch
 
 import bidnerf as bn
 import tiny
+from bidnerf.results import read_positions
 from bidnerf.testing import BOUNDS, CAMERA, textured_map, unseen
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.fields import levels
@@ -19,7 +20,6 @@ from bidnerf_core.io import FileInUse, locked
 # Inside: the place of a map by its name
 from bidnerf_core.maps import Anchor, Map, MapInfo, factor_of_distance, factor_of_poses, load_info
 from bidnerf_core.maps.known_lengths import place_of
-from bidnerf_core.results import read_positions
 from commands import Run
 from refusals import refused
 

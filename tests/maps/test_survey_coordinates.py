@@ -28,6 +28,7 @@ from bidnerf import (
     resume,
     train,
 )
+from bidnerf.results import overlay
 from bidnerf.testing import POSES, training_views, view
 from bidnerf_core.errors import Cancelled
 from bidnerf_core.geometry import Similarity
@@ -39,7 +40,6 @@ from bidnerf_core.maps.known_lengths import place_of
 from bidnerf_core.maps.views import chosen_origin
 from bidnerf_core.progress import Progress
 from bidnerf_core.registry import registered
-from bidnerf_core.results import overlay
 
 ORIGIN = (500_000.0, 4_000_000.0, 100.0)
 OFFSET = torch.tensor(ORIGIN, dtype=torch.float64)

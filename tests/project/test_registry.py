@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 from bidnerf.cli import _warnings_as_lines
+from bidnerf.results import write_poses
 from bidnerf_core.backend import Backend, load_backend
 from bidnerf_core.datasets import Capture, DatasetOptions, Reader, find_reader, open_dataset, open_sequence
 from bidnerf_core.errors import InputError, InputWarning
@@ -30,7 +31,6 @@ from bidnerf_core.registry import (
     load_plugin,
     register,
 )
-from bidnerf_core.results import write_poses
 from refusals import refused
 
 FOG = '''"""A field of fog.

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
 from bidnerf.evaluation import bid_start
-from bidnerf_core.geometry import SE3, perturb, random_units
-from bidnerf_core.results import (
+from bidnerf.results import (
     CRITERIA,
     PoseError,
     Reduced,
@@ -26,7 +25,8 @@ from bidnerf_core.results import (
 )
 
 # Inside: the angles of rotations near zero and pi, and criteria with other bars
-from bidnerf_core.results.errors import Within, rotation_angle
+from bidnerf.results.errors import Within, rotation_angle
+from bidnerf_core.geometry import SE3, perturb, random_units
 from refusals import refused
 
 tangents = st.lists(st.floats(-3, 3), min_size=6, max_size=6).map(

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.results import as_picture, save_gif, tile
+from bidnerf.results import as_picture, save_gif, tile
 
 # Inside: single tiles of an overlay, before they are put together
-from bidnerf_core.results.overlays import blend, edges
+from bidnerf.results.overlays import blend, edges
 from refusals import refused
 
 

@@ -17,16 +17,16 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import drawn
+from bidnerf.results import PosedImage, read_poses, write_poses
+
+# Inside: writers of single formats, with poses and names that a path does not have
+from bidnerf.results.pose_files import write_pose_transforms, write_tum
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import open_dataset, open_sequence, read_frames, read_posed_images, read_trajectory
 from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import read_record
-from bidnerf_core.results import PosedImage, read_poses, write_poses
-
-# Inside: writers of single formats, with poses and names that a path does not have
-from bidnerf_core.results.pose_files import write_pose_transforms, write_tum
 from photo_files import noise, write_photo
 from refusals import refused
 

@@ -22,11 +22,7 @@ from hypothesis import strategies as st
 import bidnerf as bn
 import drawn
 from bidnerf import SE3, Frame, InputError, InputWarning, Localization, Localizer, Outcome
-from bidnerf.testing import textured_map
-from bidnerf_core.datasets import Capture, DatasetOptions, Photos, Shot, write_transforms
-from bidnerf_core.frames import BLACK, View
-from bidnerf_core.progress import Progress
-from bidnerf_core.results import (
+from bidnerf.results import (
     Answer,
     Answers,
     Failure,
@@ -37,6 +33,10 @@ from bidnerf_core.results import (
     read_pose,
     within,
 )
+from bidnerf.testing import textured_map
+from bidnerf_core.datasets import Capture, DatasetOptions, Photos, Shot, write_transforms
+from bidnerf_core.frames import BLACK, View
+from bidnerf_core.progress import Progress
 from drawn import record
 from flights import covered, flight
 from refusals import refused

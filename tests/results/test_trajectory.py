@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from bidnerf import SE3
-from bidnerf_core.results import TrajectoryErrors, spans
+from bidnerf.results import TrajectoryErrors, spans
 
 # Inside: errors after each alignment, compared with evo's, and the paths that are drawn
-from bidnerf_core.results.errors import ErrorSummary, alignment_errors, relative_errors
-from bidnerf_core.results.plots import draw_path
+from bidnerf.results.errors import ErrorSummary, alignment_errors, relative_errors
+from bidnerf.results.plots import draw_path
 from refusals import refused
 
 

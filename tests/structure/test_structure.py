@@ -21,12 +21,12 @@ from PIL import Image
 
 import bidnerf as bn
 import tiny
+from bidnerf.results import pose_error
 from bidnerf_core.datasets import lacks_poses, write_transforms
 from bidnerf_core.geometry import fit_similarity
 
 # Inside: each stage of the search for poses, with its rare geometry
 from bidnerf_core.maps.training import posed_images, poses_folder
-from bidnerf_core.results import pose_error
 from bidnerf_core.structure import FoundPoses
 from bidnerf_core.structure.colmap import NEIGHBOURS, described, similar_pairs, to_colmap
 from bidnerf_core.structure.model import agreement, from_colmap

@@ -9,10 +9,10 @@ from dataclasses import replace
 import torch
 
 from bidnerf import SE3, Frame, Localization, Localizer, Tracker
+from bidnerf.results import pose_error
 from bidnerf.testing import textured_map, view
 from bidnerf_core.geometry import look_at
 from bidnerf_core.localization import AutoConfig
-from bidnerf_core.results import pose_error
 from localizations import without_depth as without_depth
 
 FRAMES = 10

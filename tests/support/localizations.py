@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from bidnerf import SE3, Frame, Localization, Outcome, View
-from bidnerf_core.results import normalized_error_squared, pose_error
+from bidnerf.results import normalized_error_squared, pose_error
 
 CHI2_99, CHI2_999 = 16.8, 22.5  # of six degrees of freedom
 

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf.results import Answer
 from bidnerf.service import LONGEST_NAME, Refused, Upload
 from bidnerf_core.camera import MODELS
 from bidnerf_core.errors import InputError
@@ -27,7 +28,6 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import png_bytes
 from bidnerf_core.localization import Localization
 from bidnerf_core.maps import Anchor
-from bidnerf_core.results import Answer
 from bidnerf_geopose.earth import GeographicPose
 from bidnerf_geopose.protocol import GeoPose, GeoPoseRequest, Reading
 from bidnerf_geopose.wgs84 import Geodetic

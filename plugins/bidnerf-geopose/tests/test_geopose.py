@@ -15,10 +15,10 @@ import torch
 from PIL import Image
 
 from bidnerf import SE3, InputError, Intrinsics, Localization, Outcome
+from bidnerf.results import Answer
 from bidnerf.service import Refused, checked, service_app
 from bidnerf_core.maps import Anchor
 from bidnerf_core.registry import registered
-from bidnerf_core.results import Answer
 from bidnerf_geopose import answers
 from bidnerf_geopose.earth import GeographicPose
 from bidnerf_geopose.protocol import GEOPOSE, GeoPoseRequest

@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from bidnerf.results import head, ply
 from bidnerf_core.captures import StoredCamera, write_inria_cameras
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.io import write_file
 from bidnerf_core.maps import Map
-from bidnerf_core.results import head, ply
 from bidnerf_scan.meshing import Mesh, mesh_of_surface
 
 T_WORLD_FILE = "T_world_file.json"

@@ -13,6 +13,7 @@ import torch
 import trimesh
 
 from bidnerf import ImportOptions, Map, export_map, import_map
+from bidnerf.results import read_pose
 from bidnerf.testing import BOUNDS, textured_map, training_views
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import stored_cameras
@@ -21,7 +22,6 @@ from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import SE3, look_at
 from bidnerf_core.mapping import SurfaceMap, surface_of_points
 from bidnerf_core.maps import MapInfo, sphere
-from bidnerf_core.results import read_pose
 from bidnerf_scan import meshing, read_scan
 from bidnerf_scan.meshing import Mesh, mesh_of_surface
 

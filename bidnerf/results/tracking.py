@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+from bidnerf.results.answers import Answer, Answers
 from bidnerf_core.datasets import BreaksOff, Capture, open_sequence
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.frames import Frame
@@ -16,7 +17,6 @@ from bidnerf_core.localization import (
     landmark_cameras,
 )
 from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context
-from bidnerf_core.results.answers import Answer, Answers
 
 
 def track(

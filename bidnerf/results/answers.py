@@ -12,6 +12,17 @@ from typing import Any
 
 import torch
 
+from bidnerf.results.errors import (
+    PoseError,
+    TrajectoryErrors,
+    pose_error,
+    rotation_angle,
+    spans,
+    standard_deviations,
+    within,
+)
+from bidnerf.results.plots import draw_path
+from bidnerf.results.pose_files import PosedImage, pose_format, write_poses
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import UpDirection, as_given
 from bidnerf_core.datasets import Query, QuerySource
@@ -30,17 +41,6 @@ from bidnerf_core.localization import (
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.maps import MapCollection, Placement
 from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context
-from bidnerf_core.results.errors import (
-    PoseError,
-    TrajectoryErrors,
-    pose_error,
-    rotation_angle,
-    spans,
-    standard_deviations,
-    within,
-)
-from bidnerf_core.results.plots import draw_path
-from bidnerf_core.results.pose_files import PosedImage, pose_format, write_poses
 
 log = logging.getLogger("bidnerf")
 

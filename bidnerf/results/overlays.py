@@ -14,13 +14,13 @@ from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from bidnerf.results.answers import Answer
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import render_picture
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import reduced, write_file
 from bidnerf_core.localization import Localization, SceneMap, Start, origin_of, scene_of, start_pose
-from bidnerf_core.results.answers import Answer
 
 SIDE = 240
 """Pixels along the longer side of pictures drawn in large numbers, since each rendered pixel takes time; also the width

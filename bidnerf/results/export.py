@@ -17,14 +17,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf.results.colmap_poses import write_colmap_model
+from bidnerf.results.pose_files import PosedImage, frame_of, write_pose_transforms
 from bidnerf_core.captures import write_inria_cameras
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.io import output_folder, write_file
 from bidnerf_core.localization import origin_of
 from bidnerf_core.maps import Map, load_map
 from bidnerf_core.registry import Plugins, interface_defects
-from bidnerf_core.results.colmap_poses import write_colmap_model
-from bidnerf_core.results.pose_files import PosedImage, frame_of, write_pose_transforms
 
 log = logging.getLogger("bidnerf")
 
