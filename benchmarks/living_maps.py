@@ -26,12 +26,12 @@ from _lab import LIMITS, RESULTS, Scene, one_thread, parser, record, without_dep
 
 import bidnerf as bn
 from bidnerf.results import pose_error
+from bidnerf.scenes import orbit
 from bidnerf.testing import BOUNDS, POSES, ground, view
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import build_landmarks
 from bidnerf_core.maps import MapInfo, rendering_scores
-from bidnerf_core.scenes import orbit
 
 GROUND_VIEWS = 6
 

@@ -25,6 +25,7 @@ from torch.nn.functional import avg_pool2d, grid_sample
 from bidnerf import Localizer
 from bidnerf.evaluation import texture
 from bidnerf.results import success_rate
+from bidnerf.scenes import HomogeneousBall
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds, Stratified
@@ -32,7 +33,6 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3, look_at
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.mapping import LandmarkMap, build_landmarks
-from bidnerf_core.scenes import HomogeneousBall
 
 CAMERA = Intrinsics(400.0, 400.0, 240.0, 180.0, 480, 360)
 SUPERSAMPLED = 2

@@ -9,8 +9,8 @@ import argparse
 
 import bidnerf as bn
 from bidnerf.results import pose_error
+from bidnerf.scenes import closed_form_data
 from bidnerf_core.geometry import perturb
-from bidnerf_core.scenes import closed_form_data
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--backend", default="hashgrid")

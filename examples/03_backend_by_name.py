@@ -11,9 +11,9 @@ import tempfile
 
 import bidnerf as bn
 from bidnerf.results import pose_error
+from bidnerf.scenes import closed_form_data
 from bidnerf_core.geometry import perturb
 from bidnerf_core.registry import list_plugins
-from bidnerf_core.scenes import closed_form_data
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("backend", nargs="?", default="hashgrid")

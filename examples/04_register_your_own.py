@@ -9,8 +9,8 @@ import torch
 from torch.nn.functional import grid_sample, softplus
 
 import bidnerf as bn
+from bidnerf.scenes import closed_form_data
 from bidnerf_core.backend import FieldValues, RecipeBackend, Stratified, Supervision, SupervisionConfig
-from bidnerf_core.scenes import closed_form_data
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ Without maps, each backend is trained briefly, in memory, on a scene in closed f
 import argparse
 
 import bidnerf as bn
+from bidnerf.scenes import closed_form_data
 from bidnerf_core.registry import list_plugins
-from bidnerf_core.scenes import closed_form_data
 
 
 def main() -> None:

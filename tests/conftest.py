@@ -133,7 +133,7 @@ def map_folder(shared: Path, tmp_path: Path) -> Path:
 def small_images(monkeypatch: pytest.MonkeyPatch) -> None:
     """Closed-form data have images as small as those of the tiny dataset, and 64 rays judge an answer in place of 1,024."""
     import tiny
-    from bidnerf_core.scenes import closed_form_data
+    from bidnerf.scenes import closed_form_data
 
     module = sys.modules[closed_form_data.__module__]  # a function of the same name shadows it
     monkeypatch.setattr(module, "DEMO_CAMERA", tiny.CAMERA)

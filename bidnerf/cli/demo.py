@@ -56,6 +56,7 @@ def run_demo(
     The frames are RGB-D images from poses that training never saw. Each is localized twice: by method auto without a start, and
     by method bid from a start far from its pose.
     """
+    from bidnerf.scenes import demo_object, orbit, views
     from bidnerf_core.backend import load_backend, quick_config
     from bidnerf_core.camera import Intrinsics
     from bidnerf_core.datasets import DatasetOptions, write_transforms
@@ -63,7 +64,6 @@ def run_demo(
     from bidnerf_core.io import output_folder
     from bidnerf_core.localization import Localizer, settings_of
     from bidnerf_core.maps import TrainOptions, train
-    from bidnerf_core.scenes import demo_object, orbit, views
     from bidnerf_core.settings import from_flat
 
     config = quick_config(load_backend(backend))

@@ -35,6 +35,7 @@ from bidnerf.evaluation.trial import (
     registered_for,
     run_trial,
 )
+from bidnerf.scenes import is_closed_form
 from bidnerf_core.errors import InputError, amount, printable
 from bidnerf_core.fields import device_of, levels
 from bidnerf_core.frames import View, draw, uniform
@@ -50,7 +51,6 @@ from bidnerf_core.progress import (
     job_context,
     report_progress,
 )
-from bidnerf_core.scenes import is_closed_form
 from bidnerf_core.settings import to_flat
 
 

@@ -17,13 +17,13 @@ import torch
 from jaxtyping import Float, Int
 
 from bidnerf.evaluation.faults import NO_FAULT, check_depth, expand_faults
+from bidnerf.scenes import ClosedFormData, is_closed_form
 from bidnerf_core.datasets import Capture, DatasetOptions, in_other_split
 from bidnerf_core.errors import InputError, InputWarning, amount, refuse_text, unknown_name
 from bidnerf_core.frames import INVERTED, HiddenColour
 from bidnerf_core.geometry import SE3, perturb, random_units, turned_about
 from bidnerf_core.io import parse_record
 from bidnerf_core.localization import find_method, settings_of
-from bidnerf_core.scenes import ClosedFormData, is_closed_form
 from bidnerf_core.settings import LARGEST_SEED, Range, Settings, WholeNumbers, to_flat
 
 # Protocols.

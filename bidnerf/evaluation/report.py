@@ -29,10 +29,10 @@ from bidnerf.evaluation.summary import (
 )
 from bidnerf.evaluation.trial import TrialResult, open_data, trial_views
 from bidnerf.results import CRITERIA, CRITERION_NAMES, as_picture, require_matplotlib
+from bidnerf.scenes import is_closed_form
 from bidnerf_core.datasets import Capture, DatasetOptions
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.io import is_temporary, output_folder, write_file
-from bidnerf_core.scenes import is_closed_form
 
 MARK = '<meta name="generator" content="bidnerf report">'
 """Marks a page as a report, which a later report may replace."""

@@ -25,6 +25,7 @@ from torch import Tensor
 from bidnerf.evaluation.faults import faulty, parse_faults
 from bidnerf.evaluation.plan import Setup, Trial, find_protocol, parse_settings
 from bidnerf.results import PoseError, plain_localization, pose_error
+from bidnerf.scenes import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import Capture, DatasetOptions, SparseChoice, SparsePoints, of_views
 from bidnerf_core.devices import threads_at_most, working_device
@@ -35,7 +36,6 @@ from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.localization import Localizer
 from bidnerf_core.maps import DESCRIPTION, Map, load_map, named_poses
 from bidnerf_core.registry import registered_names, require_registered
-from bidnerf_core.scenes import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.settings import to_flat
 
 Rows: TypeAlias = tuple[tuple[float, ...], ...]

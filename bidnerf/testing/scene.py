@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf.scenes import demo_object, orbit
+from bidnerf.scenes import views as seen_from
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import Rays, widened
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.scenes import demo_object, orbit
-from bidnerf_core.scenes import views as seen_from
 
 CAMERA = Intrinsics(32.0, 32.0, 12.0, 12.0, 24, 24)
 SCENE_BOUNDS = demo_object().bounds

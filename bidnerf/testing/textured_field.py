@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf.scenes import orbit
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import FieldValues, RadianceField, RaySampler, SceneBounds, Stratified, render_image
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import BakeConfig, LandmarkMap, SurfaceMap, bake, build_landmarks
-from bidnerf_core.scenes import orbit
 
 BOUNDS = SceneBounds((-1.2, -1.2, -0.3), (1.2, 1.2, 0.3), 0.1, 6.0)
 CAMERA = Intrinsics(130.0, 130.0, 64.0, 48.0, 128, 96)

@@ -9,6 +9,8 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
+from bidnerf.scenes import demo_room, look_around
+from bidnerf.scenes import views as seen_from
 from bidnerf.testing import SCENE_BOUNDS as BOUNDS
 from bidnerf.testing import BackendContract, Recorder, awkward_rays, colour_error, rgbd_views
 from bidnerf_adanerf import AdaNerfConfig, AdaNerfField, backend
@@ -20,8 +22,6 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import FieldValues, Rays, RaySamples, query_samples, render, rendering_weights
 from bidnerf_core.frames import View
-from bidnerf_core.scenes import demo_room, look_around
-from bidnerf_core.scenes import views as seen_from
 from bidnerf_core.training import RayBank, TrainingBatch
 from tiny import black_batch
 

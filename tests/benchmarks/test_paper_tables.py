@@ -11,7 +11,7 @@ from types import ModuleType
 import pytest
 
 from bidnerf.evaluation import Group, Plan, Trial, grouped, planned
-from bidnerf_core.scenes import closed_form_data
+from bidnerf.scenes import closed_form_data
 from trial_results import trial_result
 
 Script = Callable[[str], ModuleType]

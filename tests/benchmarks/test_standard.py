@@ -15,8 +15,8 @@ import torch
 
 from bidnerf import SE3, Intrinsics, View
 from bidnerf.results import as_picture
+from bidnerf.scenes import demo_object, orbit, views
 from bidnerf_core.errors import InputError
-from bidnerf_core.scenes import demo_object, orbit, views
 
 Script = Callable[[str], ModuleType]
 CAMERA, SFM_FOCAL = Intrinsics(32.0, 32.0, 16.0, 12.0, 32, 24), 33.0

@@ -14,6 +14,7 @@ import torch
 
 from bidnerf import SE3, Frame, Intrinsics, View
 from bidnerf.results import draw_capture
+from bidnerf.scenes import demo_object, orbit, views
 from bidnerf.testing import BOUNDS, TexturedGround
 from bidnerf_core.captures import (
     CaptureReport,
@@ -31,7 +32,6 @@ from bidnerf_core.captures.survey import groups
 from bidnerf_core.fields import Stratified, render_image
 from bidnerf_core.geometry import look_at
 from bidnerf_core.mapping import tracked_views
-from bidnerf_core.scenes import demo_object, orbit, views
 from bidnerf_core.training import photo_measures
 from landmark_scene import Points, looking_in, ring
 from refusals import refused

@@ -25,12 +25,12 @@ import torch
 from safetensors.torch import load_file, save_file
 
 import tiny
-from bidnerf import Intrinsics
+from bidnerf import Intrinsics, scenes
 from bidnerf.cli import COMMANDS, main
 
 # Inside: a line of progress, without a training that takes as long as the line says
 from bidnerf.cli.running import displayed
-from bidnerf_core import scenes
+from bidnerf.scenes import demo_object
 from bidnerf_core.backend import load_backend
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.geometry import SE3
@@ -38,7 +38,6 @@ from bidnerf_core.localization import Localizer
 from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps import Checkpoints, MapInfo, load_info, load_map
 from bidnerf_core.registry import list_plugins
-from bidnerf_core.scenes import demo_object
 from bidnerf_core.training import TrainingStep
 from commands import Run, assert_refused, strict
 from trainings import assert_same_map, stop_at

@@ -18,13 +18,13 @@ import torch
 import tiny
 from bidnerf import train
 from bidnerf.cli import main
+from bidnerf.scenes import HomogeneousBall
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import located
 from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, TrackedViews, tracked_views
 from bidnerf_core.maps import Map, TrainOptions, load_info, load_map
-from bidnerf_core.scenes import HomogeneousBall
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid import backend as hashgrid
 from commands import CommandResult, Run, assert_refused

@@ -13,13 +13,13 @@ import torch
 
 import sparse_model
 import tiny
+from bidnerf.scenes import demo_object, orbit
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.datasets import SparseChoice, SparsePoints, read_model
 from bidnerf_core.fields import render
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.scenes import demo_object, orbit
 from bidnerf_core.training import RayBank, Silent, ray_termination
 from bidnerf_hashgrid import backend as hashgrid
 from refusals import refused

@@ -39,9 +39,9 @@ from bidnerf.evaluation import (
 from bidnerf.evaluation.plan import arc
 from bidnerf.evaluation.results import as_line
 from bidnerf.results import pose_error
+from bidnerf.scenes import closed_form_data, orbit
 from bidnerf_core.geometry import look_at
 from bidnerf_core.io import to_plain
-from bidnerf_core.scenes import closed_form_data, orbit
 from refusals import refused
 
 QUICK = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--workers", "1"]

@@ -38,12 +38,12 @@ from bidnerf.evaluation import (
 # Inside: a map that stays in memory, and processes that outlive an evaluation
 from bidnerf.evaluation.run import InThisProcess
 from bidnerf.results import pose_error
+from bidnerf.scenes import closed_form_data, closed_form_map
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.localization import find_method
 from bidnerf_core.progress import Progress
-from bidnerf_core.scenes import closed_form_data, closed_form_map
 from refusals import refused
 
 QUICK: dict[str, Any] = {

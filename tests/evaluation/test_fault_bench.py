@@ -30,8 +30,8 @@ from bidnerf.evaluation import (
 # Inside: the images of a trial
 from bidnerf.evaluation.run import InThisProcess
 from bidnerf.evaluation.trial import trial_views
+from bidnerf.scenes import closed_form_data
 from bidnerf_core.registry import registered
-from bidnerf_core.scenes import closed_form_data
 from refusals import refused
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"

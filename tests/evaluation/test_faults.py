@@ -12,11 +12,11 @@ import torch
 from scipy.ndimage import label
 
 from bidnerf.evaluation import FAULTS, NO_FAULT, expand_faults, faulty, parse_faults, rolling_shutter
+from bidnerf.scenes import demo_object, demo_room, orbit
+from bidnerf.scenes import views as seen_from
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3, look_at, random_units
-from bidnerf_core.scenes import demo_object, demo_room, orbit
-from bidnerf_core.scenes import views as seen_from
 from refusals import refused
 
 CAMERA = Intrinsics(70.0, 72.0, 41.0, 29.5, 80, 60)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from bidnerf.scenes import GaussianBlobs, HomogeneousBall, Sphere, orbit
 from bidnerf.testing import (
     check_background,
     check_intervals,
@@ -19,7 +20,6 @@ from bidnerf.testing import (
     check_shapes,
 )
 from bidnerf_core.fields import RadianceField, Rays, SceneBounds, render
-from bidnerf_core.scenes import GaussianBlobs, HomogeneousBall, Sphere, orbit
 
 BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 8.0)
 

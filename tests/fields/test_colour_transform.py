@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core.scenes import demo_object
+from bidnerf.scenes import demo_object
 from bidnerf_core.training import ColourTransforms, RayBank, Supervision, SupervisionConfig, fitted_colours
 
 

@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from bidnerf.results import pose_error
+from bidnerf.scenes import GaussianBlobs, orbit
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import Objective, Observations, SceneBounds, colour_term, depth_term, render, widened
 from bidnerf_core.frames import Frame, View, draw, uniform
 from bidnerf_core.geometry import SE3, Robust, look_at, perturb
 from bidnerf_core.localization import Problem, rig
-from bidnerf_core.scenes import GaussianBlobs, orbit
 from problems import FieldMap, localize, single
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from bidnerf.scenes import HomogeneousBall, closed_form_data, closed_form_map
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import (
     FieldValues,
@@ -28,7 +29,6 @@ from bidnerf_core.fields import (
     widened,
 )
 from bidnerf_core.geometry import SE3
-from bidnerf_core.scenes import HomogeneousBall, closed_form_data, closed_form_map
 from resampled import Resampled
 
 BLUE = (0.1, 0.2, 0.9)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Generator
 
+from bidnerf.scenes import GaussianBlobs, HomogeneousBall
 from bidnerf.testing import check_background, check_intervals, check_rays_alone, check_repeatable
 from bidnerf_core.fields import (
     Concentrated,
@@ -22,7 +23,6 @@ from bidnerf_core.fields import (
     Stratified,
     render,
 )
-from bidnerf_core.scenes import GaussianBlobs, HomogeneousBall
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 from resampled import Resampled
 from voxels import cell_centres

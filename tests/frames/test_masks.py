@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from bidnerf import Frame, InputError, InputWarning, Intrinsics, View, open_dataset, open_sequence
+from bidnerf.scenes import demo_object
 from bidnerf_core.camera import Orientation, Raster
 from bidnerf_core.carving import FreeSpace
 from bidnerf_core.fields import RenderedImage
@@ -23,7 +24,6 @@ from bidnerf_core.localization.terms.images import Thumbnail
 from bidnerf_core.localization.terms.rays import averaged
 from bidnerf_core.mapping import SIFT, image_keypoints, tracked_views
 from bidnerf_core.maps import rendering_scores
-from bidnerf_core.scenes import demo_object
 
 # Inside: each quantity computed from pixels, which is equal whatever a mask hides
 from bidnerf_core.training import RayBank, photo_measures

@@ -15,11 +15,11 @@ import module_fields
 from bidnerf import Localizer
 from bidnerf.evaluation import faulty
 from bidnerf.results import pose_error
+from bidnerf.scenes import demo_room
 from bidnerf_core.fields import Observations
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.localization import AutoConfig, Localization, Outcome, Problem, rig, settings_of
-from bidnerf_core.scenes import demo_room
 from localizations import assert_covered, assert_near, colour_only
 from problems import FieldMap, localize
 from refusals import refused

@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from bidnerf.scenes import GaussianBlobs
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import FieldValues, RaySampler, SceneBounds, Stratified, render_image
 from bidnerf_core.frames import Frame, View
@@ -36,7 +37,6 @@ from bidnerf_core.localization import (
 
 # Inside: the length of a block of steps
 from bidnerf_core.localization.adam import RATE, WINDOW
-from bidnerf_core.scenes import GaussianBlobs
 from bidnerf_core.settings import to_flat
 from blob_images import BOUNDS, CAMERA, TRUTH
 from problems import FieldMap, localize, single

@@ -11,10 +11,10 @@ import torch
 
 from bidnerf import SE3, Frame, Localization, Localizer, Outcome, View
 from bidnerf.results import pose_error
+from bidnerf.scenes import orbit
 from bidnerf_core.geometry import perturb
 from bidnerf_core.localization import METHODS, settings_of
 from bidnerf_core.mapping import BakeConfig, bake
-from bidnerf_core.scenes import orbit
 from blob_images import BOUNDS, CAMERA, FIELD, FRAME, POSES, TRUTH, photograph
 from localizations import assert_near
 from problems import FieldMap

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from bidnerf.scenes import GaussianBlobs
 from bidnerf_core.fields import (
     DEPTH_RESIDUALS,
     Objective,
@@ -22,7 +23,6 @@ from bidnerf_core.fields import (
 )
 from bidnerf_core.geometry import RobustName
 from bidnerf_core.localization import METHODS, BidConfig, ColourSettings, DepthSettings, objective_of
-from bidnerf_core.scenes import GaussianBlobs
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0)
 

@@ -11,6 +11,7 @@ from scipy.ndimage import convolve1d
 from torch import Tensor
 
 import baked
+from bidnerf.scenes import GaussianBlobs, orbit
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import (
     FieldValues,
@@ -48,7 +49,6 @@ from bidnerf_core.localization.terms.images import (
 from bidnerf_core.localization.terms.rays import averaged
 from bidnerf_core.localization.terms.rendering import differentiate
 from bidnerf_core.mapping import States, descend
-from bidnerf_core.scenes import GaussianBlobs, orbit
 from problems import FieldMap
 from tiny import depth_rays_of
 

@@ -15,6 +15,7 @@ import torch
 from torch import Generator, Tensor
 
 import baked
+from bidnerf.scenes import Box, HomogeneousBall, Sphere, blotches, orbit
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.fields import FieldValues, SceneBounds, VoxelGrid
 from bidnerf_core.frames import View
@@ -31,7 +32,6 @@ from bidnerf_core.mapping.surface.posed_depth import (
     surface_bytes,
 )
 from bidnerf_core.progress import job_context
-from bidnerf_core.scenes import Box, HomogeneousBall, Sphere, blotches, orbit
 
 RADIUS = 0.6
 BALL = baked.one_solid(Sphere(RADIUS), blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1))

@@ -7,9 +7,9 @@ import torch
 from torch import Generator, Tensor
 
 import baked
+from bidnerf.scenes import Box, Primitive, Shape, Sphere, blotches
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import SurfaceMap, cast, trace
-from bidnerf_core.scenes import Box, Primitive, Shape, Sphere, blotches
 
 
 def rays(count: int, generator: Generator) -> tuple[torch.Tensor, torch.Tensor]:

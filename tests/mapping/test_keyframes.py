@@ -10,14 +10,14 @@ import pytest
 import torch
 
 from bidnerf import SE3, View
+
+# Inside: the limits on the number and size of keyframes, which a map does not state
+from bidnerf.scenes import HomogeneousBall, orbit
 from bidnerf.testing import BOUNDS, CAMERA, ground, training_views, unseen
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import SceneBounds, Stratified
 from bidnerf_core.localization import LandmarkMatcher, Loop
 from bidnerf_core.mapping import build_landmarks, colour_noise, rendered_views
-
-# Inside: the limits on the number and size of keyframes, which a map does not state
-from bidnerf_core.scenes import HomogeneousBall, orbit
 from localizations import assert_near
 
 BALL = HomogeneousBall(0.5, 400.0, rgb=(0.8, 0.3, 0.2), sampler=Stratified(256))

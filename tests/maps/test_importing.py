@@ -14,6 +14,7 @@ from torch import Tensor
 import tiny
 from bidnerf import import_map, load_map
 from bidnerf.cli import main
+from bidnerf.scenes import demo_object
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import write_transforms
 from bidnerf_core.errors import InputError, InputWarning
@@ -24,7 +25,6 @@ from bidnerf_core.maps import ImportedField, ImportOptions, bounds_about, import
 # Inside: viewpoints of given fields and bounds, whose number a map does not state
 from bidnerf_core.maps.importing import VIEWS, viewpoints
 from bidnerf_core.registry import registered
-from bidnerf_core.scenes import demo_object
 from bidnerf_core.training import Silent
 from bidnerf_hashgrid import backend
 from refusals import refused

@@ -15,6 +15,7 @@ import bidnerf as bn
 
 # Inside: the share of landmarks in view, and a worker of the service without its processes
 import bidnerf_core.maps.collection as collections_module
+from bidnerf.scenes import orbit
 from bidnerf.service import Upload
 from bidnerf.service.worker import Worker
 from bidnerf.testing import BOUNDS, CAMERA, POSES, ground, view
@@ -24,7 +25,6 @@ from bidnerf_core.fields import NoField
 from bidnerf_core.mapping import BakeConfig, bake, build_landmarks
 from bidnerf_core.mapping.landmarks.vocabulary import visible
 from bidnerf_core.maps import Map, MapInfo, maps_in
-from bidnerf_core.scenes import orbit
 from commands import Run
 from refusals import refused
 

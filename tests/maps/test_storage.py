@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 import baked
 import tiny
+from bidnerf.scenes import HomogeneousBall
 from bidnerf_core.backend import load_backend
 from bidnerf_core.captures import CaptureReport, CoverageRecord, PoseRefinement, StoredCamera, stored_cameras
 from bidnerf_core.errors import InputError
@@ -42,7 +43,6 @@ from bidnerf_core.maps import (
 )
 from bidnerf_core.maps.description import FieldFrame
 from bidnerf_core.maps.store import load_state
-from bidnerf_core.scenes import HomogeneousBall
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import HashGridField, backend
 from commands import Run

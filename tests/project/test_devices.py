@@ -15,6 +15,7 @@ import baked
 import module_fields
 import tiny
 from bidnerf import Localizer, Map
+from bidnerf.scenes import HomogeneousBall
 from bidnerf.testing import DEVICE, Elsewhere, textured_map
 from bidnerf_core.backend import load_backend
 from bidnerf_core.devices import Resident, may_wait, moved, run_on
@@ -22,7 +23,6 @@ from bidnerf_core.io import to_plain
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.maps import MapInfo
-from bidnerf_core.scenes import HomogeneousBall
 from problems import FieldMap
 from refusals import refused
 

@@ -26,13 +26,13 @@ import tiny
 from bidnerf import Localization, Localizer, Map, Outcome
 from bidnerf.cli import COMMANDS, main
 from bidnerf.results import pose_error
+from bidnerf.scenes import demo_object
 from bidnerf.testing import BackendContract
 from bidnerf_core.fields import DEPTH_RESIDUALS
 from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.localization import ADVICE, METHODS, AutoConfig, Problem, settings_of
 from bidnerf_core.maps import MapInfo
 from bidnerf_core.registry import registered
-from bidnerf_core.scenes import demo_object
 from bidnerf_core.training import Silent
 
 ROOT = Path(__file__).parents[2]

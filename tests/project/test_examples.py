@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from bidnerf.scenes import closed_form_data, orbit
 from bidnerf_core import registry
 from bidnerf_core.fields import DEPTH_RESIDUALS
-from bidnerf_core.scenes import closed_form_data, orbit
 
 pytestmark = pytest.mark.slow
 

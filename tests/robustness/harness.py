@@ -34,10 +34,10 @@ from bidnerf import SE3, Frame, InputError, Intrinsics, Localizer, Tracker, load
 
 # Inside: the modules of the commands are imported before a process is forked for each case
 from bidnerf.cli import evaluate, localize, main, maps, track, train  # noqa: F401  (before a fork)
+from bidnerf.scenes import demo_object, orbit
+from bidnerf.scenes import views as seen_from
 from bidnerf_core.datasets import open_dataset, write_transforms
 from bidnerf_core.localization import settings_of
-from bidnerf_core.scenes import demo_object, orbit
-from bidnerf_core.scenes import views as seen_from
 
 CAMERA = Intrinsics(32.0, 32.0, 12.0, 12.0, 24, 24)
 SMALL_FIELD = shlex.split(

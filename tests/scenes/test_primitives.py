@@ -9,11 +9,11 @@ import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
-from bidnerf_core.geometry import SE3
-from bidnerf_core.scenes import Box, Primitive, Shape, Sphere, blotches
+from bidnerf.scenes import Box, Primitive, Shape, Sphere, blotches
 
 # Inside: a solid and two textures that only the scenes for demonstrations use
-from bidnerf_core.scenes.primitives import Cylinder, checker, stripes
+from bidnerf.scenes.primitives import Cylinder, checker, stripes
+from bidnerf_core.geometry import SE3
 
 PAINT = checker((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.5)
 SHAPES = [Sphere(0.7), Box((0.3, 0.6, 0.5)), Cylinder(0.5, 0.4), Cylinder(0.8, 0.01)]

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from bidnerf.scenes import demo_room, look_around, orbit
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.geometry import look_at
-from bidnerf_core.scenes import demo_room, look_around, orbit
 from refusals import refused
 
 CAMERA = Intrinsics(70.0, 75.0, 31.0, 24.5, 64, 48)

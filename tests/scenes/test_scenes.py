@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from bidnerf.scenes import ClosedFormScene, demo_object, demo_room, look_around, orbit, views
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import SE3, look_at
-from bidnerf_core.scenes import ClosedFormScene, demo_object, demo_room, look_around, orbit, views
 
 CAMERA = Intrinsics(70.0, 75.0, 31.0, 24.5, 64, 48)
 SCENES = [demo_object(), demo_room()]

@@ -8,13 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.fields import SceneBounds, VoxelGrid
-from bidnerf_core.frames import View
-from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import Problem, Surface, rig
-from bidnerf_core.mapping import BakeConfig, SurfaceMap, SurfelIndex, Surfels, bake
-from bidnerf_core.scenes import (
+from bidnerf.scenes import (
     Box,
     ClosedFormScene,
     GaussianBlobs,
@@ -25,6 +19,12 @@ from bidnerf_core.scenes import (
     demo_object,
     orbit,
 )
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.fields import SceneBounds, VoxelGrid
+from bidnerf_core.frames import View
+from bidnerf_core.geometry import SE3
+from bidnerf_core.localization import Problem, Surface, rig
+from bidnerf_core.mapping import BakeConfig, SurfaceMap, SurfelIndex, Surfels, bake
 from problems import FieldMap
 
 CAMERA = Intrinsics(96.0, 96.0, 36.0, 36.0, 72, 72)

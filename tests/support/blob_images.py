@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 
+from bidnerf.scenes import GaussianBlobs, orbit
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import SceneBounds, render
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
-from bidnerf_core.scenes import GaussianBlobs, orbit
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))
 CAMERA = Intrinsics(50.0, 50.0, 24.0, 20.0, 48, 40)

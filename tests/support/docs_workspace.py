@@ -13,6 +13,8 @@ from PIL import Image
 from PIL.ExifTags import Base
 
 import tiny
+from bidnerf.scenes import demo_object, orbit
+from bidnerf.scenes import views as views_of
 from bidnerf_core.backend import load_backend
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import stored_cameras
@@ -22,8 +24,6 @@ from bidnerf_core.io import to_plain
 from bidnerf_core.localization import Outcome
 from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.maps import MapInfo, write_parts
-from bidnerf_core.scenes import demo_object, orbit
-from bidnerf_core.scenes import views as views_of
 from bidnerf_core.training import Silent, TrainingState
 
 TEST_FRAMES = ("r_0", "r_4", "r_8")

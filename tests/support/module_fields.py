@@ -9,11 +9,11 @@ import torch
 from torch import Tensor, nn
 
 import baked
+from bidnerf.scenes import GaussianBlobs, orbit
 from bidnerf_core.devices import moved
 from bidnerf_core.fields import FieldValues, RaySampler, render_image
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.mapping import SurfaceMap, bake
-from bidnerf_core.scenes import GaussianBlobs, orbit
 
 
 class AsModule(nn.Module):

@@ -11,13 +11,13 @@ import imageio.v3 as iio
 import numpy as np
 import torch
 
+from bidnerf.scenes import demo_object, orbit
+from bidnerf.scenes import views as seen_from
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import Observations, Rays
 from bidnerf_core.frames import View, all_pixels, observe
 from bidnerf_core.io import to_plain
 from bidnerf_core.maps import Anchor
-from bidnerf_core.scenes import demo_object, orbit
-from bidnerf_core.scenes import views as seen_from
 from bidnerf_core.training import TrainingBatch
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid.encoding import HashEncodingConfig

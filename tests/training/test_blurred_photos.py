@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from bidnerf.scenes import demo_object
 from bidnerf.testing import ground
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import render
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.scenes import demo_object
 from bidnerf_core.training import Silent, Supervision, SupervisionConfig, TrainingStep, detail_kept
 from landmark_scene import looking_in
 from test_supervision import BACKENDS

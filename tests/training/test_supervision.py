@@ -10,11 +10,11 @@ import pytest
 import torch
 
 import tiny
+from bidnerf.scenes import demo_object
 from bidnerf_adanerf import AdaNerfConfig
 from bidnerf_adanerf import backend as adanerf
 from bidnerf_core.fields import Rays, RaySamples, Rendering, render, rendering_weights
 from bidnerf_core.frames import SeenLandmarks, View
-from bidnerf_core.scenes import demo_object
 from bidnerf_core.training import RayBank, Silent, TrainingBatch, ray_termination, supervised_loss
 
 # Inside: single terms of the loss are compared with their definitions, integrals and differences

@@ -12,12 +12,12 @@ import torch
 from torch import Generator, Tensor, nn
 
 import tiny
+from bidnerf.scenes import orbit
 from bidnerf.testing import DEVICE, Elsewhere
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.frames import Frame, View, all_pixels, observe
-from bidnerf_core.scenes import orbit
 from bidnerf_core.training import (
     RayBank,
     Report,

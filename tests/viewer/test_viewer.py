@@ -17,6 +17,7 @@ import torch
 import viewed
 from bidnerf import SE3, InputError, Intrinsics, Localization, Localizer, Map, View, view
 from bidnerf.results import PosedImage, write_poses
+from bidnerf.scenes import closed_form_map, orbit
 from bidnerf.viewer import shown_trajectory
 
 # Inside: what a page states of one answer is read from its parts, without a browser
@@ -41,7 +42,6 @@ from bidnerf_core.localization import (
 )
 from bidnerf_core.mapping import States
 from bidnerf_core.progress import job_context
-from bidnerf_core.scenes import closed_form_map, orbit
 from commands import Run, assert_refused
 
 

@@ -1,7 +1,7 @@
 """Makes the runs beside the tests, with nerfstudio itself and what it renders: needs nerfstudio 1.1.5, but no GPU.
 
     python -c "
-    from bidnerf_core.scenes.closed_form_data import closed_form_data
+    from bidnerf.scenes.closed_form_data import closed_form_data
     from bidnerf_core.datasets import write_transforms
     room = closed_form_data('demo:room')
     write_transforms('room', {split: room.views(split) for split in room.splits}, room.background)"

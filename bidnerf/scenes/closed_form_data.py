@@ -1,7 +1,7 @@
 """Closed-form scenes as maps and datasets, so that an evaluation needs no files.
 
 ``demo:blobs`` is both a dataset and a map: coloured clouds whose field is known exactly, with images rendered
-from it. ``demo:object`` and ``demo:room`` are the scenes of ``bidnerf demo`` and ``bidnerf_core.scenes`` with
+from it. ``demo:object`` and ``demo:room`` are the scenes of ``bidnerf demo`` and ``bidnerf.scenes`` with
 exact depth, as datasets for training maps and localizing in them.
 """
 
@@ -15,6 +15,9 @@ from pathlib import Path
 
 import torch
 
+from bidnerf.scenes.closed_form import look_around, orbit
+from bidnerf.scenes.demo import demo_object, demo_room
+from bidnerf.scenes.fields import GaussianBlobs
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import Capture, Shot
 from bidnerf_core.errors import InputError
@@ -22,9 +25,6 @@ from bidnerf_core.fields import SceneBounds, render_image
 from bidnerf_core.frames import BLACK, Frame
 from bidnerf_core.geometry import SE3, turned_about
 from bidnerf_core.maps import Map, MapInfo
-from bidnerf_core.scenes.closed_form import look_around, orbit
-from bidnerf_core.scenes.demo import demo_object, demo_room
-from bidnerf_core.scenes.fields import GaussianBlobs
 
 PREFIX = "demo:"
 DEMO_CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)

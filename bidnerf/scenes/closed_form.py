@@ -14,11 +14,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf.scenes.primitives import Primitive
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3, look_at
-from bidnerf_core.scenes.primitives import Primitive
 
 
 @dataclass(frozen=True, eq=False)

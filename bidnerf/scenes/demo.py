@@ -11,10 +11,8 @@ from types import SimpleNamespace
 
 import torch
 
-from bidnerf_core.fields import SceneBounds
-from bidnerf_core.geometry import SE3
-from bidnerf_core.scenes.closed_form import ClosedFormScene
-from bidnerf_core.scenes.primitives import (
+from bidnerf.scenes.closed_form import ClosedFormScene
+from bidnerf.scenes.primitives import (
     Box,
     Cylinder,
     Faces,
@@ -26,6 +24,8 @@ from bidnerf_core.scenes.primitives import (
     checker,
     stripes,
 )
+from bidnerf_core.fields import SceneBounds
+from bidnerf_core.geometry import SE3
 
 C = SimpleNamespace(
     navy=(0.15, 0.27, 0.42), teal=(0.16, 0.62, 0.56), sand=(0.93, 0.78, 0.45), orange=(0.96, 0.60, 0.30),
