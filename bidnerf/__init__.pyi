@@ -7,6 +7,7 @@ from bidnerf.results import track as track
 from bidnerf.results import write_poses as write_poses
 from bidnerf.service import ServiceClient as ServiceClient
 from bidnerf.service import serve as serve
+from bidnerf.structure import find_poses as find_poses
 from bidnerf.viewer import view as view
 from bidnerf_core.camera import Intrinsics as Intrinsics
 from bidnerf_core.datasets import DatasetOptions as DatasetOptions
@@ -33,4 +34,3 @@ from bidnerf_core.maps import load_map as load_map
 from bidnerf_core.maps import resume as resume
 from bidnerf_core.maps import train as train
 from bidnerf_core.registry import register as register
-from bidnerf_core.structure import find_poses as find_poses

@@ -45,8 +45,8 @@ def run_poses(
     The dataset refers to the photos in place; its poses.json lists those that were left out, and why. The unit of length is
     arbitrary. Ctrl-C stops, and the same command resumes. 'bidnerf train PHOTOS' performs this step first.
     """
+    from bidnerf.structure import find_poses
     from bidnerf_core.io import to_plain
-    from bidnerf_core.structure import find_poses
 
     check_folder(out, (photos,))
     with working("stopping (Ctrl-C again: at once); what was found is kept"):

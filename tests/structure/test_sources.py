@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from bidnerf.structure import photos_of, refuse_panoramas
 from bidnerf_core.errors import InputWarning
-from bidnerf_core.structure import photos_of, refuse_panoramas
 from refusals import refused
 
 

@@ -22,16 +22,11 @@ from PIL import Image
 import bidnerf as bn
 import tiny
 from bidnerf.results import pose_error
-from bidnerf_core.datasets import lacks_poses, write_transforms
-from bidnerf_core.geometry import fit_similarity
-
-# Inside: each stage of the search for poses, with its rare geometry
-from bidnerf_core.maps.training import posed_images, poses_folder
-from bidnerf_core.structure import FoundPoses
-from bidnerf_core.structure.colmap import NEIGHBOURS, described, similar_pairs, to_colmap
-from bidnerf_core.structure.model import agreement, from_colmap
-from bidnerf_core.structure.record import begin, clear, digest
-from bidnerf_core.structure.sources import (
+from bidnerf.structure import FoundPoses
+from bidnerf.structure.colmap import NEIGHBOURS, described, similar_pairs, to_colmap
+from bidnerf.structure.model import agreement, from_colmap
+from bidnerf.structure.record import begin, clear, digest
+from bidnerf.structure.sources import (
     MOST,
     STEP,
     SourceImage,
@@ -40,6 +35,11 @@ from bidnerf_core.structure.sources import (
     photos_of,
     write_frames,
 )
+from bidnerf_core.datasets import lacks_poses, write_transforms
+from bidnerf_core.geometry import fit_similarity
+
+# Inside: each stage of the search for poses, with its rare geometry
+from bidnerf_core.maps.training import posed_images, poses_folder
 from commands import Run
 from photo_files import write_photo
 from photo_room import CAMERA, looking, photograph, walk, write_photos
@@ -334,7 +334,7 @@ def test_lenses_go_to_colmap_and_back(numbers: tuple[float, ...], lens: tuple[fl
 
 def test_upright_axes_are_those_of_the_turned_image(tmp_path: Path) -> None:
     """The brightest corner of the upright image lies where its axes say, for all eight orientations."""
-    from bidnerf_core.structure.model import _upright_axes
+    from bidnerf.structure.model import _upright_axes
 
     stored = torch.zeros(4, 6)
     for code in range(1, 9):

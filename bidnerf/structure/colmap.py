@@ -16,6 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch
 
+from bidnerf.structure.sources import SourceImage
 from bidnerf_core.camera import (
     UPRIGHT,
     CameraSource,
@@ -31,7 +32,6 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.io import read_header, read_image
 from bidnerf_core.mapping import Keypoints, Sift, Vocabulary
 from bidnerf_core.progress import counter
-from bidnerf_core.structure.sources import SourceImage
 
 LARGEST = 1600
 """Pixels along the longer side of downscaled photos: more give slightly more accurate poses, but take far longer."""

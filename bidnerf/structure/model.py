@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from bidnerf.structure.colmap import Described, ListedPhoto
+from bidnerf.structure.record import MODEL, TRANSFORMS
 from bidnerf_core.camera import Intrinsics, colmap_camera
 from bidnerf_core.captures import up_direction
 from bidnerf_core.datasets import frame_entry
@@ -21,8 +23,6 @@ from bidnerf_core.errors import amount
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import write_file
 from bidnerf_core.progress import counter
-from bidnerf_core.structure.colmap import Described, ListedPhoto
-from bidnerf_core.structure.record import MODEL, TRANSFORMS
 
 LEAST_PHOTOS = 3
 """Smallest number of photos in a model: two photos have a single baseline, which allows no check."""

@@ -14,12 +14,7 @@ from typing import Any
 
 import torch
 
-from bidnerf_core.camera import UPRIGHT, Intrinsics
-from bidnerf_core.datasets import is_video
-from bidnerf_core.errors import Cancelled, InputError, InputWarning, amount
-from bidnerf_core.io import output_folder, to_plain, write_file
-from bidnerf_core.progress import Cancel, ProgressCallback, job_context
-from bidnerf_core.structure.colmap import (
+from bidnerf.structure.colmap import (
     Described,
     described,
     match,
@@ -28,7 +23,7 @@ from bidnerf_core.structure.colmap import (
     write_cameras,
     write_keypoints,
 )
-from bidnerf_core.structure.model import (
+from bidnerf.structure.model import (
     LEAST_PHOTOS,
     agreement,
     full_size,
@@ -38,7 +33,7 @@ from bidnerf_core.structure.model import (
     turn_upright,
     write_dataset,
 )
-from bidnerf_core.structure.record import (
+from bidnerf.structure.record import (
     FRAMES,
     RECORD,
     FoundPoses,
@@ -50,7 +45,7 @@ from bidnerf_core.structure.record import (
     is_ours,
     read_found,
 )
-from bidnerf_core.structure.sources import (
+from bidnerf.structure.sources import (
     SourceImage,
     chosen,
     measured,
@@ -58,6 +53,11 @@ from bidnerf_core.structure.sources import (
     refuse_panoramas,
     write_frames,
 )
+from bidnerf_core.camera import UPRIGHT, Intrinsics
+from bidnerf_core.datasets import is_video
+from bidnerf_core.errors import Cancelled, InputError, InputWarning, amount
+from bidnerf_core.io import output_folder, to_plain, write_file
+from bidnerf_core.progress import Cancel, ProgressCallback, job_context
 
 log = logging.getLogger("bidnerf")
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bidnerf.structure.colmap import DETECTOR
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.io import from_plain, read_json, write_file
-from bidnerf_core.structure.colmap import DETECTOR
 
 RECORD, TRANSFORMS, WORK, MODEL, FRAMES = "poses.json", "transforms.json", "work", "sparse/0", "images"
 
