@@ -10,11 +10,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+# Inside: the published calibration, with which the recording is rendered
+from bidnerf.formats.seven_scenes import COLOUR_CAMERA, DEPTH_CAMERA, T_COLOUR_DEPTH
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import Capture, open_dataset, open_sequence
-
-# Inside: the published calibration, with which the recording is rendered
-from bidnerf_core.datasets.formats.seven_scenes import COLOUR_CAMERA, DEPTH_CAMERA, T_COLOUR_DEPTH
 from bidnerf_core.depth import DepthCamera
 from bidnerf_core.geometry import SE3
 from refusals import refused

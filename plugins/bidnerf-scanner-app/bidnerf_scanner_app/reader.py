@@ -27,17 +27,9 @@ from pathlib import Path
 
 import torch
 
+from bidnerf.formats import LidarDepth
 from bidnerf_core.camera import Intrinsics, same_aspect
-from bidnerf_core.datasets import (
-    Capture,
-    DatasetOptions,
-    DepthFile,
-    LidarDepth,
-    Reader,
-    Shot,
-    hold_out,
-    pose_of_rows,
-)
+from bidnerf_core.datasets import Capture, DatasetOptions, DepthFile, Reader, Shot, hold_out, pose_of_rows
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame
 from bidnerf_core.io import Record, read_file, read_header, read_record

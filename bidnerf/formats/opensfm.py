@@ -17,10 +17,17 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bidnerf_core.camera import Camera, PanoramaFace, colmap_camera
-from bidnerf_core.datasets.capture import Capture, Shot, remark
-from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames
-from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
+from bidnerf_core.datasets import (
+    IMAGE_ENDINGS,
+    Capture,
+    DatasetOptions,
+    FileNames,
+    Format,
+    Shot,
+    camera_of,
+    first_file,
+    remark,
+)
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import SE3

@@ -12,12 +12,20 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from bidnerf_core.datasets import lidar
-from bidnerf_core.datasets.capture import Capture, DepthFile, Shot
-from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
-from bidnerf_core.datasets.trajectories import pose_of_numbers, read_table
-from bidnerf_core.datasets.video import Video, VideoPicture
+from bidnerf.formats import lidar
+from bidnerf_core.datasets import (
+    Capture,
+    DatasetOptions,
+    DepthFile,
+    Format,
+    Shot,
+    Video,
+    VideoPicture,
+    camera_of,
+    first_file,
+    pose_of_numbers,
+    read_table,
+)
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import is_file, read_rows
 

@@ -15,10 +15,18 @@ import re
 from pathlib import Path
 
 from bidnerf_core.camera import CameraSource
-from bidnerf_core.datasets.capture import Capture, Shot
-from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
-from bidnerf_core.datasets.trajectories import numbers_in, pose_of_matrix, read_timed_files, read_trajectory
+from bidnerf_core.datasets import (
+    Capture,
+    DatasetOptions,
+    Format,
+    Shot,
+    camera_of,
+    first_file,
+    numbers_in,
+    pose_of_matrix,
+    read_timed_files,
+    read_trajectory,
+)
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import is_file, read_file

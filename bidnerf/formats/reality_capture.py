@@ -15,11 +15,17 @@ from pathlib import Path
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.datasets.capture import Capture, Shot
-from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames
-from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format
-from bidnerf_core.datasets.trajectories import column_names, read_table
+from bidnerf_core.datasets import (
+    IMAGE_ENDINGS,
+    Capture,
+    DatasetOptions,
+    FileNames,
+    Format,
+    Shot,
+    camera_of,
+    column_names,
+    read_table,
+)
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import SE3

@@ -16,10 +16,17 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from bidnerf_core.datasets import lidar
-from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, remark
-from bidnerf_core.datasets.pose_rows import camera_of, pose_of_rows
-from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf.formats import lidar
+from bidnerf_core.datasets import (
+    Capture,
+    DatasetOptions,
+    DepthFile,
+    Format,
+    Shot,
+    camera_of,
+    pose_of_rows,
+    remark,
+)
 from bidnerf_core.errors import amount
 from bidnerf_core.frames import natural_order, photos_in
 from bidnerf_core.io import is_file, read_header, read_record

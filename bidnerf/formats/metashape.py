@@ -14,11 +14,17 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from bidnerf_core.camera import Camera, PanoramaFace, colmap_camera
-from bidnerf_core.datasets.capture import Capture, Shot
-from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames
-from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format
-from bidnerf_core.datasets.trajectories import numbers_in, pose_of_matrix
+from bidnerf_core.datasets import (
+    IMAGE_ENDINGS,
+    Capture,
+    DatasetOptions,
+    FileNames,
+    Format,
+    Shot,
+    camera_of,
+    numbers_in,
+    pose_of_matrix,
+)
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import SE3

@@ -12,12 +12,18 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+from bidnerf.formats.twelve_scenes import own_sensor
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets.capture import Capture, DepthFile, Shot
-from bidnerf_core.datasets.formats.twelve_scenes import own_sensor
-from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
-from bidnerf_core.datasets.trajectories import read_pose_matrix
+from bidnerf_core.datasets import (
+    Capture,
+    DatasetOptions,
+    DepthFile,
+    Format,
+    Shot,
+    camera_of,
+    first_file,
+    read_pose_matrix,
+)
 from bidnerf_core.depth import MILLIMETRE, DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import photos_in

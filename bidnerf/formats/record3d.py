@@ -21,11 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bidnerf_core.datasets import lidar
-from bidnerf_core.datasets.capture import Capture, DepthFile, Shot
-from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format
-from bidnerf_core.datasets.trajectories import pose_of_numbers
+from bidnerf.formats import lidar
+from bidnerf_core.datasets import Capture, DatasetOptions, DepthFile, Format, Shot, camera_of, pose_of_numbers
 from bidnerf_core.depth import DepthImage, depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import Archive, ImageSource, Record, is_file, parse_record, read_file

@@ -16,11 +16,9 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from bidnerf.formats.seven_scenes import frames_of, images_of
 from bidnerf_core.camera import CameraSource, Intrinsics
-from bidnerf_core.datasets.capture import Capture, Shot
-from bidnerf_core.datasets.formats.seven_scenes import frames_of, images_of
-from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
+from bidnerf_core.datasets import Capture, DatasetOptions, Format, Shot, camera_of, first_file
 from bidnerf_core.depth import MILLIMETRE, DepthCamera, DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3

@@ -15,10 +15,16 @@ from pathlib import Path
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets.capture import Capture, Shot, remark
-from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
-from bidnerf_core.datasets.trajectories import read_matrices
+from bidnerf_core.datasets import (
+    Capture,
+    DatasetOptions,
+    Format,
+    Shot,
+    camera_of,
+    first_file,
+    read_matrices,
+    remark,
+)
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import photos_in
 from bidnerf_core.geometry import SE3

@@ -13,10 +13,16 @@ from functools import partial
 from pathlib import Path
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets.capture import Capture, DepthFile, Shot
-from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
-from bidnerf_core.datasets.trajectories import pose_of_matrix
+from bidnerf_core.datasets import (
+    Capture,
+    DatasetOptions,
+    DepthFile,
+    Format,
+    Shot,
+    camera_of,
+    first_file,
+    pose_of_matrix,
+)
 from bidnerf_core.depth import DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order

@@ -30,9 +30,7 @@ from pathlib import Path
 import torch
 
 from bidnerf_core.camera import CameraSource, Intrinsics, folder_camera
-from bidnerf_core.datasets.capture import Capture, DepthFile, Shot
-from bidnerf_core.datasets.reader import DatasetOptions, Format
-from bidnerf_core.datasets.trajectories import read_pose_matrix
+from bidnerf_core.datasets import Capture, DatasetOptions, DepthFile, Format, Shot, read_pose_matrix
 from bidnerf_core.depth import MILLIMETRE, DepthCamera, DepthImage, DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order

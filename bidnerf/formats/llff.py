@@ -15,9 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from bidnerf_core.datasets.capture import Capture, Shot
-from bidnerf_core.datasets.pose_rows import camera_of
-from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
+from bidnerf_core.datasets import Capture, DatasetOptions, Format, Shot, camera_of, first_file
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import photos_in
 from bidnerf_core.geometry import rigid_pose

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Integer
 
-from bidnerf_core.datasets.capture import remark
+from bidnerf_core.datasets import remark
 from bidnerf_core.depth import MILLIMETRE, DepthImage, read_depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import decode

@@ -1,0 +1,1 @@
+from .lidar import LidarDepth as LidarDepth
