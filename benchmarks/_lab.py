@@ -54,19 +54,11 @@ def parser(
     """Return a parser that shows a script's docstring, with the name of its record (required if there is no default)."""
     found = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     if named:
-        found.add_argument(
-            "--name", default=name, required=name is None, help="of the record (default: %(default)s)"
-        )
+        found.add_argument("--name", default=name, required=name is None, help="of the record (default: %(default)s)")
     if scenes:
-        found.add_argument(
-            "scenes", nargs="+", metavar="MAP:DATA", help="folder of a map, folder of its dataset"
-        )
-        found.add_argument(
-            "--frames", type=int, help="test frames of each scene, evenly spaced (default: all)"
-        )
-        found.add_argument(
-            "--tuning-frames", action="store_true", help="only frames that settings are tuned on"
-        )
+        found.add_argument("scenes", nargs="+", metavar="MAP:DATA", help="folder of a map, folder of its dataset")
+        found.add_argument("--frames", type=int, help="test frames of each scene, evenly spaced (default: all)")
+        found.add_argument("--tuning-frames", action="store_true", help="only frames that settings are tuned on")
     return found
 
 

@@ -29,8 +29,14 @@ def installed() -> bool:
 
 
 def tried(
-    address: str, scene: str, photos: Sequence[bytes], examples: int, seed: int = 0, token: str | None = None, without: str = ""
-) -> dict[str, Any]:  # fmt: skip
+    address: str,
+    scene: str,
+    photos: Sequence[bytes],
+    examples: int,
+    seed: int = 0,
+    token: str | None = None,
+    without: str = "",
+) -> dict[str, Any]:
     """Send photos of the map ``scene`` in every way that is described, and up to ``examples`` drawn requests to each operation, beside those that the description itself suggests.
 
     Paths that match ``without`` are left out. There is one client: Hypothesis changes the recursion limit, which Python 3.11's parser does not survive in another thread.
@@ -44,17 +50,44 @@ def tried(
         (folder / "schemathesis.toml").write_text(CONFIG)
         report, counts = folder / "report.json", folder / "counts.json"
         words = [
-            "--config-file", folder / "schemathesis.toml", "--no-color", "run", f"{address}/openapi.json", "--checks", "all",
-            "--mode", "all", "--max-examples", examples, "--seed", seed, "--workers", 1, "--continue-on-failure",
-            "--request-timeout", 90, "--suppress-health-check", "all", "--generation-database", "none",
-            "--report", "json", "--report-json-path", report, *(["-H", f"Authorization: Bearer {token}"] if token else []),
+            "--config-file",
+            folder / "schemathesis.toml",
+            "--no-color",
+            "run",
+            f"{address}/openapi.json",
+            "--checks",
+            "all",
+            "--mode",
+            "all",
+            "--max-examples",
+            examples,
+            "--seed",
+            seed,
+            "--workers",
+            1,
+            "--continue-on-failure",
+            "--request-timeout",
+            90,
+            "--suppress-health-check",
+            "all",
+            "--generation-database",
+            "none",
+            "--report",
+            "json",
+            "--report-json-path",
+            report,
+            *(["-H", f"Authorization: Bearer {token}"] if token else []),
             *(["--exclude-path-regex", without] if without else []),
-        ]  # fmt: skip
+        ]
         done = subprocess.run(
             [sys.executable, "-c", "from schemathesis.cli import schemathesis; schemathesis()", *map(str, words)],
-            cwd=folder, capture_output=True, text=True, check=False,
-            env=os.environ | {"SCHEMATHESIS_HOOKS": str(HOOKS), "MAP": scene, "PHOTOS": str(folder / "photos"), "COUNTS": str(counts)},
-        )  # fmt: skip
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            check=False,
+            env=os.environ
+            | {"SCHEMATHESIS_HOOKS": str(HOOKS), "MAP": scene, "PHOTOS": str(folder / "photos"), "COUNTS": str(counts)},
+        )
         if not report.exists():
             raise RuntimeError(done.stdout + done.stderr)
         return _summary(json.loads(report.read_text()), json.loads(counts.read_text()), done.stdout)

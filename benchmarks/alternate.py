@@ -87,9 +87,7 @@ def _started(checkout: Path, metadata: Path) -> subprocess.Popen[str]:
     # Without -P, the folder of this script, with the modules of the new code, would come first.
     command = [sys.executable, "-P", str(HERE / "benchmarks" / "_questions.py")]
     environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
-    )
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
 
 
 def tracked(ask: Respondents, scene: str, first: int | None) -> Iterator[tuple[str, list[Pair]]]:
@@ -105,10 +103,7 @@ def localized(ask: Respondents, scene: str, count: int | None) -> Iterator[tuple
     """Yield the answers to test frames of a scene and of others."""
     place, data = SCENES.index(scene), folder_of("BIDNERF_DATA")
     others = [SCENES[(place + step) % len(SCENES)] for step in range(1, FOREIGN + 1)]
-    names = {
-        name: held_out(open_dataset(data / name).frame_names("test"), count=count)
-        for name in (scene, *others)
-    }
+    names = {name: held_out(open_dataset(data / name).frame_names("test"), count=count) for name in (scene, *others)}
     ask("localize", data=str(data / scene), name=names[scene][0], depth=True)  # the first one starts lazily
     for mode, depth in (("RGB", False), ("RGB-D", True)):
         for kind, shown in (("", [scene]), (", other scenes", others)):
@@ -136,8 +131,9 @@ def summary(pairs: Sequence[Pair]) -> dict[str, Any]:
         times = [row["cpu_seconds"] for row in answers]
         found[name] = {
             "accepted": sum(row["converged"] for row in answers),
-            "mean_cpu_seconds": statistics.mean(times), "slowest_cpu_seconds": max(times),
-        }  # fmt: skip
+            "mean_cpu_seconds": statistics.mean(times),
+            "slowest_cpu_seconds": max(times),
+        }
         known = [row for row in answers if row["translation"] is not None]
         if known:
             accepted = [row for row in known if row["converged"]]
@@ -155,21 +151,19 @@ def overall(cells: dict[str, dict[str, Any]]) -> dict[str, Any]:
     own = {name: cell for name, cell in cells.items() if not name.endswith("other scenes")}
     ratios = {name: cell["cpu_ratio"] for name, cell in own.items()}
     found: dict[str, Any] = {
-        "mean_cpu_ratio": statistics.mean(ratios.values()), "largest_cpu_ratio": max(ratios.values()),
+        "mean_cpu_ratio": statistics.mean(ratios.values()),
+        "largest_cpu_ratio": max(ratios.values()),
         "slowest_cpu_seconds": max(cell["new"]["slowest_cpu_seconds"] for cell in cells.values()),
-    }  # fmt: skip
+    }
     refusals = [
-        cell["new"]["mean_cpu_seconds"]
-        / cells[name.removesuffix(", other scenes")]["new"]["mean_cpu_seconds"]
+        cell["new"]["mean_cpu_seconds"] / cells[name.removesuffix(", other scenes")]["new"]["mean_cpu_seconds"]
         for name, cell in cells.items()
         if name not in own
     ]
     return found | ({"refusal_to_answer": statistics.mean(refusals)} if refusals else {})
 
 
-TASKS: dict[
-    str, tuple[Sequence[str], Callable[[Respondents, str, int | None], Iterator[tuple[str, list[Pair]]]]]
-] = {
+TASKS: dict[str, tuple[Sequence[str], Callable[[Respondents, str, int | None], Iterator[tuple[str, list[Pair]]]]]] = {
     "track": (SEQUENCES, tracked),
     "localize": (SCENES, localized),
 }
@@ -204,10 +198,14 @@ def _line(name: str, cell: dict[str, Any]) -> str:
     parts = [f"{name}: n {cell['n']}, CPU time {cell['cpu_ratio']:.2f} of the old"]
     for code in ("old", "new"):
         c = cell[code]
-        known = "" if "right" not in c else (
-            f", right {c['right']}, strict {c['strict']}, wrong {c['silent']}, median {c['median_translation']:.4f} m"
-            f" {c['median_rotation_deg']:.2f} deg, inside {c['inside_95_of_converged']}"
-        )  # fmt: skip
+        known = (
+            ""
+            if "right" not in c
+            else (
+                f", right {c['right']}, strict {c['strict']}, wrong {c['silent']}, median {c['median_translation']:.4f} m"
+                f" {c['median_rotation_deg']:.2f} deg, inside {c['inside_95_of_converged']}"
+            )
+        )
         parts.append(
             f"{code}: accepted {c['accepted']}{known}, mean {1000 * c['mean_cpu_seconds']:.0f} ms,"
             f" slowest {1000 * c['slowest_cpu_seconds']:.0f} ms"

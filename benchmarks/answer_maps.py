@@ -42,9 +42,7 @@ def map_folder(scene: str) -> Path:
     hashed = hashlib.blake2b(json.dumps([VERSION, CONFIG], sort_keys=True).encode(), digest_size=6)
     for path in sorted(path for path in data.rglob("*") if path.is_file()):
         with path.open("rb") as file:
-            hashed.update(
-                str(path.relative_to(data)).encode() + hashlib.file_digest(file, "blake2b").digest()
-            )
+            hashed.update(str(path.relative_to(data)).encode() + hashlib.file_digest(file, "blake2b").digest())
     return folder_of("BIDNERF_MAPS") / f"{scene}-{hashed.hexdigest()}"
 
 

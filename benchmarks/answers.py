@@ -267,11 +267,16 @@ class Question:
         return errors[0] | {
             "pose": pose.tolist() if bool(pose.isfinite().all()) else None,
             # The shortest decimal numbers that are these in single precision, to keep the rows small.
-            "covariance": None if upper is None or not bool(upper.isfinite().all())
+            "covariance": None
+            if upper is None or not bool(upper.isfinite().all())
             else [float(str(value)) for value in upper.float().numpy()],
-            "converged": found.converged, "outcome": str(found.outcome), "reason": found.reason,
-            "confidence": found.confidence, "cpu_seconds": seconds, "evidence": evidence,
-        }  # fmt: skip
+            "converged": found.converged,
+            "outcome": str(found.outcome),
+            "reason": found.reason,
+            "confidence": found.confidence,
+            "cpu_seconds": seconds,
+            "evidence": evidence,
+        }
 
 
 class Subject:
@@ -344,9 +349,7 @@ class Subject:
         how, given = CONDITIONS[condition], self.view(name)
         view, right, start = given, [given], None
         if condition == "two averaged":
-            other = self.view(
-                self.frames[(self.frames.index(name) + len(self.frames) // 2) % len(self.frames)]
-            )
+            other = self.view(self.frames[(self.frames.index(name) + len(self.frames) // 2) % len(self.frames)])
             view = replace(view, frame=replace(view.frame, rgb=(view.frame.rgb + other.frame.rgb) / 2))
             right = [given, other]
         elif condition == "start 5 deg":
@@ -448,10 +451,15 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """Return the counts of some answers."""
     judged, times = judgement(rows), cpu_seconds(rows)
     return {
-        "n": len(rows), "right": sum(map(within, rows)), "strict": sum(within(row, STRICT) for row in rows),
-        "accepted": judged["converged"], "silent": judged["silent"], "inside": judged["inside_95_of_converged"],
-        "median_s": times["median_cpu_seconds"], "slowest_s": times["slowest_cpu_seconds"],
-    }  # fmt: skip
+        "n": len(rows),
+        "right": sum(map(within, rows)),
+        "strict": sum(within(row, STRICT) for row in rows),
+        "accepted": judged["converged"],
+        "silent": judged["silent"],
+        "inside": judged["inside_95_of_converged"],
+        "median_s": times["median_cpu_seconds"],
+        "slowest_s": times["slowest_cpu_seconds"],
+    }
 
 
 TESTED: dict[str, Callable[[Row], bool]] = {
@@ -462,9 +470,7 @@ TESTED: dict[str, Callable[[Row], bool]] = {
 }
 
 
-def mcnemar(
-    first: Sequence[Row], second: Sequence[Row], test: Callable[[Row], bool]
-) -> tuple[int, int, float]:
+def mcnemar(first: Sequence[Row], second: Sequence[Row], test: Callable[[Row], bool]) -> tuple[int, int, float]:
     """Return how often only the first and only the second pass a test, and the p-value of the exact McNemar test."""
     pairs = [(test(a), test(b)) for a, b in zip(first, second, strict=True)]
     only = sum(a and not b for a, b in pairs), sum(b and not a for a, b in pairs)
@@ -489,8 +495,7 @@ def moved(first: list[list[float]] | None, second: list[list[float]] | None) -> 
     if first is None or second is None:
         return first is not second
     return bool(
-        (torch.tensor(first, dtype=torch.float64) - torch.tensor(second, dtype=torch.float64)).abs().max()
-        > ROUNDING
+        (torch.tensor(first, dtype=torch.float64) - torch.tensor(second, dtype=torch.float64)).abs().max() > ROUNDING
     )
 
 
@@ -526,15 +531,11 @@ def compare(paths: Sequence[Path]) -> None:
         f"{len(keys)} answers"
         + (f" that both have; only in one: {left_out[0]}, {left_out[1]}" if len(files) > 1 else "")
     )
-    print(
-        "\n| map | mode | condition | n | right | strict | accepted | silent | inside 95 % | median s | slowest s |"
-    )
+    print("\n| map | mode | condition | n | right | strict | accepted | silent | inside 95 % | median s | slowest s |")
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     for (name, mode, condition), some in cells(keys).items():
         columns = zip(*(shown(summary([rows[key] for key in some])) for rows in files), strict=True)
-        print(
-            f"| {name} | {mode} | {condition} | {len(some)} | " + " | ".join(map(" / ".join, columns)) + " |"
-        )
+        print(f"| {name} | {mode} | {condition} | {len(some)} | " + " | ".join(map(" / ".join, columns)) + " |")
     if len(files) == 1:
         return
     first, second = ([rows[key] for key in keys] for rows in files)
@@ -542,9 +543,7 @@ def compare(paths: Sequence[Path]) -> None:
     for name, test in TESTED.items():
         only_first, only_second, p = mcnemar(first, second, test)
         print(f"| {name} | {only_first} | {only_second} | {p:.3g} |")
-    print(
-        "\nChanged answers: " + ", ".join(f"{part} {count}" for part, count in changes(first, second).items())
-    )
+    print("\nChanged answers: " + ", ".join(f"{part} {count}" for part, count in changes(first, second).items()))
 
 
 def judged_anew(row: Row) -> Row:

@@ -38,9 +38,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-def scene_results(
-    scene: Scene, tuning: bool, count: int | None, slow: bool, store: RowStore
-) -> dict[str, Any]:
+def scene_results(scene: Scene, tuning: bool, count: int | None, slow: bool, store: RowStore) -> dict[str, Any]:
     """Try all variants on the frames of one scene, as RGB and, where there is depth, as RGB-D."""
     found: dict[str, Any] = {}
     for mode, views in modes(scene.views(tuning, count)).items():
@@ -50,9 +48,7 @@ def scene_results(
             localizer = Localizer(scene.map, "auto", settings_of("auto", settings))
             kind = f"{mode}, {label}"
             rows = [
-                store.get(
-                    [*scene.key, kind, view.frame.name], partial(answer, partial(localizer, view.frame), view)
-                )
+                store.get([*scene.key, kind, view.frame.name], partial(answer, partial(localizer, view.frame), view))
                 for view in views
             ]
             found[kind] = rates(rows) | judgement(rows) | cpu_seconds(rows)

@@ -101,9 +101,7 @@ def main() -> None:
     parser.add_argument("--stop-after", type=float, help="minutes")
     given = parser.parse_args()
     frames = test_frames(given.map, given.data, tuning=True)
-    base = Plan(
-        protocol="bid", method="bid", trials=given.trials, seed=given.seed, frames=frames, device=given.device
-    )
+    base = Plan(protocol="bid", method="bid", trials=given.trials, seed=given.seed, frames=frames, device=given.device)
     for group in given.group:
         chosen = plans(group, base, given.variant, given.size)
         # One trial of every variant, then the next, so that the results at any moment compare all variants.

@@ -53,9 +53,7 @@ class Case:
     arrangement: str | None = None
 
 
-def drawn(
-    views: Sequence[View], count: int, generator: Generator, among: Sequence[int] | None = None
-) -> list[int]:
+def drawn(views: Sequence[View], count: int, generator: Generator, among: Sequence[int] | None = None) -> list[int]:
     """Return the numbers of ``count`` photos, drawn without replacement."""
     left = torch.tensor(range(len(views)) if among is None else among)
     return left[torch.randperm(len(left), generator=generator)[:count]].tolist()
@@ -86,9 +84,7 @@ def with_image(view: View, image: np.ndarray) -> View:
 
 def misplaced(view: View, middle: Tensor, generator: Generator) -> View:
     """Return the photo with a pose that is turned and shifted in random directions."""
-    directions = torch.nn.functional.normalize(
-        torch.randn((2, 3), generator=generator, dtype=torch.float64), dim=-1
-    )
+    directions = torch.nn.functional.normalize(torch.randn((2, 3), generator=generator, dtype=torch.float64), dim=-1)
     T = view.T_ref_camera.to("cpu", torch.float64)
     size = SHIFT * torch.linalg.vector_norm(T.translation - middle)
     return replace(
@@ -129,9 +125,11 @@ def poses_turns_and_exposure(views: list[View], report: CaptureReport, generator
     for place, i in enumerate(jumps):
         changed[i] = exposed(views[i], STOPS if place % 2 else -STOPS)
     truth = {
-        "badly posed": names(views, chosen[:wrong]), "turned": names(views, [turned]),
-        "mirrored": names(views, [mirrored]), "badly exposed": names(views, jumps),
-    }  # fmt: skip
+        "badly posed": names(views, chosen[:wrong]),
+        "turned": names(views, [turned]),
+        "mirrored": names(views, [mirrored]),
+        "badly exposed": names(views, jumps),
+    }
     return Case(changed, truth)
 
 
@@ -202,11 +200,15 @@ def judged(case: Case, report: CaptureReport, usual: dict[str, set[str]]) -> dic
         new = false - usual.get(problem, set())
         right = len(named & truth)
         problems[problem] = {
-            "damaged": len(truth), "named": len(named), "right": right, "missed": sorted(truth - named),
-            "named_without_damage_too": sorted(false - new), "false": sorted(new),
+            "damaged": len(truth),
+            "named": len(named),
+            "right": right,
+            "missed": sorted(truth - named),
+            "named_without_damage_too": sorted(false - new),
+            "false": sorted(new),
             "recall": right / len(truth) if truth else None,
             "precision": right / (right + len(new)) if right + len(new) else None,
-        }  # fmt: skip
+        }
     found: dict[str, Any] = {"photos": len(report.photos), "problems": problems, "summary": summary(report)}
     if case.gap is not None:
         ends = {case.gap.after, case.gap.before}
@@ -236,9 +238,7 @@ def scene(views: list[View], others: list[View] | None, seed: int, only: Sequenc
     """Apply each kind of damage to one dataset, and judge the record of each."""
     features = FoundOnce(SIFT)  # most photos are the same in all cases
     plain, cost = survey(views, features)
-    usual = {
-        p: {photo.name for photo in plain.with_problem(p)} for photo in plain.photos for p in photo.problems
-    }
+    usual = {p: {photo.name for photo in plain.with_problem(p)} for photo in plain.photos for p in photo.problems}
     found = {"as it is": judged(Case(views), plain, usual) | cost}
     print("as it is", *found["as it is"]["summary"], sep="\n  ", flush=True)
     generator = torch.Generator().manual_seed(seed)

@@ -31,9 +31,13 @@ FOCAL = 3000.0  # pixels at that size
 DRAWN = 4  # photos are drawn at SIZE / DRAWN, and enlarged
 ROOM = (5.0, 4.0, 3.0)  # metres
 WALLS = (  # corner, and the two edges from it
-    ((0, 0, 0), (1, 0, 0), (0, 0, 1)), ((1, 0, 0), (0, 1, 0), (0, 0, 1)), ((1, 1, 0), (-1, 0, 0), (0, 0, 1)),
-    ((0, 1, 0), (0, -1, 0), (0, 0, 1)), ((0, 0, 0), (1, 0, 0), (0, 1, 0)), ((0, 0, 1), (1, 0, 0), (0, 1, 0)),
-)  # fmt: skip
+    ((0, 0, 0), (1, 0, 0), (0, 0, 1)),
+    ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    ((1, 1, 0), (-1, 0, 0), (0, 0, 1)),
+    ((0, 1, 0), (0, -1, 0), (0, 0, 1)),
+    ((0, 0, 0), (1, 0, 0), (0, 1, 0)),
+    ((0, 0, 1), (1, 0, 0), (0, 1, 0)),
+)
 TEXELS = 2048
 
 
@@ -143,13 +147,17 @@ def dataset(work: Path, photos: Path, count: int) -> Path:
     folder.mkdir(exist_ok=True)
     names = [os.path.relpath(photos / f"{number:04d}.jpg", folder) for number in range(count)]
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
-    frames = [
-        {"file_path": name, "transform_matrix": (pose(n) @ flip).tolist()} for n, name in enumerate(names)
-    ]
+    frames = [{"file_path": name, "transform_matrix": (pose(n) @ flip).tolist()} for n, name in enumerate(names)]
     content = {
-        "fl_x": FOCAL, "fl_y": FOCAL, "cx": SIZE[0] / 2, "cy": SIZE[1] / 2, "w": SIZE[0], "h": SIZE[1],
-        "train_filenames": names, "frames": frames,
-    }  # fmt: skip
+        "fl_x": FOCAL,
+        "fl_y": FOCAL,
+        "cx": SIZE[0] / 2,
+        "cy": SIZE[1] / 2,
+        "w": SIZE[0],
+        "h": SIZE[1],
+        "train_filenames": names,
+        "frames": frames,
+    }
     (folder / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
     return folder
 
@@ -173,9 +181,11 @@ def measured(command: Sequence[str], work: Path) -> dict[str, Any]:
         raise SystemExit(f"bidnerf {' '.join(command)}: {said[-1:]}")
     shutil.copy(work / "output.txt", work / f"output_{command[0]}_{int(began)}.txt")
     return {
-        "seconds": time.perf_counter() - began, "resident_MB": peaks["VmHWM"] / 1e3,
-        "anonymous_MB": peaks["RssAnon"] / 1e3, "said": [line for line in said if " read at " in line],
-    }  # fmt: skip
+        "seconds": time.perf_counter() - began,
+        "resident_MB": peaks["VmHWM"] / 1e3,
+        "anonymous_MB": peaks["RssAnon"] / 1e3,
+        "said": [line for line in said if " read at " in line],
+    }
 
 
 def status(pid: int, key: str) -> int:

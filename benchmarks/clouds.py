@@ -149,14 +149,20 @@ class Open3d:
         source, source_features = self._described(self._seen(measured, config.voxel), config.voxel)
         reach = config.distance * config.voxel
         found = registration.registration_ransac_based_on_feature_matching(
-            source, target, source_features, target_features, config.mutual, reach,
-            registration.TransformationEstimationPointToPoint(False), 3,
+            source,
+            target,
+            source_features,
+            target_features,
+            config.mutual,
+            reach,
+            registration.TransformationEstimationPointToPoint(False),
+            3,
             [
                 registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
                 registration.CorrespondenceCheckerBasedOnDistance(reach),
             ],
             registration.RANSACConvergenceCriteria(config.iterations, config.confidence),
-        )  # fmt: skip
+        )
         return np.asarray(found.transformation)
 
     def refine(self, measured: Points, start: Matrix, config: Refine) -> Matrix:
@@ -177,9 +183,7 @@ class Open3d:
         for voxel, distance in zip(config.voxels, config.distances, strict=True):
             source = self._seen(measured, voxel)
             try:
-                T = np.asarray(
-                    run(source, self.at(voxel), distance * voxel, T, estimate, criteria).transformation
-                )
+                T = np.asarray(run(source, self.at(voxel), distance * voxel, T, estimate, criteria).transformation)
             except RuntimeError:  # raised by coloured ICP if no points match
                 return T
         return T
@@ -301,15 +305,11 @@ def tuned_open3d(library: Open3d, tries: Sequence[Case], voxel: float) -> tuple[
     results |= {s: search(s) for s in ransac_neighbours(_quickest(results))}
     best = _quickest(results)
     starts = results[best][1]
-    refines = [
-        _nearest(tries, starts, library.refine, refine_choices(voxel, colour)) for colour in (False, True)
-    ]
+    refines = [_nearest(tries, starts, library.refine, refine_choices(voxel, colour)) for colour in (False, True)]
     return best, refines[0], refines[1]
 
 
-def tuned_gicp(
-    library: SmallGicp, tries: Sequence[Case], starts: Sequence[Matrix], voxel: float, near: bool
-) -> Gicp:
+def tuned_gicp(library: SmallGicp, tries: Sequence[Case], starts: Sequence[Matrix], voxel: float, near: bool) -> Gicp:
     return _nearest(tries, starts, library.refine, gicp_choices(voxel, near))
 
 

@@ -132,9 +132,7 @@ def answers(
             for condition, change in conditions.items():
                 for name in in_turn(names, place):
 
-                    def make(
-                        name: str = name, change: Any = change, test: str = test, maps: Maps = maps
-                    ) -> Row:
+                    def make(name: str = name, change: Any = change, test: str = test, maps: Maps = maps) -> Row:
                         (view,) = map(without_depth, data.views("test", [test]))
                         matcher = maps[name]
                         return localized(matcher, detector(name), replace(view, frame=change(view.frame)))
@@ -192,9 +190,7 @@ def in_succession(first: Sequence[Row], second: Sequence[Row]) -> list[Row]:
 
 def line(cell: dict[str, Any]) -> str:
     """Return a summary as a line of a table."""
-    translation, rotation = (
-        cell[f"median_{part}"] or float("nan") for part in ("translation", "rotation_deg")
-    )
+    translation, rotation = (cell[f"median_{part}"] or float("nan") for part in ("translation", "rotation_deg"))
     return (
         f"n {cell['n']:3}  right {cell['right']:3}  strict {cell['strict']:3}  accepted {cell['accepted']:3}"
         f"  wrong {cell['accepted_but_wrong']:2}  median {translation:.4f} {rotation:.3f} deg"
@@ -216,8 +212,7 @@ def scene_results(
                 shown[f"{other}, then {base}"] = in_succession(rows[other], rows[base])
             cells = {name: summary(found, rows[base]) for name, found in shown.items()}
             result[f"every {k}, {condition}"] = {
-                name: cell if name in rows else {part: cell[part] for part in BRIEFLY}
-                for name, cell in cells.items()
+                name: cell if name in rows else {part: cell[part] for part in BRIEFLY} for name, cell in cells.items()
             }
             for name, cell in cells.items():
                 print(f"{folder.name:16} {k:2} {condition:18} {name:20} {line(cell)}", flush=True)
@@ -237,9 +232,7 @@ def scene_results(
 def main() -> None:
     arguments = parser(__doc__, "detectors")
     arguments.add_argument("data", nargs="+", type=Path, metavar="DATA", help="folder of a dataset")
-    arguments.add_argument(
-        "--detectors", nargs="+", default=["sift", "xfeat", "sift-xfeat", ONE_GRID], metavar="NAME"
-    )
+    arguments.add_argument("--detectors", nargs="+", default=["sift", "xfeat", "sift-xfeat", ONE_GRID], metavar="NAME")
     arguments.add_argument("--every", nargs="+", type=int, default=list(EVERY), metavar="K")
     arguments.add_argument("--frames", type=int, help="test frames of each dataset (default: all)")
     given = arguments.parse_args()

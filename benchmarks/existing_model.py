@@ -54,13 +54,9 @@ def make_large_project(project: Path) -> None:
         return
     (project / "sparse" / "0").mkdir(parents=True)
     random = np.random.default_rng(0)
-    points = np.concatenate(
-        [random.uniform(0, SIDE, (POINTS, 2)), random.normal(0, 0.5, (POINTS, 1))], axis=1
-    )
+    points = np.concatenate([random.uniform(0, SIDE, (POINTS, 2)), random.normal(0, 0.5, (POINTS, 1))], axis=1)
     descriptors = random.random((POINTS, 128), dtype=np.float32) ** 4
-    descriptors = (
-        (512 * np.sqrt(descriptors / descriptors.sum(1, keepdims=True))).clip(0, 255).astype(np.uint8)
-    )
+    descriptors = (512 * np.sqrt(descriptors / descriptors.sum(1, keepdims=True))).clip(0, 255).astype(np.uint8)
     columns = int(np.ceil(IMAGES**0.5))
     places = SIDE * (np.stack(np.divmod(np.arange(IMAGES), columns), -1)[:, ::-1] + 0.5) / columns
     camera = pycolmap.Camera(
@@ -125,9 +121,11 @@ def imported(project: Path, out: Path, keypoints: str) -> dict[str, Any]:
     began, cpu = time.monotonic(), time.process_time()
     scene = bn.import_map(project, out, {"keypoints": keypoints}, options=bn.ImportOptions(overwrite=True))
     return {
-        "seconds": time.monotonic() - began, "cpu_seconds": time.process_time() - cpu, "photos": len(scene.info.cameras),
+        "seconds": time.monotonic() - began,
+        "cpu_seconds": time.process_time() - cpu,
+        "photos": len(scene.info.cameras),
         "landmarks": 0 if scene.landmarks is None else len(scene.landmarks),
-    }  # fmt: skip
+    }
 
 
 def localized(data: Any, out: Path, poses: Path) -> dict[str, Any]:
@@ -154,17 +152,18 @@ def localized(data: Any, out: Path, poses: Path) -> dict[str, Any]:
     read.read_text(poses)
     stored = {image.name: image.cam_from_world().matrix() for image in read.images.values()}
     off = max(
-        float(
-            np.abs(
-                stored[answer.file.name] - answer.found.T_world_camera.inverse().matrix().numpy()[:3]
-            ).max()
-        )
+        float(np.abs(stored[answer.file.name] - answer.found.T_world_camera.inverse().matrix().numpy()[:3]).max())
         for answer in answers.accepted
     )
     return {
-        "n": len(rows), "right": sum(map(_lab.within, rows)), "strict": sum(_lab.within(row, _lab.STRICT) for row in rows),
-        "accepted": len(answers.accepted), "rates": _lab.rates(rows), "read_by_pycolmap": len(stored), "largest_difference_read": off,
-    }  # fmt: skip
+        "n": len(rows),
+        "right": sum(map(_lab.within, rows)),
+        "strict": sum(_lab.within(row, _lab.STRICT) for row in rows),
+        "accepted": len(answers.accepted),
+        "rates": _lab.rates(rows),
+        "read_by_pycolmap": len(stored),
+        "largest_difference_read": off,
+    }
 
 
 def main() -> None:

@@ -46,9 +46,15 @@ def draw_panel(panel: Any, mode: str, cells: dict[str, dict[str, int]]) -> None:
         middle = np.array([rate.rate for rate in rates])
         spread = 100 * np.abs(np.array([[r.low for r in rates], [r.high for r in rates]]) - middle)
         panel.errorbar(
-            100 * middle, places + 0.18 * (turn - 1), xerr=spread, fmt="o", color=colour, label=label, markersize=4,
+            100 * middle,
+            places + 0.18 * (turn - 1),
+            xerr=spread,
+            fmt="o",
+            color=colour,
+            label=label,
+            markersize=4,
             elinewidth=1,
-        )  # fmt: skip
+        )
     panel.set_yticks(places, [f"{fault}  (n={cell['n']})" for fault, cell in cells.items()])
     panel.set(xlabel="answers (%)", xlim=(-3, 103), ylim=(len(cells) - 0.5, -0.5), title=mode)
     panel.grid(axis="x")

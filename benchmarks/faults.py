@@ -137,9 +137,7 @@ def diagnostics_of(found: Localization) -> dict[str, Any]:
         return {}
     numbers = asdict(found.diagnostics)
     numbers |= numbers.pop("measures", {})
-    known = {
-        name: value for name, value in numbers.items() if not isinstance(value, float) or isfinite(value)
-    }
+    known = {name: value for name, value in numbers.items() if not isinstance(value, float) or isfinite(value)}
     return {"diagnostics": to_plain(known)}
 
 
@@ -221,22 +219,14 @@ def measured(given: argparse.Namespace, store: RowStore, executor: Executor) -> 
 
 def arguments() -> argparse.Namespace:
     found = parser(__doc__, "faults", scenes=True)
-    found.add_argument(
-        "--faults", nargs="*", metavar="FAULT", help="NAME:SIZE,SIZE... or none (default: all)"
-    )
+    found.add_argument("--faults", nargs="*", metavar="FAULT", help="NAME:SIZE,SIZE... or none (default: all)")
     found.add_argument(
         "--foreign", nargs="*", default=[], metavar="DATA", help="datasets of other scenes to query with"
     )
     mode = found.add_mutually_exclusive_group()
-    mode.add_argument(
-        "--rgb", dest="modes", action="store_const", const=(False,), help="only without measured depth"
-    )
-    mode.add_argument(
-        "--rgbd", dest="modes", action="store_const", const=(True,), help="only with measured depth"
-    )
-    found.add_argument(
-        "--config", default="{}", help="JSON of settings of auto that differ from its defaults"
-    )
+    mode.add_argument("--rgb", dest="modes", action="store_const", const=(False,), help="only without measured depth")
+    mode.add_argument("--rgbd", dest="modes", action="store_const", const=(True,), help="only with measured depth")
+    found.add_argument("--config", default="{}", help="JSON of settings of auto that differ from its defaults")
     found.add_argument("--seed", type=int, default=0)
     found.add_argument("--jobs", type=int, default=1, help="number of processes, of one thread each")
     found.set_defaults(modes=(False, True))

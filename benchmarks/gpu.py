@@ -75,9 +75,13 @@ step: twice the default, which is meant for a small CPU, take hardly more time o
 
 
 def made_steps(
-    folder: str, data: str, level: int, device: torch.device, rays: int = TIMED_RAYS,
+    folder: str,
+    data: str,
+    level: int,
+    device: torch.device,
+    rays: int = TIMED_RAYS,
     generator: torch.Generator | None = None,
-) -> AdamSteps:  # fmt: skip
+) -> AdamSteps:
     """Return the steps of ``bid`` that start 0.1 units from the first test frame's pose."""
     stored, dataset = opened(folder, data)
     there = None if device.type == "cpu" else device
@@ -86,9 +90,13 @@ def made_steps(
     problem = rig(scene, [view], perturb(view.T_ref_camera, 0.1, 2.0, seed=0))
     usual = METHODS["bid"].settings("paper-scene")
     loss = SampledLoss(
-        problem.on_device(), objective_of(usual.colour, usual.depth), 0,
-        DescentSettings(rays=rays, level=level), ReachSettings(), generator or torch.Generator(device).manual_seed(0),
-    )  # fmt: skip
+        problem.on_device(),
+        objective_of(usual.colour, usual.depth),
+        0,
+        DescentSettings(rays=rays, level=level),
+        ReachSettings(),
+        generator or torch.Generator(device).manual_seed(0),
+    )
     # Poses hardly move, so that all steps render the same.
     rate = AdamSettings(learning_rate=1e-9, decay=1.0)
     return AdamSteps(loss, pivot("scene", problem), rate, problem.start_for("bid").to(device))
@@ -168,9 +176,7 @@ def step_rows(folder: str, data: str, device: torch.device) -> dict[str, Any]:
 def kernel_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
     """Return the time of the field with its derivatives at many points, and what its accesses and products take alone."""
     stored = opened(folder, data)[0].to(device)
-    lower, upper = (
-        torch.tensor(corner, device=device) for corner in (stored.bounds.lower, stored.bounds.upper)
-    )
+    lower, upper = (torch.tensor(corner, device=device) for corner in (stored.bounds.lower, stored.bounds.upper))
     at = lower + (upper - lower) * torch.rand(POINTS, 3, device=device)
     along = torch.nn.functional.normalize(torch.randn(POINTS, 3, device=device), dim=-1)
     field: Any = trained_field(stored.field)
@@ -180,9 +186,7 @@ def kernel_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
     index = torch.randint(len(table), (len(field.encoding.levels) * POINTS // 2,), device=device)
     reads = 16 * timed(lambda: table.index_select(0, index), 20)[0]
     # The values, three derivatives of the density network, and six of the colour network, in the precision of the kernel.
-    geometry, colour = (
-        sum(part.numel() for part in net.parameters()) for net in (field.geometry, field.colour)
-    )
+    geometry, colour = (sum(part.numel() for part in net.parameters()) for net in (field.geometry, field.colour))
     matrix = torch.randn(SIDE, SIDE, device=device)
     usual = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high")
@@ -210,8 +214,10 @@ def search_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
             replay = captured(step, device)
             milliseconds = timed(replay, 50)[0]
         found[f"{poses} poses, {rays} rays"] = {
-            "ms": milliseconds, "is_graph": replay is not step, "memory_bytes": torch.cuda.max_memory_allocated(),
-        }  # fmt: skip
+            "ms": milliseconds,
+            "is_graph": replay is not step,
+            "memory_bytes": torch.cuda.max_memory_allocated(),
+        }
     return found
 
 
@@ -236,10 +242,14 @@ def query_rows(folder: str, data: str, device: torch.device) -> dict[str, Any]:
                 several = {"many_per_second": MANY / (time.perf_counter() - began)}
         expected = [_lab.answer(partial(here, view.frame), view) for view in shown]
         found[name] = {
-            "ms": statistics.median(times), "ms_most": max(times), "frames": len(shown), **several,
-            "right": sum(map(_lab.within, rows)), "right_on_cpu": sum(map(_lab.within, expected)),
+            "ms": statistics.median(times),
+            "ms_most": max(times),
+            "frames": len(shown),
+            **several,
+            "right": sum(map(_lab.within, rows)),
+            "right_on_cpu": sum(map(_lab.within, expected)),
             "same_outcomes": sum(a["outcome"] == b["outcome"] for a, b in zip(rows, expected, strict=True)),
-        }  # fmt: skip
+        }
     return found
 
 
@@ -279,8 +289,7 @@ def training_row(folder: str, data: str, device: torch.device) -> dict[str, Any]
     config = from_plain(backend.config_type, stored.info.config, "the map's settings")
     train = [view.over(bounds.background) for view in dataset.views("train", dataset.frame_names("train"))]
     unseen = [
-        view.over(bounds.background)
-        for view in dataset.views("test", test_frames(folder, data, tuning=False)[:6])
+        view.over(bounds.background) for view in dataset.views("test", test_frames(folder, data, tuning=False)[:6])
     ]
     config = replace(config, steps=backend.config_type().steps, samples_per_step=SAMPLES)
     field = backend.build(config, bounds).to(device)
@@ -289,9 +298,14 @@ def training_row(folder: str, data: str, device: torch.device) -> dict[str, Any]
     with suppress(TrainingStopped):
         backend.train(field, train, config, report)
     return {
-        "psnr": report.reached, "samples_per_step": SAMPLES, "seconds": report.seconds, "seconds_before_first_steps": report.before, "steps": report.steps,
-        "ms_a_step": 1000 * (report.seconds - report.before) / report.steps, "memory_bytes": torch.cuda.max_memory_allocated(),
-    }  # fmt: skip
+        "psnr": report.reached,
+        "samples_per_step": SAMPLES,
+        "seconds": report.seconds,
+        "seconds_before_first_steps": report.before,
+        "steps": report.steps,
+        "ms_a_step": 1000 * (report.seconds - report.before) / report.steps,
+        "memory_bytes": torch.cuda.max_memory_allocated(),
+    }
 
 
 def table_rows(folder: str, data: str, device: torch.device, out: Path, workers: int) -> dict[str, Any]:
@@ -299,10 +313,23 @@ def table_rows(folder: str, data: str, device: torch.device, out: Path, workers:
     script = Path(__file__).with_name("paper_tables.py")
     began, tables = time.perf_counter(), out / "tables"
     subprocess.run(
-        [sys.executable, str(script), data, "--map", folder, "--out", str(tables), "--preset", "paper-scene",
-         "--device", str(device), "--workers", str(workers)],
+        [
+            sys.executable,
+            str(script),
+            data,
+            "--map",
+            folder,
+            "--out",
+            str(tables),
+            "--preset",
+            "paper-scene",
+            "--device",
+            str(device),
+            "--workers",
+            str(workers),
+        ],
         check=True,
-    )  # fmt: skip
+    )
     return {"folder": tables.name, "seconds": time.perf_counter() - began}
 
 
@@ -321,14 +348,16 @@ def main() -> None:
     parser.add_argument("--map", action="append", required=True, help="a folder; may be given again")
     parser.add_argument("--out", type=Path, default=_lab.RESULTS)
     rows: dict[str, Callable[..., dict[str, Any]]] = {
-        "kernel": kernel_row, "steps": step_rows, "search": search_row, "queries": query_rows, "training": training_row,
+        "kernel": kernel_row,
+        "steps": step_rows,
+        "search": search_row,
+        "queries": query_rows,
+        "training": training_row,
         "tables": table_rows,
-    }  # fmt: skip
+    }
     parser.add_argument("--part", nargs="+", choices=list(rows), default=list(rows))
     parser.add_argument("--name", default="gpu", help="of the record (default: %(default)s)")
-    parser.add_argument(
-        "--workers", type=int, default=4, help="processes that share the device for the tables"
-    )
+    parser.add_argument("--workers", type=int, default=4, help="processes that share the device for the tables")
     given = parser.parse_args()
     if not torch.cuda.is_available():
         print("no GPU here: nothing was measured, and no record was written")

@@ -86,8 +86,11 @@ from bidnerf_core.io import from_plain, to_plain
 
 OURS = "auto"
 LIBRARIES = {
-    "pycolmap": ("pycolmap",), "kiss_matcher": ("kiss-matcher",), "small_gicp": ("small_gicp",), "open3d": ("open3d", "open3d-cpu"),
-}  # fmt: skip
+    "pycolmap": ("pycolmap",),
+    "kiss_matcher": ("kiss-matcher",),
+    "small_gicp": ("small_gicp",),
+    "open3d": ("open3d", "open3d-cpu"),
+}
 """Distributions that peers need, by module name."""
 KISS_GICP, FROM_START = "kiss-matcher + gicp", "gicp from a start"
 OPEN3D_PEERS = {f"open3d fpfh + ransac + {name}": name for name in ("icp", "coloured icp")}
@@ -138,11 +141,7 @@ def image_peers(scene: Scene, cache: Path) -> dict[str, Peer]:
 
 def pnp(matcher: SiftMatcher, solve: Callable[..., Any], view: View, seed: int) -> Answer:
     found = solve(*matcher(view.frame), view.frame.intrinsics, seed)
-    return (
-        Answer(None, False)
-        if found is None
-        else Answer(found.T_world_camera, found.inliers >= FEWEST_INLIERS)
-    )
+    return Answer(None, False) if found is None else Answer(found.T_world_camera, found.inliers >= FEWEST_INLIERS)
 
 
 def depth_peers(
@@ -172,9 +171,7 @@ def depth_peers(
         gicp = SmallGicp(points)
         if wanted(FROM_START):
             starts = [bid_start(case.truth, given.off, i).matrix().numpy() for i, case in enumerate(tries)]
-            settings[FROM_START] = tuned(
-                FROM_START, lambda: to_plain(tuned_gicp(gicp, tries, starts, voxel, False))
-            )
+            settings[FROM_START] = tuned(FROM_START, lambda: to_plain(tuned_gicp(gicp, tries, starts, voxel, False)))
             refine = from_plain(Gicp, settings[FROM_START], FROM_START)
             peers[FROM_START] = lambda view, seed: Answer(
                 gicp.refine(
@@ -209,9 +206,7 @@ def depth_peers(
     return peers, settings
 
 
-def kiss_gicp(
-    kiss: KissMatcher, gicp: SmallGicp, voxel: float, refine: Gicp, view: View, seed: int
-) -> Answer:
+def kiss_gicp(kiss: KissMatcher, gicp: SmallGicp, voxel: float, refine: Gicp, view: View, seed: int) -> Answer:
     """Register a frame with KISS-Matcher, which is deterministic, and refine the pose."""
     measured = measured_points(view.frame)
     T, accepted = kiss.search(measured, voxel)
@@ -237,9 +232,7 @@ def answer(peer: Peer, view: View, seed: int) -> Row:
         "normalized_error_squared": None,
     }
     error = (
-        None
-        if found.T_world_camera is None
-        else pose_error(as_pose(found.T_world_camera), view.T_ref_camera).plain()
+        None if found.T_world_camera is None else pose_error(as_pose(found.T_world_camera), view.T_ref_camera).plain()
     )
     return row | (error or {})
 
@@ -289,9 +282,12 @@ def against(ours: Sequence[Row], theirs: Sequence[Row]) -> dict[str, Any]:
         only_ours, only_theirs = found.count((True, False)), found.count((False, True))
         apart = only_ours + only_theirs
         result[name] = {
-            "both": found.count((True, True)), "only_auto": only_ours, "only_peer": only_theirs,
-            "neither": found.count((False, False)), "p": float(binomtest(only_ours, apart).pvalue) if apart else 1.0,
-        }  # fmt: skip
+            "both": found.count((True, True)),
+            "only_auto": only_ours,
+            "only_peer": only_theirs,
+            "neither": found.count((False, False)),
+            "p": float(binomtest(only_ours, apart).pvalue) if apart else 1.0,
+        }
     return result | {"cpu_seconds_against_auto": times_slower(theirs, ours)}
 
 
@@ -315,9 +311,7 @@ def line(found: dict[str, Any]) -> str:
     return text
 
 
-def scene_rows(
-    scene: Scene, given: argparse.Namespace, store: RowStore
-) -> tuple[dict[str, Any], dict[str, Any]]:
+def scene_rows(scene: Scene, given: argparse.Namespace, store: RowStore) -> tuple[dict[str, Any], dict[str, Any]]:
     """Compare the peers on one scene, with images alone and, where there is depth, with depth; return summaries and rows."""
     tuning = scene.views(True)
     results, every = {}, {}
@@ -327,9 +321,7 @@ def scene_rows(
             peers, settings = depth_peers(scene, tuning, given, store)
         if given.peers:
             peers = {name: peer for name, peer in peers.items() if name == OURS or name in given.peers}
-        rows = every[mode] = compared(
-            peers, views, modes(tuning)[mode][0], [*scene.key, mode], settings, store
-        )
+        rows = every[mode] = compared(peers, views, modes(tuning)[mode][0], [*scene.key, mode], settings, store)
         results[mode] = {"settings": settings, "peers": summaries(rows)}
         for name, found in results[mode]["peers"].items():
             print(f"{scene.name:15} {mode:5} {name:38} {line(found)}", flush=True)
@@ -346,13 +338,9 @@ def totals(scenes: Sequence[dict[str, Any]], mode: str) -> dict[str, Any]:
 def main() -> None:
     arguments = parser(__doc__, "landmark_peers", scenes=True)
     arguments.add_argument("--peers", nargs="+", metavar="PEER", help="only these, and ours")
-    arguments.add_argument(
-        "--voxel", type=float, default=0.05, help="metres, where tuning of point clouds begins"
-    )
+    arguments.add_argument("--voxel", type=float, default=0.05, help="metres, where tuning of point clouds begins")
     arguments.add_argument("--off", type=float, default=0.5, help="size of the starts that are given")
-    arguments.add_argument(
-        "--cache", type=Path, default=RESULTS.parent / "cache", help="of triangulated points"
-    )
+    arguments.add_argument("--cache", type=Path, default=RESULTS.parent / "cache", help="of triangulated points")
     mode = arguments.add_mutually_exclusive_group()
     mode.add_argument("--rgb", dest="modes", action="store_const", const=("RGB",))
     mode.add_argument("--rgbd", dest="modes", action="store_const", const=("RGB-D",))

@@ -54,25 +54,19 @@ def scaled(scene: Scene, frames: int) -> dict[str, Any]:
             }
         )
     return {
-        "n": len(rows), "same_outcomes": sum(row["same_outcomes"] for row in rows),
+        "n": len(rows),
+        "same_outcomes": sum(row["same_outcomes"] for row in rows),
         "scaled_back_same_to_the_bit": sum(row["same_bits"] for row in rows),
         "halved_off_at_most": max(row["off"] for row in rows),
-    }  # fmt: skip
+    }
 
 
 def which(scenes: list[Scene], count: int, frames: int) -> dict[str, Any]:
     """Ask many maps which of them an image shows."""
-    maps = [
-        replace(scene.map, folder=None, info=replace(scene.map.info, data=scene.name)) for scene in scenes
-    ]
-    queries = [
-        (scene.name, without_depth(each).frame) for scene in scenes for each in scene.views(count=frames)
-    ]
+    maps = [replace(scene.map, folder=None, info=replace(scene.map.info, data=scene.name)) for scene in scenes]
+    queries = [(scene.name, without_depth(each).frame) for scene in scenes for each in scene.views(count=frames)]
     for seed in range(count - len(maps)):
-        images = [
-            view(T, f"{n}", seed)
-            for n, T in enumerate(orbit(1.8, GROUND_VIEWS, elevation=(45.0, 75.0), seed=0))
-        ]
+        images = [view(T, f"{n}", seed) for n, T in enumerate(orbit(1.8, GROUND_VIEWS, elevation=(45.0, 75.0), seed=0))]
         info = MapInfo(
             "ground", {}, BOUNDS, 1, True, f"ground{seed}", weights=f"g{seed}", cameras=stored_cameras(images)
         )
@@ -104,11 +98,15 @@ def which(scenes: list[Scene], count: int, frames: int) -> dict[str, Any]:
             continue
         rows.append(
             {
-                "first": ranking[0] == truth, "right": placed.converged and placed.map == truth,
-                "wrong": placed.converged and placed.map != truth, "rank": ranked, "all": time.process_time() - began,
-                "asked": len(placed.asked), "rank_of_truth": ranking.index(truth) + 1,
+                "first": ranking[0] == truth,
+                "right": placed.converged and placed.map == truth,
+                "wrong": placed.converged and placed.map != truth,
+                "rank": ranked,
+                "all": time.process_time() - began,
+                "asked": len(placed.asked),
+                "rank_of_truth": ranking.index(truth) + 1,
             }
-        )  # fmt: skip
+        )
     each_asked = bn.MapCollection(maps, asked=len(maps))
     each_asked._localizers = collection._localizers
     times, agreed = [], 0
@@ -118,15 +116,18 @@ def which(scenes: list[Scene], count: int, frames: int) -> dict[str, Any]:
         times.append(time.process_time() - began)
         agreed += [name for name, converged in found.items() if converged] == [truth]
     return {
-        "maps": len(maps), "images": len(rows), "index_seconds": index,
-        "most_similar_is_right": sum(row["first"] for row in rows), "found": sum(row["right"] for row in rows),
+        "maps": len(maps),
+        "images": len(rows),
+        "index_seconds": index,
+        "most_similar_is_right": sum(row["first"] for row in rows),
+        "found": sum(row["right"] for row in rows),
         "accepted_in_a_wrong_map": sum(row["wrong"] for row in rows),
         "worst_rank": max(row.get("rank_of_truth", len(maps)) for row in rows),
         "rank_seconds": statistics.median(row["rank"] for row in rows),
         "seconds": statistics.median(row["all"] for row in rows),
         "asked": statistics.fmean(row["asked"] for row in rows),
         "each_asked": {"images": len(times), "found_in_its_own_alone": agreed, "seconds": statistics.median(times)},
-    }  # fmt: skip
+    }
 
 
 def extended(scene: Scene, first: int, steps: int, work: Path) -> dict[str, Any]:
@@ -175,15 +176,16 @@ def measured(stored: bn.Map, scene: Scene) -> dict[str, Any]:
         found = localizer(each.frame)
         error = pose_error(found.T_world_camera, each.T_ref_camera)
         rows.append((found.converged, float(error.translation), float(error.rotation_deg)))
-    within = {
-        name: sum(t < length and r < degrees for _, t, r in rows)
-        for name, (length, degrees) in LIMITS.items()
-    }
+    within = {name: sum(t < length and r < degrees for _, t, r in rows) for name, (length, degrees) in LIMITS.items()}
     return {
-        "psnr": statistics.fmean(scores), "images": len(stored.info.cameras), "landmarks": len(stored.landmarks or ()),
-        "test": len(rows), "accepted": sum(row[0] for row in rows), "right": within,
+        "psnr": statistics.fmean(scores),
+        "images": len(stored.info.cameras),
+        "landmarks": len(stored.landmarks or ()),
+        "test": len(rows),
+        "accepted": sum(row[0] for row in rows),
+        "right": within,
         "median_translation": statistics.median(row[1] for row in rows),
-    }  # fmt: skip
+    }
 
 
 def main() -> None:
@@ -201,9 +203,7 @@ def main() -> None:
     results: dict[str, Any] = json.loads(before.read_text())["results"] if before.exists() else {}
     scenes = [Scene.open(pair) for pair in given.scenes]
     if "scale" in given.part:
-        results["scale"] = results.get("scale", {}) | {
-            each.name: scaled(each, given.frames or 10) for each in scenes
-        }
+        results["scale"] = results.get("scale", {}) | {each.name: scaled(each, given.frames or 10) for each in scenes}
     if "which" in given.part:
         results["which"] = which(scenes, given.maps, given.frames or 5)
     if "extend" in given.part:

@@ -93,10 +93,15 @@ def trials(given: argparse.Namespace, start: str, method: str) -> list[Trial]:
     names = dataset.frame_names("test")
     kept = names if given.all_frames else held_out(names, given.tuning_frames)
     plan = Plan(
-        protocol=protocol, sizes=[list(map(float, size))], method=method, trials=given.trials or len(kept),
-        config=json.dumps(json.loads(given.config), sort_keys=True), seed=given.seed, frames=kept,
+        protocol=protocol,
+        sizes=[list(map(float, size))],
+        method=method,
+        trials=given.trials or len(kept),
+        config=json.dumps(json.loads(given.config), sort_keys=True),
+        seed=given.seed,
+        frames=kept,
         depth=not given.no_depth,
-    )  # fmt: skip
+    )
     return planned(plan, given.map, given.data, dataset)
 
 
@@ -112,15 +117,11 @@ def main() -> None:
     arguments.add_argument("--trials", type=int, help="from each start")
     arguments.add_argument("--seed", type=int, default=0)
     arguments.add_argument("--workers", type=int, default=1)
-    arguments.add_argument(
-        "--tuning-frames", action="store_true", help="only frames that settings are tuned on"
-    )
+    arguments.add_argument("--tuning-frames", action="store_true", help="only frames that settings are tuned on")
     arguments.add_argument("--all-frames", action="store_true", help="also those that settings were tuned on")
     arguments.add_argument("--no-depth", action="store_true", help="withhold the measured depth")
     given = arguments.parse_args()
-    wanted = {
-        (start, method): trials(given, start, method) for start in given.start for method in given.method
-    }
+    wanted = {(start, method): trials(given, start, method) for start in given.start for method in given.method}
     partial = RESULTS / f"{given.name}.rows.jsonl"
     with ResultsFile(partial) as file, job_context(lambda now: print(".", end="", flush=True)):
         turns = [

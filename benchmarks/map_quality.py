@@ -139,9 +139,7 @@ def at_landmark_poses(stored: Map, views: list[View]) -> dict[str, Any] | None:
             updates.append((T.inverse() @ found.T_world_rig).log())
     if not placed:
         return None
-    translation, rotation = (
-        torch.linalg.vector_norm(p, dim=-1) for p in torch.stack(updates).split(3, dim=-1)
-    )
+    translation, rotation = (torch.linalg.vector_norm(p, dim=-1) for p in torch.stack(updates).split(3, dim=-1))
     return {
         "translation_median": float(translation.median()),
         "rotation_deg_median": float(rotation.rad2deg().median()),
@@ -165,9 +163,7 @@ def moved_median(updates: Sequence[Tensor | RowMotion | None]) -> dict[str, floa
 def on_training_frames(stored: Map, data: Path) -> dict[str, float | None]:
     """Return the quality on a few training frames, at their poses in the map."""
     views = open_dataset(data, stored.bounds.background).views("train")
-    return judge(
-        stored.field, stored.bounds, at_stored_poses(views, stored.info.cameras)[:: max(1, len(views) // 20)]
-    )
+    return judge(stored.field, stored.bounds, at_stored_poses(views, stored.info.cameras)[:: max(1, len(views) // 20)])
 
 
 def beside_dense(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[str, Any] | None:
@@ -192,9 +188,7 @@ def main() -> None:
         help="judge the levels on test frames at their given poses only",
     )
     parser.add_argument("--results", type=Path, default=_lab.RESULTS, help="folder of the record")
-    parser.add_argument(
-        "--device", default="cpu", help="where images are rendered; to train there too: -- --device"
-    )
+    parser.add_argument("--device", default="cpu", help="where images are rendered; to train there too: -- --device")
     words = sys.argv[1:]
     end = words.index("--") if "--" in words else len(words)
     given = parser.parse_args(words[:end])

@@ -34,9 +34,7 @@ def split_again(source: Path, out: Path, on_record: set[str]) -> None:
     out.mkdir(parents=True)
     for split, frames in {"train": train[::2], "test": left}.items():
         (out / f"transforms_{split}.json").write_text(json.dumps(old[split] | {"frames": frames}))
-    for folder in {Path(frame["file_path"]).parts[0] for some in old.values() for frame in some["frames"]} | {
-        "depth"
-    }:
+    for folder in {Path(frame["file_path"]).parts[0] for some in old.values() for frame in some["frames"]} | {"depth"}:
         if (source / folder).is_dir():
             shutil.copytree(source / folder, out / folder)
 

@@ -200,9 +200,7 @@ def compare_pair(first: Group, second: Group, criterion: str) -> PairTest:
         second=second.label,
         trials=(len(a), len(b)),
         successes=(len(good_a), len(good_b)),
-        rates_p=float(
-            fisher_exact([[len(good_a), len(a) - len(good_a)], [len(good_b), len(b) - len(good_b)]]).pvalue
-        ),
+        rates_p=float(fisher_exact([[len(good_a), len(a) - len(good_a)], [len(good_b), len(b) - len(good_b)]]).pvalue),
         median_steps=(median(good_a), median(good_b)),
         steps_u=None if test is None else float(test.statistic),
         steps_p=None if test is None else float(test.pvalue),
@@ -221,9 +219,7 @@ def as_record(groups: Sequence[Group]) -> dict[str, Any]:
         }
         for group in groups
     ]
-    pairs = [
-        asdict(pair) | {"criterion": c} for c in ("10%", "5deg 0.05") for pair in pairwise_tests(groups, c)
-    ]
+    pairs = [asdict(pair) | {"criterion": c} for c in ("10%", "5deg 0.05") for pair in pairwise_tests(groups, c)]
     return {"cells": cells, "settings": [g.results[0].settings for g in groups], "pairs": pairs}
 
 
@@ -248,9 +244,7 @@ def main() -> None:
     for part in given.part:
         for folder in given.map:
             scene = folder, given.data
-            base = Plan(
-                method="bid", seed=given.seed, device=given.device, frames=test_frames(*scene, tuning=False)
-            )
+            base = Plan(method="bid", seed=given.seed, device=given.device, frames=test_frames(*scene, tuning=False))
             plans = PARTS[part](base, common, given.trials, scene)
             trials = [trial for plan in plans for trial in trials_of(plan, scene)]
             name = f"{part}_{trials[0].portable.map.replace(':', '_')}"

@@ -48,19 +48,13 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="test photos, evenly spaced (default: all)")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
-    truth = {
-        timed.frame.name: (timed.split, timed.truth)
-        for timed in coloured(given.data)
-        if timed.truth is not None
-    }
+    truth = {timed.frame.name: (timed.split, timed.truth) for timed in coloured(given.data) if timed.truth is not None}
     order = list(truth)
     source = written(given.data, given.out, given.video)
     known = given.out / "poses" / "poses.json"
     began = time.monotonic()
     found = bn.find_poses(source, given.out / "poses", progress=_quiet())
-    result = without_files(to_plain(found)) | (
-        {"seconds": time.monotonic() - began} if not known.exists() else {}
-    )
+    result = without_files(to_plain(found)) | ({"seconds": time.monotonic() - began} if not known.exists() else {})
     placed = {v.frame.name: v for v in bn.open_dataset(given.out / "poses").views("all")}
     if given.video:  # frames are named by their numbers
         placed = {order[int(name)]: renamed(view, order[int(name)]) for name, view in placed.items()}
@@ -166,8 +160,12 @@ def compared(pairs: Sequence[tuple[SE3, SE3]], align: Similarity) -> dict[str, A
     return {
         "scale": align.scale,
         "translation": {"median": float(away.median()), "p90": float(away.quantile(0.9)), "max": float(away.max())},
-        "rotation_deg": {"median": float(turned.median()), "p90": float(turned.quantile(0.9)), "max": float(turned.max())},
-    }  # fmt: skip
+        "rotation_deg": {
+            "median": float(turned.median()),
+            "p90": float(turned.quantile(0.9)),
+            "max": float(turned.max()),
+        },
+    }
 
 
 def trained(views: Sequence[View], folder: Path, steps: int | None) -> Map:
@@ -196,11 +194,12 @@ def localized(scene: Map, queries: Sequence[View], align: Similarity) -> dict[st
         finite = bool(found.T_world_camera.matrix().isfinite().all())
         rows.append(
             {
-                "frame": view.frame.name, "converged": found.converged,
+                "frame": view.frame.name,
+                "converged": found.converged,
                 "translation": float(error.translation) if finite else None,
                 "rotation_deg": float(error.rotation_deg) if finite else None,
             }
-        )  # fmt: skip
+        )
     wrong = [row["frame"] for row in rows if row["converged"] and not _lab.within(row)]
     return _lab.rates(rows) | {"accepted": sum(row["converged"] for row in rows), "accepted_wrong": wrong}
 

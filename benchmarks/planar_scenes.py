@@ -115,9 +115,7 @@ class PlanarMap:
     has_distances: bool = True
 
 
-def rectangle(
-    width: float, height: float, seed: int, pixels: int, at: Sequence[float] = (0, 0, 0)
-) -> Rectangle:
+def rectangle(width: float, height: float, seed: int, pixels: int, at: Sequence[float] = (0, 0, 0)) -> Rectangle:
     """Return a rectangle that faces +z, whose texture has ``pixels`` on its longer side."""
     rows, columns = (max(16, round(pixels * side / max(width, height))) for side in (height, width))
     image = texture(rows, columns, Generator().manual_seed(seed)).permute(2, 0, 1)[None]
@@ -185,11 +183,15 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     right = sum(row["right"] for row in rows)
     missed = sum(row["right"] and not row["converged"] for row in rows)
     return {
-        "n": len(rows), "right": right, "accepted": sum(row["converged"] for row in rows), "silent": len(wrong),
-        "right_not_believed": missed, "share_not_believed": asdict(success_rate(missed, max(right, 1))),
+        "n": len(rows),
+        "right": right,
+        "accepted": sum(row["converged"] for row in rows),
+        "silent": len(wrong),
+        "right_not_believed": missed,
+        "share_not_believed": asdict(success_rate(missed, max(right, 1))),
         "outcomes": {o: sum(r["outcome"] == o for r in rows) for o in sorted({r["outcome"] for r in rows})},
         "silent_errors": [(row["translation"], row["rotation_deg"], row["normalized_error_squared"]) for row in wrong],
-    }  # fmt: skip
+    }
 
 
 def main() -> None:

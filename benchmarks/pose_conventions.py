@@ -115,12 +115,8 @@ WRONG: dict[str, Change] = {
     "positions in a world turned by 30 degrees": lambda T: moved(T, times(T, turn("x", 30))),
     "quaternions w x y z for x y z w": lambda T: reordered(T, 1, 2, 3, 0),
     "quaternions x y z w for w x y z": lambda T: reordered(T, 3, 0, 1, 2),
-    "quaternions x y z w for w x y z, world to camera": lambda T: reordered(
-        T.inverse(), 1, 2, 3, 0
-    ).inverse(),
-    "quaternions w x y z for x y z w, world to camera": lambda T: reordered(
-        T.inverse(), 3, 0, 1, 2
-    ).inverse(),
+    "quaternions x y z w for w x y z, world to camera": lambda T: reordered(T.inverse(), 1, 2, 3, 0).inverse(),
+    "quaternions w x y z for x y z w, world to camera": lambda T: reordered(T.inverse(), 3, 0, 1, 2).inverse(),
     "each of the next image": lambda T: shifted(T, 1),
     "each of the image before the previous one": lambda T: shifted(T, -2),
     "reverse order": lambda T: T[list(range(len(T.translation)))[::-1]],
@@ -133,9 +129,7 @@ WRONG: dict[str, Change] = {
     "angles applied in the reverse order": euler,
     "increments as poses": increments,
     "angles halved": lambda T: SE3(
-        torch.from_numpy(
-            Rotation.from_rotvec(Rotation.from_matrix(T.rotation.numpy()).as_rotvec() / 2).as_matrix()
-        ),
+        torch.from_numpy(Rotation.from_rotvec(Rotation.from_matrix(T.rotation.numpy()).as_rotvec() / 2).as_matrix()),
         T.translation,
     ),
 }
@@ -172,9 +166,10 @@ def checked(images: Sequence[ImageKeypoints], T: SE3, truth: SE3) -> dict[str, A
         answer |= {"agreeing": found.agreeing_as_given, "pairs": found.pairs}
         if found.reading is not None:
             answer |= {
-                "says": found.reading.clause, "then_agreeing": found.agreeing,
+                "says": found.reading.clause,
+                "then_agreeing": found.agreeing,
                 "remedy_right": remedied(found.reading.understand(T), truth),
-            }  # fmt: skip
+            }
     return answer
 
 
@@ -209,9 +204,7 @@ def summary(rows: dict[str, Any]) -> dict[str, Any]:
 def condensed(row: dict[str, Any]) -> dict[str, Any]:
     """Return a capture's row without what its messages say and how long they took."""
     kept = ("refused", "agreeing", "pairs", "then_agreeing", "remedy_right")
-    wrong = {
-        mistake: {key: found[key] for key in kept if key in found} for mistake, found in row["wrong"].items()
-    }
+    wrong = {mistake: {key: found[key] for key in kept if key in found} for mistake, found in row["wrong"].items()}
     return {
         "images": row["images"],
         "right_refused": [part for part, found in row["right"].items() if found["refused"]],

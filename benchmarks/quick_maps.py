@@ -50,14 +50,10 @@ def trained(data: Path, folder: Path) -> Row:
     stored = folder.with_name(f"{folder.name}.json")
     if not stored.exists():
         stages = StageTimes()
-        scene = bn.train(
-            data, out=folder, config="quick", options=bn.TrainOptions(overwrite=True), progress=stages
-        )
+        scene = bn.train(data, out=folder, config="quick", options=bn.TrainOptions(overwrite=True), progress=stages)
         stages.end()
         times = {"cpu_minutes": sum(stages.seconds.values()) / 60, "photos": len(scene.info.cameras)}
-        stored.write_text(
-            json.dumps(times | {"steps": scene.info.step, "cpu_seconds_of_stages": stages.seconds})
-        )
+        stored.write_text(json.dumps(times | {"steps": scene.info.step, "cpu_seconds_of_stages": stages.seconds}))
     found: Row = json.loads(stored.read_text())
     return found
 

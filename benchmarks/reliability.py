@@ -50,14 +50,16 @@ def draw(panel: Any, name: str, found: dict[str, Any]) -> None:
         bins = curves["all"]["reliability"]
         error = curves["all"]["expected_calibration_error"]
         panel.plot(
-            [b["said"] for b in bins], [b["right"] for b in bins], "o-", color=colour, label=f"{label}: error {error:.3f}",
+            [b["said"] for b in bins],
+            [b["right"] for b in bins],
+            "o-",
+            color=colour,
+            label=f"{label}: error {error:.3f}",
             markersize=4,
-        )  # fmt: skip
+        )
     for b in found["right"]["all"]["reliability"]:
         panel.annotate(str(b["n"]), (b["said"], -0.01), ha="center", va="top", fontsize=7, color="0.4")
-    panel.set(
-        xlabel="stated confidence", ylabel="share of answers", title=name, xlim=(0, 1), ylim=(-0.07, 1.03)
-    )
+    panel.set(xlabel="stated confidence", ylabel="share of answers", title=name, xlim=(0, 1), ylim=(-0.07, 1.03))
     panel.legend(loc="lower right", bbox_to_anchor=(1.0, 0.08))
 
 

@@ -147,16 +147,12 @@ def main() -> None:
     scenes: dict[str, Any] = {}
     total: dict[str, Counter[str]] = {}
     for scene in map(Scene.open, given.scenes):
-        found = scenes[scene.folder.name] = measured(
-            scene.map, scene.views(given.tuning_frames, given.frames)
-        )
+        found = scenes[scene.folder.name] = measured(scene.map, scene.views(given.tuning_frames, given.frames))
         print(scene.folder.name, found, flush=True)
         for name, count in found.items():
             total.setdefault(name, Counter()).update(count)
     believed = {name: asdict(success_rate(count["believed"], count["n"])) for name, count in total.items()}
-    record(
-        given.name, {"scenes": scenes, "all": {n: dict(c) for n, c in total.items()}, "believed": believed}
-    )
+    record(given.name, {"scenes": scenes, "all": {n: dict(c) for n, c in total.items()}, "believed": believed})
 
 
 if __name__ == "__main__":

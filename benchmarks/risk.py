@@ -182,9 +182,7 @@ def main() -> None:
     answers = crossed(rows)
     scenes = sorted({row["scene"] for row in rows})
     held_out = {
-        scene: realised(
-            tested([r for r in rows if r["scene"] != scene], [r for r in rows if r["scene"] == scene])
-        )
+        scene: realised(tested([r for r in rows if r["scene"] != scene], [r for r in rows if r["scene"] == scene]))
         for scene in scenes
     }
     least = {f"{risk:g}": value for risk, value in calibrated(rows).items() if value < float("inf")}

@@ -100,9 +100,7 @@ def localizer(name: str, data: Path, folder: Path) -> Localizer:
         if found.surface is None:
             raise InputError("not finished")
     except InputError:
-        import_map(
-            folder / file, place, photos=data if has_photos else None, options=ImportOptions(overwrite=True)
-        )
+        import_map(folder / file, place, photos=data if has_photos else None, options=ImportOptions(overwrite=True))
         found = load_map(place)
     return Localizer(found)
 
@@ -160,8 +158,11 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
     judged = judgement(rows) if all(row["converged"] is not None for row in rows) else {}
     names = {"accepted": "converged", "silent": "silent", "right_but_rejected": "right_but_rejected"}
     return {
-        "n": len(rows), **rates(rows), **cpu_seconds(rows), **{n: judged.get(k) for n, k in names.items()},
-    }  # fmt: skip
+        "n": len(rows),
+        **rates(rows),
+        **cpu_seconds(rows),
+        **{n: judged.get(k) for n, k in names.items()},
+    }
 
 
 def main() -> None:
@@ -174,10 +175,7 @@ def main() -> None:
     given = arguments.parse_args()
     one_thread()
     with RowStore(RESULTS / f"{given.name}.rows.jsonl") as store:
-        found = {
-            data.name: {n: summary(r) for n, r in scene_rows(data, given, store).items()}
-            for data in given.data
-        }
+        found = {data.name: {n: summary(r) for n, r in scene_rows(data, given, store).items()} for data in given.data}
     versions = {
         name: version(name)
         for name in ("open3d", "kiss-matcher", "small_gicp", "trimesh")

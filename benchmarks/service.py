@@ -79,9 +79,7 @@ class Server:
     def ask(
         self, method: str, path: str, body: bytes | None = None, kind: str = FORM, timeout: float = 120
     ) -> tuple[int, bytes]:
-        connection = http.client.HTTPConnection(
-            str(self.address.hostname), self.address.port, timeout=timeout
-        )
+        connection = http.client.HTTPConnection(str(self.address.hostname), self.address.port, timeout=timeout)
         with contextlib.closing(connection):
             connection.request(method, path, body, {"Content-Type": kind})
             answer = connection.getresponse()
@@ -89,9 +87,7 @@ class Server:
 
     def raw(self, content: bytes, timeout: float = 30) -> bytes:
         """Send bytes, and return what comes back until the connection ends."""
-        with socket.create_connection(
-            (self.address.hostname, self.address.port), timeout=timeout
-        ) as connection:
+        with socket.create_connection((self.address.hostname, self.address.port), timeout=timeout) as connection:
             with contextlib.suppress(OSError):
                 connection.sendall(content)
                 connection.shutdown(socket.SHUT_WR)
@@ -103,9 +99,7 @@ class Server:
 
     def metric(self, name: str) -> float:
         text = self.ask("GET", "/metrics")[1].decode()
-        return sum(
-            float(line.rpartition(" ")[2]) for line in text.splitlines() if line.startswith(f"bidnerf_{name}")
-        )
+        return sum(float(line.rpartition(" ")[2]) for line in text.splitlines() if line.startswith(f"bidnerf_{name}"))
 
     def processes(self) -> list[int]:
         """Return the service, the process with the maps, and the workers."""
@@ -160,8 +154,12 @@ def photos(folder: Path, data: Path, count: int) -> list[Photo]:
         ]
         done = subprocess.run(
             [sys.executable, "-c", program, *map(str, words), "--json"],
-            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, check=True, env=os.environ | {"OMP_NUM_THREADS": "1"},
-        )  # fmt: skip
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            check=True,
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
+        )
     answers = [json.loads(line) for line in done.stdout.splitlines()]
     unit, given = b"0.001", camera.encode()
     return [
@@ -185,9 +183,7 @@ def form(**parts: bytes) -> bytes:
     for name, content in parts.items():
         file = f'; filename="{name}"' if name in ("photo", "depth", "camera") else ""
         text += (
-            f'--boundary\r\nContent-Disposition: form-data; name="{name}"{file}\r\n\r\n'.encode()
-            + content
-            + b"\r\n"
+            f'--boundary\r\nContent-Disposition: form-data; name="{name}"{file}\r\n\r\n'.encode() + content + b"\r\n"
         )
     return text + b"--boundary--\r\n"
 
@@ -234,10 +230,15 @@ def asked(server: Server, given: list[Photo], clients: int, seconds: float) -> R
         thread.join()
     p50, p95, p99 = map(float, np.percentile(taken, [50, 95, 99]))
     return {
-        "clients": clients, "seconds": seconds, "requests": sum(statuses.values()), "statuses": dict(statuses),
-        "latency_seconds": {"p50": p50, "p95": p95, "p99": p99}, "per_second": len(taken) / seconds,
-        "identical": sum(value == 0 for value in worst), "largest_difference": max(worst, default=0.0),
-    }  # fmt: skip
+        "clients": clients,
+        "seconds": seconds,
+        "requests": sum(statuses.values()),
+        "statuses": dict(statuses),
+        "latency_seconds": {"p50": p50, "p95": p95, "p99": p99},
+        "per_second": len(taken) / seconds,
+        "identical": sum(value == 0 for value in worst),
+        "largest_difference": max(worst, default=0.0),
+    }
 
 
 def load(folder: Path, given: list[Photo], workers: int, seconds: float) -> Row:
@@ -277,9 +278,7 @@ def kills(folder: Path, given: list[Photo], workers: int, seconds: float) -> Row
 def malformed(folder: Path, given: list[Photo], workers: int, seconds: float) -> Row:
     """Send 1,000 requests that are wrong in the head, in the form, in the image or in the values."""
     drawn, statuses, slowest = random.Random(0), Counter[str](), 0.0
-    small = form(
-        photo=png(40, 30), focal=b"30", seed=b"1", start=b"[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
-    )
+    small = form(photo=png(40, 30), focal=b"30", seed=b"1", start=b"[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]")
     bodies = [
         (b"/localize", FORM, small),
         (b"/localize", FORM, given[0].body),
@@ -302,19 +301,20 @@ def malformed(folder: Path, given: list[Photo], workers: int, seconds: float) ->
             statuses[answer[9:12].decode() if answer.startswith(b"HTTP/1.1 ") else "closed"] += 1
         alive = server.ask("POST", "/localize", given[0].body)[0]
         return {
-            "requests": 1000, "statuses": dict(sorted(statuses.items())), "slowest_seconds": slowest,
-            "memory_MiB": {"before": before, "after": server.memory()}, "then": alive,
+            "requests": 1000,
+            "statuses": dict(sorted(statuses.items())),
+            "slowest_seconds": slowest,
+            "memory_MiB": {"before": before, "after": server.memory()},
+            "then": alive,
             "workers_ended": server.metric('worker_restarts_total{reason="died"}'),
-        }  # fmt: skip
+        }
 
 
 def png(width: int, height: int) -> bytes:
     """Return a PNG of one bit a pixel, all of which are black; a large one is cut short."""
 
     def chunk(kind: bytes, content: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-        )
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
     head = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
     rows = zlib.compress(bytes(((width + 7) // 8 + 1) * min(height, 4000)), 9)
@@ -420,9 +420,7 @@ def leave(server: Server, photo: Photo) -> Row:
     before = server.metric('worker_restarts_total{reason="cancelled"}')
     head = f"POST /localize HTTP/1.1\r\nHost: localhost\r\nContent-Type: {FORM}\r\nContent-Length: {len(photo.body)}\r\n\r\n"
     for number in range(50):
-        with socket.create_connection(
-            (server.address.hostname, server.address.port), timeout=30
-        ) as connection:
+        with socket.create_connection((server.address.hostname, server.address.port), timeout=30) as connection:
             connection.sendall(head.encode() + photo.body[: len(photo.body) // (1 + number % 2)])
             time.sleep(0.1)
     return {"work_stopped": server.metric('worker_restarts_total{reason="cancelled"}') - before}
@@ -447,8 +445,9 @@ def schema(folder: Path, given: list[Photo], workers: int, seconds: float) -> Ro
                 row["headers"] = sorted(set().union(*row["headers"].values()))
                 ended = None if token else server.metric('worker_restarts_total{reason="died"}')
                 found[name] = row | {
-                    "memory_MiB": {"before": before, "after": server.memory()}, "workers_ended": ended,
-                }  # fmt: skip
+                    "memory_MiB": {"before": before, "after": server.memory()},
+                    "workers_ended": ended,
+                }
     return found
 
 
@@ -462,13 +461,9 @@ def main() -> None:
     options.add_argument(
         "scene", metavar="MAP:DATA", help="folder of a map, folder of its dataset with transforms_test.json"
     )
-    options.add_argument(
-        "--seconds", type=float, default=60.0, help="of each level of load (default: %(default)s)"
-    )
+    options.add_argument("--seconds", type=float, default=60.0, help="of each level of load (default: %(default)s)")
     options.add_argument("--workers", type=int, default=2)
-    options.add_argument(
-        "--photos", type=int, default=12, help="different test images (default: %(default)s)"
-    )
+    options.add_argument("--photos", type=int, default=12, help="different test images (default: %(default)s)")
     options.add_argument("--part", nargs="+", choices=PARTS, default=list(PARTS))
     options.add_argument("--work", type=Path, help="file in which finished parts are kept")
     given = options.parse_args()

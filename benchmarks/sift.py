@@ -243,9 +243,14 @@ def opencv_pnp(
     cv2.setRNGSeed(seed)
     camera = (intrinsics.matrix().numpy(), np.array(intrinsics.distortion) if intrinsics.distortion else None)
     good, turn, shift, inliers = cv2.solvePnPRansac(
-        points, pixels, *camera, iterationsCount=OPENCV_TRIALS, reprojectionError=OPENCV_ERROR,
-        confidence=OPENCV_CONFIDENCE, flags=cv2.SOLVEPNP_AP3P,
-    )  # fmt: skip
+        points,
+        pixels,
+        *camera,
+        iterationsCount=OPENCV_TRIALS,
+        reprojectionError=OPENCV_ERROR,
+        confidence=OPENCV_CONFIDENCE,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
     if not good or inliers is None:
         return None
     kept = inliers[:, 0]

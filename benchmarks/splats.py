@@ -135,15 +135,12 @@ def by_mode(
         for name, scene in scenes.items():
             print(line(f"{scene.name} {mode} {method} {name}", rows[name]), flush=True)
         summaries[mode] = {
-            name: {"n": len(part), **rates(part), **judgement(part), **cpu_seconds(part)}
-            for name, part in rows.items()
+            name: {"n": len(part), **rates(part), **judgement(part), **cpu_seconds(part)} for name, part in rows.items()
         }
     return summaries
 
 
-def started(
-    scenes: dict[str, Scene], method: str, given: argparse.Namespace, store: RowStore
-) -> dict[str, Any]:
+def started(scenes: dict[str, Scene], method: str, given: argparse.Namespace, store: RowStore) -> dict[str, Any]:
     """Return summaries of the answers of a method that needs a start."""
     settings = STEPS.get(method, {})
     config = settings_of(method, settings)
@@ -184,15 +181,9 @@ def main() -> None:
     arguments = parser(__doc__, "splats")
     arguments.add_argument("scenes", nargs="+", metavar="SPLAT:HASHGRID:DATA")
     arguments.add_argument("--frames", type=int, help="test frames of each scene (default: all)")
-    arguments.add_argument(
-        "--tuning-frames", action="store_true", help="only frames that settings are tuned on"
-    )
-    arguments.add_argument(
-        "--images", type=int, default=8, help="test images to render (default: %(default)s)"
-    )
-    arguments.add_argument(
-        "--pairs", type=int, default=10, help="timed steps of each field (default: %(default)s)"
-    )
+    arguments.add_argument("--tuning-frames", action="store_true", help="only frames that settings are tuned on")
+    arguments.add_argument("--images", type=int, default=8, help="test images to render (default: %(default)s)")
+    arguments.add_argument("--pairs", type=int, default=10, help="timed steps of each field (default: %(default)s)")
     arguments.add_argument("--methods", nargs="*", default=[], help="methods that need a start")
     arguments.add_argument(
         "--start-in",
@@ -200,9 +191,7 @@ def main() -> None:
         metavar="DATA",
         help="names of the data that they are tried on (default: all)",
     )
-    arguments.add_argument(
-        "--started", type=int, default=4, help="test frames with a start (default: %(default)s)"
-    )
+    arguments.add_argument("--started", type=int, default=4, help="test frames with a start (default: %(default)s)")
     given = arguments.parse_args()
     one_thread()
     with RowStore(RESULTS / f"{given.name}.rows.jsonl") as store:

@@ -151,7 +151,7 @@ def summary(rows: Sequence[Row], right: tuple[float, float]) -> dict[str, Any]:
         "wrong_of_accepted": sum(not within(row, right) for row in accepted),
         "inside_95_of_accepted": sum(value is not None and value <= BOUND for value in squared),
         **cpu_seconds(rows),
-    }  # fmt: skip
+    }
 
 
 def main() -> None:

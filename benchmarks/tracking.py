@@ -98,9 +98,7 @@ def plain_wall(frames: Frames) -> Run:
 
     def wall(frame: Frame) -> Frame:
         rgb = (0.6 + 0.02 * torch.randn(frame.rgb.shape, generator=generator)).clamp(0, 1)
-        return replace(
-            frame, rgb=rgb, depth=None if frame.depth is None else torch.full_like(frame.depth, 1.0)
-        )
+        return replace(frame, rgb=rgb, depth=None if frame.depth is None else torch.full_like(frame.depth, 1.0))
 
     return changed(frames, range(FIRST, FIRST + 30), wall)
 
@@ -183,13 +181,22 @@ def changed(frames: Frames, part: range, change: Callable[[Frame], Frame]) -> Ru
 
 
 ORDERS: dict[str, Callable[[Frames], Run]] = {
-    "in order": whole, "every 2nd": thinned(2), "every 4th": thinned(4), "backwards": backwards,
-}  # fmt: skip
+    "in order": whole,
+    "every 2nd": thinned(2),
+    "every 4th": thinned(4),
+    "backwards": backwards,
+}
 FAULTS: dict[str, Callable[[Frames], Run]] = {
-    "covered for 15 frames": covered, "carried 100 frames on": carried, "plain wall for 30 frames": plain_wall,
-    "half the image covered": half_covered, "depth stops": depth_stops, "exposure ramp": exposure_ramp,
-    "frames doubled": doubled, "frames out of order": out_of_order, "no time stamps": without_times,
-}  # fmt: skip
+    "covered for 15 frames": covered,
+    "carried 100 frames on": carried,
+    "plain wall for 30 frames": plain_wall,
+    "half the image covered": half_covered,
+    "depth stops": depth_stops,
+    "exposure ramp": exposure_ramp,
+    "frames doubled": doubled,
+    "frames out of order": out_of_order,
+    "no time stamps": without_times,
+}
 
 
 # Baselines.
@@ -229,22 +236,32 @@ class GicpFromLast:
         points = (ray * frame.depth.double()[..., None])[frame.depth > 0]
         source, _ = self._gicp.preprocess_points(points.numpy(), self._voxel, num_threads=1)
         done = self._gicp.align(
-            self._target, source, self._tree, self._last.matrix().numpy(), registration_type="GICP",
-            max_correspondence_distance=5 * self._voxel, num_threads=1,
-        )  # fmt: skip
+            self._target,
+            source,
+            self._tree,
+            self._last.matrix().numpy(),
+            registration_type="GICP",
+            max_correspondence_distance=5 * self._voxel,
+            num_threads=1,
+        )
         self._last = SE3.from_matrix(torch.from_numpy(done.T_target_source).double())
         return Localization(
-            self._last, Outcome.CONVERGED, "", 1, 0.0, float(done.error),
-            "gicp", self._last[None], torch.zeros(1),
-        )  # fmt: skip
+            self._last,
+            Outcome.CONVERGED,
+            "",
+            1,
+            0.0,
+            float(done.error),
+            "gicp",
+            self._last[None],
+            torch.zeros(1),
+        )
 
 
 # Tracking.
 
 
-def tracked(
-    run: Run, step: Callable[[Frame, float | None], Localization], depth: bool
-) -> list[dict[str, Any]]:
+def tracked(run: Run, step: Callable[[Frame, float | None], Localization], depth: bool) -> list[dict[str, Any]]:
     """Track a run; return one row per frame."""
     rows = []
     for timed in run.frames:
@@ -258,9 +275,13 @@ def tracked(
 
 def _row(timed: TimedFrame, found: Localization, seconds: float) -> dict[str, Any]:
     row: dict[str, Any] = {
-        "frame": timed.frame.name, "split": timed.split, "accepted": found.converged, "cpu_seconds": seconds,
-        "pose": found.T_world_camera.matrix().tolist(), "truth": None,
-    }  # fmt: skip
+        "frame": timed.frame.name,
+        "split": timed.split,
+        "accepted": found.converged,
+        "cpu_seconds": seconds,
+        "pose": found.T_world_camera.matrix().tolist(),
+        "truth": None,
+    }
     if timed.truth is None:
         return row
     error = pose_error(found.T_world_camera, timed.truth)
@@ -277,9 +298,7 @@ def frames_until_accepted(rows: Sequence[dict[str, Any]], first: int) -> int:
     return next(later, len(rows) - first + 1)
 
 
-def summary(
-    rows: Sequence[dict[str, Any]], blind: range = range(0), returns: int | None = None
-) -> dict[str, Any]:
+def summary(rows: Sequence[dict[str, Any]], blind: range = range(0), returns: int | None = None) -> dict[str, Any]:
     """Return errors of accepted poses, how well the answers judge themselves, recovery, and time."""
     known = [r for r in rows if r["truth"] is not None]
     accepted = [r for r in known if r["accepted"]]
@@ -298,10 +317,11 @@ def summary(
         "longest_loss_in_sight": max((b - a + 1 for a, b in _losses(rows, blind)), default=0),
         "inside_95": None if not inside else sum(inside) / len(inside),
         "cpu_ms": {
-            "median": 1000 * statistics.median(times), "mean": 1000 * statistics.mean(times),
+            "median": 1000 * statistics.median(times),
+            "mean": 1000 * statistics.mean(times),
             "p95": 1000 * sorted(times)[int(0.95 * (len(times) - 1))],
         },
-    }  # fmt: skip
+    }
     if accepted:
         poses = [torch.tensor([r[name] for r in accepted], dtype=torch.float64) for name in ("pose", "truth")]
         found["errors"] = asdict(TrajectoryErrors.of(*(SE3.from_matrix(m) for m in poses)))
@@ -353,10 +373,14 @@ def sequence(stored: Map, path: Path, given: argparse.Namespace, store: RowStore
 
 def _line(sequence: str, name: str, s: dict[str, Any]) -> str:
     errors = s.get("errors")
-    raw = "no pose" if errors is None else (
-        f"median {errors['raw']['translation_median']:.4f} m {errors['raw']['rotation_deg_median']:.2f} deg,"
-        f" p95 {errors['raw']['translation_p95']:.4f} m"
-    )  # fmt: skip
+    raw = (
+        "no pose"
+        if errors is None
+        else (
+            f"median {errors['raw']['translation_median']:.4f} m {errors['raw']['rotation_deg_median']:.2f} deg,"
+            f" p95 {errors['raw']['translation_p95']:.4f} m"
+        )
+    )
     inside = "-" if s["inside_95"] is None else f"{s['inside_95']:.3f}"
     return (
         f"{sequence} {name}: {s['accepted']}/{s['frames']}, wrong {s['accepted_but_wrong']}, blind"
@@ -420,8 +444,11 @@ def remembered(tracker: Tracker, frames: Iterator[TimedFrame], depth: bool) -> I
             cpu = {"median": statistics.median(milliseconds), "mean": statistics.mean(milliseconds)}
             objects = len(gc.get_objects())
             yield {
-                "frames": number, "resident_bytes": resident_bytes(), "python_objects": objects, "cpu_ms": cpu,
-            } | counts  # fmt: skip
+                "frames": number,
+                "resident_bytes": resident_bytes(),
+                "python_objects": objects,
+                "cpu_ms": cpu,
+            } | counts
             milliseconds, counts = [], dict.fromkeys(counts, 0)
 
 
@@ -444,14 +471,10 @@ def main() -> None:
     arguments = parser(__doc__, "tracking")
     arguments.add_argument("scenes", nargs="*", metavar="MAP:SEQUENCE")
     arguments.add_argument("--tuning-frames", action="store_true", help="the training split alone")
-    arguments.add_argument(
-        "--quick", action="store_true", help="leave out auto on each frame, which takes longest"
-    )
+    arguments.add_argument("--quick", action="store_true", help="leave out auto on each frame, which takes longest")
     arguments.add_argument("--first", type=int, help="the first frames of each sequence alone")
     arguments.add_argument("--only", nargs="*", default=(), help="runs whose names contain one of these")
-    arguments.add_argument(
-        "--memory", type=int, metavar="COUNT", help="track that many frames in one tracker instead"
-    )
+    arguments.add_argument("--memory", type=int, metavar="COUNT", help="track that many frames in one tracker instead")
     arguments.add_argument("--no-depth", action="store_true", help="with --memory: show colours alone")
     given = arguments.parse_args()
     one_thread()

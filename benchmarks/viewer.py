@@ -75,9 +75,11 @@ def answers_while_localizing(page: Any, address: str, photo: Path) -> Row:
         urllib.request.urlopen(f"{address}/health").read()
         taken.append(1000 * (time.perf_counter() - asked))
     return {
-        "seconds_to_answer_with_pictures": time.perf_counter() - began, "answers": len(taken),
-        "median_ms": statistics.median(taken), "largest_ms": max(taken),
-    }  # fmt: skip
+        "seconds_to_answer_with_pictures": time.perf_counter() - began,
+        "answers": len(taken),
+        "median_ms": statistics.median(taken),
+        "largest_ms": max(taken),
+    }
 
 
 def main() -> None:
@@ -117,11 +119,21 @@ def main() -> None:
         browser.close()
     stop.set()
     server.join()
-    record(given.name, {
-        "scene": scene.name, "cameras": given.cameras, "surfels": len(shown.surface.surfels) if shown.surface else 0,
-        "chromium": version, "window": SIZE, "start_seconds": started, "page_megabytes": page_bytes / 1e6,
-        "server_mebibytes_added": resident() - before, "median": {k: statistics.median(r[k] for r in rounds) for k in rounds[0]}, "rounds": rounds,
-    })  # fmt: skip
+    record(
+        given.name,
+        {
+            "scene": scene.name,
+            "cameras": given.cameras,
+            "surfels": len(shown.surface.surfels) if shown.surface else 0,
+            "chromium": version,
+            "window": SIZE,
+            "start_seconds": started,
+            "page_megabytes": page_bytes / 1e6,
+            "server_mebibytes_added": resident() - before,
+            "median": {k: statistics.median(r[k] for r in rounds) for k in rounds[0]},
+            "rounds": rounds,
+        },
+    )
 
 
 if __name__ == "__main__":

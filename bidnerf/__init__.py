@@ -12,12 +12,7 @@ import bidnerf_core as bidnerf_core  # sets what must be set before torch is loa
 # Modules are imported on first use (PEP 562): importing torch takes seconds, and ``bidnerf --help`` does not need it. The
 # stub beside this file, which type checkers read, names each public name and the package that defines it.
 _STUB = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
-_HOMES = {
-    each.name: str(node.module)
-    for node in _STUB.body
-    if isinstance(node, ast.ImportFrom)
-    for each in node.names
-}
+_HOMES = {each.name: str(node.module) for node in _STUB.body if isinstance(node, ast.ImportFrom) for each in node.names}
 __all__ = sorted(_HOMES)
 
 

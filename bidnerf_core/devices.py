@@ -118,9 +118,7 @@ def captured(
             if generator is not None and before is not None:
                 generator.graphsafe_set_state(before)  # the registered one still expects a capture
             why = str(error).partition("\n")[0]
-            warnings.warn(
-                f"operations are launched one by one, since a step cannot be captured: {why}", stacklevel=2
-            )
+            warnings.warn(f"operations are launched one by one, since a step cannot be captured: {why}", stacklevel=2)
             return step
         finally:  # by identity, since two empty lists are equal
             _notes[:] = [notes for notes in _notes if notes is not constants]
@@ -188,9 +186,7 @@ class _Lane:
 class _Remote:
     """A function whose arguments are copied into fixed tensors on a device, as a CUDA graph requires."""
 
-    def __init__(
-        self, function: Callable[..., Any], values: Any, tensors: Sequence[Tensor], lane: _Lane
-    ) -> None:
+    def __init__(self, function: Callable[..., Any], values: Any, tensors: Sequence[Tensor], lane: _Lane) -> None:
         self._lane, self._calls, device = lane, 0, lane.device
         # Tensors of any dtype begin at multiples of 16 bytes in the common buffer.
         sizes = [-(-t.nbytes // 16) * 16 if t.device.type == "cpu" else 0 for t in tensors]

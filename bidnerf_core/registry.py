@@ -133,8 +133,11 @@ def list_plugins(group: str) -> list[PluginInfo]:
     """
     if group not in GROUPS:
         raise unknown_name("group of plugins", group, GROUPS)
-    own = [PluginInfo(of, name, type(value).__name__, "this process", "")
-           for (of, name), value in list(registered.items()) if of == group]  # fmt: skip
+    own = [
+        PluginInfo(of, name, type(value).__name__, "this process", "")
+        for (of, name), value in list(registered.items())
+        if of == group
+    ]
     replaced = {info.name for info in own}
     declared = [info for info in _declared(group) if info.name not in replaced]
     return sorted([*own, *declared], key=lambda info: (info.name, info.distribution, info.value))
@@ -241,9 +244,7 @@ class Plugins(Mapping[str, Plugin], Generic[Plugin]):
         return self.load(name)
 
 
-def interface_defects(
-    plugin: Any, attributes: Sequence[str], methods: Mapping[str, Sequence[str]]
-) -> Iterator[str]:
+def interface_defects(plugin: Any, attributes: Sequence[str], methods: Mapping[str, Sequence[str]]) -> Iterator[str]:
     """Yield the reasons why an object does not implement an interface.
 
     ``attributes`` are names, and ``methods`` maps names to the names of parameters. Among the attributes,

@@ -82,8 +82,7 @@ class OneOf:
         return any(
             isinstance(value, type(known))
             and value == known
-            and isinstance(value, bool)
-            == isinstance(known, bool)  # True is 1, but not where a number is expected
+            and isinstance(value, bool) == isinstance(known, bool)  # True is 1, but not where a number is expected
             for known in self.table
         )
 
@@ -139,9 +138,7 @@ def to_flat(settings: Any) -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
-        flat |= (
-            to_flat(value) if dataclasses.is_dataclass(value) else {field.name: to_plain(value, field.name)}
-        )
+        flat |= to_flat(value) if dataclasses.is_dataclass(value) else {field.name: to_plain(value, field.name)}
     return flat
 
 

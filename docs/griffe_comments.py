@@ -34,9 +34,7 @@ class Comments(griffe.Extension):
 
 def _describe(kind: griffe.Class) -> None:
     """Add the attributes of ``kind`` that have a comment to its docstring."""
-    fields = [
-        m for m in kind.members.values() if isinstance(m, griffe.Attribute) and "property" not in m.labels
-    ]
+    fields = [m for m in kind.members.values() if isinstance(m, griffe.Attribute) and "property" not in m.labels]
     for member in kind.members.values():
         if member.name == "__post_init__":  # it checks values, and is of no use to a caller
             member.public = False

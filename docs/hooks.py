@@ -36,9 +36,7 @@ LINK = re.compile(r"\[([^\]]+)\]\((?!https?:)([^)]+)\)")
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     """Add the README as the first page, and the measurements that are kept beside the records."""
     for name, file in {"index.md": "README.md", "measurements.md": "benchmarks/results/README.md"}.items():
-        files.append(
-            File.generated(config, name, content=page_of_site((ROOT / file).read_text(encoding="utf-8")))
-        )
+        files.append(File.generated(config, name, content=page_of_site((ROOT / file).read_text(encoding="utf-8"))))
     return files
 
 
@@ -134,10 +132,7 @@ def field_comments(kind: type) -> dict[str, str]:
     }
     body = typing.cast(ast.ClassDef, ast.parse(source).body[0]).body
     fields = [node for node in body if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)]
-    return {
-        typing.cast(ast.Name, node.target).id: _comment(node, source.splitlines(), comments)
-        for node in fields
-    }
+    return {typing.cast(ast.Name, node.target).id: _comment(node, source.splitlines(), comments) for node in fields}
 
 
 def _comment(field: ast.AnnAssign, lines: list[str], comments: dict[int, str]) -> str:

@@ -63,11 +63,7 @@ def origin(record: Record) -> str:
     """Return the date, the commit and the hardware of a record."""
     date = datetime.fromisoformat(record["date"])
     cpu = re.sub(r"\(R\)| Processor| @.*", "", record["cpu"])
-    machine = (
-        " ".join(str(record["gpu"]).split()[:2])
-        if record.get("gpu")
-        else f"{record['cores']} cores of an {cpu}"
-    )
+    machine = " ".join(str(record["gpu"]).split()[:2]) if record.get("gpu") else f"{record['cores']} cores of an {cpu}"
     return f"{date.day} {date:%B %Y}, {record['commit'][:7]}; {machine}"
 
 
@@ -107,16 +103,43 @@ def _lines(head: Row, rows: Iterable[Row]) -> str:
 
 MEASURES = {
     "images": ("n", "frames", "trials", "tried", "photos", "images", "test", "requests", "pairs"),
-    "right": ("5deg 0.05", "right", "right.5deg 0.05", "success.5deg 0.05", "criteria.5deg 0.05", "within 5 degrees, 0.05", "5 cm, 5 deg"),
+    "right": (
+        "5deg 0.05",
+        "right",
+        "right.5deg 0.05",
+        "success.5deg 0.05",
+        "criteria.5deg 0.05",
+        "within 5 degrees, 0.05",
+        "5 cm, 5 deg",
+    ),
     "within 1°, 0.02": ("1deg 0.02", "strict", "right.1deg 0.02", "success.1deg 0.02", "criteria.1deg 0.02"),
     "within 2 cm, 2°": ("2 cm, 2 deg",),
     "to 10 % of the start": ("success.10%", "criteria.10%", "10%"),
     "accepted": ("accepted", "converged", "believed"),
-    "of these wrong": ("silent", "accepted_but_wrong", "converged_but_wrong", "wrong_of_accepted", "accepted_wrong", "wrong"),
+    "of these wrong": (
+        "silent",
+        "accepted_but_wrong",
+        "converged_but_wrong",
+        "wrong_of_accepted",
+        "accepted_wrong",
+        "wrong",
+    ),
     "right but refused": ("right_but_rejected", "right_but_not_converged", "right_lost"),
     "inside the 95 % bound": ("inside", "inside_95_of_converged", "inside_95_of_accepted", "inside_95"),
-    "median error": ("median_translation", "translation_median", "errors.raw.translation_median", "translation", "translation.median"),
-    "and angle": ("median_rotation_deg", "rotation_deg_median", "errors.raw.rotation_deg_median", "rotation_deg", "rotation_deg.median"),
+    "median error": (
+        "median_translation",
+        "translation_median",
+        "errors.raw.translation_median",
+        "translation",
+        "translation.median",
+    ),
+    "and angle": (
+        "median_rotation_deg",
+        "rotation_deg_median",
+        "errors.raw.rotation_deg_median",
+        "rotation_deg",
+        "rotation_deg.median",
+    ),
     "calibration error": ("expected_calibration_error",),
     "refused": ("refused",),
     "damaged": ("damaged",),
@@ -135,17 +158,50 @@ MEASURES = {
     "time, ms": ("cpu_ms.median", "graph_ms", "ms", "ms_per_step", "milliseconds_per_step"),
     "as launched, ms": ("launched_ms",),
     "memory": ("peak_resident_GiB", "training.peak_resident_GiB", "resident_MB", "megabytes"),
-}  # fmt: skip
+}
 """The columns of the page of all measurements, and the names that records have for each."""
 INNER = {
-    "cells", "scenes", "counts", "peers", "methods", "maps", "variants", "measurements", "starts", "summary", "extend", "levels",
-    "load", "localized", "answers", "from_starts", "held_out", "problems", "by_scene", "wrong", "rows", "sizes",
-}  # fmt: skip
+    "cells",
+    "scenes",
+    "counts",
+    "peers",
+    "methods",
+    "maps",
+    "variants",
+    "measurements",
+    "starts",
+    "summary",
+    "extend",
+    "levels",
+    "load",
+    "localized",
+    "answers",
+    "from_starts",
+    "held_out",
+    "problems",
+    "by_scene",
+    "wrong",
+    "rows",
+    "sizes",
+}
 """Names in records that say nothing of what was measured."""
 ASIDE = {
-    "settings", "common_settings", "config", "versions", "map", "localization_map", "run", "pairs", "rounds", "paper_percent",
-    "right", "success", "criteria", "errors", "median",
-}  # fmt: skip
+    "settings",
+    "common_settings",
+    "config",
+    "versions",
+    "map",
+    "localization_map",
+    "run",
+    "pairs",
+    "rounds",
+    "paper_percent",
+    "right",
+    "success",
+    "criteria",
+    "errors",
+    "median",
+}
 """Parts of records that hold no measurements."""
 NAMES = ("scene", "start", "condition", "clients", "title", "level")
 """What tells the elements of a list apart."""
@@ -231,11 +287,7 @@ def _shown_value(value: Any) -> str:
     counts = isinstance(value, list) and len(value) == 2 and all(isinstance(x, int) for x in value)
     if counts or (isinstance(value, dict) and ("rate" in value or {"successes", "trials"} <= value.keys())):
         return _of(value)
-    return (
-        str(len(value))
-        if isinstance(value, list) and all(isinstance(x, str) for x in value) and value
-        else ""
-    )
+    return str(len(value)) if isinstance(value, list) and all(isinstance(x, str) for x in value) and value else ""
 
 
 def _seconds(value: float) -> str:
@@ -258,8 +310,7 @@ def _shown(name: str) -> str:
     """Return faults as ``--fault`` takes them, without the size of those that are just on or off."""
     parts = (part.partition(":") for part in name.split("+"))
     return "+".join(
-        kind if kind in FAULTS and FAULTS[kind].is_switch else kind + mark + size
-        for kind, mark, size in parts
+        kind if kind in FAULTS and FAULTS[kind].is_switch else kind + mark + size for kind, mark, size in parts
     )
 
 
@@ -273,13 +324,10 @@ CLEAN = {"RGB": "no_start_rgb", "RGB-D": "no_start_rgbd"}
 def headline(records: Records) -> str:
     """README's sentence about localization without a start."""
     cells = {
-        sensor: [scene[sensor]["none"] for scene in records[name]["cells"].values()]
-        for sensor, name in CLEAN.items()
+        sensor: [scene[sensor]["none"] for scene in records[name]["cells"].values()] for sensor, name in CLEAN.items()
     }
     every = [cell for some in cells.values() for cell in some]
-    counts = {
-        sensor: [sum(cell[key] for cell in some) for key in ("right", "n")] for sensor, some in cells.items()
-    }
+    counts = {sensor: [sum(cell[key] for cell in some) for key in ("right", "n")] for sensor, some in cells.items()}
     accepted, wrong = (sum(cell[key] for cell in every) for key in ("converged", "silent"))
     times = [cell["median_cpu_seconds"] for cell in every]
     (a, b), (c, d) = counts.values()
@@ -301,9 +349,16 @@ def peers(records: Records) -> str:
         for name, title in names.items():
             p = sensors["RGB"]["peers"][name]
             rows.append(
-                (SCENES[scene], title, _of(p["5deg 0.05"]), _of(p["1deg 0.02"]), _length(p["median_translation"]),
-                 f"{p['accepted']}, {p['silent']} wrong", _seconds(p["median_cpu_seconds"]))
-            )  # fmt: skip
+                (
+                    SCENES[scene],
+                    title,
+                    _of(p["5deg 0.05"]),
+                    _of(p["1deg 0.02"]),
+                    _length(p["median_translation"]),
+                    f"{p['accepted']}, {p['silent']} wrong",
+                    _seconds(p["median_cpu_seconds"]),
+                )
+            )
     head = ("scene", "method", "within 5°, 0.05", "within 1°, 0.02", "median error", "accepted", "CPU time")
     return _table(head, rows, records)
 
@@ -360,9 +415,7 @@ def other_answers(records: Records) -> str:
         if (cell := some.get("all")) is not None and name != "all, all":
             title = f"all, {sensor}" if scene == "all" else SCENES[scene]
             known = sums.get(title, [0] * (len(keys) + 2))
-            sums[title] = [
-                a + b for a, b in zip(known, (*(cell[key] for key in keys), *cell["inside"]), strict=True)
-            ]
+            sums[title] = [a + b for a, b in zip(known, (*(cell[key] for key in keys), *cell["inside"]), strict=True)]
     rows = [(name, *counts[:-2], f"{counts[-2]}/{counts[-1]}") for name, counts in sums.items()]
     head = (
         "scene",
@@ -389,9 +442,7 @@ def unknown(records: Records) -> str:
         "RGB, start": "RGB, scene present twice, with a start near one copy",
     }.items():
         parts = [records[name]["all"][query] for name in ("repeated_scene", "repeated_scene_lego")]
-        n, accepted, right = (
-            sum(part[key] for part in parts) for key in ("n", "believed", "believed and right")
-        )
+        n, accepted, right = (sum(part[key] for part in parts) for key in ("n", "believed", "believed and right"))
         rows.append((title, n, accepted, accepted - right))
     return _table(("images", "number", "accepted", "of these wrong"), rows, records)
 
@@ -409,12 +460,16 @@ def tracking(records: Records) -> str:
                     "GICP from the last pose (small_gicp)" if "GICP" in name else "tracker",
                 )
                 rows.append(
-                    (f"{SCENES[scene]}, {name.partition(',')[0]}", way, f"{run['accepted']} of {run['frames']}", run["accepted_but_wrong"],
-                     f"{_length(raw['translation_median'])} m, {raw['rotation_deg_median']:.2f}°", f"{run['cpu_ms']['median']:.0f} ms")
-                )  # fmt: skip
-    return _table(
-        ("sequence", "method", "accepted", "of these wrong", "median error", "CPU per frame"), rows, records
-    )
+                    (
+                        f"{SCENES[scene]}, {name.partition(',')[0]}",
+                        way,
+                        f"{run['accepted']} of {run['frames']}",
+                        run["accepted_but_wrong"],
+                        f"{_length(raw['translation_median'])} m, {raw['rotation_deg_median']:.2f}°",
+                        f"{run['cpu_ms']['median']:.0f} ms",
+                    )
+                )
+    return _table(("sequence", "method", "accepted", "of these wrong", "median error", "CPU per frame"), rows, records)
 
 
 @table
@@ -465,19 +520,24 @@ def risk(records: Records) -> str:
     rows = []
     for risk, halves in record["other_halves"].items():
         tested, scenes = record["other_faults"], record["scene_left_out"]
-        worst = max(
-            scenes, key=lambda scene: scenes[scene][risk]["wrong"] / max(scenes[scene][risk]["accepted"], 1)
-        )
+        worst = max(scenes, key=lambda scene: scenes[scene][risk]["wrong"] / max(scenes[scene][risk]["accepted"], 1))
         if halves["halves_with_a_threshold"]:
             rows.append(
-                (f"{float(risk):.1%}", counted(tested[risk]), f"{tested[risk]['right_lost']} of {tested['right']}",
-                 f"{halves['exceeded']} of {halves['halves_with_a_threshold']}",
-                 f"{counted(scenes[worst][risk])} ({SCENES.get(worst, worst)})")
-            )  # fmt: skip
+                (
+                    f"{float(risk):.1%}",
+                    counted(tested[risk]),
+                    f"{tested[risk]['right_lost']} of {tested['right']}",
+                    f"{halves['exceeded']} of {halves['halves_with_a_threshold']}",
+                    f"{counted(scenes[worst][risk])} ({SCENES.get(worst, worst)})",
+                )
+            )
     head = (
-        "stated risk", "other faults: wrong of accepted", "right answers lost", "halves in which the risk is exceeded",
+        "stated risk",
+        "other faults: wrong of accepted",
+        "right answers lost",
+        "halves in which the risk is exceeded",
         "worst scene when left out: wrong of accepted",
-    )  # fmt: skip
+    )
     return _table(head, rows, records)
 
 
@@ -489,8 +549,13 @@ def gpu(records: Records) -> str:
         for level, m in levels.items():
             coarse = "coarse level" if level == "level 0" and len(levels) > 1 else "full detail"
             rows.append(
-                (f"step of `bid` with {found['rays']} rays, {coarse}", SCENES[scene], f"{m['graph_ms']:.2f} ms", f"{m['launched_ms']:.1f} ms one by one")
-            )  # fmt: skip
+                (
+                    f"step of `bid` with {found['rays']} rays, {coarse}",
+                    SCENES[scene],
+                    f"{m['graph_ms']:.2f} ms",
+                    f"{m['launched_ms']:.1f} ms one by one",
+                )
+            )
     for scene, sizes in found["search"].items():
         for size, m in sizes.items():
             rows.append((f"5 Gauss-Newton steps of {size}", SCENES[scene], f"{m['ms']:.1f} ms", ""))
@@ -503,18 +568,14 @@ def gpu(records: Records) -> str:
         rows.append((f"training to {m['psnr']:.1f} dB", SCENES[scene], f"{m['seconds']:.0f} s", rest))
     for scene, m in found["kernel"].items():
         rest = f"{m['share']:.0%} of what its reads allow"
-        rows.append(
-            (f"hash grid with derivatives, {m['points']} points", SCENES[scene], f"{m['ms']:.1f} ms", rest)
-        )
+        rows.append((f"hash grid with derivatives, {m['points']} points", SCENES[scene], f"{m['ms']:.1f} ms", rest))
     return _table(("what", "map", "time", ""), rows, records)
 
 
 # The paper's experiments
 
 
-def _successes(
-    records: Records, name: str, condition: str, start: str = "bid, all sizes", within: str = "10%"
-) -> str:
+def _successes(records: Records, name: str, condition: str, start: str = "bid, all sizes", within: str = "10%") -> str:
     cells = records[name]["cells"]
     (cell,) = [c for c in cells if c["condition"] == condition and c["start"] == start]
     return _of(cell.get("success", cell.get("criteria"))[within])
@@ -554,9 +615,7 @@ def paper_images(records: Records) -> str:
         row = [title]
         for size in sizes:
             paper = records["table2_blender_lego"]["paper_percent"][title][size]
-            row.append(
-                f"{paper:.0f} %; {_successes(records, 'table2_blender_lego', condition, f'bid {size}')}"
-            )
+            row.append(f"{paper:.0f} %; {_successes(records, 'table2_blender_lego', condition, f'bid {size}')}")
         rows.append((*row, _successes(records, "table2_blender_lego", condition, within="1deg 0.02")))
     head = ("images", *(f"start {size} away: paper; here" for size in sizes), "all sizes, within 1°, 0.02")
     return _table(head, rows, records)
@@ -576,8 +635,7 @@ def paper_inerf(records: Records) -> str:
         "10%": "10 % of the start's error",
     }
     rows = [
-        (f"`{m}`", said[m], *(_successes(records, "inerf_blender_lego", m, "inerf", c) for c in criteria))
-        for m in said
+        (f"`{m}`", said[m], *(_successes(records, "inerf_blender_lego", m, "inerf", c) for c in criteria)) for m in said
     ]
     return _table(("method", "paper", *criteria.values()), rows, records)
 
@@ -590,8 +648,7 @@ def schedule(records: Records) -> str:
         for rate, scale in (("0.02", "0.1"), ("0.01", "0.1"), ("0.02", "1")):
             condition = f"bid, colour scale {scale}, depth scale {scale}, learning rate {rate}, pivot {pivot}"
             found = (
-                _successes(records, "bid_schedule_blender_lego", condition, within=c)
-                for c in ("10%", "5deg 0.05")
+                _successes(records, "bid_schedule_blender_lego", condition, within=c) for c in ("10%", "5deg 0.05")
             )
             rows.append((f"`{pivot}`", rate, scale, *found))
     head = ("`pivot`", "learning rate", "Huber scale", "10 % of the start's error", "within 5°, 0.05")
@@ -601,12 +658,24 @@ def schedule(records: Records) -> str:
 @table
 def basin(records: Records) -> str:
     """Settings of ``bid`` that may widen the basin of convergence."""
-    neutral = {"blur": "0", "box weight": "0", "candidates": "1", "free space weight": "0", "opacity weight": "0",
-               "samples": "0", "wide": "1"}  # fmt: skip
+    neutral = {
+        "blur": "0",
+        "box weight": "0",
+        "candidates": "1",
+        "free space weight": "0",
+        "opacity weight": "0",
+        "samples": "0",
+        "wide": "1",
+    }
     variants: list[dict[str, str]] = [
-        {}, {"wide": "2"}, {"opacity weight": "0.3"}, {"free space weight": "1"},
-        {"candidates": "3"}, {"box weight": "1"}, {"box weight": "1", "candidates": "3"},
-    ]  # fmt: skip
+        {},
+        {"wide": "2"},
+        {"opacity weight": "0.3"},
+        {"free space weight": "1"},
+        {"candidates": "3"},
+        {"box weight": "1"},
+        {"box weight": "1", "candidates": "3"},
+    ]
     name, sizes = "bid_reach_blender_lego", ("0.9", "1.7", "3.4")
     rows = []
     for variant in variants:

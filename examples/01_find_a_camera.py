@@ -18,9 +18,7 @@ given = parser.parse_args()
 
 # A scene in closed form stands in for your own images, which open_dataset("FOLDER") opens.
 data = closed_form_data("demo:object")
-scene = bn.train(
-    data, given.backend, config={"steps": given.steps}, bake=False
-)  # load_map loads a stored one
+scene = bn.train(data, given.backend, config={"steps": given.steps}, bake=False)  # load_map loads a stored one
 
 (unseen,) = data.views("test", ["0003"])
 start = perturb(unseen.T_ref_camera, translation=0.4, rotation_deg=10, seed=0)

@@ -14,9 +14,7 @@ from bidnerf_core.registry import list_plugins
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--maps", nargs="+", default=[])
     parser.add_argument("--data", help="dataset of what the maps show")
     parser.add_argument("--backends", nargs="+", help="backends to train (default: all that are installed)")

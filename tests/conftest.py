@@ -144,9 +144,7 @@ def small_images(monkeypatch: pytest.MonkeyPatch) -> None:
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures are files without content, since drawing them takes most of a report's time."""
     target = "bidnerf.results.plots.write_figure"
-    monkeypatch.setattr(
-        target, lambda figure, *paths, **options: [path.write_text("<svg/>") for path in paths]
-    )
+    monkeypatch.setattr(target, lambda figure, *paths, **options: [path.write_text("<svg/>") for path in paths])
 
 
 @pytest.fixture

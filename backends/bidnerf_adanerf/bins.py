@@ -53,9 +53,7 @@ class Sparse:
     @torch.no_grad()
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
         whole = self.bins(rays, jitter)
-        scores = torch.where(
-            whole.valid, ray_logits(self.oracle, self.bins, rays).sigmoid().to(whole.starts), -1.0
-        )
+        scores = torch.where(whole.valid, ray_logits(self.oracle, self.bins, rays).sigmoid().to(whole.starts), -1.0)
         return chosen(whole, scores, self.threshold, self.most)
 
 

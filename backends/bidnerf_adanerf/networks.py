@@ -27,9 +27,7 @@ def trunk(inputs: int, width: int, layers: int) -> nn.Sequential:
 class ShadingNetwork(nn.Module):
     """The MLP of NeRF without its skip connection: maps position to density and, with the direction, to colour."""
 
-    def __init__(
-        self, width: int, layers: int, position_frequencies: int, direction_frequencies: int
-    ) -> None:
+    def __init__(self, width: int, layers: int, position_frequencies: int, direction_frequencies: int) -> None:
         super().__init__()
         self.frequencies = position_frequencies, direction_frequencies
         self.trunk = trunk(encoded_width(position_frequencies), width, layers)

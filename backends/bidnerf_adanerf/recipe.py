@@ -93,9 +93,14 @@ def room_for_matter(views: Sequence[View], bounds: SceneBounds, resolution: int)
 
 
 def dense_step(
-    field: AdaNerfField, supervision: Supervision, batch: TrainingBatch, room: OccupancyMask | None,
-    phase: Phase, sparsity_weight: Float[Tensor, ""], generator: Generator,
-) -> StepOutcome:  # fmt: skip
+    field: AdaNerfField,
+    supervision: Supervision,
+    batch: TrainingBatch,
+    room: OccupancyMask | None,
+    phase: Phase,
+    sparsity_weight: Float[Tensor, ""],
+    generator: Generator,
+) -> StepOutcome:
     """Return the outcome of a step that shades all bins, each weighted fully or, in the soft phase, according to its score."""
     config = supervision.config
     assert isinstance(config, AdaNerfConfig)

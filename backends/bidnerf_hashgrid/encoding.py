@@ -110,9 +110,13 @@ def _spread(gradient: Float[Tensor, " w"], weights: Float[Tensor, "3 w"]) -> Flo
 
 
 def _encode_level(
-    points: Float[Tensor, "3 n"], table: Float[Tensor, "t f"], level: Level, smooth: bool, values: Float[Tensor, "c w"],
+    points: Float[Tensor, "3 n"],
+    table: Float[Tensor, "t f"],
+    level: Level,
+    smooth: bool,
+    values: Float[Tensor, "c w"],
     slopes: Float[Tensor, "c 3 w"] | None,
-) -> None:  # fmt: skip
+) -> None:
     """Write a level's features to ``values``, and their derivatives with respect to position (in cells) to ``slopes``."""
     unit = _unit(table.shape[1])
     columns = _as_units(table, unit).unbind(1)
@@ -134,8 +138,12 @@ def _encode_level(
 
 
 def _write_table_gradient(
-    points: Float[Tensor, "3 n"], gradient: Float[Tensor, "c w"], level: Level, smooth: bool, table: Float[Tensor, "t f"]
-) -> None:  # fmt: skip
+    points: Float[Tensor, "3 n"],
+    gradient: Float[Tensor, "c w"],
+    level: Level,
+    smooth: bool,
+    table: Float[Tensor, "t f"],
+) -> None:
     """Backpropagate the gradient of a level's features to the table's entries, and write the result to ``table``."""
     unit = _unit(table.shape[1])
     table.zero_()
@@ -171,9 +179,7 @@ class _Encode(torch.autograd.Function):
         unit = _unit(features)
         rows = points.new_empty(total, features // unit, count * unit)
         rows[len(levels) :] = 0
-        slopes = [
-            points.new_empty(features // unit, 3, count * unit) if want_slopes else None for _ in levels
-        ]
+        slopes = [points.new_empty(features // unit, 3, count * unit) if want_slopes else None for _ in levels]
         tasks = [
             partial(_encode_level, points, table, level, smooth, row, slope)
             for table, level, row, slope in zip(tables, levels, rows, slopes, strict=False)
@@ -231,8 +237,7 @@ class HashEncoding(nn.Module):
         )
         # One table per level: an inactive level then has no gradient at all and costs the optimizer nothing.
         self.tables = nn.ParameterList(
-            nn.Parameter(torch.empty(level.entries, config.features).uniform_(-1e-4, 1e-4))
-            for level in self.levels
+            nn.Parameter(torch.empty(level.entries, config.features).uniform_(-1e-4, 1e-4)) for level in self.levels
         )
 
     @property

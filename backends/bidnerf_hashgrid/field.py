@@ -105,7 +105,7 @@ class HashGridField(nn.Module):
 
     def jacobian(
         self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"], wanted: Bool[Tensor, "p"] | None = None
-    ) -> FieldDerivatives:  # fmt: skip
+    ) -> FieldDerivatives:
         return self.jacobian_of_levels(positions, directions, wanted, None)
 
     def query_levels(
@@ -140,9 +140,12 @@ class HashGridField(nn.Module):
         return log_density.clamp(max=LARGEST_LOG_DENSITY).exp() / self.side
 
     def jacobian_of_levels(
-        self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"], wanted: Bool[Tensor, "p"] | None,
+        self,
+        positions: Float[Tensor, "p 3"],
+        directions: Float[Tensor, "p 3"],
+        wanted: Bool[Tensor, "p"] | None,
         active: int | None,
-    ) -> FieldDerivatives:  # fmt: skip
+    ) -> FieldDerivatives:
         """Return the values of ``query_levels`` and their derivatives by position and direction.
 
         Where a kernel is used, all of these are 0 at points that are not ``wanted``.
@@ -219,5 +222,5 @@ class CoarseField:
 
     def jacobian(
         self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"], wanted: Bool[Tensor, "p"] | None = None
-    ) -> FieldDerivatives:  # fmt: skip
+    ) -> FieldDerivatives:
         return self.fine.jacobian_of_levels(positions, directions, wanted, self.fine.config.coarse_levels)

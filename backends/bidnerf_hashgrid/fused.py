@@ -66,9 +66,14 @@ class Encode(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, points: Float[Tensor, "3 n"], levels: tuple[Level, ...], total: int, smooth: bool, want_slopes: bool,
+        ctx: Any,
+        points: Float[Tensor, "3 n"],
+        levels: tuple[Level, ...],
+        total: int,
+        smooth: bool,
+        want_slopes: bool,
         *tables: Float[Tensor, "_ f"],
-    ) -> Float[Tensor, "n width"]:  # fmt: skip
+    ) -> Float[Tensor, "n width"]:
         from bidnerf_hashgrid.kernels import encode_kernel
 
         n, features = points.shape[1], tables[0].shape[1]
@@ -77,9 +82,19 @@ class Encode(torch.autograd.Function):
         slopes = points.new_empty((3, n, width) if want_slopes else (0,))
         with torch.cuda.device_of(points):
             encode_kernel[_blocks(n, POINTS)](
-                points, values, slopes, *_launched(levels, tables), n, width,
-                LEVELS=len(levels), F=features, C=_power_of_two(width), SMOOTH=smooth, SLOPES=want_slopes, BLOCK=POINTS,
-            )  # fmt: skip
+                points,
+                values,
+                slopes,
+                *_launched(levels, tables),
+                n,
+                width,
+                LEVELS=len(levels),
+                F=features,
+                C=_power_of_two(width),
+                SMOOTH=smooth,
+                SLOPES=want_slopes,
+                BLOCK=POINTS,
+            )
         ctx.save_for_backward(points, slopes)
         ctx.levels, ctx.smooth, ctx.features = levels, smooth, features
         return values
@@ -99,9 +114,17 @@ class Encode(torch.autograd.Function):
         n, width = gradient.shape
         with torch.cuda.device_of(points):
             scatter_kernel[_blocks(n, POINTS)](
-                points, gradient.contiguous(), *_launched(levels, parts), n, width,
-                LEVELS=len(levels), F=ctx.features, C=_power_of_two(width), SMOOTH=ctx.smooth, BLOCK=POINTS,
-            )  # fmt: skip
+                points,
+                gradient.contiguous(),
+                *_launched(levels, parts),
+                n,
+                width,
+                LEVELS=len(levels),
+                F=ctx.features,
+                C=_power_of_two(width),
+                SMOOTH=ctx.smooth,
+                BLOCK=POINTS,
+            )
         found = [part if wanted else None for part, wanted in zip(parts, needed, strict=True)]
         return to_points, None, None, None, None, *found
 
@@ -121,25 +144,24 @@ class PackedNetworks:
     @staticmethod
     def of(geometry: nn.Sequential, colour: nn.Sequential) -> PackedNetworks | None:
         """Return the packed networks, or None if the kernel cannot compute them: it supports one or two hidden layers of colour."""
-        first, out_of, into, *between, last = (
-            part for part in (*geometry, *colour) if isinstance(part, nn.Linear)
-        )
+        first, out_of, into, *between, last = (part for part in (*geometry, *colour) if isinstance(part, nn.Linear))
         width, features = _power_of_two(first.out_features), _power_of_two(out_of.out_features)
         if into is last or len(between) > 1 or max(width, features, first.in_features) > WIDEST:
             return None
         passed = out_of.out_features - 1
         of_features = pad(into.weight[:, :passed].t(), (0, 0, 1, 0))  # none of the log density
         parts = [
-            (out_of.weight.t(), width, features), (of_features, features, width), (into.weight[:, passed:].t(), 16, width),
-            *((layer.weight.t(), width, width) for layer in between), (last.weight.t(), width, 16),
-        ]  # fmt: skip
+            (out_of.weight.t(), width, features),
+            (of_features, features, width),
+            (into.weight[:, passed:].t(), 16, width),
+            *((layer.weight.t(), width, width) for layer in between),
+            (last.weight.t(), width, 16),
+        ]
         sizes, layers = (
             (width, features, width, *([width] * len(between)), 16),
             (first, out_of, into, *between, last),
         )
-        biases = [
-            pad(layer.bias, (0, size - len(layer.bias))) for layer, size in zip(layers, sizes, strict=True)
-        ]
+        biases = [pad(layer.bias, (0, size - len(layer.bias))) for layer, size in zip(layers, sizes, strict=True)]
         rest = torch.cat([_padded(part, rows, columns).flatten() for part, rows, columns in parts])
         return PackedNetworks(first.weight, rest, torch.cat(biases), width, features, len(between), {})
 
@@ -156,9 +178,16 @@ def _padded(matrix: Float[Tensor, "i o"], rows: int, columns: int) -> Float[Tens
 
 
 def query(
-    positions: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], derivatives: bool, wanted: Bool[Tensor, "n"] | None,
-    packed: PackedNetworks, levels: tuple[Level, ...], tables: Sequence[Tensor], smooth: bool, limits: tuple[SceneBounds, float],
-) -> tuple[Float[Tensor, "n 4"], Float[Tensor, "n 4 6"]]:  # fmt: skip
+    positions: Float[Tensor, "n 3"],
+    directions: Float[Tensor, "n 3"],
+    derivatives: bool,
+    wanted: Bool[Tensor, "n"] | None,
+    packed: PackedNetworks,
+    levels: tuple[Level, ...],
+    tables: Sequence[Tensor],
+    smooth: bool,
+    limits: tuple[SceneBounds, float],
+) -> tuple[Float[Tensor, "n 4"], Float[Tensor, "n 4 6"]]:
     """Return density and colour at points (metres, world) along unit directions.
 
     With ``derivatives``, also return the derivatives of density and colour by position and by direction. ``limits`` are the
@@ -183,19 +212,44 @@ def query(
     # Products of derivatives are rounded to TF32; those of values are as exact as single precision.
     with torch.cuda.device_of(values):
         field_kernel[_blocks(n, block)](
-            positions.contiguous(), directions.contiguous(), values, by_both, index, count, *_launched(levels, tables),
-            packed.weights(inputs), packed.biases, box, n,
-            LEVELS=len(levels), F=features, C=_power_of_two(inputs), WIDTH=packed.width, FEATURES=packed.features,
-            HIDDEN=packed.hidden, SMOOTH=smooth, CONTRACTED=bounds.contracted, LIMIT=largest, DERIVATIVES=derivatives,
-            SOME=wanted is not None, BLOCK=block, PRECISION="tf32",
-        )  # fmt: skip
+            positions.contiguous(),
+            directions.contiguous(),
+            values,
+            by_both,
+            index,
+            count,
+            *_launched(levels, tables),
+            packed.weights(inputs),
+            packed.biases,
+            box,
+            n,
+            LEVELS=len(levels),
+            F=features,
+            C=_power_of_two(inputs),
+            WIDTH=packed.width,
+            FEATURES=packed.features,
+            HIDDEN=packed.hidden,
+            SMOOTH=smooth,
+            CONTRACTED=bounds.contracted,
+            LIMIT=largest,
+            DERIVATIVES=derivatives,
+            SOME=wanted is not None,
+            BLOCK=block,
+            PRECISION="tf32",
+        )
     return values, by_both
 
 
 def sampled(
-    rays: Rays, bounds: SceneBounds, occupied: Bool[Tensor, "n n n"], density: Float[Tensor, "n n n"], step: float,
-    count: int, most: int, jitter: Generator | None,
-) -> RaySamples:  # fmt: skip
+    rays: Rays,
+    bounds: SceneBounds,
+    occupied: Bool[Tensor, "n n n"],
+    density: Float[Tensor, "n n n"],
+    step: float,
+    count: int,
+    most: int,
+    jitter: Generator | None,
+) -> RaySamples:
     """Return ``count`` intervals of each ray (r), concentrated where the ``density`` of a grid's cells is high.
 
     The intervals divide the ray's first ``most`` steps in ``occupied`` cells; if ``count`` is ``most``, they are these steps. The
@@ -220,12 +274,37 @@ def sampled(
     steps = _power_of_two(most)
     with torch.cuda.device_of(packed):
         march_kernel[(n,)](
-            packed, grid, offset, occupied.view(torch.uint8), middles, counts, n,
-            STEPS=math.ceil(length / step) + 1, MOST=most, CONTRACTED=bounds.contracted, CHUNK=2 * POINTS,
-        )  # fmt: skip
+            packed,
+            grid,
+            offset,
+            occupied.view(torch.uint8),
+            middles,
+            counts,
+            n,
+            STEPS=math.ceil(length / step) + 1,
+            MOST=most,
+            CONTRACTED=bounds.contracted,
+            CHUNK=2 * POINTS,
+        )
         concentrate_kernel[(n,)](
-            packed, grid, middles, counts, density, shift, starts, ends, valid.view(torch.uint8), n, LARGEST_THICKNESS, TAIL,
-            COUNT=count, EVEN=even, MOST=most, S=steps, J=_power_of_two(count + 1), CONTRACTED=bounds.contracted,
+            packed,
+            grid,
+            middles,
+            counts,
+            density,
+            shift,
+            starts,
+            ends,
+            valid.view(torch.uint8),
+            n,
+            LARGEST_THICKNESS,
+            TAIL,
+            COUNT=count,
+            EVEN=even,
+            MOST=most,
+            S=steps,
+            J=_power_of_two(count + 1),
+            CONTRACTED=bounds.contracted,
             num_warps=max(4, steps // 32),
-        )  # fmt: skip
+        )
     return RaySamples(starts, ends, valid)

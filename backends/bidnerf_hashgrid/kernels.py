@@ -67,7 +67,7 @@ def _columns(meta, tables, offsets, LEVELS: tl.constexpr, F: tl.constexpr, C: tl
 @triton.jit
 def _encoded(
     x, y, z, inside, table, resolution, entries, hashed, stride_y, stride_z, F: tl.constexpr, SMOOTH: tl.constexpr
-):  # fmt: skip
+):
     """Return the features at positions (points, 1) in the unit cube, and their derivatives by x, y and z, with eight reads per column."""
     tx, ty, tz, fx, fy, fz = _cells(x, y, z, resolution, entries, hashed, stride_y, stride_z)
     wx, dx = _weight(fx, SMOOTH)
@@ -79,12 +79,8 @@ def _encoded(
     c110 = tl.load(table + F * _index(tx + 1, ty + stride_y, tz, entries, hashed), mask=inside, other=0.0)
     c001 = tl.load(table + F * _index(tx, ty, tz + stride_z, entries, hashed), mask=inside, other=0.0)
     c101 = tl.load(table + F * _index(tx + 1, ty, tz + stride_z, entries, hashed), mask=inside, other=0.0)
-    c011 = tl.load(
-        table + F * _index(tx, ty + stride_y, tz + stride_z, entries, hashed), mask=inside, other=0.0
-    )
-    c111 = tl.load(
-        table + F * _index(tx + 1, ty + stride_y, tz + stride_z, entries, hashed), mask=inside, other=0.0
-    )
+    c011 = tl.load(table + F * _index(tx, ty + stride_y, tz + stride_z, entries, hashed), mask=inside, other=0.0)
+    c111 = tl.load(table + F * _index(tx + 1, ty + stride_y, tz + stride_z, entries, hashed), mask=inside, other=0.0)
     # Interpolated along z, then y, then x, with the differences that give the derivatives.
     z00, z10, z01, z11 = c001 - c000, c101 - c100, c011 - c010, c111 - c110
     a00, a10 = c000 + wz * z00, c100 + wz * z10
@@ -101,18 +97,28 @@ def _encoded(
 
 @triton.jit
 def encode_kernel(
-    points, values, slopes, meta, tables, offsets, n, width,
-    LEVELS: tl.constexpr, F: tl.constexpr, C: tl.constexpr, SMOOTH: tl.constexpr, SLOPES: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
+    points,
+    values,
+    slopes,
+    meta,
+    tables,
+    offsets,
+    n,
+    width,
+    LEVELS: tl.constexpr,
+    F: tl.constexpr,
+    C: tl.constexpr,
+    SMOOTH: tl.constexpr,
+    SLOPES: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
     """Encode points (3 n): values (n width) and, with ``SLOPES``, derivatives (3 n width)."""
     row = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK))[:, None]
     there = row < n
     x = tl.load(points + row, mask=there, other=0.0)
     y = tl.load(points + n + row, mask=there, other=0.0)
     z = tl.load(points + 2 * n + row, mask=there, other=0.0)
-    table, resolution, entries, hashed, stride_y, stride_z, used = _columns(
-        meta, tables, offsets, LEVELS, F, C
-    )
+    table, resolution, entries, hashed, stride_y, stride_z, used = _columns(meta, tables, offsets, LEVELS, F, C)
     value, by_x, by_y, by_z = _encoded(
         x, y, z, there & used, table, resolution, entries, hashed, stride_y, stride_z, F, SMOOTH
     )
@@ -128,18 +134,26 @@ def encode_kernel(
 
 @triton.jit
 def scatter_kernel(
-    points, gradient, meta, tables, offsets, n, width,
-    LEVELS: tl.constexpr, F: tl.constexpr, C: tl.constexpr, SMOOTH: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
+    points,
+    gradient,
+    meta,
+    tables,
+    offsets,
+    n,
+    width,
+    LEVELS: tl.constexpr,
+    F: tl.constexpr,
+    C: tl.constexpr,
+    SMOOTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
     """Add the gradient (n width) of the encoding to the tables' gradients: the transpose of ``encode_kernel``."""
     row = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK))[:, None]
     there = row < n
     x = tl.load(points + row, mask=there, other=0.0)
     y = tl.load(points + n + row, mask=there, other=0.0)
     z = tl.load(points + 2 * n + row, mask=there, other=0.0)
-    table, resolution, entries, hashed, stride_y, stride_z, used = _columns(
-        meta, tables, offsets, LEVELS, F, C
-    )
+    table, resolution, entries, hashed, stride_y, stride_z, used = _columns(meta, tables, offsets, LEVELS, F, C)
     inside = there & used
     pull = tl.load(gradient + row.to(tl.int64) * width + tl.arange(0, C)[None, :], mask=inside, other=0.0)
     inside = inside & (pull != 0)  # most samples are padding or lie in empty space
@@ -219,11 +233,33 @@ def _colour_tangent(
 
 @triton.jit
 def field_kernel(
-    positions, directions, values, derivatives, index, count, meta, tables, offsets, weights, biases, box, n,
-    LEVELS: tl.constexpr, F: tl.constexpr, C: tl.constexpr, WIDTH: tl.constexpr, FEATURES: tl.constexpr, HIDDEN: tl.constexpr,
-    SMOOTH: tl.constexpr, CONTRACTED: tl.constexpr, LIMIT: tl.constexpr, DERIVATIVES: tl.constexpr, SOME: tl.constexpr,
-    BLOCK: tl.constexpr, PRECISION: tl.constexpr,
-):  # fmt: skip
+    positions,
+    directions,
+    values,
+    derivatives,
+    index,
+    count,
+    meta,
+    tables,
+    offsets,
+    weights,
+    biases,
+    box,
+    n,
+    LEVELS: tl.constexpr,
+    F: tl.constexpr,
+    C: tl.constexpr,
+    WIDTH: tl.constexpr,
+    FEATURES: tl.constexpr,
+    HIDDEN: tl.constexpr,
+    SMOOTH: tl.constexpr,
+    CONTRACTED: tl.constexpr,
+    LIMIT: tl.constexpr,
+    DERIVATIVES: tl.constexpr,
+    SOME: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
     """Compute density and colour (n 4) at points (n 3, world) along directions (n 3) and, with ``DERIVATIVES``, (n 4 6).
 
     Derivatives by position (three) and by direction (three) are propagated forward with the values. ``box`` holds the scene's
@@ -251,9 +287,7 @@ def field_kernel(
         outside = norm < 0
         shrink = tl.full(norm.shape, 1.0, tl.float32)
     ux, uy, uz = (px * shrink + 1) / 2, (py * shrink + 1) / 2, (pz * shrink + 1) / 2
-    table, resolution, entries, hashed, stride_y, stride_z, used = _columns(
-        meta, tables, offsets, LEVELS, F, C
-    )
+    table, resolution, entries, hashed, stride_y, stride_z, used = _columns(meta, tables, offsets, LEVELS, F, C)
     x = tl.minimum(tl.maximum(ux, 0.0), 1.0)
     y = tl.minimum(tl.maximum(uy, 0.0), 1.0)
     z = tl.minimum(tl.maximum(uz, 0.0), 1.0)
@@ -266,9 +300,7 @@ def field_kernel(
     dz = tl.load(directions + 3 * far + 2, mask=there, other=0.0)
 
     into, out_of = weights, weights + C * WIDTH
-    of_features, of_harmonics, of_hidden, of_logits = _colour_layers(
-        out_of + WIDTH * FEATURES, WIDTH, FEATURES, HIDDEN
-    )
+    of_features, of_harmonics, of_hidden, of_logits = _colour_layers(out_of + WIDTH * FEATURES, WIDTH, FEATURES, HIDDEN)
     hidden = tl.dot(encoded, _tile(into, C, WIDTH), input_precision="tf32x3")
     hidden += tl.load(biases + tl.arange(0, WIDTH))[None, :]
     geometry = hidden > 0
@@ -311,9 +343,7 @@ def field_kernel(
                 if CONTRACTED:
                     mine = px if axis == 0 else py if axis == 1 else pz
                     largest = outside & (tl.abs(mine) == norm)
-                    by_axis = by_axis * shrink + along * tl.where(
-                        largest, turn * tl.where(mine > 0, 1.0, -1.0), 0.0
-                    )
+                    by_axis = by_axis * shrink + along * tl.where(largest, turn * tl.where(mine > 0, 1.0, -1.0), 0.0)
                 by_axis = by_axis * (scale / 2)
                 tangent = tl.dot(by_axis, _tile(into, C, WIDTH), input_precision=PRECISION)
                 tangent = tl.where(geometry, tangent, 0.0)

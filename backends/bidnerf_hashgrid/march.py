@@ -79,9 +79,18 @@ def _cell_at(x, y, z, grid, CONTRACTED: tl.constexpr):
 
 @triton.jit
 def march_kernel(
-    rays, grid, offset, occupied, middles, counts, n,
-    STEPS: tl.constexpr, MOST: tl.constexpr, CONTRACTED: tl.constexpr, CHUNK: tl.constexpr,
-):  # fmt: skip
+    rays,
+    grid,
+    offset,
+    occupied,
+    middles,
+    counts,
+    n,
+    STEPS: tl.constexpr,
+    MOST: tl.constexpr,
+    CONTRACTED: tl.constexpr,
+    CHUNK: tl.constexpr,
+):
     """Write the coordinates of the first ``MOST`` steps of each ray in occupied cells (r MOST), and how many there are.
 
     Each program handles one ray. ``counts`` may exceed ``MOST``; the farther steps are then not stored.
@@ -147,9 +156,25 @@ def _neighbour(values, by, J: tl.constexpr):
 
 @triton.jit
 def concentrate_kernel(
-    rays, grid, middles, counts, density, shift, starts, ends, valid, n, thickest, tail,
-    COUNT: tl.constexpr, EVEN: tl.constexpr, MOST: tl.constexpr, S: tl.constexpr, J: tl.constexpr, CONTRACTED: tl.constexpr,
-):  # fmt: skip
+    rays,
+    grid,
+    middles,
+    counts,
+    density,
+    shift,
+    starts,
+    ends,
+    valid,
+    n,
+    thickest,
+    tail,
+    COUNT: tl.constexpr,
+    EVEN: tl.constexpr,
+    MOST: tl.constexpr,
+    S: tl.constexpr,
+    J: tl.constexpr,
+    CONTRACTED: tl.constexpr,
+):
     """Write ``COUNT`` intervals of each ray (r COUNT), concentrated where ``density`` gives large weights, see ``Concentrated``.
 
     ``shift`` (r COUNT + 1) is added to the levels of the borders: first those by weight, then ``EVEN`` by length. Each program
@@ -188,9 +213,7 @@ def concentrate_kernel(
 
         # Borders by weight, where the share passes their levels, then by length.
         by_weight: tl.constexpr = COUNT + 1 - EVEN
-        level = tl.where(
-            j < by_weight, j / (by_weight - 1.0 + (by_weight == 1)), (j - by_weight) / (EVEN - 1.0)
-        )
+        level = tl.where(j < by_weight, j / (by_weight - 1.0 + (by_weight == 1)), (j - by_weight) / (EVEN - 1.0))
         level += tl.load(shift + ray * (COUNT + 1) + j, mask=j <= COUNT, other=0.0)
         dense = (tail + (1 - 2 * tail) * level)[None, :]
         below = share[:, None] <= dense
@@ -198,9 +221,7 @@ def concentrate_kernel(
         y0 = tl.max(tl.where(below, laid[:, None], 0.0), 0)
         x1 = tl.min(tl.where(below, 1.0, share[:, None]), 0)
         y1 = tl.min(tl.where(below, total, laid[:, None]), 0)
-        between = y0 + (tail + (1 - 2 * tail) * level - x0) * (y1 - y0) / tl.maximum(
-            x1 - x0, 1.1754943508222875e-38
-        )
+        between = y0 + (tail + (1 - 2 * tail) * level - x0) * (y1 - y0) / tl.maximum(x1 - x0, 1.1754943508222875e-38)
         border = tl.where(j < by_weight, tl.minimum(tl.maximum(between, y0), y1), level * total)
         border = tl.sort(tl.where(j <= COUNT, border, float("inf")))
 

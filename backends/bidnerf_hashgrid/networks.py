@@ -27,7 +27,7 @@ Layers = list[tuple[Tensor, Tensor]]
 
 def log_density_and_rgb(
     geometry: nn.Sequential, colour: nn.Sequential, encoded: Float[Tensor, "n e"], harmonics: Float[Tensor, "n h"]
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:  # fmt: skip
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
     """Return the first output of ``geometry`` (log density), and the output of ``colour`` given the other outputs and ``harmonics``.
 
     Both networks are linear layers with ReLUs between them; ``colour`` ends with a sigmoid. On a CPU, the results cannot be
@@ -75,9 +75,13 @@ def _backward(
 class _Evaluate(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, differentiable: bool, geometry_layers: int, encoded: Float[Tensor, "n e"], harmonics: Float[Tensor, "n h"],
+        ctx: Any,
+        differentiable: bool,
+        geometry_layers: int,
+        encoded: Float[Tensor, "n e"],
+        harmonics: Float[Tensor, "n h"],
         *flat: Tensor,
-    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:  # fmt: skip
+    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
         geometry, colour = _networks(flat, geometry_layers)
         chunks = slices(len(encoded), NETWORK_CHUNK)
         log_density, rgb = encoded.new_empty(len(encoded)), encoded.new_empty(len(encoded), 3)
@@ -120,9 +124,7 @@ class _Evaluate(torch.autograd.Function):
             to_geometry: Layers | None = None
             to_colour: Layers | None = None
             if sums is not None:
-                rows = [
-                    row.view(part.shape) for row, part in zip(sums[number].split(sizes), flat, strict=True)
-                ]
+                rows = [row.view(part.shape) for row, part in zip(sums[number].split(sizes), flat, strict=True)]
                 to_geometry, to_colour = _networks(rows, ctx.geometry_layers)
             gradient = _backward(to_rgb[at] * (rgb[at] * (1 - rgb[at])), own[split:], colour, to_colour)
             to_features = torch.cat([to_log_density[at, None], gradient[:, :passed]], dim=-1)
@@ -131,9 +133,7 @@ class _Evaluate(torch.autograd.Function):
                 if target is not None:
                     target[at] = part
 
-        concurrently(
-            [partial(differentiate, k) for k in range(len(chunks))], threads_for(len(encoded), encoded.device)
-        )
+        concurrently([partial(differentiate, k) for k in range(len(chunks))], threads_for(len(encoded), encoded.device))
         to_flat: Sequence[Tensor | None] = [None] * len(flat)
         if sums is not None:
             to_flat = [row.view(part.shape) for row, part in zip(sums.sum(0).split(sizes), flat, strict=True)]

@@ -121,9 +121,7 @@ class OccupancyGrid(nn.Module):
             # The remainder of a step at the far end is short in the coordinate, but long in metres.
             last = torch.arange(middles.shape[-1], device=middles.device) == valid.sum(-1, keepdim=True) - 1
             ends = torch.where(last & (far - ends < self.step), far, ends)
-        return RaySamples(spacing.distance(starts), spacing.distance(ends), valid).unflattened(
-            rays.near.shape
-        )
+        return RaySamples(spacing.distance(starts), spacing.distance(ends), valid).unflattened(rays.near.shape)
 
     def by_kernel(self, rays: Rays, count: int, jitter: Generator | None) -> RaySamples | None:
         """Return up to ``count`` intervals per ray in occupied cells, concentrated if there are more; None if no kernel is used."""
@@ -148,8 +146,13 @@ class OccupancyGrid(nn.Module):
         return self._steps if self.training else MOST
 
     def _all_steps(
-        self, rays: Rays, spacing: RaySpacing, near: Float[Tensor, "r"], far: Float[Tensor, "r"], offset: Float[Tensor, "r"]
-    ) -> tuple[Float[Tensor, "r s"], Bool[Tensor, "r s"]]:  # fmt: skip
+        self,
+        rays: Rays,
+        spacing: RaySpacing,
+        near: Float[Tensor, "r"],
+        far: Float[Tensor, "r"],
+        offset: Float[Tensor, "r"],
+    ) -> tuple[Float[Tensor, "r s"], Bool[Tensor, "r s"]]:
         """Return the coordinates of each ray's steps in occupied cells, padded to the longest row, and the mask of real steps."""
         length = BLOCK * self.step
         count = int(((far - near).amax() / length).ceil()) if near.numel() else 0
@@ -169,8 +172,13 @@ class OccupancyGrid(nn.Module):
         return far[:, None].expand(-1, width).masked_scatter(valid, place), valid
 
     def _first_steps(
-        self, rays: Rays, spacing: RaySpacing, near: Float[Tensor, "r"], far: Float[Tensor, "r"], offset: Float[Tensor, "r"]
-    ) -> tuple[Float[Tensor, "r s"], Bool[Tensor, "r s"]]:  # fmt: skip
+        self,
+        rays: Rays,
+        spacing: RaySpacing,
+        near: Float[Tensor, "r"],
+        far: Float[Tensor, "r"],
+        offset: Float[Tensor, "r"],
+    ) -> tuple[Float[Tensor, "r s"], Bool[Tensor, "r s"]]:
         """Return each ray's first steps in occupied cells in the form of ``_all_steps``, without waiting for the device."""
         box = self.grid.rays(rays.origins, rays.directions)
         # Steps are counted from ``near``, as everywhere. Those before the grid are skipped; a contracted grid has none.
@@ -181,9 +189,7 @@ class OccupancyGrid(nn.Module):
         order = (~kept).sort(dim=-1, stable=True).indices[:, :most]
         place, kept = place.gather(-1, order), kept.gather(-1, order)
         missing = most - kept.shape[-1]
-        middles = torch.cat(
-            [torch.where(kept, place, far[:, None]), far[:, None].expand(-1, missing)], dim=-1
-        )
+        middles = torch.cat([torch.where(kept, place, far[:, None]), far[:, None].expand(-1, missing)], dim=-1)
         return middles, pad(kept, (0, missing))
 
     def _occupied_at(self, positions: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
@@ -226,9 +232,7 @@ class ConcentratedInGrid(Concentrated):
         return super().__call__(rays, jitter) if found is None else found
 
 
-def _at(
-    rays: Rays, distance: Float[Tensor, "b s"], ray: Int[Tensor, "b"] | None = None
-) -> Float[Tensor, "b s 3"]:
+def _at(rays: Rays, distance: Float[Tensor, "b s"], ray: Int[Tensor, "b"] | None = None) -> Float[Tensor, "b s 3"]:
     """Return the positions at distances along the rays, or along the rays with the indices ``ray``.
 
     Each coordinate of the positions is contiguous in memory, since sums over rows of three numbers take ten times as long.

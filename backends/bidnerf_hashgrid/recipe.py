@@ -67,9 +67,7 @@ class HashGridConfig(FieldConfig, SupervisionConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.coarse_every == 1:
-            raise InputError(
-                "coarse_every is 1", expected="0 or 2 and more: the field itself would not be trained"
-            )
+            raise InputError("coarse_every is 1", expected="0 or 2 and more: the field itself would not be trained")
         if self.coarse_every > self.prune_every:
             raise InputError(
                 f"coarse_every is {self.coarse_every}", expected=f"{self.prune_every} (prune_every) or less"
@@ -86,9 +84,12 @@ def adapted(config: HashGridConfig, bounds: SceneBounds) -> HashGridConfig:
     if not bounds.contracted:
         return config
     return replace(
-        config, learning_rate=config.learning_rate / 2, prune_fade=config.prune_fade**0.4,
-        prune_threshold=config.prune_threshold / 5, grow_until=max(config.grow_until, 0.9),
-    )  # fmt: skip
+        config,
+        learning_rate=config.learning_rate / 2,
+        prune_fade=config.prune_fade**0.4,
+        prune_threshold=config.prune_threshold / 5,
+        grow_until=max(config.grow_until, 0.9),
+    )
 
 
 def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, report: Report) -> None:
@@ -162,15 +163,18 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
 
 @torch.no_grad()
 def _update(
-    grid: OccupancyGrid, rays: Rays, samples: RaySamples, density: Float[Tensor, "r s"], step: int, config: HashGridConfig
-) -> None:  # fmt: skip
+    grid: OccupancyGrid,
+    rays: Rays,
+    samples: RaySamples,
+    density: Float[Tensor, "r s"],
+    step: int,
+    config: HashGridConfig,
+) -> None:
     """Update the occupancy grid with the densities of one step's samples, and their rendering weights."""
     # The weights are scaled to samples of one grid step, since concentrated samples are longer or shorter.
     place = grid.bounds.spacing(rays).place
     weights = (
-        rendering_weights(density, samples)
-        * grid.step
-        / (place(samples.ends) - place(samples.starts)).clamp(min=1e-9)
+        rendering_weights(density, samples) * grid.step / (place(samples.ends) - place(samples.starts)).clamp(min=1e-9)
     )
     valid = samples.valid.reshape(-1)
     index = torch.arange(valid.numel(), device=valid.device)

@@ -56,9 +56,5 @@ class VanillaField(HierarchicalField):
         self.bounds = bounds
         self.side = bounds.side
         self.room = OccupancyMask(VoxelGrid.cube(bounds, config.room_resolution))
-        self.coarse = Level(
-            config, bounds, OccupiedOnly(self.room, Stratified(config.coarse_samples, bounds))
-        )
-        self.fine = Level(
-            config, bounds, OccupiedOnly(self.room, Importance(self.coarse, config.fine_samples))
-        )
+        self.coarse = Level(config, bounds, OccupiedOnly(self.room, Stratified(config.coarse_samples, bounds)))
+        self.fine = Level(config, bounds, OccupiedOnly(self.room, Importance(self.coarse, config.fine_samples)))

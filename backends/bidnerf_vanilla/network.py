@@ -53,9 +53,7 @@ class NerfNetwork(nn.Module):
     ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p 3"]]:
         """Return density before its activation, and rgb in [0, 1], at ``points`` of the cube [-1, 1]."""
         config = self.config
-        factors = [
-            octaves(count, points) for count in (config.position_frequencies, config.direction_frequencies)
-        ]
+        factors = [octaves(count, points) for count in (config.position_frequencies, config.direction_frequencies)]
         position = frequency_encoding(points, factors[0], config.include_input)
         direction = frequency_encoding(directions, factors[1], config.include_input)
         hidden = position

@@ -38,9 +38,13 @@ COMMANDS = {
 }
 
 MODULES = {
-    "backends": "plugins", "poses": "train", "serve": "view", "compare": "evaluate", "report": "evaluate",
+    "backends": "plugins",
+    "poses": "train",
+    "serve": "view",
+    "compare": "evaluate",
+    "report": "evaluate",
     **dict.fromkeys(("import", "bake", "info", "extend", "export", "scale", "render"), "maps"),
-}  # fmt: skip
+}
 """The module of each command that has no module of its name. The function ``run_COMMAND`` in it runs the command."""
 DONE, BAD_INPUT, WRONG_USAGE, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
 """Exit statuses; the last two are 128 plus the number of the signal, as is customary for shells. SIGTERM and SIGHUP lead to
@@ -58,9 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sys.stdout.flush()  # here, where a full disk can still be reported
             return status
     except KeyboardInterrupt as stopped:
-        return _failed(
-            name, "interrupted", 128 + stopped.number if isinstance(stopped, Interrupted) else INTERRUPTED
-        )
+        return _failed(name, "interrupted", 128 + stopped.number if isinstance(stopped, Interrupted) else INTERRUPTED)
     except Cancelled as stopped:
         return _failed(name, str(stopped), INTERRUPTED)
     except BrokenPipeError:

@@ -45,9 +45,7 @@ def run_demo(
     backend: Annotated[str, Option("NAME", "one of 'bidnerf backends'")] = USUAL_BACKEND,
     out: Annotated[Path, Option("DIR", "folder for the map, the images and the pictures")] = Path("demo-out"),
     frames: Annotated[int, WholeNumbers(1), Option("N", "number of unseen frames to localize")] = 4,
-    steps: Annotated[
-        int | None, WholeNumbers(1), Option("N", "training steps", "the backend's quick choice")
-    ] = None,
+    steps: Annotated[int | None, WholeNumbers(1), Option("N", "training steps", "the backend's quick choice")] = None,
     seed: Seed = 0,
     overwrite: Annotated[Flag, Option(None, "replace the contents of --out")] = False,
 ) -> None:
@@ -97,11 +95,18 @@ def run_demo(
             starts = ["none", ""], [f"{begin.translation:.3f} {unit}", f"{begin.rotation_deg:.1f} deg"]
             for found, cells in zip((trial.auto, trial.bid), starts, strict=True):
                 end = trial.errors(found.T_world_camera)
-                rows.append([
-                    view.frame.name, found.method, *cells, f"{end.translation:.4f} {unit}",
-                    f"{end.rotation_deg:.2f} deg", str(found.steps), f"{found.seconds:.1f}",
-                    "yes" if found.converged else "NO",
-                ])  # fmt: skip
+                rows.append(
+                    [
+                        view.frame.name,
+                        found.method,
+                        *cells,
+                        f"{end.translation:.4f} {unit}",
+                        f"{end.rotation_deg:.2f} deg",
+                        str(found.steps),
+                        f"{found.seconds:.1f}",
+                        "yes" if found.converged else "NO",
+                    ]
+                )
         show("Pose errors before and after")
         print_table(["frame", "method", "start", "", "found", "", "steps", "seconds", "converged"], rows)
         _draw(stored, trials, out)

@@ -54,19 +54,25 @@ class TrialOptions:
         try:
             numbers = [[float(number) for number in size.split(":")] for size in self.size]
         except ValueError as error:
-            raise UsageError(
-                f"--size is {' '.join(self.size)}", expected="numbers such as 0.5, or 0.2:10"
-            ) from error
+            raise UsageError(f"--size is {' '.join(self.size)}", expected="numbers such as 0.5, or 0.2:10") from error
         with wrong_usage():
             usual = "bid" if find_method(method.method).needs_start else "none"
             return Plan(
-                protocol=self.protocol or usual, sizes=numbers or None, method=method.method, config=method.config,
-                trials=self.trials, seed=self.seed, frames=self.frame or None, split=dataset.split,
+                protocol=self.protocol or usual,
+                sizes=numbers or None,
+                method=method.method,
+                config=method.config,
+                trials=self.trials,
+                seed=self.seed,
+                frames=self.frame or None,
+                split=dataset.split,
                 camera=None if dataset.camera is None else str(dataset.camera),
                 register_depth=registration if registration in (None, False) else str(registration),
-                depth_unit=dataset.depth_unit, masks=None if dataset.masks is None else str(dataset.masks),
-                mask_hides=dataset.mask_hides, **more,
-            )  # fmt: skip
+                depth_unit=dataset.depth_unit,
+                masks=None if dataset.masks is None else str(dataset.masks),
+                mask_hides=dataset.mask_hides,
+                **more,
+            )
 
 
 @dataclass(frozen=True)
@@ -101,9 +107,7 @@ class WorkOptions:
         WholeNumbers(1, 10_000),
         Option("N", "number of single-threaded processes", "one per core; one on a GPU"),
     ] = None
-    dask: Annotated[
-        str | None, Option("ADDRESS", "address of a dask scheduler whose workers run the trials")
-    ] = None
+    dask: Annotated[str | None, Option("ADDRESS", "address of a dask scheduler whose workers run the trials")] = None
     shards: Annotated[int, Option("N", "number of parts that the trials are split into")] = 1
     shard: Annotated[int, Option("I", "the part to run, from 0")] = 0
 
@@ -134,10 +138,17 @@ def run_evaluate(
     if work.dask is not None and work.workers is not None:
         raise UsageError("--workers and --dask contradict each other: a cluster has its own workers")
     plan = starts.plan(
-        method, dataset, images=input.images, angle=input.angle, device=work.device, depth=input.depth,
-        depth_points=None if input.depth_points is None else str(input.depth_points), faults=input.fault,
-        shard=work.shard, shards=work.shards,
-    )  # fmt: skip
+        method,
+        dataset,
+        images=input.images,
+        angle=input.angle,
+        device=work.device,
+        depth=input.depth,
+        depth_points=None if input.depth_points is None else str(input.depth_points),
+        faults=input.fault,
+        shard=work.shard,
+        shards=work.shards,
+    )
     require_outside_maps(out.parent, out)
     with working("waiting for the trials under way (Ctrl-C again: at once)"):
         found = evaluate(map, data or map, plan, out=out, workers=work.dask or work.workers)
@@ -153,9 +164,7 @@ def run_compare(
             positional=True,
         ),
     ] = (),
-    out: Annotated[
-        Path | None, Option("DIR", "write compare.json, compare.png and compare.svg there")
-    ] = None,
+    out: Annotated[Path | None, Option("DIR", "write compare.json, compare.png and compare.svg there")] = None,
     size: Annotated[
         str | None,
         Option("SIZE", "error of the start: e_t, or METRES:DEGREES for perturb", "the protocol's first"),
@@ -214,7 +223,7 @@ def run_report(
     data: Annotated[
         Names, Option("DATA...", "datasets of the results, from which the worst frames are shown", "no pictures")
     ] = (),
-) -> None:  # fmt: skip
+) -> None:
     """Write tables and figures of results as one page that works offline.
 
     Trials are compared by map, data, start, method and settings. A trial in several files counts once.
@@ -228,17 +237,13 @@ def run_report(
     with wrong_usage():
         chosen = chosen_criterion(criterion, table.groups)
     if view is not None and not view.is_file():
-        raise InputError(
-            "no such page", where=view, expected="one written by 'bidnerf view MAP --results ... --save'"
-        )
+        raise InputError("no such page", where=view, expected="one written by 'bidnerf view MAP --results ... --save'")
     if missing := [folder for folder in data if not Path(folder).is_dir()]:
         raise InputError("no such folder", where=missing[0], expected="a dataset that the results are of")
     check_folder(out, (*results, *data))
     runs = [(path.name, read_runs(path)) for path in results]
     with console.status("drawing"):
-        page = write_report(
-            table, out, title, chosen, runs, None if view is None else link_to(view, out), data
-        )
+        page = write_report(table, out, title, chosen, runs, None if view is None else link_to(view, out), data)
     for line in str(table).split("\n"):
         show(line)
     show(f"look at {page}")

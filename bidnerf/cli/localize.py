@@ -86,9 +86,7 @@ class OutputOptions:
             " or .json with all details",
         ),
     ] = None
-    draw: Annotated[
-        Path | None, Option("DIR", "draw each photo next to the map rendered from the pose found")
-    ] = None
+    draw: Annotated[Path | None, Option("DIR", "draw each photo next to the map rendered from the pose found")] = None
     json: Json = False
 
     def check(self, inputs: Sequence[Path]) -> None:
@@ -196,13 +194,14 @@ def _check_for_several(output: OutputOptions, queries: QueryOptions, start: Star
     from bidnerf.results import pose_format
 
     given = {
-        "--start": start.start, "--perturb": start.perturb, "--draw": output.draw, "--depth-points": queries.depth_points
-    }  # fmt: skip
+        "--start": start.start,
+        "--perturb": start.perturb,
+        "--draw": output.draw,
+        "--depth-points": queries.depth_points,
+    }
     refuse(given, "applies to one map, but several are given")
     if output.out is not None and pose_format(output.out) != ".json":
-        raise UsageError(
-            "poses in several maps have different worlds", where=output.out, expected="a .json file"
-        )
+        raise UsageError("poses in several maps have different worlds", where=output.out, expected="a .json file")
 
 
 @dataclass
@@ -265,9 +264,7 @@ class Run:
                     if not is_whole:
                         say(f"{out}: written after {len(answers)} of {total} images")
         if out is not None and not is_written:
-            raise InputError(
-                "not written, since no pose converged; a .json file takes all of them", where=out
-            )
+            raise InputError("not written, since no pose converged; a .json file takes all of them", where=out)
         if failed := len(answers) - len(answers.answers):
             raise InputError(f"{failed} of {total} queries could not be read or localized, see above")
 

@@ -38,9 +38,7 @@ if TYPE_CHECKING:
 def run_info(
     map: MapFolder,
     json: Json = False,
-    draw: Annotated[
-        Path | None, Option("PNG", "file for a picture of the capture from above", "no picture")
-    ] = None,
+    draw: Annotated[Path | None, Option("PNG", "file for a picture of the capture from above", "no picture")] = None,
 ) -> None:
     """Describe a map and the photos it was built from. The whole map is loaded, so that damage is detected."""
     from bidnerf.results import draw_capture
@@ -142,9 +140,7 @@ def run_scale(
         assert factor is not None
         stored = scene.scaled(factor).stored_in(out or map)
     sides = " x ".join(f"{side:.3g}" for side in stored.bounds.size)
-    show(
-        f"{out or map}: all lengths multiplied by {factor:.6g}; the scene is now in metres, in a box of {sides}"
-    )
+    show(f"{out or map}: all lengths multiplied by {factor:.6g}; the scene is now in metres, in a box of {sides}")
 
 
 def run_render(
@@ -152,9 +148,7 @@ def run_render(
     data: Annotated[Path, Option("DATA", "folder of a dataset, or a .r3d file", positional=True)],
     out: Annotated[Path, Option("DIR", "folder for the images")],
     frame: Annotated[Names, Option("NAME...", "render only these frames", "all of the split")] = (),
-    level: Annotated[
-        int | None, Option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
-    ] = None,
+    level: Annotated[int | None, Option("N", "level of detail, 0 the coarsest", "the field itself, the finest")] = None,
     overwrite: Annotated[Flag, Option(None, "replace images in --out")] = False,
     images: Annotated[DatasetOptions, Without("masks", "mask_hides", "largest", "background")] = TEST_IMAGES,
 ) -> None:
@@ -215,9 +209,7 @@ def write_images(out: Path, name: str, image: RenderedImage) -> None:
     millimetres = (image.depth * 1000).round().numpy()
     deepest = np.iinfo(np.uint16).max
     if millimetres.max() > deepest:
-        say(
-            f"{name}: depth beyond {deepest / 1000} units does not fit a 16-bit image in steps of 0.001 and is clipped"
-        )
+        say(f"{name}: depth beyond {deepest / 1000} units does not fit a 16-bit image in steps of 0.001 and is clipped")
     depth = millimetres.clip(0, deepest).astype(np.uint16)
     write_file(out / f"{name}.depth.png", png_bytes(depth))
 
@@ -255,21 +247,15 @@ def run_bake(
     from bidnerf_core.maps import load_map
 
     if rendered_landmarks:
-        refuse(
-            {"--data": data}, "gives photos, but --rendered-landmarks uses none;", expected="only one of them"
-        )
+        refuse({"--data": data}, "gives photos, but --rendered-landmarks uses none;", expected="only one of them")
     if data is None:
-        refuse(
-            {"--masks": images.masks}, "was given without --data", expected="the dataset that they belong to"
-        )
+        refuse({"--masks": images.masks}, "was given without --data", expected="the dataset that they belong to")
     if landmark_features is not None:
         find_features(landmark_features)
     # The baked parts may be damaged, so they are not loaded here.
     scene = load_map(map, device, baked=False)
     with working():
-        scene.bake(
-            data, config, images=images, rendered_landmarks=rendered_landmarks, features=landmark_features
-        )
+        scene.bake(data, config, images=images, rendered_landmarks=rendered_landmarks, features=landmark_features)
 
 
 def run_extend(
@@ -280,16 +266,12 @@ def run_extend(
     ],
     data: Annotated[
         Path | None,
-        Option(
-            "DATA", "dataset that the map was built from", "none: images rendered by the field replace it"
-        ),
+        Option("DATA", "dataset that the map was built from", "none: images rendered by the field replace it"),
     ] = None,
     steps: Annotated[
         int | None,
         WholeNumbers(1),
-        Option(
-            "N", "training steps", "in proportion to the new photos, at least a quarter of the usual number"
-        ),
+        Option("N", "training steps", "in proportion to the new photos, at least a quarter of the usual number"),
     ] = None,
     *,
     images: Annotated[DatasetOptions, Without("masks", "mask_hides", "largest", "background")],
@@ -305,9 +287,7 @@ def run_extend(
     from bidnerf_core.maps import extend, load_info
 
     info = load_info(map)
-    given = {
-        "--camera": images.camera, "--register-depth": images.register_depth, "--depth-unit": images.depth_unit
-    }  # fmt: skip
+    given = {"--camera": images.camera, "--register-depth": images.register_depth, "--depth-unit": images.depth_unit}
     is_stated = any(value is not None for value in given.values())
     paths = [new] if data is None else [new, data]
     datasets = [path for path in paths if is_stated and find_reader(path) is not None]
@@ -345,9 +325,7 @@ class WorldOptions:
     scale: Annotated[float, Above(0.0), Option("FACTOR", "metres per unit of length in the file")] = 1.0
     T_world_file: Annotated[
         Path | None,
-        Option(
-            "POSE", "file of a pose (JSON, 4x4) that takes the scaled coordinates of the file to the world"
-        ),
+        Option("POSE", "file of a pose (JSON, 4x4) that takes the scaled coordinates of the file to the world"),
     ] = None
 
 
@@ -364,9 +342,7 @@ def run_import(
     world: WorldOptions,
     photos: Annotated[
         Path | None,
-        Option(
-            "DATA", "dataset whose photos, with poses in the world, provide the landmarks", "rendered images"
-        ),
+        Option("DATA", "dataset whose photos, with poses in the world, provide the landmarks", "rendered images"),
     ] = None,
     target: MapOptions,
     images: Annotated[
@@ -394,8 +370,6 @@ def run_import(
     if world.T_world_file is not None:
         with wrong_usage():
             pose = read_pose(world.T_world_file)
-    options = ImportOptions(
-        images, target.landmark_features, target.device, target.overwrite, as_, world.scale, pose
-    )
+    options = ImportOptions(images, target.landmark_features, target.device, target.overwrite, as_, world.scale, pose)
     with working():
         import_map(file, out, config, photos=photos, bake=not target.no_bake, options=options)

@@ -24,9 +24,7 @@ if TYPE_CHECKING:
 TEST_IMAGES = DatasetOptions(split="test")
 """The default options for images with which a map is tested."""
 
-MapFolder: TypeAlias = Annotated[
-    Path, Option("MAP", "folder of a map, as written by 'bidnerf train'", positional=True)
-]
+MapFolder: TypeAlias = Annotated[Path, Option("MAP", "folder of a map, as written by 'bidnerf train'", positional=True)]
 Method: TypeAlias = Annotated[str, Option("NAME", "how poses are found, one of 'bidnerf plugins methods'")]
 Device: TypeAlias = Annotated[str, Option("NAME", "device on which the field computes: cpu, cuda ...")]
 Host: TypeAlias = Annotated[
@@ -143,9 +141,7 @@ class QueryOptions:
     ] = None
     frame: Annotated[
         Names,
-        Option(
-            "NAME...", "frames of a dataset, together as a rig (default: each frame of the split on its own)"
-        ),
+        Option("NAME...", "frames of a dataset, together as a rig (default: each frame of the split on its own)"),
     ] = ()
     window: Annotated[
         int,

@@ -96,9 +96,7 @@ def check_folder(
         require_outside_maps(out, out)
     for given in [Path(each) for each in inputs if each is not None]:
         if out.exists() and given.exists() and out.samefile(given):
-            raise UsageError(
-                "is an input of this command", where=out, expected="another folder for its output"
-            )
+            raise UsageError("is an input of this command", where=out, expected="another folder for its output")
     if create:
         try:
             out.mkdir(parents=True, exist_ok=True)

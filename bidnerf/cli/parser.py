@@ -91,9 +91,7 @@ class Parameter:
     @property
     def option(self) -> Option:
         """The ``Option`` among the annotations, or else an ``Option`` whose metavar is the first string among them."""
-        return self.note(Option) or Option(
-            next((n for n in self.notes if isinstance(n, str) and n != FLAG), None)
-        )
+        return self.note(Option) or Option(next((n for n in self.notes if isinstance(n, str) and n != FLAG), None))
 
     @property
     def flag(self) -> str:
@@ -147,9 +145,7 @@ def _walk(
             yield from _walk(type(group), loaded, group, parameter.left_out)
 
 
-def _built(
-    target: Callable[..., T], given: Mapping[str, Any], loaded: Mapping[str, Any], default: Any = None
-) -> T:
+def _built(target: Callable[..., T], given: Mapping[str, Any], loaded: Mapping[str, Any], default: Any = None) -> T:
     """Call ``target`` with the given values for its parameters and for the fields of nested dataclasses."""
     values = dict[str, Any]()
     for parameter in parameters_of(target):
@@ -181,15 +177,21 @@ class _Parser(argparse.ArgumentParser):
     """
 
     def __init__(
-        self, command: str, target: Callable[..., Any], loaded: Mapping[str, Any] | None,
+        self,
+        command: str,
+        target: Callable[..., Any],
+        loaded: Mapping[str, Any] | None,
         options_only: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.width = max(40, shutil.get_terminal_size().columns)  # 40 columns even in narrower terminals
         super().__init__(
-            f"bidnerf {command}", add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS,
+            f"bidnerf {command}",
+            add_help=False,
+            allow_abbrev=False,
+            argument_default=argparse.SUPPRESS,
             description=self._filled(inspect.getdoc(target) or ""),
             formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, 2, 24, self.width),
-        )  # fmt: skip
+        )
         self._is_short, self._options_only = loaded is None, options_only
         self._positional, self._required = list[str](), list[str]()  # for the usage
         own = self.add_argument_group("options")
@@ -209,9 +211,7 @@ class _Parser(argparse.ArgumentParser):
         more = "show all options" + (f", also {' and '.join(announced)}" if announced else "")
         own.add_argument(HELP_ALL, action="store_true", help=more)
         usage = " ".join([f"bidnerf {command} [OPTIONS]", *self._positional, *self._required])
-        self.usage = textwrap.fill(usage, self.width - len("usage: "), subsequent_indent="  ").replace(
-            "%", "%%"
-        )
+        self.usage = textwrap.fill(usage, self.width - len("usage: "), subsequent_indent="  ").replace("%", "%%")
 
     def _filled(self, text: str, indent: int = 0) -> str:
         """Return the paragraphs of ``text``, wrapped to the width of the terminal less ``indent`` columns."""
@@ -244,9 +244,13 @@ class _Parser(argparse.ArgumentParser):
             self._required.append(f"{flag} {shown}")
         common["metavar"] = tuple(shown.split()) if isinstance(nargs, int) else shown.removesuffix("...")
         group.add_argument(
-            flag, action="extend" if nargs == "+" else "store", nargs=nargs, dest=parameter.name,
-            required=is_required and not self._options_only, **common,
-        )  # fmt: skip
+            flag,
+            action="extend" if nargs == "+" else "store",
+            nargs=nargs,
+            dest=parameter.name,
+            required=is_required and not self._options_only,
+            **common,
+        )
 
     def values(self, words: Sequence[str]) -> dict[str, Any]:
         """Parse words, and return the values of the arguments given, by parameter name. Raises ``UsageError``."""
@@ -254,9 +258,7 @@ class _Parser(argparse.ArgumentParser):
         found, more = self.parse_known_intermixed_args(_escaped(words))
         if more:
             self.error(f"unexpected argument {more[0].strip()!r}")
-        return {
-            name: tuple(value) if isinstance(value, list) else value for name, value in vars(found).items()
-        }
+        return {name: tuple(value) if isinstance(value, list) else value for name, value in vars(found).items()}
 
     def error(self, message: str) -> NoReturn:
         """Raise ``UsageError``. An unknown option is reported instead of ``message``, since it explains the other errors."""
@@ -372,9 +374,7 @@ def conversion(hint: Any) -> tuple[int | str | None, Callable[[str], Any], str]:
         _, convert, metavar = conversion(parts[0])
         return ("+", convert, metavar) if several else (len(parts), convert, " ".join([metavar] * len(parts)))
     kinds = sorted(words, key=lambda kind: 1 if kind is str else 2 if kind is Path else 0) or [str]
-    choices = {
-        str(c): c for kind in kinds if typing.get_origin(kind) is Literal for c in typing.get_args(kind)
-    }
+    choices = {str(c): c for kind in kinds if typing.get_origin(kind) is Literal for c in typing.get_args(kind)}
     plain = [kind for kind in kinds if kind in KINDS]
     metavar = KINDS[plain[0]][0] if plain else f"{{{','.join(choices)}}}"
     expected = " or ".join(

@@ -129,9 +129,13 @@ class Display:
         if self.bar is not None:
             self.bar.stop()
         columns: tuple[ProgressColumn, ...] = (
-            TextColumn(now.stage), BarColumn(), TextColumn("{task.completed}/{task.total} " + now.unit),
-            TextColumn("{task.fields[text]}"), TextColumn("left"), TimeRemainingColumn(),
-        )  # fmt: skip
+            TextColumn(now.stage),
+            BarColumn(),
+            TextColumn("{task.completed}/{task.total} " + now.unit),
+            TextColumn("{task.fields[text]}"),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+        )
         if now.total == 1:
             columns = (SpinnerColumn(), TextColumn(now.stage), TimeElapsedColumn())
         # Results on the same terminal appear above the bar.
@@ -163,9 +167,7 @@ def working(
     handler, announced = _handler(), threading.Event()
 
     def cancel() -> bool:
-        if (
-            handler.waiting is not None and not announced.is_set()
-        ):  # not in the handler, which may interrupt a print
+        if handler.waiting is not None and not announced.is_set():  # not in the handler, which may interrupt a print
             announced.set()
             say(announcement)
         return handler.waiting is not None

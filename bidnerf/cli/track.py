@@ -42,9 +42,7 @@ class OutputOptions:
             "pose file, required without --follow: .txt or .tum, transforms.json, or .json with all details",
         ),
     ] = None
-    plot: Annotated[
-        Path | None, Option("PNG", "draw the path over the map's surface, coloured by uncertainty")
-    ] = None
+    plot: Annotated[Path | None, Option("PNG", "draw the path over the map's surface, coloured by uncertainty")] = None
     video: Annotated[
         Path | None,
         Option("MP4", "draw each image next to the map rendered from its pose; takes far longer"),
@@ -72,13 +70,9 @@ class FrameOptions:
 
     follow: Annotated[
         Flag,
-        Option(
-            None, "answer frames as they arrive, one JSON object per line on stdout, until Ctrl-C or the end"
-        ),
+        Option(None, "answer frames as they arrive, one JSON object per line on stdout, until Ctrl-C or the end"),
     ] = False
-    split: Annotated[str | None, Option("NAME", "use only the frames of one split of a dataset", "all")] = (
-        None
-    )
+    split: Annotated[str | None, Option("NAME", "use only the frames of one split of a dataset", "all")] = None
     every: Annotated[int, WholeNumbers(1), Option("N", "use only every Nth frame")] = 1
     depth: Annotated[bool, Option(None, "use measured depth if available")] = True
     depth_sensor: Annotated[
@@ -102,9 +96,7 @@ class TrackingOptions:
             "accepted as usual",
         ),
     ] = None
-    config: Annotated[Any, Settings(lambda *_: localization.TrackerConfig(), "settings of the tracker")] = (
-        None
-    )
+    config: Annotated[Any, Settings(lambda *_: localization.TrackerConfig(), "settings of the tracker")] = None
 
 
 def run_track(
@@ -159,9 +151,13 @@ def run_track(
             recorded = opened.open_sequence(sequence)
             recorded = recorded if frames.split is None else recorded.split(frames.split)
             track(
-                tracker, recorded, every=frames.every, depth=frames.depth, answers=path,
+                tracker,
+                recorded,
+                every=frames.every,
+                depth=frames.depth,
+                answers=path,
                 each=None if video is None else video.add,
-            )  # fmt: skip
+            )
     finally:  # however tracking ended, the frames so far are written
         with uninterrupted():
             if path.given:
@@ -180,7 +176,7 @@ def run_track(
 
 def _follow(
     source: str, images: DatasetOptions, depth: bool, tracker: Tracker, path: Answers, video: TrackingVideo | None
-) -> None:  # fmt: skip
+) -> None:
     """Answer each frame on arrival with one line of JSON."""
     from bidnerf.results import BAD_INPUT
 
@@ -238,9 +234,14 @@ class FrameRequest:
 
         mask = None if self.mask is None else MaskFile(Path(self.mask))
         return Frame.read(
-            self.image, images.camera_source, depth=self.depth, depth_unit=self.depth_unit, sensor=sensor,
-            background=images.background, mask=mask,
-        )  # fmt: skip
+            self.image,
+            images.camera_source,
+            depth=self.depth,
+            depth_unit=self.depth_unit,
+            sensor=sensor,
+            background=images.background,
+            mask=mask,
+        )
 
 
 def requests(source: str) -> Iterator[FrameRequest | InputError]:
@@ -266,9 +267,7 @@ def _arriving(folder: Path) -> Iterator[FrameRequest]:
     from bidnerf_core.io import IMAGE_SUFFIXES
 
     if not folder.is_dir():
-        raise InputError(
-            "no such folder", where=folder, expected=f"one that receives images, or {STDIN} for stdin"
-        )
+        raise InputError("no such folder", where=folder, expected=f"one that receives images, or {STDIN} for stdin")
     given, sizes = set[Path](), dict[Path, tuple[int, int]]()
     while True:
         photos, others = photos_in(folder)
@@ -276,9 +275,10 @@ def _arriving(folder: Path) -> Iterator[FrameRequest]:
         for photo in waiting:
             # Other files of the photo's name, such as NAME.json, are not depth.
             depths = [
-                file for file in others
+                file
+                for file in others
                 if file.name.startswith(f"{photo.stem}.") and file.suffix.lower() in (".npy", *IMAGE_SUFFIXES)
-            ]  # fmt: skip
+            ]
             if not all(_is_steady(file, sizes) for file in (photo, *depths[:1])):
                 break  # later names have to wait, to keep the name order
             given.add(photo)

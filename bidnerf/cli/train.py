@@ -82,13 +82,11 @@ class TrainingOptions:
     """Which training, and how far it goes."""
 
     backend: Annotated[str | None, Option("NAME", "one of 'bidnerf backends'", USUAL_BACKEND)] = None
-    quick: Annotated[Flag, Option(None, "train a short time: settings of the backend for a first map")] = (
+    quick: Annotated[Flag, Option(None, "train a short time: settings of the backend for a first map")] = False
+    resume: Annotated[Flag, Option(None, "continue the interrupted training in --out")] = False
+    finish: Annotated[Flag, Option(None, "end the interrupted training in --out now, with the steps done so far")] = (
         False
     )
-    resume: Annotated[Flag, Option(None, "continue the interrupted training in --out")] = False
-    finish: Annotated[
-        Flag, Option(None, "end the interrupted training in --out now, with the steps done so far")
-    ] = False
     checkpoint_every: Annotated[
         float,
         Range(0.0),
@@ -107,9 +105,7 @@ class PoseOptions:
             "refine the given poses with the keypoints that images share: always, never, or auto (if inconsistent)",
         ),
     ] = "auto"
-    trust_poses: Annotated[
-        Flag, Option(None, "train even if the given poses contradict most pairs of photos")
-    ] = False
+    trust_poses: Annotated[Flag, Option(None, "train even if the given poses contradict most pairs of photos")] = False
 
 
 @dataclass(frozen=True)
@@ -136,9 +132,7 @@ def run_train(
     images: DatasetOptions,
     config: Annotated[
         Any,
-        Settings(
-            _backend_settings, "size and training of the field: settings of the backend, such as --steps"
-        ),
+        Settings(_backend_settings, "size and training of the field: settings of the backend, such as --steps"),
     ] = None,
 ) -> None:
     """Build a map from a dataset, or from photos without poses.
@@ -169,9 +163,7 @@ def run_train(
     working_device(target.device)
     photos = lacks_poses(data)
     if photos:
-        given = {
-            "--depth-unit": images.depth_unit, "--register-depth": images.register_depth, "--masks": images.masks
-        }  # fmt: skip
+        given = {"--depth-unit": images.depth_unit, "--register-depth": images.register_depth, "--masks": images.masks}
         refuse(given, f"is for a dataset, but {data} has no poses; 'bidnerf poses' makes a dataset of photos")
     # A run that was interrupted during pose estimation resumes by itself.
     resumes = resumes and not (photos and not (out / DESCRIPTION).exists())
@@ -179,9 +171,16 @@ def run_train(
         info = _interrupted(out, training.backend, config, target, given_poses, images)
         images = replace(images, background=images.background or info.bounds.background)
     options = TrainOptions(
-        images, target.landmark_features, target.device, target.overwrite, given_poses.refine_poses,
-        given_poses.trust_poses, sparse_depth.depth_points, sparse_depth.model_points, training.checkpoint_every,
-    )  # fmt: skip
+        images,
+        target.landmark_features,
+        target.device,
+        target.overwrite,
+        given_poses.refine_poses,
+        given_poses.trust_poses,
+        sparse_depth.depth_points,
+        sparse_depth.model_points,
+        training.checkpoint_every,
+    )
     with working():
         if not resumes:
             train(data, training.backend or USUAL_BACKEND, out, config, bake=bake, options=options)
@@ -194,7 +193,7 @@ def run_train(
 
 def _interrupted(
     out: Path, backend: str | None, config: Any, target: MapOptions, given_poses: PoseOptions, images: DatasetOptions
-) -> MapInfo:  # fmt: skip
+) -> MapInfo:
     """Return the description of the map to resume.
 
     Raises ``UsageError`` for options that differ from those of the map, since they would be ignored.

@@ -64,17 +64,13 @@ def run_view(
     map: MapFolder,
     query: Annotated[
         tuple[Path, ...],
-        Option(
-            "[QUERY...]", "photos, folders of photos, or one dataset, to localize and show", positional=True
-        ),
+        Option("[QUERY...]", "photos, folders of photos, or one dataset, to localize and show", positional=True),
     ] = (),
     *,
     page: PageOptions,
     frame: Annotated[
         Names,
-        Option(
-            "NAME...", "show only these frames of a dataset, each localized on its own", "all of the split"
-        ),
+        Option("NAME...", "show only these frames of a dataset, each localized on its own", "all of the split"),
     ] = (),
     server: ServerOptions,
     queries: Annotated[QueryOptions, Without("frame", "window", "depth_points", "model_points")],
@@ -119,9 +115,11 @@ def run_view(
         source = Chosen(source, places)
     if page.save is None:
         serve_view(
-            LiveView(localizer, source, path, rows, camera), host=server.host, port=server.port,
+            LiveView(localizer, source, path, rows, camera),
+            host=server.host,
+            port=server.port,
             ready=lambda address: say(f"look at {address}; Ctrl-C ends"),
-        )  # fmt: skip
+        )
         return
     answers = () if source is None else _localized(localizer, source)
     with console.status("drawing the map"):
@@ -220,6 +218,12 @@ def run_serve(
             say(f"clients need the header  Authorization: Bearer {shown}")
 
     serve_maps(
-        maps, host=host, port=port, token=stated, method=method, device=device, limits=limits,
+        maps,
+        host=host,
+        port=port,
+        token=stated,
+        method=method,
+        device=device,
+        limits=limits,
         ready=announce,
-    )  # fmt: skip
+    )

@@ -69,19 +69,24 @@ class MapRow(Summary):
         """Return the statistics of trials on one map of ``size`` bytes; ``samples`` holds the samples per ray of each."""
         first = results[0]
         return cls(
-            map=label, backend=first.backend, weights=first.weights, samples_per_ray=statistics.fmean(samples),
-            map_bytes=size, **vars(summarize(results)),
-        )  # fmt: skip
+            map=label,
+            backend=first.backend,
+            weights=first.weights,
+            samples_per_ray=statistics.fmean(samples),
+            map_bytes=size,
+            **vars(summarize(results)),
+        )
 
     def cells(self) -> dict[str, str]:
         """Return the statistics as text, by name."""
         usual = self.success[RELATIVE] or self.success[ABSOLUTE]
         assert usual is not None  # the absolute criterion always applies
         rates = {
-            f"success {name}": "-" if s is None
+            f"success {name}": "-"
+            if s is None
             else f"{s.rate.successes}/{s.rate.trials} ({100 * s.rate.low:.0f}-{100 * s.rate.high:.0f} %)"
             for name, s in self.success.items()
-        }  # fmt: skip
+        }
         return {
             "backend": self.backend,
             **rates,
@@ -95,7 +100,7 @@ class MapRow(Summary):
             "peak memory, MiB": f"{self.peak_memory_bytes / 2**20:.0f}",
             "samples a ray": f"{self.samples_per_ray:.1f}",
             "map, MiB": f"{self.map_bytes / 2**20:.1f}",
-        }  # fmt: skip
+        }
 
 
 def _known(value: float | None, digits: int) -> str:
@@ -134,9 +139,7 @@ class Comparison:
             *([n, *(cells[n] for cells in columns)] for n in names),
         ]
         usual = RELATIVE if self.rows[0].success[RELATIVE] else ABSOLUTE
-        note = (
-            f"success: number and Wilson's 95 % interval; to success: median of the trials that met {usual}"
-        )
+        note = f"success: number and Wilson's 95 % interval; to success: median of the trials that met {usual}"
         return "\n".join([printable(self.title), aligned(lines), note])
 
     def save(self, path: str | Path) -> None:
@@ -191,10 +194,11 @@ def compare(
                 found[name].append(running.result())
             except BrokenProcessPool as error:
                 raise InputError(
-                    f"the process that localized frame {trial.frame} ended", where=trial.map,
+                    f"the process that localized frame {trial.frame} ended",
+                    where=trial.map,
                     expected="a result; was memory short, or does the main module begin work outside of"
                     " 'if __name__ == \"__main__\"'?",
-                ) from error  # fmt: skip
+                ) from error
             text = f"{trial.frame} in {name}"
             report_progress(Progress("comparison", number, len(turns), "trials", text))
     results = {name: tuple(result for result, _ in pairs) for name, pairs in found.items()}
@@ -204,9 +208,17 @@ def compare(
     )
     first, run = starts[0], next(iter(results.values()))[0]
     return Comparison(
-        run.trial.data, first.split, first.protocol, first.size, run.method, run.settings, first.seed,
-        len(starts), rows, tuple(results.values()),
-    )  # fmt: skip
+        run.trial.data,
+        first.split,
+        first.protocol,
+        first.size,
+        run.method,
+        run.settings,
+        first.seed,
+        len(starts),
+        rows,
+        tuple(results.values()),
+    )
 
 
 def measured(
@@ -248,18 +260,14 @@ def named_maps(scenes: Sequence[Scene] | Mapping[str, Scene]) -> dict[str, Scene
     single map that is not in a list, and for a folder that is named twice.
     """
     if isinstance(scenes, str | Path | Map):
-        raise InputError(
-            f"scenes is the one map {name_of(scenes)}", expected="a list of maps, or a dictionary of them"
-        )
+        raise InputError(f"scenes is the one map {name_of(scenes)}", expected="a list of maps, or a dictionary of them")
     if not scenes:
         raise InputError("no maps to compare", expected="at least one")
     if isinstance(scenes, Mapping):
         return dict(scenes)
     folders = {str(scene): Path(scene).resolve().parts for scene in scenes if not isinstance(scene, Map)}
     if len(set(folders.values())) < sum(not isinstance(scene, Map) for scene in scenes):
-        raise InputError(
-            f"{', '.join(map(str, scenes))}: one is named twice", where="maps", expected="different ones"
-        )
+        raise InputError(f"{', '.join(map(str, scenes))}: one is named twice", where="maps", expected="different ones")
     length = next(n for n in count(1) if len({parts[-n:] for parts in folders.values()}) == len(folders))
     found: dict[str, Scene] = {}
     for scene in scenes:

@@ -152,13 +152,9 @@ class Protocol:
         """Raise ``InputError`` for a size with the wrong number of values, or with a value out of range."""
         most = [180.0 if "deg" in unit else 1e6 for unit in self.units]  # degrees, metres
         if len(size) != len(self.units) or not all(0 <= x <= m for x, m in zip(size, most, strict=True)):
-            expected = (
-                " : ".join(self.units) or "none, since this protocol has no sizes, as bid and others have"
-            )
+            expected = " : ".join(self.units) or "none, since this protocol has no sizes, as bid and others have"
             limits = f", 0 to {' : '.join(f'{m:g}' for m in most)}" if most else ""
-            raise InputError(
-                f"size is {':'.join(f'{x:g}' for x in size) or 'missing'}", expected=f"{expected}{limits}"
-            )
+            raise InputError(f"size is {':'.join(f'{x:g}' for x in size) or 'missing'}", expected=f"{expected}{limits}")
 
 
 PROTOCOLS = {
@@ -327,9 +323,7 @@ class Plan(Setup, Settings):
             rows = (size if isinstance(size, Sequence) else [size] for size in self.sizes)
             sizes = tuple(tuple(map(float, row)) for row in rows)
         except (TypeError, ValueError) as error:
-            raise InputError(
-                f"sizes is {self.sizes!r}", expected="a list of numbers or of lists of numbers"
-            ) from error
+            raise InputError(f"sizes is {self.sizes!r}", expected="a list of numbers or of lists of numbers") from error
         for size in sizes:
             protocol.check_size(size)
         return sizes
@@ -359,9 +353,7 @@ def planned(plan: Plan, map: str, data: str, dataset: Capture) -> list[Trial]:
     check_depth(plan.faults, plan.depth)
     rigs = _rigs(plan, dataset, names, data)
     if protocol.fixed and (plan.frames is not None or len(rigs) < len(names)):
-        raise InputError(
-            f"protocol {plan.protocol!r} defines its own frames", expected="one image and all frames"
-        )
+        raise InputError(f"protocol {plan.protocol!r} defines its own frames", expected="one image and all frames")
     count = protocol.trials if plan.trials is None else plan.trials
     cases = protocol.cases(len(rigs), count, protocol.seed if plan.seed is None else plan.seed)
     shared = {field.name: getattr(plan, field.name) for field in fields(Setup)}

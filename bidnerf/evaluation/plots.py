@@ -73,10 +73,12 @@ QUANTITIES = {
     ),
     "seconds": Quantity("time (s)", "right trials (%)", None, lambda r, _: r.seconds if succeeded(r) else NEVER),
     "steps": Quantity(
-        "step", "successful trials (%)", None,
+        "step",
+        "successful trials (%)",
+        None,
         lambda r, criterion: steps_of([r], criterion)[0] if applies(criterion, [r]) else NEVER,
     ),
-}  # fmt: skip
+}
 ERRORS = ("translation", "rotation_deg")
 
 Panel = tuple[str, Callable[[Any], None]]
@@ -117,11 +119,13 @@ class Figures:
     def errors(self) -> Figure | None:
         """Draw the cumulative share of trials over their errors, and that of right answers over time, for each situation."""
         return self._by_situation(
-            "errors", self.groups, self.cumulative(),
+            "errors",
+            self.groups,
+            self.cumulative(),
             "Cumulative errors: the share of all trials whose final error is at most that on the axis; answers that the"
             " method itself refused count as well, and the dashed lines are 0.05 and 5 degrees. Right: the share of all"
             f" trials that were answered rightly (within both) in at most that time.{self.omitted}",
-        )  # fmt: skip
+        )
 
     def cumulative(self) -> list[Callable[..., None]]:
         """Return functions that draw the cumulative share of trials over each kind of error, and over time."""
@@ -131,11 +135,13 @@ class Figures:
         """Draw errors and success after each step, for methods that work in steps; None if there are none."""
         draw = [*(partial(self._quartiles, kind=kind) for kind in ERRORS), partial(self._shares, of="steps")]
         return self._by_situation(
-            "convergence", [group for group in self.groups if are_stepwise(group.results)], draw,
+            "convergence",
+            [group for group in self.groups if are_stepwise(group.results)],
+            draw,
             "Errors after each step: median and quartiles of all trials; the dashed lines are 0.05 and 5 degrees. Right: the"
             f" share of all trials that meet the criterion ({CRITERION_NAMES[self.criterion]}) from each step on."
             f"{self.omitted}",
-        )  # fmt: skip
+        )
 
     # What a panel shows of the groups of a situation.
 
@@ -265,8 +271,7 @@ def comparison_figure(folder: Path, comparison: Comparison) -> Path:
     }
     titles = (comparison.title, "", "")
     panels: list[Panel] = [
-        (title, partial(draw, groups=groups))
-        for title, draw in zip(titles, figures.cumulative(), strict=True)
+        (title, partial(draw, groups=groups)) for title, draw in zip(titles, figures.cumulative(), strict=True)
     ]
     panels += [(name, partial(bars, values=values)) for name, values in costs.items() if any(values)]
     drawn = figures._figure("compare", panels, figures.looks, "")

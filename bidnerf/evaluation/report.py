@@ -63,9 +63,7 @@ def write_report(
     path = folder / "index.html"
     is_ours = path.is_file() and MARK.encode() in path.read_bytes()[:4096]  # the head of the page
     if folder.is_dir() and not is_ours and not all(is_temporary(file.name) for file in folder.iterdir()):
-        raise InputError(
-            "holds something other than a bidnerf report; name another --out or remove it", where=folder
-        )
+        raise InputError("holds something other than a bidnerf report; name another --out or remove it", where=folder)
     frames = pictured(worst(table.rows)[:24], data)
     with output_folder(folder, overwrite=True):
         if not path.exists():  # so that an interrupted report is recognized as one
@@ -102,9 +100,7 @@ def page(
     frames: Sequence[tuple[TrialResult, str | None]] = (),
 ) -> str:
     """Return a report as HTML; ``frames`` lists trials with their images, see ``pictured``."""
-    environment = Environment(
-        autoescape=True, finalize=_printed, undefined=StrictUndefined, keep_trailing_newline=True
-    )
+    environment = Environment(autoescape=True, finalize=_printed, undefined=StrictUndefined, keep_trailing_newline=True)
     environment.filters["number"] = _number
     source = files(__package__).joinpath("report.html.jinja").read_text(encoding="utf-8")
     template = environment.from_string(source.strip() + "\n")
@@ -127,9 +123,7 @@ def page(
         succeeded=succeeded,
         wrong=sum(row.converged and not succeeded(row) for row in table.rows),
         refused=sum(not row.converged for row in table.rows),
-        runs=[
-            (name, _facts(name, known), list(dict.fromkeys(r.command for r in known))) for name, known in runs
-        ],
+        runs=[(name, _facts(name, known), list(dict.fromkeys(r.command for r in known))) for name, known in runs],
     )
 
 
@@ -187,9 +181,7 @@ def _facts(name: str, runs: Sequence[Provenance]) -> dict[str, str]:
         return {}
     first, last = runs[0], runs[-1]
     changed = {False: "", True: ", with local changes"}
-    commits = [
-        f"{r.commit}{changed[r.dirty]}" if r.commit else "unknown (no checkout of this code)" for r in runs
-    ]
+    commits = [f"{r.commit}{changed[r.dirty]}" if r.commit else "unknown (no checkout of this code)" for r in runs]
     machines = [
         f"{r.cpu}, {r.cores} cores{f', {r.memory_bytes / 2**30:.0f} GiB' if r.memory_bytes else ''},"
         f" {r.gpu or 'no GPU'}, {r.system}"

@@ -81,9 +81,7 @@ class ResultTable:
     def summary(self) -> tuple[SummaryRow, ...]:
         """Success rates with Wilson's 95 % intervals, errors and cost of each group."""
         titles = situation_titles([group.situation for group in self.groups])
-        return tuple(
-            SummaryRow(titles[g.situation], g.label, g.situation, summarize(g.results)) for g in self.groups
-        )
+        return tuple(SummaryRow(titles[g.situation], g.label, g.situation, summarize(g.results)) for g in self.groups)
 
     def __str__(self) -> str:
         lines = [["success by", "n", "frames", *CRITERIA, "median error"]]
@@ -253,9 +251,7 @@ class ResultsFile:
                 open_binary(path, EXPECTED).close()  # raises for a pipe, which would wait for a reader
             self._file = path.open("a+b")
         except OSError as error:
-            raise InputError(
-                f"cannot be written ({error.strerror})", where=path, expected="a file"
-            ) from error
+            raise InputError(f"cannot be written ({error.strerror})", where=path, expected="a file") from error
         if not take_lock(self._file.fileno()):
             self.__exit__()
             raise FileInUse("another process is writing to it; name another --out", where=path)

@@ -135,8 +135,10 @@ def run_trials(
         log.info("%s: %d of %d trials are already there", file.path, len(trials) - len(todo), len(trials))
     if unchecked := sum(trial in file and file[trial].inputs is None for trial in trials):
         log.info(
-            "%s: %d results of an earlier version do not record their images and are kept unchecked", file.path, unchecked
-        )  # fmt: skip
+            "%s: %d results of an earlier version do not record their images and are kept unchecked",
+            file.path,
+            unchecked,
+        )
     if not todo:
         return
     where = "" if file.path is None else f" in {file.path}"
@@ -153,16 +155,12 @@ def run_trials(
             ) from error
         except Cancelled as error:
             left = sum(trial not in file for trial in trials)
-            kept = (
-                "nothing is kept without a results file" if file.path is None else "the same command resumes"
-            )
+            kept = "nothing is kept without a results file" if file.path is None else "the same command resumes"
             are = "is" if left == 1 else "are"
             raise Cancelled(f"stopped; {amount(left, 'trial')} {are} left{where}, {kept}") from error
 
 
-def _run(
-    todo: Sequence[Trial], file: ResultsFile, executor: Executor, at_once: int, scene: Opened | None
-) -> None:
+def _run(todo: Sequence[Trial], file: ResultsFile, executor: Executor, at_once: int, scene: Opened | None) -> None:
     """Run trials, ``at_once`` at a time, and store their results; raise the first error once the running ones have ended."""
     running = set[Future[TrialResult]]()
     count = right = 0
@@ -213,9 +211,7 @@ def left_to_do(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None 
         for name, value in to_flat(parse_settings(trial.method, trial.config)).items():
             before = known.settings.get(name, usual[name])
             if before != value:
-                raise InputError(
-                    f"was made with {name} {before}, expected {value}; {advice}", where=file.path
-                )
+                raise InputError(f"was made with {name} {before}, expected {value}; {advice}", where=file.path)
         if known.inputs is None:  # not recorded by an earlier version
             continue
         # The images depend on the seed only if they have faults.

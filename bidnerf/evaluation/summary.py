@@ -73,9 +73,7 @@ def grouped(results: Sequence[TrialResult]) -> list[Group]:
         found.setdefault((pooled, label), []).append(result)
         sizes.setdefault((pooled, label), set()).add(t.size)
     order = {situation: place for place, (situation, _) in reversed(list(enumerate(sizes)))}
-    groups = [
-        Group(*key, tuple(rows)) for key, rows in found.items() if key not in sizes or len(sizes[key]) > 1
-    ]
+    groups = [Group(*key, tuple(rows)) for key, rows in found.items() if key not in sizes or len(sizes[key]) > 1]
 
     def rank(group: Group) -> tuple[Any, ...]:
         pooled, size = replace(group.situation, size=None), group.situation.size
@@ -107,15 +105,17 @@ def situation_titles(every: Sequence[Situation]) -> dict[Situation, str]:
 def _condition(result: TrialResult) -> dict[str, Any]:
     """Return the properties that define the condition of a trial, by name: method, input, hardware and settings."""
     trial = result.trial
-    own = {
-        name: getattr(trial, name)
-        for name in ("depth", "depth_points", "camera", "register_depth", "depth_unit")
-    }
+    own = {name: getattr(trial, name) for name in ("depth", "depth_points", "camera", "register_depth", "depth_unit")}
     hidden = None if trial.masks is None else f"{trial.mask_hides} of {trial.masks}"
     return {
-        "method": result.method, "images": len(trial.frames), "hidden": hidden, **own, "backend": result.backend,
-        "device": trial.device, **result.settings,
-    }  # fmt: skip
+        "method": result.method,
+        "images": len(trial.frames),
+        "hidden": hidden,
+        **own,
+        "backend": result.backend,
+        "device": trial.device,
+        **result.settings,
+    }
 
 
 WORDS: dict[str, Callable[[Any], str]] = {

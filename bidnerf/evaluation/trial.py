@@ -66,9 +66,7 @@ class Trace:
     def __post_init__(self) -> None:
         lengths = len(self.translation), len(self.rotation_deg)
         if lengths[0] != lengths[1] or lengths[0] == 0:
-            raise ValueError(
-                f"{lengths[0]} translation and {lengths[1]} rotation errors, expected as many of each"
-            )
+            raise ValueError(f"{lengths[0]} translation and {lengths[1]} rotation errors, expected as many of each")
 
     def as_error(self) -> PoseError:
         """Return the errors as tensors (n), NaN where a pose was not finite."""
@@ -124,9 +122,7 @@ class TrialResult:
                 raise ValueError(f"{name} is larger than any measurement")
 
 
-def run_trial(
-    trial: Trial, scene: Opened | None = None, registered: Sequence[tuple[str, str]] = ()
-) -> TrialResult:
+def run_trial(trial: Trial, scene: Opened | None = None, registered: Sequence[tuple[str, str]] = ()) -> TrialResult:
     """Run a trial on the map and dataset ``scene``, by default those named by the trial.
 
     ``registered`` has the group and name of everything that the planning process registered for it. Raises
@@ -210,9 +206,7 @@ def open_data(data: Data, options: DatasetOptions, stored: Map | None = None) ->
     else:
         views = [view for view in data if isinstance(view, View)] if isinstance(data, Sequence) else []
         if not views or len(views) < len(data):
-            raise InputError(
-                f"data is a {type(data).__name__}", expected="a folder, a dataset or a list of views"
-            )
+            raise InputError(f"data is a {type(data).__name__}", expected="a folder, a dataset or a list of views")
         name, count = Counter(view.frame.name for view in views).most_common(1)[0]
         if count > 1:  # trials identify their frames by name
             raise InputError(f"data holds {count} frames named {name!r}", expected="different names")

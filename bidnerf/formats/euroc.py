@@ -65,9 +65,7 @@ def _sensor(file: Path, options: DatasetOptions) -> tuple[CameraSource, SE3]:
     model = re.search(r"distortion_model\s*:\s*([\w-]+)", text)
     if any(lens) and (model is None or model[1] not in ("radial-tangential", "radtan", "plumb_bob")):
         found = "unknown" if model is None else model[1]
-        raise InputError(
-            f"distortion_model is {found}", where=file, expected="radial-tangential; undistort the images"
-        )
+        raise InputError(f"distortion_model is {found}", where=file, expected="radial-tangential; undistort the images")
     numbers = _numbers(file, text, "intrinsics", 4)
     return CameraSource(camera_of(file, numbers, (int(width), int(height)), lens)), T_body_camera
 

@@ -53,9 +53,7 @@ class LidarDepth:
             raise InputError(f"has {sure.shape[-1]} channels", where=confidence, expected="one")
         return self.sure(measured, sure.astype(np.int64), str(confidence))
 
-    def sure(
-        self, measured: DepthImage, confidence: Integer[np.ndarray, "h w"] | None, where: str
-    ) -> DepthImage:
+    def sure(self, measured: DepthImage, confidence: Integer[np.ndarray, "h w"] | None, where: str) -> DepthImage:
         """Return the depth where its confidence, if known, is high, and 0 elsewhere.
 
         Depth beyond 5 m, the range of the lidar according to Apple, is 0 as well.
@@ -73,9 +71,7 @@ class LidarDepth:
         largest = int(confidence.max())
         high = next((scale for scale in sorted(self._scales) if 0 < largest <= scale), max(self._scales))
         if largest > high:
-            raise InputError(
-                f"has values up to {largest}", where=where, expected=f"confidences from 0 to {high}"
-            )
+            raise InputError(f"has values up to {largest}", where=where, expected=f"confidences from 0 to {high}")
         sure = torch.where(torch.from_numpy(confidence == high), metres, 0)
         if not self._remarked and bool(metres.any()) and not bool(sure.any()):
             self._remarked = True

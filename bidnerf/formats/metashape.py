@@ -35,8 +35,7 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     """Read the cameras. Raises ``InputError`` if one is invalid."""
     chunk = _chunk(file)
     sensors = {
-        sensor.get("id"): _camera(sensor, f"{file}: sensor {sensor.get('id')}")
-        for sensor in chunk.iter("sensor")
+        sensor.get("id"): _camera(sensor, f"{file}: sensor {sensor.get('id')}") for sensor in chunk.iter("sensor")
     }
     metric = chunk.find("transform/scale")
     scale = 1.0 if metric is None else numbers_in(f"{file}: the scale of the chunk", metric.text or "", 1)[0]
@@ -59,9 +58,14 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
             pose = SE3(pose.rotation, pose.translation * scale)
         shots.append(Shot(image=image, camera=sensor, T_world_camera=pose))
     return Capture(
-        path, shots, options.colour, unit=None if metric is None else "metres", pose_file=file,
-        poses_expected="a transform of each aligned camera", unposed="they are not aligned",
-    )  # fmt: skip
+        path,
+        shots,
+        options.colour,
+        unit=None if metric is None else "metres",
+        pose_file=file,
+        poses_expected="a transform of each aligned camera",
+        unposed="they are not aligned",
+    )
 
 
 def _find(path: Path) -> Path | None:
@@ -98,9 +102,7 @@ def _camera(sensor: ElementTree.Element, where: str) -> Camera | None:
         return None
     sides = [size.get(side) or "" for side in ("width", "height")]
     if not all(side.isdecimal() for side in sides):
-        raise InputError(
-            f"its resolution is {' x '.join(sides)}", where=where, expected="whole numbers of pixels"
-        )
+        raise InputError(f"its resolution is {' x '.join(sides)}", where=where, expected="whole numbers of pixels")
     width, height = map(int, sides)
     if sensor.get("type") == "spherical":
         return PanoramaFace("front", (width, height))

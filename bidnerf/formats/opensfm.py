@@ -58,8 +58,7 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
         if not isinstance(own, dict):
             raise record.error(f"has the camera {record.value('camera')!r}", expected="one of cameras")
         turn, position = (
-            [record.checked_number(n, key) for n in record.items(key) or []]
-            for key in ("rotation", "translation")
+            [record.checked_number(n, key) for n in record.items(key) or []] for key in ("rotation", "translation")
         )
         if not len(turn) == len(position) == 3:
             raise record.error("has no pose", expected="rotation and translation of 3 numbers each")

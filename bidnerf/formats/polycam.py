@@ -93,6 +93,4 @@ def _find(path: Path) -> Path | None:
     return None
 
 
-reader = Format(
-    "keyframes/images and keyframes/cameras, or the corrected ones (Polycam, raw data)", _find, _read
-)
+reader = Format("keyframes/images and keyframes/cameras, or the corrected ones (Polycam, raw data)", _find, _read)

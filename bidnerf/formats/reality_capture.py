@@ -65,9 +65,7 @@ def _shot(row: Row, values: dict[str, str], image: Path) -> Shot:
     position = torch.tensor([number(key) for key in POSE[:3]], dtype=torch.float64)
     pose = SE3(turn * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64), position)
     if number("k4") != 0:
-        raise row.error(
-            ": k4 is not 0, which OpenCV's model does not support; export undistorted images instead"
-        )
+        raise row.error(": k4 is not 0, which OpenCV's model does not support; export undistorted images instead")
     if not is_file(image):
         return Shot(image=image)
     header = read_header(image)

@@ -91,16 +91,27 @@ def _read(path: Path, metadata_file: Path, options: DatasetOptions) -> Capture:
         if not isinstance(pose, list) or len(pose) != 7 or not all(type(x) in (int, float) for x in pose):
             raise InputError("is not 7 numbers", where=where, expected="qx qy qz qw tx ty tz")
         file = f"{path / depth}" if depth in files else path / depth
-        shots.append(Shot(
-            image=files.file(f"rgbd/{number}.jpg"), camera=camera_of(metadata.where, cameras[number], (width, height)),
-            T_world_camera=pose_of_numbers(where, [*pose[4:], *pose[:4]], opengl=True), time=times[number],
-            depth=DepthFile(file, partial(files.depth, number, size)) if has_depth else None,
-            stem=str(number), folders=(), usual_side=lidar.LARGEST_SIDE,
-        ))  # fmt: skip
+        shots.append(
+            Shot(
+                image=files.file(f"rgbd/{number}.jpg"),
+                camera=camera_of(metadata.where, cameras[number], (width, height)),
+                T_world_camera=pose_of_numbers(where, [*pose[4:], *pose[:4]], opengl=True),
+                time=times[number],
+                depth=DepthFile(file, partial(files.depth, number, size)) if has_depth else None,
+                stem=str(number),
+                folders=(),
+                usual_side=lidar.LARGEST_SIDE,
+            )
+        )
     return Capture(
-        path, shots, options.colour, unit="metres", pose_file=metadata.where, rate=lidar.FRAMES_PER_SECOND,
+        path,
+        shots,
+        options.colour,
+        unit="metres",
+        pose_file=metadata.where,
+        rate=lidar.FRAMES_PER_SECOND,
         poses_expected="finite qx qy qz qw tx ty tz of each frame",
-    )  # fmt: skip
+    )
 
 
 def _find(path: Path) -> Path | None:

@@ -50,9 +50,14 @@ def _read(path: Path, found: tuple[list[Path], Path], options: DatasetOptions) -
             )
         )
     return Capture(
-        path, shots, options.colour, unit="metres", depth_unit=unit, pose_file=path / "pose",
+        path,
+        shots,
+        options.colour,
+        unit="metres",
+        depth_unit=unit,
+        pose_file=path / "pose",
         poses_expected="NUMBER.txt of finite numbers for each image",
-    )  # fmt: skip
+    )
 
 
 def _find(path: Path) -> tuple[list[Path], Path] | None:

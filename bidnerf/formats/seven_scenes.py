@@ -48,9 +48,7 @@ T_COLOUR_DEPTH = SE3(
         ],
         dtype=torch.float64,
     ),
-    torch.tensor(
-        [-2.5558943178152542e-02, 1.0109636268061706e-04, 2.0318321729487039e-03], dtype=torch.float64
-    ),
+    torch.tensor([-2.5558943178152542e-02, 1.0109636268061706e-04, 2.0318321729487039e-03], dtype=torch.float64),
 ).normalized()
 """Pose of another Kinect's depth camera in its colour camera's frame, as used by ACE's ``setup_7scenes.py``:
 https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html."""
@@ -68,17 +66,13 @@ def _read(path: Path, folders: dict[int, Path], options: DatasetOptions) -> Capt
     unit, read_depth = options.depth_unit or MILLIMETRE, DepthReader(documented=("65535",))
     T_depth_colour = SE3.identity() if sensor is None else sensor.T_colour_depth.inverse()
     lists = {"train": path / "TrainSplit.txt", "test": path / "TestSplit.txt"}
-    numbers = {
-        split: _listed(file, folders) for split, file in lists.items() if -1 not in folders and file.is_file()
-    }
+    numbers = {split: _listed(file, folders) for split, file in lists.items() if -1 not in folders and file.is_file()}
     shots = list[Shot]()
     for number in dict.fromkeys(n for group in numbers.values() for n in group) or sorted(folders):
         splits = tuple(split for split, group in numbers.items() if number in group)
         for shot in frames_of(folders[number], camera, partial(read_depth, unit=unit), sensor):
             T = shot.T_world_camera
-            shots.append(
-                shot if T is None else replace(shot, T_world_camera=T @ T_depth_colour, splits=splits)
-            )
+            shots.append(shot if T is None else replace(shot, T_world_camera=T @ T_depth_colour, splits=splits))
     return Capture(
         path,
         shots,
@@ -138,6 +132,8 @@ def _listed(file: Path, folders: dict[int, Path]) -> list[int]:
 
 
 reader = Format(
-    "frame-000000.color.png ... in the folder or in seq-01 ... (7-Scenes)", _find, _read,
+    "frame-000000.color.png ... in the folder or in seq-01 ... (7-Scenes)",
+    _find,
+    _read,
     ("camera", "register_depth", "depth_unit"),
-)  # fmt: skip
+)

@@ -69,9 +69,15 @@ def _read(path: Path, odometry: Path, options: DatasetOptions) -> Capture:
             )
         )
     return Capture(
-        path, shots, options.colour, unit="metres", up=lidar.UP, pose_file=odometry, rate=lidar.FRAMES_PER_SECOND,
+        path,
+        shots,
+        options.colour,
+        unit="metres",
+        up=lidar.UP,
+        pose_file=odometry,
+        rate=lidar.FRAMES_PER_SECOND,
         poses_expected="a finite one for each frame",
-    )  # fmt: skip
+    )
 
 
 def _find(path: Path) -> Path | None:

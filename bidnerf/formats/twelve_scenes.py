@@ -41,9 +41,13 @@ def _read(path: Path, found: tuple[Path, Path], options: DatasetOptions) -> Capt
     read_depth = partial(DepthReader(documented=("65535",)), unit=unit)
     shots = frames_of(folder, CameraSource(options.given_camera or colour), read_depth, sensor)
     return Capture(
-        path, _in_splits(path, shots), options.colour, unit="metres", depth_unit=unit,
+        path,
+        _in_splits(path, shots),
+        options.colour,
+        unit="metres",
+        depth_unit=unit,
         poses_expected="frame-000000.pose.txt of finite numbers",
-    )  # fmt: skip
+    )
 
 
 def _find(path: Path) -> tuple[Path, Path] | None:

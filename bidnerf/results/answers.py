@@ -68,9 +68,7 @@ class Answer:
         Only the final pose is kept: intermediate ones take up a lot of memory in long sequences.
         """
         intrinsics = found.frame_as_taken(frame).intrinsics
-        return Answer(
-            frame.name, number, intrinsics, replace(found, poses=found.poses[-1:], shown=None), **about
-        )
+        return Answer(frame.name, number, intrinsics, replace(found, poses=found.poses[-1:], shown=None), **about)
 
     @property
     def accepted(self) -> bool:
@@ -186,10 +184,22 @@ class Answers:
             values |= plain_localization(answer.found, backend, answer.error)
         else:
             values |= {
-                "T_world_camera": None, "converged": False, "outcome": BAD_INPUT, "reason": answer.reason, "steps": 0,
-                "seconds": 0.0, "covariance": None, "loss": None, "method": answer.method, "focal_factor": 1.0,
-                "intrinsics": None, "confidence": None, "unit": self.unit, "backend": backend, "error": None,
-            }  # fmt: skip
+                "T_world_camera": None,
+                "converged": False,
+                "outcome": BAD_INPUT,
+                "reason": answer.reason,
+                "steps": 0,
+                "seconds": 0.0,
+                "covariance": None,
+                "loss": None,
+                "method": answer.method,
+                "focal_factor": 1.0,
+                "intrinsics": None,
+                "confidence": None,
+                "unit": self.unit,
+                "backend": backend,
+                "error": None,
+            }
         if placement is not None:
             values |= placement.plain()
         elif isinstance(self.scene, MapCollection):
@@ -210,9 +220,7 @@ class Answers:
     def remark(self) -> str | None:
         """A remark if one similarity transform explains all pose errors, as for true poses in another world frame; else None."""
         known = self._known
-        if (
-            known is None or len(known[0].translation) < 4
-        ):  # a similarity fits nearly any three pairs of positions
+        if known is None or len(known[0].translation) < 4:  # a similarity fits nearly any three pairs of positions
             return None
         found, true = known[0].translation.double(), known[1].translation.double()
         try:
@@ -297,9 +305,7 @@ class Answers:
         found, true = (SE3.stack(list(poses)) for poses in zip(*known, strict=True))
         return found, true
 
-    def plot(
-        self, file: str | Path, surface: SurfaceMap | None = None, up: UpDirection | None = None
-    ) -> None:
+    def plot(self, file: str | Path, surface: SurfaceMap | None = None, up: UpDirection | None = None) -> None:
         """Plot the trajectory over the surface of its map, as PNG or SVG by file extension.
 
         ``up`` is the up direction of the scene (``Map.up``), by default estimated from the surface and the

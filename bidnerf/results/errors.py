@@ -34,8 +34,7 @@ class PoseError:
 
     def __str__(self) -> str:
         shown = (
-            (float(v.median()), "median ") if v.ndim else (float(v), "")
-            for v in (self.translation, self.rotation_deg)
+            (float(v.median()), "median ") if v.ndim else (float(v), "") for v in (self.translation, self.rotation_deg)
         )
         return " and ".join(
             f"{note}{v:.3g} {unit}" for (v, note), unit in zip(shown, (symbol(self.unit), "deg"), strict=True)
@@ -58,9 +57,7 @@ def pose_error(found: SE3, true: SE3, unit: LengthUnit = "units") -> PoseError:
     return PoseError(distance, torch.rad2deg(rotation_angle(true.rotation.mT @ found.rotation)), unit)
 
 
-def normalized_error_squared(
-    found: SE3, true: SE3, covariance: Float[Tensor, "*c 6 6"]
-) -> Float[Tensor, "*b"]:
+def normalized_error_squared(found: SE3, true: SE3, covariance: Float[Tensor, "*c 6 6"]) -> Float[Tensor, "*b"]:
     """Return the squared error normalized by its covariance C: ``xi^T C^-1 xi`` with ``true = found exp(xi)``.
 
     xi and C hold the translation (unit of the poses), then the rotation (radians). If C is consistent, the
@@ -78,9 +75,7 @@ def standard_deviations(covariance: Float[Tensor, "6 6"]) -> tuple[float, float]
     return position, rotation
 
 
-def within(
-    found: SE3, true: SE3, covariance: Float[Tensor, "*c 6 6"], probability: float = 0.95
-) -> Bool[Tensor, "*b"]:
+def within(found: SE3, true: SE3, covariance: Float[Tensor, "*c 6 6"], probability: float = 0.95) -> Bool[Tensor, "*b"]:
     """Return whether the error of ``found`` lies within the confidence bound that its covariance implies.
 
     The bound is the quantile of the chi-squared distribution with 6 degrees of freedom, 12.59 for 0.95. If
@@ -140,9 +135,7 @@ def steps_to_success(trace: PoseError, criterion: Criterion) -> int | None:
     """
     if trace.translation.dim() != 1 or len(trace.translation) == 0:
         shape = tuple(trace.translation.shape)
-        raise InputError(
-            f"expected errors of the start and of each step, got shape {shape}", where="steps to success"
-        )
+        raise InputError(f"expected errors of the start and of each step, got shape {shape}", where="steps to success")
     failures = (~criterion(trace, trace[0])).nonzero()
     first = int(failures[-1]) + 1 if len(failures) else 0
     return first if first < len(trace.translation) else None
@@ -171,9 +164,7 @@ class Rate:
 def success_rate(successes: int, trials: int) -> Rate:
     """Return the success rate of independent trials with Wilson's 95 % interval (Wilson 1927)."""
     if not (trials >= 1 and 0 <= successes <= trials):
-        raise InputError(
-            f"{successes} of {trials}", where="success rate", expected="0 to n of at least one trial"
-        )
+        raise InputError(f"{successes} of {trials}", where="success rate", expected="0 to n of at least one trial")
     return _with_interval(successes, trials, trials)
 
 
@@ -210,9 +201,7 @@ def _with_interval(successes: int, trials: int, effective: float, frames: int | 
     """Return a rate with Wilson's interval for ``effective`` independent trials, which need not be an integer."""
     share, z = successes / trials, NormalDist().inv_cdf(0.975)
     middle = (share + z * z / (2 * effective)) / (1 + z * z / effective)
-    half = (
-        z / (1 + z * z / effective) * math.sqrt(share * (1 - share) / effective + (z / (2 * effective)) ** 2)
-    )
+    half = z / (1 + z * z / effective) * math.sqrt(share * (1 - share) / effective + (z / (2 * effective)) ** 2)
     low, high = min(middle - half, share), max(middle + half, share)  # up to rounding
     return Rate(successes, trials, max(low, 0.0), min(high, 1.0), frames)
 
@@ -285,9 +274,7 @@ def alignment_errors(found: SE3, true: SE3) -> Float[Tensor, "n"] | None:
         rotation = fit_similarity(source, target).T_target_source.rotation
     except InputError:
         return None
-    return torch.linalg.vector_norm(
-        (source - source.mean(0)) @ rotation.mT - (target - target.mean(0)), dim=-1
-    )
+    return torch.linalg.vector_norm((source - source.mean(0)) @ rotation.mT - (target - target.mean(0)), dim=-1)
 
 
 def relative_errors(found: SE3, true: SE3) -> PoseError:

@@ -145,9 +145,7 @@ def check_video(file: Path) -> None:
             "writing a video needs the extra 'video' (pip install 'bidnerf[video]')", where=file
         ) from error
     if file.suffix.lower() not in CODECS or not file.parent.is_dir():
-        raise InputError(
-            where=file, expected=f"a name that ends with {', '.join(CODECS)}, in an existing folder"
-        )
+        raise InputError(where=file, expected=f"a name that ends with {', '.join(CODECS)}, in an existing folder")
 
 
 CODECS = {".mp4": "libx264", ".mkv": "libx264", ".webm": "libvpx-vp9"}

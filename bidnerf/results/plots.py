@@ -48,12 +48,25 @@ def require_matplotlib() -> Any:
 def styled() -> Any:
     """Return a context in which figures are drawn and saved in the common style."""
     style = {
-        "font.family": "DejaVu Sans", "font.size": 9, "axes.titlesize": 9, "axes.titlelocation": "left",
-        "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.7, "axes.edgecolor": "#555",
-        "xtick.color": "#333", "ytick.color": "#333", "xtick.major.width": 0.7, "ytick.major.width": 0.7,
-        "grid.color": "#ddd", "grid.linewidth": 0.6, "legend.frameon": False, "legend.fontsize": 8.5,
-        "svg.hashsalt": "bidnerf", "text.parse_math": False,  # names may contain dollar signs
-    }  # fmt: skip
+        "font.family": "DejaVu Sans",
+        "font.size": 9,
+        "axes.titlesize": 9,
+        "axes.titlelocation": "left",
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.linewidth": 0.7,
+        "axes.edgecolor": "#555",
+        "xtick.color": "#333",
+        "ytick.color": "#333",
+        "xtick.major.width": 0.7,
+        "ytick.major.width": 0.7,
+        "grid.color": "#ddd",
+        "grid.linewidth": 0.6,
+        "legend.frameon": False,
+        "legend.fontsize": 8.5,
+        "svg.hashsalt": "bidnerf",
+        "text.parse_math": False,  # names may contain dollar signs
+    }
     return require_matplotlib().rc_context(style)
 
 
@@ -87,9 +100,7 @@ def write_figure(figure: Any, *paths: Path, dpi: int = 150) -> None:
 
     for text in figure.findobj(Text):
         text.set_text(_drawable(text.get_text()))
-    for formatter in (
-        axis.get_major_formatter() for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)
-    ):
+    for formatter in (axis.get_major_formatter() for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
         if isinstance(formatter, FuncFormatter):  # its labels are set again whenever a figure is drawn
             formatter.func = lambda *place, labels=formatter.func: _drawable(str(labels(*place)))
     for path in paths:
@@ -112,9 +123,12 @@ def line_look(place: int) -> dict[str, Any]:
 
 
 def draw_capture(
-    report: CaptureReport, points: Float[Tensor, "n 3"] | None, seen_by: Int[Tensor, "n"] | None, out: Path,
+    report: CaptureReport,
+    points: Float[Tensor, "n 3"] | None,
+    seen_by: Int[Tensor, "n"] | None,
+    out: Path,
     unit: LengthUnit = "units",
-) -> None:  # fmt: skip
+) -> None:
     """Draw a top view of a capture to ``out``, a PNG: its cameras with their directions and problems, and its landmarks.
 
     ``points`` (world, in ``unit``) are the landmarks, and ``seen_by`` is the number of photos that show each
@@ -182,9 +196,7 @@ def draw_path(
     with styled():
         figure = new_figure(9.6, 4.9)
         panels = figure.subplots(1, 2)
-        for panel, upward, title in zip(
-            panels, (back, up.tensor()), ("from above", "from the side"), strict=True
-        ):
+        for panel, upward, title in zip(panels, (back, up.tensor()), ("from above", "from the side"), strict=True):
             projection = torch.stack([right, upward], dim=-1).numpy()
             places = poses.translation.double().numpy() @ projection
             # A sample of the surfels around the path is drawn, up to a distance of at least half of the
@@ -198,9 +210,7 @@ def draw_path(
                 paint = 0.3 + 0.7 * surfels.rgb[torch.from_numpy(some)].clamp(0, 1).numpy()
                 panel.scatter(*points[some].T, s=2, c=paint, linewidths=0, rasterized=True)
             if known:
-                panel.plot(
-                    *(np.array(known) @ projection).T, color="#000", linewidth=0.8, label="ground truth"
-                )
+                panel.plot(*(np.array(known) @ projection).T, color="#000", linewidth=0.8, label="ground truth")
             found, colours = accepted.numpy(), scale * deviations.double().numpy()
             if not found.all():
                 panel.scatter(*places[~found].T, s=14, marker="x", color=COLOURS[1], label="lost")

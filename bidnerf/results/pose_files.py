@@ -49,9 +49,7 @@ class PosedImage:
         """T_world_camera in float64, on the CPU. Raises ``InputError`` if it is not finite."""
         found = self.T_world_camera.to("cpu", torch.float64)
         if not bool(found.matrix().isfinite().all()):
-            raise InputError(
-                f"the pose of {self.name} is not finite", expected="to leave it out, or a .json file"
-            )
+            raise InputError(f"the pose of {self.name} is not finite", expected="to leave it out, or a .json file")
         return found
 
     @property
@@ -261,9 +259,7 @@ def pose_of(poses: dict[str, SE3], name: str, path: str | Path) -> SE3:
     if len(poses) == 1:
         return next(iter(poses.values()))
     if name not in poses:
-        raise InputError(
-            f"no pose named {name!r} among its {len(poses)}{spelling_hint(name, poses)}", where=path
-        )
+        raise InputError(f"no pose named {name!r} among its {len(poses)}{spelling_hint(name, poses)}", where=path)
     return poses[name]
 
 

@@ -49,9 +49,7 @@ def track(
         tracker = Tracker(tracker if isinstance(tracker, Localizer) else Localizer(tracker))
     if not isinstance(sequence, Capture):
         stored = tracker.localizer.scene
-        sequence = open_sequence(
-            sequence, assumed=landmark_cameras(stored), background=stored.bounds.background
-        )
+        sequence = open_sequence(sequence, assumed=landmark_cameras(stored), background=stored.bounds.background)
     if answers is None:
         answers = Answers(tracker.localizer.scene, is_sequence=True)
     total = -(-len(sequence) // every)
@@ -65,11 +63,7 @@ def track(
             except InputError as error:
                 # If none of the first three frames can be read, probably none can.
                 if not answers.answers and number + 1 >= min(3, total):
-                    many = (
-                        "the first frame cannot"
-                        if number == 0
-                        else f"none of the first {number + 1} frames can"
-                    )
+                    many = "the first frame cannot" if number == 0 else f"none of the first {number + 1} frames can"
                     raise InputError(f"{many} be read: {error}") from error
                 warnings.warn(f"{error}; left out", InputWarning, stacklevel=2)
                 answers.unread += 1

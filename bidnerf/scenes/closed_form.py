@@ -56,9 +56,7 @@ class ClosedFormScene:
         return distance.reshape(directions.shape[:-1]), rgb.reshape_as(directions)
 
     @torch.no_grad()
-    def render(
-        self, intrinsics: Intrinsics, T_world_camera: SE3, name: str = "", supersample: int = 2
-    ) -> Frame:
+    def render(self, intrinsics: Intrinsics, T_world_camera: SE3, name: str = "", supersample: int = 2) -> Frame:
         """Render an image from a pose: colour and coverage are averaged over each pixel, depth is exact at its centre."""
         steps = (torch.arange(supersample) + 0.5) / supersample - 0.5
         offsets = torch.cartesian_prod(steps, steps).reshape(-1, 1, 1, 2)

@@ -28,11 +28,23 @@ from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import SE3
 
 C = SimpleNamespace(
-    navy=(0.15, 0.27, 0.42), teal=(0.16, 0.62, 0.56), sand=(0.93, 0.78, 0.45), orange=(0.96, 0.60, 0.30),
-    red=(0.88, 0.36, 0.28), cream=(0.96, 0.94, 0.87), sky=(0.55, 0.78, 0.88), blue=(0.25, 0.48, 0.66),
-    plum=(0.45, 0.30, 0.48), rose=(0.86, 0.55, 0.62), moss=(0.42, 0.56, 0.28), leaf=(0.64, 0.76, 0.38),
-    wood=(0.72, 0.51, 0.33), oak=(0.55, 0.37, 0.24), slate=(0.30, 0.32, 0.36), white=(0.99, 0.98, 0.95),
-)  # fmt: skip
+    navy=(0.15, 0.27, 0.42),
+    teal=(0.16, 0.62, 0.56),
+    sand=(0.93, 0.78, 0.45),
+    orange=(0.96, 0.60, 0.30),
+    red=(0.88, 0.36, 0.28),
+    cream=(0.96, 0.94, 0.87),
+    sky=(0.55, 0.78, 0.88),
+    blue=(0.25, 0.48, 0.66),
+    plum=(0.45, 0.30, 0.48),
+    rose=(0.86, 0.55, 0.62),
+    moss=(0.42, 0.56, 0.28),
+    leaf=(0.64, 0.76, 0.38),
+    wood=(0.72, 0.51, 0.33),
+    oak=(0.55, 0.37, 0.24),
+    slate=(0.30, 0.32, 0.36),
+    white=(0.99, 0.98, 0.95),
+)
 """The colours of the scenes."""
 
 
@@ -61,9 +73,7 @@ def _lorry() -> list[Primitive]:
         outward = math.copysign(0.1, y)
         wheels.append(_solid(Cylinder(radius, 0.1), place, checker(C.slate, C.navy, 0.24, phase=x), roll=90))
         cap = (x, y + outward, radius - 0.85)
-        wheels.append(
-            _solid(Cylinder(0.6 * radius, 0.03), cap, blotches(hub, C.red, 0.25, round(9 * x * y)), roll=90)
-        )
+        wheels.append(_solid(Cylinder(0.6 * radius, 0.03), cap, blotches(hub, C.red, 0.25, round(9 * x * y)), roll=90))
     return [
         _solid(Box((0.9, 0.36, 0.09)), (0, 0, -0.36), stripes(C.navy, C.blue, (1, 0.6, 0), 0.3)),
         _solid(Box((0.24, 0.38, 0.38)), (0.44, 0, 0.1), blotches(C.red, C.orange, 0.5, 1)),

@@ -196,9 +196,7 @@ class Primitive:
     T_world_shape: SE3
     texture: Texture
 
-    def distance(
-        self, origins: Float[Tensor, "3 #n"], directions: Float[Tensor, "3 n"]
-    ) -> Float[Tensor, " n"]:
+    def distance(self, origins: Float[Tensor, "3 #n"], directions: Float[Tensor, "3 n"]) -> Float[Tensor, " n"]:
         """Return the distance to the first crossing in front of the origin (metres; world, unit directions); inf: none.
 
         For an origin inside a solid, this is where the ray leaves the solid: a box seen from inside is a room.

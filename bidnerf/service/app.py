@@ -60,17 +60,27 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
         if scope["method"] == "POST" or status >= 400:
             client = scope.get("client")
             line = {
-                "time": round(time.time(), 3), "client": client and f"{client[0]}:{client[1]}", "method": scope["method"],
-                "path": scope["path"][:200], "status": status, "seconds": round(seconds, 4),
+                "time": round(time.time(), 3),
+                "client": client and f"{client[0]}:{client[1]}",
+                "method": scope["method"],
+                "path": scope["path"][:200],
+                "status": status,
+                "seconds": round(seconds, 4),
                 **scope.get("state", {}).get("facts", {}),
-            }  # fmt: skip
+            }
             log.log(logging.ERROR if status >= 500 else logging.INFO, "%s", json.dumps(line))
 
-    app = Application("bidnerf", token, report=report, lifespan=lifespan, description=(
-        "Poses of photos in radiance fields. Poses are camera to world with OpenCV axes (x right, y down, z forward).\n"
-        f"A request has at most {limits.max_megabytes:g} MiB, an image at most {limits.max_megapixels:g} megapixels. Errors are\n"
-        "application/problem+json; a method that a path lacks results in 405."
-    ))  # fmt: skip
+    app = Application(
+        "bidnerf",
+        token,
+        report=report,
+        lifespan=lifespan,
+        description=(
+            "Poses of photos in radiance fields. Poses are camera to world with OpenCV axes (x right, y down, z forward).\n"
+            f"A request has at most {limits.max_megabytes:g} MiB, an image at most {limits.max_megapixels:g} megapixels. Errors are\n"
+            "application/problem+json; a method that a path lacks results in 405."
+        ),
+    )
     app.state.pool, app.state.limits = pool, limits
 
     async def known(map: str = Path(json_schema_extra={"enum": [*names]})) -> str:
@@ -79,9 +89,7 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
             raise Refused(404, f"no map with that name, expected one of {', '.join(names)}")
         return map
 
-    @app.get(
-        "/", response_model=dict[str, Any], summary="The version, the maps and where this description is."
-    )
+    @app.get("/", response_model=dict[str, Any], summary="The version, the maps and where this description is.")
     async def index() -> Response:
         return JSONResponse({"bidnerf": version("bidnerf"), "maps": names, "description": "/openapi.json"})
 
@@ -144,21 +152,31 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
     for prefix in ("", "/maps/{map}"):
         in_map: dict[str, Any] = {"dependencies": [Depends(known)] if prefix else []}
         app.post(
-            f"{prefix}/localize", openapi_extra=photo_body("map") if prefix else photo_body(), response_model=Localization,
-            responses=failures, summary="Find the pose of a photo.", **in_map,
+            f"{prefix}/localize",
+            openapi_extra=photo_body("map") if prefix else photo_body(),
+            response_model=Localization,
+            responses=failures,
+            summary="Find the pose of a photo.",
+            **in_map,
             description="The response is that of 'bidnerf localize --json', in several maps if none is named. Never use a pose whose\n"
             "'converged' is false. Each field is given once, in the query or in the form; at most one of focal, hfov and camera.",
-        )(localize)  # fmt: skip
+        )(localize)
         for name, protocol in PROTOCOLS.items():
             app.get(
-                f"{prefix}/{name}", response_model=dict[str, str], responses=errors(404), **in_map,
+                f"{prefix}/{name}",
+                response_model=dict[str, str],
+                responses=errors(404),
+                **in_map,
                 summary=f"Whether the endpoint is up: {protocol.summary}",
-            )(running)  # fmt: skip
+            )(running)
             app.post(
-                f"{prefix}/{name}", response_model=protocol.response, summary=protocol.summary, **in_map,
+                f"{prefix}/{name}",
+                response_model=protocol.response,
+                summary=protocol.summary,
+                **in_map,
                 openapi_extra={**json_body(protocol.request), "parameters": [] if prefix else [query]},
                 responses={200: {"content": {protocol.media_type: {}}}, **failures},
-            )(ask(name, protocol))  # fmt: skip
+            )(ask(name, protocol))
     return app
 
 

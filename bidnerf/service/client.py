@@ -31,9 +31,7 @@ class ServiceClient:
     Requests to a busy service are retried for up to ``timeout`` seconds. All methods raise ``ServiceError`` on failure.
     """
 
-    def __init__(
-        self, url: str = "http://127.0.0.1:8000", token: str | None = None, timeout: float = 120.0
-    ) -> None:
+    def __init__(self, url: str = "http://127.0.0.1:8000", token: str | None = None, timeout: float = 120.0) -> None:
         self.url, self.token, self.timeout = url.rstrip("/"), token, timeout
 
     def localize(
@@ -64,9 +62,7 @@ class ServiceClient:
             "start": None if start is None else json.dumps(rows).encode(),
         }
         parts = [
-            _part(edge, name, str(value).encode())
-            for name, value in {**known, "map": map}.items()
-            if value is not None
+            _part(edge, name, str(value).encode()) for name, value in {**known, "map": map}.items() if value is not None
         ]
         for name, file in files.items():
             if file is not None:
@@ -98,9 +94,7 @@ class ServiceClient:
                 if error.code not in (429, 503) or time.monotonic() + wait > until:
                     text = error.read().decode(errors="replace")
                     is_problem = "problem+json" in error.headers.get("Content-Type", "")
-                    raise ServiceError(
-                        error.code, json.loads(text)["detail"] if is_problem else text
-                    ) from error
+                    raise ServiceError(error.code, json.loads(text)["detail"] if is_problem else text) from error
                 time.sleep(wait)
             except OSError as error:
                 raise ServiceError(0, f"{self.url}: {getattr(error, 'reason', error)}") from error
@@ -129,9 +123,7 @@ def _png(array: Any) -> bytes:
         raise ServiceError(0, f"photo is {pixels.dtype} {pixels.shape}, expected bytes (h, w) or (h, w, 3)")
 
     def chunk(kind: bytes, content: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-        )
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
     height, width = pixels.shape[:2]
     head = struct.pack(">IIBBBBB", width, height, 8, kinds[pixels.shape[2:]], 0, 0, 0)

@@ -35,9 +35,7 @@ ABSENT: Any = None
 class Refused(Exception):
     """Raised to refuse a request; carries the HTTP status, a ``detail``, headers, and further JSON fields."""
 
-    def __init__(
-        self, status: int, detail: str, headers: Mapping[str, str] | None = None, **more: Any
-    ) -> None:
+    def __init__(self, status: int, detail: str, headers: Mapping[str, str] | None = None, **more: Any) -> None:
         super().__init__(detail)
         self.status, self.detail, self.headers, self.more = status, detail, dict(headers or {}), more
 
@@ -90,9 +88,7 @@ class PhotoForm(BaseModel):
     model_config = ConfigDict(extra="forbid", json_schema_extra=_only_given_defaults)
 
     map: str = Field(ABSENT, description="by default the one that the photo shows")
-    name: str = Field(
-        ABSENT, min_length=1, max_length=LONGEST_NAME, description="the frame's name in the answer"
-    )
+    name: str = Field(ABSENT, min_length=1, max_length=LONGEST_NAME, description="the frame's name in the answer")
     focal: Number = Field(ABSENT, ge=1e-3, le=1e9, description="focal length in pixels of the stored image")
     hfov: Number = Field(ABSENT, ge=1e-3, le=WIDEST, description="horizontal field of view in degrees")
     depth_unit: Number = Field(ABSENT, ge=1e-9, le=1e9, description="metres per step of the depth image")
@@ -118,13 +114,26 @@ class PhotoForm(BaseModel):
 
 
 EXPECTED = {
-    "greater_than_equal": "a number from {ge:g} up", "less_than_equal": "a number up to {le:g}",
-    "float_type": "a number", "float_parsing": "a number", "finite_number": "a finite number", "int_type": "a whole number",
-    "int_parsing": "a whole number", "int_parsing_size": "a whole number", "int_from_float": "a whole number",
-    "string_type": "text", "string_too_short": "{min_length} or more characters", "string_too_long": "{max_length} or fewer characters",
-    "list_type": "a list", "too_short": "{min_length} or more values", "too_long": "{max_length} or fewer values",
-    "bool_type": "true or false", "bool_parsing": "true or false", "model_type": "a JSON object", "dict_type": "a JSON object",
-}  # fmt: skip
+    "greater_than_equal": "a number from {ge:g} up",
+    "less_than_equal": "a number up to {le:g}",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "finite_number": "a finite number",
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_parsing_size": "a whole number",
+    "int_from_float": "a whole number",
+    "string_type": "text",
+    "string_too_short": "{min_length} or more characters",
+    "string_too_long": "{max_length} or fewer characters",
+    "list_type": "a list",
+    "too_short": "{min_length} or more values",
+    "too_long": "{max_length} or fewer values",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "model_type": "a JSON object",
+    "dict_type": "a JSON object",
+}
 """What was expected, in words, by pydantic's error type; errors of other types already have a message of ours."""
 
 

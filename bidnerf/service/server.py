@@ -51,14 +51,15 @@ def service_app(
     except ImportError as error:
         raise InputError(NEEDS) from error
     if config is not None and not isinstance(config, Mapping) and not is_dataclass(config):
-        raise InputError(
-            f"config is a {type(config).__name__}", expected=f"settings of {method}, or a dictionary"
-        )
+        raise InputError(f"config is a {type(config).__name__}", expected=f"settings of {method}, or a dictionary")
     limits = limits or ServiceLimits()
     order = {
-        "maps": named(scenes), "method": method, "device": device, "max_pixels": limits.max_pixels,
+        "maps": named(scenes),
+        "method": method,
+        "device": device,
+        "max_pixels": limits.max_pixels,
         "config": dict(to_flat(config) if is_dataclass(config) else config or {}),
-    }  # fmt: skip
+    }
     return application(order, limits, checked_token(token))
 
 
@@ -82,9 +83,7 @@ def serve(
     ``InputError`` for maps and settings that cannot be served, and if the port is taken.
     """
     if not hasattr(os, "fork"):
-        raise InputError(
-            "this system has no fork, but workers share the maps' memory by forking; use Linux or macOS"
-        )
+        raise InputError("this system has no fork, but workers share the maps' memory by forking; use Linux or macOS")
     token = token_for(host, token, NEEDS)
     app = service_app(scenes, token=token, **options)
     run_app(app, host, port, lambda address: ready and ready(address, token), stop)
@@ -128,24 +127,29 @@ def run_app(
     async def run(bound: socket.socket) -> None:
         async with app.router.lifespan_context(app):
             name, number = bound.getsockname()[:2]
-            ready(
-                f"http://[{name}]:{number}" if ":" in name else f"http://{name}:{number}"
-            )  # connections wait by now
+            ready(f"http://[{name}]:{number}" if ":" in name else f"http://{name}:{number}")  # connections wait by now
             await server.serve(sockets=[bound])
 
     options = uvicorn.Config(
-        app, http="h11", ws="none", loop="asyncio", lifespan="off", log_config=None, access_log=False,
-        server_header=False, proxy_headers=False, timeout_keep_alive=15, timeout_graceful_shutdown=grace,
-    )  # fmt: skip
+        app,
+        http="h11",
+        ws="none",
+        loop="asyncio",
+        lifespan="off",
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        proxy_headers=False,
+        timeout_keep_alive=15,
+        timeout_graceful_shutdown=grace,
+    )
     server, host = Server(options), host or "127.0.0.1"
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         listening = socket.create_server((host, port), family=family)
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise InputError(
-            f"cannot listen there ({reason}); choose another port", where=f"{host}:{port}"
-        ) from error
+        raise InputError(f"cannot listen there ({reason}); choose another port", where=f"{host}:{port}") from error
     with listening:
         try:
             asyncio.run(run(listening))
@@ -167,9 +171,10 @@ def named(scenes: Scenes) -> dict[str, Path]:
     for name, folder in pairs:
         if not re.fullmatch(r"[\w.-]{1,100}", name) or name in (".", "..") or names.count(name) > 1:
             raise UsageError(
-                f"its name is {name!r}", where=folder,
+                f"its name is {name!r}",
+                where=folder,
                 expected="another one for each map, of letters, digits, '.', '-' and '_'; give it a name: NAME=MAP",
-            )  # fmt: skip
+            )
     return {name: Path(folder) for name, folder in pairs}
 
 

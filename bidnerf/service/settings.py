@@ -22,9 +22,7 @@ class ServiceLimits(Settings):
     A request counts from the moment its head has arrived, so that ``queue`` bounds the memory of uploads too.
     """
 
-    workers: Annotated[int, Range(0, 1000)] = (
-        0  # processes that localize, each with one thread; 0: one per core
-    )
+    workers: Annotated[int, Range(0, 1000)] = 0  # processes that localize, each with one thread; 0: one per core
     queue: Annotated[int, Range(0, 100_000)] = (
         16  # requests that may upload or wait besides those at work; further ones get status 429
     )

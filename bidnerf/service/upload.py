@@ -15,9 +15,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import is_heif, read_header
 
 
-def read_upload(
-    upload: Upload, usual: CameraSource, folder: Path, max_pixels: float
-) -> tuple[Photos, SE3 | None]:
+def read_upload(upload: Upload, usual: CameraSource, folder: Path, max_pixels: float) -> tuple[Photos, SE3 | None]:
     """Write the files of a request to ``folder``, check the image sizes in their headers, and return the photo and the start pose.
 
     ``usual`` is the camera source for photos sent without a camera. Raises ``InputError``; pass it to
@@ -53,9 +51,10 @@ def read_upload(
     own = CameraSource(texts.get("camera"), focal, hfov, usual.assumed)
     photo, depth = images["photo"], images.get("depth")
     photos = Photos(
-        [photo], DatasetOptions(own if own.is_given else usual, depth_unit=upload.parameters.get("depth_unit")),
+        [photo],
+        DatasetOptions(own if own.is_given else usual, depth_unit=upload.parameters.get("depth_unit")),
         {} if depth is None else {photo: depth},
-    )  # fmt: skip
+    )
     return photos, read_pose(texts["start"]) if "start" in texts else None
 
 

@@ -61,7 +61,7 @@ ERRORS = {
     500: ("internal error", "An error in the service itself, which its log describes."),
     503: ("not available", "The service cannot answer at present."),
     504: ("took too long", "The answer took too long."),
-}  # fmt: skip
+}
 """Titles and descriptions of errors, by HTTP status."""
 Report = Callable[[Scope, int, float], None]
 """A function that receives the scope, status and duration (seconds) of each request."""
@@ -80,10 +80,17 @@ class Application(FastAPI):
     ) -> None:
         self.refused = 401 if token is not None else 403
         super().__init__(
-            title=title, version=version("bidnerf"), openapi_url=None, docs_url=None, redoc_url=None, redirect_slashes=False,
+            title=title,
+            version=version("bidnerf"),
+            openapi_url=None,
+            docs_url=None,
+            redoc_url=None,
+            redirect_slashes=False,
             generate_unique_id_function=lambda route: f"{min(route.methods or ()).lower()} {route.path}",
-            separate_input_output_schemas=False, responses=errors(self.refused, 500), **more,
-        )  # fmt: skip
+            separate_input_output_schemas=False,
+            responses=errors(self.refused, 500),
+            **more,
+        )
         self.add_middleware(Gate, token=token, cookie=cookie, report=report)
         for kind in (Refused, InputError, HTTPException):
             self.add_exception_handler(kind, _failure)
@@ -306,9 +313,7 @@ async def _parts(request: Request, content: bytes) -> list[tuple[str, str | Uplo
 
     most = len(PhotoForm.model_fields)
     try:
-        parser = MultiPartParser(
-            request.headers, once(), max_files=most, max_fields=most, max_part_size=MEBIBYTE
-        )
+        parser = MultiPartParser(request.headers, once(), max_files=most, max_fields=most, max_part_size=MEBIBYTE)
         return (await parser.parse()).multi_items()
     except (MultiPartException, KeyError, ValueError, LookupError) as error:
         reason = getattr(error, "message", None) or "no boundary, or a violation of RFC 7578"
@@ -378,9 +383,7 @@ def errors(*statuses: int) -> dict[int | str, dict[str, Any]]:
         status: {
             "description": ERRORS[status][1],
             "content": {PROBLEM: {"schema": {"$ref": "#/components/schemas/Problem"}}},
-            "headers": {headers[status]: {"schema": {"type": "string"}, "required": True}}
-            if status in headers
-            else {},
+            "headers": {headers[status]: {"schema": {"type": "string"}, "required": True}} if status in headers else {},
         }
         for status in statuses
     }

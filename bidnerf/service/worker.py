@@ -75,9 +75,7 @@ class Worker:
             found = {"status": 422, "detail": public_message(error, folder)}
         except Exception as error:  # the worker goes on, and the log states what happened
             found = {"status": 500, "detail": "internal error", "fault": f"{type(error).__name__}: {error}"}
-        return found | {
-            "outcome": outcomes[-1] if outcomes else "bad input" if found["status"] < 500 else "fault"
-        }
+        return found | {"outcome": outcomes[-1] if outcomes else "bad input" if found["status"] < 500 else "fault"}
 
     def localize(self, name: str | None, upload: Upload, folder: Path) -> tuple[Answer, dict[str, Any]]:
         """Localize a photo in the map ``name`` or, if it is None, in whichever of the maps the photo shows.
@@ -169,8 +167,7 @@ def _serve(worker: Worker, device: str, stream: BufferedRWPair) -> None:
     try:
         if device != "cpu":
             moved = {
-                name: Localizer(_scene(each), each.method, each.config, device)
-                for name, each in worker.maps.items()
+                name: Localizer(_scene(each), each.method, each.config, device) for name, each in worker.maps.items()
             }
             worker = Worker(moved, worker.max_pixels)
     except (InputError, RuntimeError) as error:

@@ -169,9 +169,7 @@ def write_keypoints(database: Any, found: Described, pycolmap: Any) -> None:
     missing = [photo for photo in found.photos if not database.exists_keypoints(photo.number)]
     with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
         try:
-            for done, (photo, keypoints) in enumerate(
-                zip(missing, pool.map(_keypoints, missing), strict=True)
-            ):
+            for done, (photo, keypoints) in enumerate(zip(missing, pool.map(_keypoints, missing), strict=True)):
                 if isinstance(keypoints, InputError):
                     found.unusable[photo.image.name] = _without_file(keypoints, photo.image)
                     found.photos.remove(photo)
@@ -242,7 +240,10 @@ def match(database: Path, pairs: Pairs, threads: int, pycolmap: Any) -> None:
         batch = todo[start : start + size]
         listed.write_text("".join(f"{key(i)} {key(j)}\n" for i, j in batch))
         pycolmap.match_image_pairs(
-            database, matching, pycolmap.ImportedPairingOptions(match_list_path=listed), verification,
+            database,
+            matching,
+            pycolmap.ImportedPairingOptions(match_list_path=listed),
+            verification,
             device=pycolmap.Device.cpu,
-        )  # fmt: skip
+        )
         count(len(pairs) - len(todo) + start + len(batch), len(pairs))

@@ -136,8 +136,13 @@ def find_poses(
 
 
 def _search(
-    source: Path, images: list[SourceImage], work: Path, inputs: str, camera: Intrinsics | str | Path | None, pycolmap: Any,
-) -> FoundPoses:  # fmt: skip
+    source: Path,
+    images: list[SourceImage],
+    work: Path,
+    inputs: str,
+    camera: Intrinsics | str | Path | None,
+    pycolmap: Any,
+) -> FoundPoses:
     """Find the poses of ``images`` or, if there are none, of frames of the video ``source``; write the dataset next to ``work``."""
     began, folder, database, video = time.monotonic(), work.parent, work / "database.db", not images
     fixed, threads = camera is not None, max(1, torch.get_num_threads())
@@ -166,9 +171,7 @@ def _search(
     models = reconstructed(database, work / "models", found, fixed, threads, pycolmap)
     with pycolmap.Database.open(database) as opened:
         matched = zip(*opened.read_two_view_geometries(), strict=True)
-        overlapping = [
-            pycolmap.pair_id_to_image_pair(pair) for pair, seen in matched if len(seen.inlier_matches)
-        ]
+        overlapping = [pycolmap.pair_id_to_image_pair(pair) for pair, seen in matched if len(seen.inlier_matches)]
         if not models:
             why = "no two of them overlap enough"
             if overlapping:
@@ -192,18 +195,26 @@ def _search(
     ]
     turned = sum(photos[number].exif.orientation != UPRIGHT for number in model.reg_image_ids())
     return FoundPoses(
-        source=source.name, photos=len(images), placed=model.num_reg_images(),
-        models=tuple(each.num_reg_images() for each in models), left_out=tuple(left), points=model.num_points3D(),
-        reprojection_error=error, seconds=round(time.monotonic() - began, 1), inputs=inputs, pycolmap=pycolmap.__version__,
-        video=video, sure_pairs=sure, contradicting=contradicting, turned=turned,
-    )  # fmt: skip
+        source=source.name,
+        photos=len(images),
+        placed=model.num_reg_images(),
+        models=tuple(each.num_reg_images() for each in models),
+        left_out=tuple(left),
+        points=model.num_points3D(),
+        reprojection_error=error,
+        seconds=round(time.monotonic() - began, 1),
+        inputs=inputs,
+        pycolmap=pycolmap.__version__,
+        video=video,
+        sure_pairs=sure,
+        contradicting=contradicting,
+        turned=turned,
+    )
 
 
 def _require_enough(found: Described, source: Path) -> None:
     if len(found.photos) < LEAST_PHOTOS:
-        why = "".join(
-            f" that can be read ({name}: {reason})" for name, reason in [*found.unusable.items()][:1]
-        )
+        why = "".join(f" that can be read ({name}: {reason})" for name, reason in [*found.unusable.items()][:1])
         raise InputError(
             f"{amount(len(found.photos), 'photo')}{why}",
             where=source,

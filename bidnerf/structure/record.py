@@ -78,8 +78,7 @@ class FoundPoses:
         if len(self.models) > 1:
             sizes = ", ".join(map(str, self.models))
             lines.append(
-                f"the photos fall into {len(self.models)} unconnected models of {sizes} photos; the largest"
-                " is kept"
+                f"the photos fall into {len(self.models)} unconnected models of {sizes} photos; the largest is kept"
             )
         if self.turned:
             lines.append(
@@ -103,9 +102,7 @@ def read_found(folder: Path) -> FoundPoses | None:
     """Load the record in a pose folder, or None if there is none. Raises ``InputError`` for a damaged one."""
     if not (folder / RECORD).is_file() or not (folder / TRANSFORMS).is_file():
         return None
-    return from_plain(
-        FoundPoses, read_json(folder / RECORD, "the record of found poses"), str(folder / RECORD)
-    )
+    return from_plain(FoundPoses, read_json(folder / RECORD, "the record of found poses"), str(folder / RECORD))
 
 
 def begun(folder: Path) -> dict[str, Any]:

@@ -80,15 +80,11 @@ def refuse_panoramas(photos: Sequence[SourceImage]) -> None:
     for photo in photos:
         try:
             with open_binary(photo.file, "a photo") as file:
-                head = file.read(
-                    2**18
-                )  # contains the XMP: a segment has at most 64 KiB, and EXIF precedes it
+                head = file.read(2**18)  # contains the XMP: a segment has at most 64 KiB, and EXIF precedes it
         except InputError:  # left out later
             continue
         if b"equirectangular" in head:
-            expected = (
-                "poses with camera_model EQUIRECTANGULAR in transforms.json, or pinhole views cut from it"
-            )
+            expected = "poses with camera_model EQUIRECTANGULAR in transforms.json, or pinhole views cut from it"
             raise InputError("is a panorama (equirectangular)", where=photo.file, expected=expected)
 
 
@@ -116,9 +112,7 @@ def measured(video: Path) -> list[Measure]:
             ok = kept.reshape(-1) == 1
             points, start = moved[ok], start[ok]
             if len(points):
-                away = float(np.median(np.linalg.norm(points - start, axis=-1))) / float(
-                    np.hypot(*grey.shape)
-                )
+                away = float(np.median(np.linalg.norm(points - start, axis=-1))) / float(np.hypot(*grey.shape))
                 motion = max(motion, until_anchor + away)
                 is_anchor = away > 0.02 or len(points) < 0.5 * corners
         if is_anchor:

@@ -190,9 +190,7 @@ class BackendContract:
     # Training.
 
     def test_training_learns_from_rgbd(self) -> None:
-        recipes.check_learning(
-            self._backend(), self._build, self._config(), rgbd_views(coverage=False), "RGB-D"
-        )
+        recipes.check_learning(self._backend(), self._build, self._config(), rgbd_views(coverage=False), "RGB-D")
 
     def test_training_learns_from_rgb(self) -> None:
         recipes.check_learning(self._backend(), self._build, self._config(), rgb_views(), "RGB")

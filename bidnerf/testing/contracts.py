@@ -222,8 +222,7 @@ class FeaturesContract(Named):
         expected = self._found(image)
         with ThreadPoolExecutor(4) as pool:
             same = [
-                torch.equal(found.pixels, expected.pixels)
-                and torch.equal(found.descriptors, expected.descriptors)
+                torch.equal(found.pixels, expected.pixels) and torch.equal(found.descriptors, expected.descriptors)
                 for found in pool.map(self._found, [image] * 8)
             ]
         require(

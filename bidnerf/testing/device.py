@@ -90,9 +90,14 @@ class _There(torch.Tensor):
     @staticmethod
     def __new__(cls, values: Tensor) -> _There:
         made: _There = torch.Tensor._make_wrapper_subclass(
-            cls, values.size(), strides=values.stride(), storage_offset=values.storage_offset(),
-            dtype=values.dtype, layout=values.layout, device=DEVICE,
-        )  # fmt: skip
+            cls,
+            values.size(),
+            strides=values.stride(),
+            storage_offset=values.storage_offset(),
+            dtype=values.dtype,
+            layout=values.layout,
+            device=DEVICE,
+        )
         made.held = values
         return made
 
@@ -161,9 +166,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any], mode: Elsewhere | None) -
     there = any(isinstance(part, _There) for part in flat)
     wanted = None if kwargs.get("device") is None else torch.device(kwargs["device"]).type
     if any(isinstance(part, Tensor) and part.is_meta and not isinstance(part, _There) for part in flat):
-        raise DeviceFault(
-            "a tensor was made of the host's numbers on the device, as torch.tensor(..., device=...)"
-        )
+        raise DeviceFault("a tensor was made of the host's numbers on the device, as torch.tensor(..., device=...)")
     if not there and wanted != DEVICE.type:
         return func(*args, **kwargs)
     name, is_returned, places = _signature(func)
@@ -179,9 +182,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any], mode: Elsewhere | None) -
         raise DeviceFault(f"{name} mixes devices: a tensor of shape {shapes} is on the CPU")
     if wanted == DEVICE.type or func is _aten._to_copy.default:
         kwargs = kwargs | {"device": torch.device("cpu")}
-    found = func(
-        *[_each(_held, part) for part in args], **{key: _each(_held, part) for key, part in kwargs.items()}
-    )
+    found = func(*[_each(_held, part) for part in args], **{key: _each(_held, part) for key, part in kwargs.items()})
     if wanted == "cpu":
         return found.clone() if isinstance(found, Tensor) else found
     # A result that is written in place is the argument itself.

@@ -145,9 +145,7 @@ def check_direction_derivatives(field: RadianceField, dtype: torch.dtype) -> Non
     """
     positions, directions = (x.to(dtype) for x in points(COUNT))
     along = points(COUNT, seed=1)[1].to(dtype)
-    along = torch.nn.functional.normalize(
-        along - (along * directions).sum(-1, keepdim=True) * directions, dim=-1
-    )
+    along = torch.nn.functional.normalize(along - (along * directions).sum(-1, keepdim=True) * directions, dim=-1)
 
     def on_circle(t: float) -> Tensor:
         angle = torch.tensor(t, dtype=dtype)
@@ -157,9 +155,12 @@ def check_direction_derivatives(field: RadianceField, dtype: torch.dtype) -> Non
 
 
 def _check_by(
-    field: RadianceField, by: str, arguments: Callable[[Tensor], tuple[Tensor, Tensor]], curve: Callable[[float], Tensor],
+    field: RadianceField,
+    by: str,
+    arguments: Callable[[Tensor], tuple[Tensor, Tensor]],
+    curve: Callable[[float], Tensor],
     speed: Float[Tensor, "n 3"],
-) -> None:  # fmt: skip
+) -> None:
     """Check the derivatives of density and colour as the argument named ``by`` moves along a curve.
 
     ``curve(t)`` returns a point on each curve at the parameter ``t``, and ``speed`` is its derivative at 0. The exact
@@ -216,9 +217,7 @@ def check_jacobian(field: RadianceField, dtype: torch.dtype) -> None:
         ("the derivative by position", found.by_position, expected.by_position),
         ("the derivative by direction", found.by_direction @ across, expected.by_direction @ across),
     ):
-        same = (
-            ours.shape == theirs.shape and float((ours - theirs).norm()) <= 1e-3 * float(theirs.norm()) + 1e-9
-        )
+        same = ours.shape == theirs.shape and float((ours - theirs).norm()) <= 1e-3 * float(theirs.norm()) + 1e-9
         require(who, (same, f"{what} differs from that of query"))
 
 
@@ -316,9 +315,7 @@ def check_rays_alone(field: RadianceField) -> None:
     whole = seen(field, picked(rays, torch.arange(count)), "rays")
     order = torch.randperm(count, generator=_generator())
     permuted = seen(field, picked(rays, order.reshape(4, -1)), "rays in another order").reshape(-1, 5)
-    alone = torch.cat(
-        [seen(field, picked(rays, torch.arange(i, i + 1)), "a ray") for i in range(0, count, 7)]
-    )
+    alone = torch.cat([seen(field, picked(rays, torch.arange(i, i + 1)), "a ray") for i in range(0, count, 7)])
     expected = "expected each ray to be sampled for itself"
     require(
         f"{type(field).__name__} rendered",
@@ -379,10 +376,7 @@ def check_hits(field: RadianceField) -> None:
         require(
             f"{type(field).__name__}.hits of {of}",
             *((x.isfinite().all(), f"{what} is NaN or infinite, also where not valid") for what, x in named),
-            *(
-                (((x >= 0) & (x <= 1)).all(), f"{what} is outside of [0, 1], expected within")
-                for what, x in named[1:]
-            ),
+            *((((x >= 0) & (x <= 1)).all(), f"{what} is outside of [0, 1], expected within") for what, x in named[1:]),
             (not (alpha[~valid] != 0).any(), "alpha is not 0 where a hit is not valid"),
             (within[valid].all(), "a valid hit lies outside [near, far] of its ray"),
         )

@@ -65,17 +65,13 @@ class ReaderContract(Named):
     def test_background_is_the_one_that_is_asked_for(self) -> None:
         colour = (1.0, 0.5, 0.0)
         found = tuple(self._dataset(background=colour).background)
-        require(
-            self._who, (found == colour, f"the background is {found}, expected {colour}, as its options say")
-        )
+        require(self._who, (found == colour, f"the background is {found}, expected {colour}, as its options say"))
 
     def test_poses_are_rigid(self) -> None:
         for view in self._views():
             pose = view.T_ref_camera
             is_right = bool(pose.is_rigid()) and pose.translation.dtype == torch.float64
-            require(
-                self._who, (is_right, f"the pose of {view.frame.name} is not a rigid transform in float64")
-            )
+            require(self._who, (is_right, f"the pose of {view.frame.name} is not a rigid transform in float64"))
 
     def test_images_are_images(self) -> None:
         for frame in (view.frame for view in self._views()):

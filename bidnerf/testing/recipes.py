@@ -27,9 +27,7 @@ EXPOSURE = 0.06
 class Recorder:
     """A ``Report`` that records progress and saved states; the states pass through safetensors, as in a map on disk."""
 
-    def __init__(
-        self, due: Collection[int] = (), stop: int | None = None, state: TrainingState | None = None
-    ) -> None:
+    def __init__(self, due: Collection[int] = (), stop: int | None = None, state: TrainingState | None = None) -> None:
         self.steps: list[TrainingStep] = []
         self.saved: list[TrainingState] = []
         self._due, self._stop, self._state = due, stop, state
@@ -73,9 +71,7 @@ def copied(field: Any) -> dict[str, Tensor]:
     return {name: value.detach().clone() for name, value in state.items()}
 
 
-def check_learning(
-    backend: Backend, make: Callable[[], Any], config: Any, views: Sequence[View], kind: str
-) -> None:
+def check_learning(backend: Backend, make: Callable[[], Any], config: Any, views: Sequence[View], kind: str) -> None:
     """Check that ``config.steps`` steps bring the rendered views closer to the given ones."""
     field = make()
     before = colour_error(field)
@@ -227,6 +223,4 @@ def _require_same(found: dict[str, Tensor], expected: dict[str, Tensor], who: st
 
 
 def _shortly(items: list[Any]) -> str:
-    return (
-        str(items) if len(items) <= 4 else f"[{items[0]}, {items[1]}, ... {items[-1]}] ({len(items)} in all)"
-    )
+    return str(items) if len(items) <= 4 else f"[{items[0]}, {items[1]}, ... {items[-1]}] ({len(items)} in all)"

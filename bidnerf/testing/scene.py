@@ -46,8 +46,7 @@ def exposed_views(log_gain: float) -> tuple[View, ...]:
     """Return the RGB views, dimmed and then made alternately brighter and darker by the factor ``exp(log_gain)``."""
     gains = [DIMMED * math.exp(log_gain * (-1) ** number) for number in range(len(rgb_views()))]
     return tuple(
-        replace(v, frame=replace(v.frame, rgb=g * v.frame.rgb))
-        for v, g in zip(rgb_views(), gains, strict=True)
+        replace(v, frame=replace(v.frame, rgb=g * v.frame.rgb)) for v, g in zip(rgb_views(), gains, strict=True)
     )
 
 
@@ -89,9 +88,7 @@ def awkward_rays() -> dict[str, Rays]:
     return {
         "rays from outside": SCENE_BOUNDS.rays(outside, across),
         "rays from within the box": SCENE_BOUNDS.rays(inside, away),
-        "rays along the axes": SCENE_BOUNDS.rays(
-            middle - 2 * SIDE * axes + 0.1 * SIDE * axes.roll(1, -1), axes
-        ),
+        "rays along the axes": SCENE_BOUNDS.rays(middle - 2 * SIDE * axes + 0.1 * SIDE * axes.roll(1, -1), axes),
         "rays that are sampled twice as far": widened(SCENE_BOUNDS.rays(outside, away), 2.0),
         "rays that miss the scene": SCENE_BOUNDS.rays(outside, -away),
     }

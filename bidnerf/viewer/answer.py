@@ -75,9 +75,14 @@ def no_answer(name: str, outcome: str, reason: str) -> Json:
 
 
 def shown_answer(
-    scene: SceneMap, name: str, found: Localization, frame: Frame | None = None, record: SearchRecord | None = None,
-    truth: SE3 | None = None, quick: bool = False,
-) -> Json:  # fmt: skip
+    scene: SceneMap,
+    name: str,
+    found: Localization,
+    frame: Frame | None = None,
+    record: SearchRecord | None = None,
+    truth: SE3 | None = None,
+    quick: bool = False,
+) -> Json:
     """Return the JSON values of a localization, with renderings if its ``frame`` is known.
 
     ``record`` is the record of the search, and ``truth`` the true T_world_camera. A ``quick`` answer renders the
@@ -154,9 +159,10 @@ def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> J
     variances, axes = torch.linalg.eigh(turn @ covariance[:3, :3] @ turn.mT)
     lengths = (2 * variances.clamp(min=0).sqrt()).flip(0)
     return {
-        "axes": (axes.flip(1) * lengths).mT.flatten().tolist(), "lengths": lengths.tolist(),
+        "axes": (axes.flip(1) * lengths).mT.flatten().tolist(),
+        "lengths": lengths.tolist(),
         "rotation_deg": torch.rad2deg(covariance.diagonal()[3:].clamp(min=0).sqrt()).tolist(),
-    }  # fmt: skip
+    }
 
 
 def depth_difference(image: RenderedImage, frame: Frame) -> Json | None:
@@ -186,9 +192,7 @@ def depth_difference(image: RenderedImage, frame: Frame) -> Json | None:
     return {"picture": picture, "range": most, "median": float(off.abs().median())}
 
 
-def _compared(
-    scene: SceneMap, camera: Intrinsics, T: SE3, frame: Frame, quick: bool
-) -> tuple[Json, Json | None]:
+def _compared(scene: SceneMap, camera: Intrinsics, T: SE3, frame: Frame, quick: bool) -> tuple[Json, Json | None]:
     if quick or not has_field(scene.field):
         return photograph(quick_image(scene, camera, T)), None
     image = render_picture(scene.field, camera, T, scene.bounds)

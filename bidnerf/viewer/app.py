@@ -188,9 +188,14 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
     usual = replace(shown.camera or CameraSource(), assumed=localizer.assumed_cameras)
     others = replace(usual, hfov=None)  # the page sends the field of view
     state = MapView(
-        shown_map(scene, thumbnails=0), live=True, queries=names, trajectory=shown.trajectory, results=shown.results,
-        hfov=usual.hfov, camera_given=others.is_given,
-    )  # fmt: skip
+        shown_map(scene, thumbnails=0),
+        live=True,
+        queries=names,
+        trajectory=shown.trajectory,
+        results=shown.results,
+        hfov=usual.hfov,
+        camera_given=others.is_given,
+    )
     jobs, painter = Jobs(localizer), ThreadPoolExecutor(1, "rendering")
 
     @contextlib.asynccontextmanager
@@ -223,9 +228,7 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
     async def health() -> Response:
         return JSONResponse({"status": "ok"})
 
-    @app.get(
-        "/api/thumbnail/{number}", responses=errors(404), summary="A rendering from a camera of the map."
-    )
+    @app.get("/api/thumbnail/{number}", responses=errors(404), summary="A rendering from a camera of the map.")
     async def thumbnail(number: str) -> Response:
         cameras = scene.info.cameras
         camera = cameras[_index(number, len(cameras), "camera of the map")]
@@ -233,9 +236,12 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
         return Response(content, headers={"Cache-Control": "private, max-age=3600"}, media_type="image/jpeg")
 
     @app.post(
-        "/api/photo", status_code=202, openapi_extra=photo_body("map"), responses=errors(400, 408, 413, 429),
+        "/api/photo",
+        status_code=202,
+        openapi_extra=photo_body("map"),
+        responses=errors(400, 408, 413, 429),
         summary="Queue the localization of a photo.",
-    )  # fmt: skip
+    )
     async def photo(request: Request) -> Response:
         with jobs.place("photo") as job:
             upload = await photo_of(request, limits)
@@ -256,9 +262,11 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
             return queued(job, read)
 
     @app.post(
-        "/api/query/{number}", status_code=202, responses=errors(404, 429),
+        "/api/query/{number}",
+        status_code=202,
+        responses=errors(404, 429),
         summary="Queue the localization of an image with which the viewer was started.",
-    )  # fmt: skip
+    )
     async def query(number: str) -> Response:
         index = _index(number, len(names), "image with which the viewer was started")
         with jobs.place(names[index]) as job:
@@ -274,9 +282,11 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
         return JSONResponse(found.plain(known))
 
     @app.post(
-        "/api/view", openapi_extra=json_body(VirtualCamera), responses=errors(400, 408, 413),
+        "/api/view",
+        openapi_extra=json_body(VirtualCamera),
+        responses=errors(400, 408, 413),
         summary="A rendering from a virtual camera.",
-    )  # fmt: skip
+    )
     async def view(request: Request) -> Response:
         body = parse_json(await body_of(request, replace(limits, max_megabytes=0.1)), "", "a camera")
         camera = checked(VirtualCamera, body)

@@ -70,9 +70,7 @@ def _contest(
     of_pose: bool = True,
 ) -> Json:
     """Return a comparison of poses or cameras: names, probabilities and, for other poses, the 16 numbers of T_world_camera."""
-    shown = [
-        {"pose": None} | dict(zip(("name", "probability", "pose"), each, strict=False)) for each in answers
-    ]
+    shown = [{"pose": None} | dict(zip(("name", "probability", "pose"), each, strict=False)) for each in answers]
     return {"question": question, "answers": shown, "remark": remark, "of_pose": of_pose}
 
 
@@ -113,47 +111,96 @@ def _of_support(support: Support) -> Json:
     against = {name: each for name in names if (each := support.measures.get(name)) is not None}
     weights = [(HERE, 1.0), *((names[name], odds(-each)) for name, each in against.items())]
     total = sum(weight for _, weight in weights)
-    moved = against["displaced"] < min(
-        [0.0, *(each for name, each in against.items() if name != "displaced")]
-    )
+    moved = against["displaced"] < min([0.0, *(each for name, each in against.items() if name != "displaced")])
     remark = "The image fits better when the pose is moved: it is not even a local optimum." if moved else ""
     return _contest("What fits the image best?", [(name, w / total) for name, w in weights], remark)
 
 
 MEASURES = {
     "log10_nfa": ("poses as good by chance", ".0e", "number expected of wrong poses; the bar compares exponents"),
-    "inliers": ("landmarks that agree", ".0f", "matched near where the pose predicts them, within three standard deviations"),
-    "above_chance": ("more than by chance", ".1f", "ratio of the landmarks that agree to those that would at a wrong pose"),
+    "inliers": (
+        "landmarks that agree",
+        ".0f",
+        "matched near where the pose predicts them, within three standard deviations",
+    ),
+    "above_chance": (
+        "more than by chance",
+        ".1f",
+        "ratio of the landmarks that agree to those that would at a wrong pose",
+    ),
     "spread": ("spread over the image", ".0%", "share of the image's cells that hold a landmark that agrees"),
     "other_place": ("another place or the mirror image", ".1%", "probability that it explains the image instead"),
-    "credible": ("camera as stated, or nearly", ".0%", "probability of the explanations of the camera that the image may have"),
+    "credible": (
+        "camera as stated, or nearly",
+        ".0%",
+        "probability of the explanations of the camera that the image may have",
+    ),
     "precision": ("uncertainty of the position", ".2%", "standard deviation, as a share of the distance to the scene"),
     "mass": ("pose within the tolerance", ".0%", "probability by all explanations of the image together"),
-    "replaced": ("another camera than stated", ".0%", "probability that it is not even like the map's; not tested by itself"),
-    "recall": ("landmarks recognised", ".0%", "share of the landmarks in view, or of the keypoints, that match; not tested by itself"),
+    "replaced": (
+        "another camera than stated",
+        ".0%",
+        "probability that it is not even like the map's; not tested by itself",
+    ),
+    "recall": (
+        "landmarks recognised",
+        ".0%",
+        "share of the landmarks in view, or of the keypoints, that match; not tested by itself",
+    ),
     "noise_ratio": ("reprojection errors", ".1f", "relative to those of the map's own images; not tested by itself"),
-    "on_surface": ("measured points on the surface", ".0%", "share of the measured depth that lies there; not tested by itself"),
-    "colour_inliers": ("points with the surface's colour", ".0%", "share that lies there and has its colour; not tested by itself"),
-}  # fmt: skip
+    "on_surface": (
+        "measured points on the surface",
+        ".0%",
+        "share of the measured depth that lies there; not tested by itself",
+    ),
+    "colour_inliers": (
+        "points with the surface's colour",
+        ".0%",
+        "share that lies there and has its colour; not tested by itself",
+    ),
+}
 """Label, format and meaning of each measure of a pose found by landmarks; the measures with a bound come first."""
 WITHOUT_LANDMARKS = {
     "mean_loss": ("mean loss", ".3g", "of the last steps of the descent"),
-    "on_surface": ("measured points on the surface", ".0%", "share of the measured depth that lies on the map's surface"),
+    "on_surface": (
+        "measured points on the surface",
+        ".0%",
+        "share of the measured depth that lies on the map's surface",
+    ),
     "colour_inliers": ("points with the surface's colour", ".0%", "share that lies there and has its colour"),
     "free_space_violations": (
-        "lines of sight through the surface", ".0%", "share that meets the surface well before the point that was measured"
+        "lines of sight through the surface",
+        ".0%",
+        "share that meets the surface well before the point that was measured",
     ),
-    "runner_up_margin": ("lead over the runner-up", ".2f", "by how much the best different pose of the search is worse"),
-    "rendered_inliers": ("rendered rays that agree", ".0%", "share of the rays whose rendering agrees with what was measured"),
-    "new_inliers": ("new rays that agree", ".0%", "share of newly drawn rays whose rendering agrees with what was measured"),
+    "runner_up_margin": (
+        "lead over the runner-up",
+        ".2f",
+        "by how much the best different pose of the search is worse",
+    ),
+    "rendered_inliers": (
+        "rendered rays that agree",
+        ".0%",
+        "share of the rays whose rendering agrees with what was measured",
+    ),
+    "new_inliers": (
+        "new rays that agree",
+        ".0%",
+        "share of newly drawn rays whose rendering agrees with what was measured",
+    ),
     "confidence": (
-        "distinguished from rivals", ".0%",
+        "distinguished from rivals",
+        ".0%",
         "its probability among poses moved a little, the best different pose of the search and a plain image",
     ),
     "explained": ("contrast explained", ".0%", "share of the image's contrast that the rendering explains"),
-    "further_step": ("further step", ".2g", "that newly drawn rays ask for, relative to the distance of the scene, and radians"),
+    "further_step": (
+        "further step",
+        ".2g",
+        "that newly drawn rays ask for, relative to the distance of the scene, and radians",
+    ),
     "colour_ratio": ("differences of colour", ".1f", "relative to those of the map's own images"),
-}  # fmt: skip
+}
 """Label, format and meaning of each measure of a pose that landmarks did not find."""
 
 
@@ -181,9 +228,7 @@ class Figure:
     pose: str = ""  # description of the measured pose, if it is not the pose found
 
     @staticmethod
-    def of(
-        text: tuple[str, str, str], value: float, limit: float | None = None, is_least: bool = True
-    ) -> Figure:
+    def of(text: tuple[str, str, str], value: float, limit: float | None = None, is_least: bool = True) -> Figure:
         """Return a figure from its texts (name, format and meaning), its value and its bound."""
         name, spec, meaning = text
         if limit is None:

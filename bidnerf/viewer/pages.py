@@ -130,9 +130,7 @@ def view(
                 Query(frame.name, (View(frame, SE3.identity()),)),
             )
         )
-    path = (
-        None if trajectory is None else shown_trajectory(Path(trajectory), scene_map.unit, scene_map.origin)
-    )
+    path = None if trajectory is None else shown_trajectory(Path(trajectory), scene_map.unit, scene_map.origin)
     return MapView(shown_map(scene_map), tuple(answers), title, trajectory=path)
 
 
@@ -140,9 +138,7 @@ def map_of(scene: object) -> Map:
     """Return the given map, or the map of a localizer. Raises ``InputError`` for anything else."""
     found = scene.scene if isinstance(scene, Localizer) else scene
     if not isinstance(found, Map):
-        raise InputError(
-            f"scene is a {type(found).__name__}", where="view", expected="a Map, such as load_map returns"
-        )
+        raise InputError(f"scene is a {type(found).__name__}", where="view", expected="a Map, such as load_map returns")
     return found
 
 
@@ -177,8 +173,11 @@ def read_and_localized(localizer: Localizer, source: QuerySource, place: int) ->
 
 
 def page_of(
-    scene: Map, answers: Iterable[Json], trajectory: Json | None = None, results: Iterable[Json] = (),
-) -> MapView:  # fmt: skip
+    scene: Map,
+    answers: Iterable[Json],
+    trajectory: Json | None = None,
+    results: Iterable[Json] = (),
+) -> MapView:
     """Build the viewer page of a map with answers, a trajectory and rows of results."""
     return MapView(shown_map(scene), tuple(answers), trajectory=trajectory, results=tuple(results))
 
@@ -192,9 +191,13 @@ def shown_row(row: Any) -> Json:
     """
     variance = math.nan if row.covariance is None else sum(row.covariance[i][i] for i in range(3))
     return {
-        "frame": row.frame, "method": row.method, "outcome": row.outcome, "accepted": row.converged, "reason": row.reason,
+        "frame": row.frame,
+        "method": row.method,
+        "outcome": row.outcome,
+        "accepted": row.converged,
+        "reason": row.reason,
         "confidence": row.confidence,
         "error": None if row.error is None else (row.error.translation, row.error.rotation_deg),
         "sigma": math.sqrt(variance) if 0 <= variance < math.inf else None,
         "pose": None if row.T_world_camera is None else [float(value) for each in row.T_world_camera for value in each],
-    }  # fmt: skip
+    }

@@ -65,9 +65,7 @@ def shown_map(scene: Map, thumbnails: int = 60) -> Json:
                 "name": camera.name,
                 "pose": rows_of(camera.pose),
                 "shape": frustum(camera.intrinsics),
-                "thumbnail": photograph(_small_image(scene, camera))
-                if thumbnails and number % every == 0
-                else None,
+                "thumbnail": photograph(_small_image(scene, camera)) if thumbnails and number % every == 0 else None,
             }
             for number, camera in enumerate(scene.info.cameras)
         ],
@@ -77,10 +75,13 @@ def shown_map(scene: Map, thumbnails: int = 60) -> Json:
 def frustum(camera: Intrinsics) -> Json:
     """Return a camera's viewing frustum without lens distortion: its sides on the plane z = 1, and the image size (pixels)."""
     return {
-        "left": -camera.cx / camera.fx, "right": (camera.width - camera.cx) / camera.fx,
-        "top": -camera.cy / camera.fy, "bottom": (camera.height - camera.cy) / camera.fy,
-        "width": camera.width, "height": camera.height,
-    }  # fmt: skip
+        "left": -camera.cx / camera.fx,
+        "right": (camera.width - camera.cx) / camera.fx,
+        "top": -camera.cy / camera.fy,
+        "bottom": (camera.height - camera.cy) / camera.fy,
+        "width": camera.width,
+        "height": camera.height,
+    }
 
 
 def thumbnail_jpeg(scene: Map, camera: StoredCamera) -> bytes:
@@ -115,17 +116,26 @@ def _facts(scene: Map) -> tuple[tuple[str, str], ...]:
 
 
 def _points(
-    points: Float[Tensor, "n 3"], count: int, radius: float, colours: Json | None = None, sizes: Json | None = None,
+    points: Float[Tensor, "n 3"],
+    count: int,
+    radius: float,
+    colours: Json | None = None,
+    sizes: Json | None = None,
     normals: Json | None = None,
-) -> Json:  # fmt: skip
+) -> Json:
     """Return the JSON values of a subset of a map's points; ``count`` is the number of all points.
 
     The radius of each point is ``radius``, in the map's unit, times the point's entry in ``sizes``, float32 (n), if
     given. The ``normals``, int8 (n, 3) scaled by 127, point towards the cameras, since back faces are culled.
     """
     return {
-        "points": packed_points(points), "count": count, "radius": radius, "colours": colours, "sizes": sizes, "normals": normals
-    }  # fmt: skip
+        "points": packed_points(points),
+        "count": count,
+        "radius": radius,
+        "colours": colours,
+        "sizes": sizes,
+        "normals": normals,
+    }
 
 
 def _surface(scene: Map) -> Json | None:
@@ -137,9 +147,12 @@ def _surface(scene: Map) -> Json | None:
     positions, keyframes = surfels.positions[some].cpu(), scene.surface.keyframes[:, :3, 3].cpu()
     normals = towards(positions, surfels.normals[some].cpu(), keyframes)
     return _points(
-        positions, len(surfels), radius, packed_colours(surfels.rgb[some]),
+        positions,
+        len(surfels),
+        radius,
+        packed_colours(surfels.rgb[some]),
         normals=packed((127 * normals).round().to(torch.int8).numpy()),
-    )  # fmt: skip
+    )
 
 
 def towards(
@@ -168,9 +181,12 @@ def _splats(scene: Map) -> Json | None:
     seen = (splats.opacity >= 0.2).nonzero()[:, 0]
     some = seen[_subset(len(seen), MOST_POINTS)]
     return _points(
-        splats.positions[some], len(splats.positions), 1.0, packed_colours(splats.rgb[some]),
+        splats.positions[some],
+        len(splats.positions),
+        1.0,
+        packed_colours(splats.rgb[some]),
         packed(splats.radius[some].float().numpy()),
-    )  # fmt: skip
+    )
 
 
 def _subset(count: int, most: int) -> Tensor:
@@ -199,9 +215,7 @@ def _framing(scene: Map) -> tuple[tuple[float, float, float], float]:
 # Trajectories.
 
 
-def shown_trajectory(
-    path: Path, unit: LengthUnit | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)
-) -> Json:
+def shown_trajectory(path: Path, unit: LengthUnit | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> Json:
     """Read a trajectory: a JSON file of 'bidnerf track' or 'localize', which has uncertainties, or a TUM, EuRoC or KITTI file.
 
     The poses are shown relative to ``origin``, the origin of the map. A remark is logged if the file states a unit
@@ -220,23 +234,23 @@ def shown_trajectory(
         stated = re.search(rb"^#.*lengths in (metres|units)", content.partition(b"\n")[0])  # by bidnerf
         of = None if stated is None else stated[1].decode()
         poses = zip(rows.times.tolist(), rows.rotations, rows.translations, strict=True)
-        found = [
-            (SE3(rotation, translation), "", time, None, "", of) for time, rotation, translation in poses
-        ]
+        found = [(SE3(rotation, translation), "", time, None, "", of) for time, rotation, translation in poses]
     if not found:
         raise InputError("holds no pose", where=path, expected="those of a trajectory")
     some = found[:: max(1, math.ceil(len(found) / 20_000))]  # longer ones are subsampled at a regular stride
     T, frames, times, sigmas, outcomes, _ = zip(*some, strict=True)
     other = {each[-1] for each in found} - {unit, None}
     if unit is not None and other:
-        log.info(
-            "%s: is in %s, but the map is in %s; its poses are shown as they are", path, other.pop(), unit
-        )
+        log.info("%s: is in %s, but the map is in %s; its poses are shown as they are", path, other.pop(), unit)
     shown = SE3.stack(list(T)).translated(-torch.tensor(origin).double()).matrix()[:, :3]
     return {
-        "name": path.name, "poses": packed(shown.flatten(1).numpy()), "frames": frames, "times": times, "sigmas": sigmas,
+        "name": path.name,
+        "poses": packed(shown.flatten(1).numpy()),
+        "frames": frames,
+        "times": times,
+        "sigmas": sigmas,
         "outcomes": outcomes,
-    }  # fmt: skip
+    }
 
 
 _Posed: TypeAlias = tuple[SE3 | None, str, float | None, float | None, str, str | None]
@@ -246,11 +260,7 @@ _Posed: TypeAlias = tuple[SE3 | None, str, float | None, float | None, str, str 
 def _posed(entry: dict[str, Any], path: Path) -> _Posed:
     try:
         rows, covariance = entry.get("T_world_camera"), entry.get("covariance")
-        T = (
-            pose_from_matrix(torch.tensor(rows, dtype=torch.float64), "T_world_camera", path)
-            if rows
-            else None
-        )
+        T = pose_from_matrix(torch.tensor(rows, dtype=torch.float64), "T_world_camera", path) if rows else None
         sigma = math.nan
         if covariance is not None:
             sigma = standard_deviations(torch.tensor(covariance, dtype=torch.float64).reshape(6, 6))[0]
@@ -258,11 +268,13 @@ def _posed(entry: dict[str, Any], path: Path) -> _Posed:
     except InputError:
         raise
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise InputError(
-            f"{entry.get('frame')!r} has no matrices of numbers", where=path, expected="poses"
-        ) from error
+        raise InputError(f"{entry.get('frame')!r} has no matrices of numbers", where=path, expected="poses") from error
     unit = entry.get("unit")
     return (
-        T, str(entry.get("frame", "")), time, sigma if math.isfinite(sigma) else None, str(entry.get("outcome", "")),
+        T,
+        str(entry.get("frame", "")),
+        time,
+        sigma if math.isfinite(sigma) else None,
+        str(entry.get("outcome", "")),
         unit if isinstance(unit, str) else None,
-    )  # fmt: skip
+    )

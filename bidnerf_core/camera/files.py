@@ -33,21 +33,36 @@ from bidnerf_core.io import Record, parse_json, parse_record, parse_rows, parse_
 KEYS = {
     "K": ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "K", "k", "M1", "M"),
     "coefficients": (
-        "distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs", "distortion", "D", "d", "D1",
+        "distortion_coefficients",
+        "Distortion_Coefficients",
+        "dist_coeffs",
+        "distCoeffs",
+        "distortion",
+        "D",
+        "d",
+        "D1",
         "distortion_coeffs",
     ),
     "width": ("image_width", "image_Width", "width", "Camera.width", "img_width"),
     "height": ("image_height", "image_Height", "height", "Camera.height", "img_height"),
     "model": ("distortion_model", "Camera.type", "camera_model"),
     "size": ("image_size", "imageSize", "resolution", "size"),
-}  # fmt: skip
+}
 """The keys of calibrations in YAML and JSON, by their meaning."""
 DISTORTIONS = {
     FISHEYE: ("equidistant", "fisheye", "kannalabrandt8", "kannala_brandt", "opencv_fisheye"),
     PERSPECTIVE: (
-        "plumb_bob", "rational_polynomial", "radtan", "none", "pinhole", "perspective", "opencv", "thin_prism", "",
+        "plumb_bob",
+        "rational_polynomial",
+        "radtan",
+        "none",
+        "pinhole",
+        "perspective",
+        "opencv",
+        "thin_prism",
+        "",
     ),
-}  # fmt: skip
+}
 """The names of distortion models in calibrations, in lower case, by our kind of model."""
 EXPECTED = "YAML from ROS (camera_info), OpenCV, ORB-SLAM or Kalibr with the intrinsics of one camera"
 
@@ -79,9 +94,7 @@ class CameraRecord:
                 focal and (focal_length(size, focal[0]) if focal[1] else focal[0])
                 for focal, size in zip(self.focals, (width, height), strict=True)
             )
-            cx, cy = (
-                size / 2 if c is None else c for size, c in zip((width, height), self.centre, strict=True)
-            )
+            cx, cy = (size / 2 if c is None else c for size, c in zip((width, height), self.centre, strict=True))
             is_lens = self.model != PERSPECTIVE
             numbers = (fx or 0.0, fx or 0.0 if fy is None else fy, cx, cy, width, height)
             flat = Intrinsics(*numbers, () if is_lens else self.coefficients)
@@ -118,9 +131,7 @@ def camera_record(record: Record) -> CameraRecord:
             raise record.error("k4 is not 0", expected="no distortion beyond k1 k2 p1 p2 k3")
         else:  # in OpenCV's order; an ideal lens has none
             lens = (k1, k2, p1, p2, k3) if k3 else (k1, k2, p1, p2) if any((k1, k2, p1, p2)) else ()
-    return CameraRecord(
-        record, width, height, model, focals, (record.number("cx"), record.number("cy")), lens
-    )
+    return CameraRecord(record, width, height, model, focals, (record.number("cx"), record.number("cy")), lens)
 
 
 def _focal(record: Record, axis: str) -> tuple[float, bool] | None:
@@ -222,9 +233,7 @@ def _text_cameras(path: Path, content: bytes, named: bool = True) -> dict[str, C
         if len(words) < 5:
             raise row.error(f" has {len(words)} entries")
         if words[1] not in MODELS:
-            raise InputError(
-                f"camera model {words[1]}", where=row.where, expected=f"one of {', '.join(MODELS)}"
-            )
+            raise InputError(f"camera model {words[1]}", where=row.where, expected=f"one of {', '.join(MODELS)}")
         key = words[0] if named and not words[0].lstrip("-").isdecimal() else str(row.integer(words[0]))
         size = row.integer(words[2]), row.integer(words[3])
         camera = colmap_camera(row.where, words[1], *size, row.numbers(words[4:]))
@@ -250,14 +259,8 @@ def calibrated_camera(where: str, values: Mapping[str, Any], size: tuple[int, in
     given, four, lens = _first(values, "K"), values.get("intrinsics"), _first(values, "coefficients")
     model = str(next((values[key] for key in KEYS["model"] if key in values), ""))
     if slam := next((name for name in ("Camera", "Camera1") if f"{name}.fx" in values), None):
-        names = (
-            ("k1", "k2", "k3", "k4")
-            if model.lower() in DISTORTIONS[FISHEYE]
-            else ("k1", "k2", "p1", "p2", "k3")
-        )
-        four, lens = (
-            [values.get(f"{slam}.{x}", 0.0) for x in some] for some in (("fx", "fy", "cx", "cy"), names)
-        )
+        names = ("k1", "k2", "k3", "k4") if model.lower() in DISTORTIONS[FISHEYE] else ("k1", "k2", "p1", "p2", "k3")
+        four, lens = ([values.get(f"{slam}.{x}", 0.0) for x in some] for some in (("fx", "fy", "cx", "cy"), names))
     if given is None and four is None:
         found = f"no camera matrix ({', '.join(KEYS['K'][:3])} or K)"
         raise InputError(found, where=where, expected=EXPECTED)

@@ -61,9 +61,7 @@ class Intrinsics:
         for value in self.distortion:
             check_number("distortion", value, *LIMITS["coefficient"])
         if len(self.distortion) not in (0, 4, 5, 8, 12, 14):
-            raise InputError(
-                f"distortion has {len(self.distortion)} coefficients", expected="0, 4, 5, 8, 12 or 14"
-            )
+            raise InputError(f"distortion has {len(self.distortion)} coefficients", expected="0, 4, 5, 8, 12 or 14")
 
     @staticmethod
     def from_focal(focal: float, width: int, height: int) -> Intrinsics:
@@ -141,9 +139,7 @@ class Intrinsics:
         length = torch.linalg.vector_norm(ray, dim=-1)
         return ray / length[..., None], length
 
-    def cells(
-        self, points: Float[Tensor, "n 3"]
-    ) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Bool[Tensor, "n"]]:
+    def cells(self, points: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Bool[Tensor, "n"]]:
         """Return the row and column of the pixels that contain the projected points (camera frame), and which
         points are in the image.
 
@@ -184,9 +180,7 @@ class Intrinsics:
     def resized(self, width: int, height: int) -> Intrinsics:
         """Return the camera of the same image resampled to another size."""
         x, y = width / self.width, height / self.height
-        return replace(
-            self, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y, width=width, height=height
-        )
+        return replace(self, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y, width=width, height=height)
 
     def quarter_turns(self) -> tuple[Intrinsics, ...]:
         """Return two cameras: this one turned 90 degrees to either side. Returns none for a tilted sensor (14 coefficients)."""
@@ -197,9 +191,14 @@ class Intrinsics:
         """Return the camera of the largest centre crop that has the aspect ratio of the given size, resized to that size."""
         scale = max(width / self.width, height / self.height)
         return replace(
-            self, fx=self.fx * scale, fy=self.fy * scale, cx=width / 2 + (self.cx - self.width / 2) * scale,
-            cy=height / 2 + (self.cy - self.height / 2) * scale, width=width, height=height,
-        )  # fmt: skip
+            self,
+            fx=self.fx * scale,
+            fy=self.fy * scale,
+            cx=width / 2 + (self.cx - self.width / 2) * scale,
+            cy=height / 2 + (self.cy - self.height / 2) * scale,
+            width=width,
+            height=height,
+        )
 
     def upright(self, orientation: Orientation) -> Intrinsics:
         """Return the camera of the upright image, where this camera describes the image as stored.

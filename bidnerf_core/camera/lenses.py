@@ -47,8 +47,13 @@ MODELS: dict[str, tuple[int, str, tuple[int, ...]]] = {
 }
 """COLMAP's models by name; a panorama has its size as parameters."""
 PANORAMA_FACES = {  # name: yaw to the right and pitch upwards, degrees
-    "front": (0, 0), "right": (90, 0), "back": (180, 0), "left": (270, 0), "up": (0, 90), "down": (0, -90),
-}  # fmt: skip
+    "front": (0, 0),
+    "right": (90, 0),
+    "back": (180, 0),
+    "left": (270, 0),
+    "up": (0, 90),
+    "down": (0, -90),
+}
 """The pinhole views, of 90 degrees each, into which a panorama is divided: the faces of a cube."""
 
 
@@ -201,9 +206,7 @@ class CentralLens(Lens):
     @property
     def sentence(self) -> str:
         flat = self.pinhole
-        return (
-            f"{self.model} undistorted to a pinhole camera of {flat.width}x{flat.height}, fx {flat.fx:.0f} px"
-        )
+        return f"{self.model} undistorted to a pinhole camera of {flat.width}x{flat.height}, fx {flat.fx:.0f} px"
 
 
 @dataclass(frozen=True)
@@ -239,18 +242,14 @@ class PanoramaFace(Lens):
         """The axes of the face in the frame of the panorama's camera: R_panorama_face, OpenCV axes."""
         yaw, pitch = map(math.radians, PANORAMA_FACES[self.face])
         turn = np.array([[math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)]])
-        tilt = np.array(
-            [[1, 0, 0], [0, math.cos(pitch), -math.sin(pitch)], [0, math.sin(pitch), math.cos(pitch)]]
-        )
+        tilt = np.array([[1, 0, 0], [0, math.cos(pitch), -math.sin(pitch)], [0, math.sin(pitch), math.cos(pitch)]])
         return turn @ tilt
 
     def project(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         rays = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1) @ self.rotation.T
         x, y, z = np.moveaxis(rays, -1, 0)
         longitude, latitude = np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))  # downwards
-        return (
-            np.stack([longitude / (2 * math.pi) + 0.5, latitude / math.pi + 0.5], axis=-1) * self.stored_size
-        )
+        return np.stack([longitude / (2 * math.pi) + 0.5, latitude / math.pi + 0.5], axis=-1) * self.stored_size
 
     def resampled(self, image: np.ndarray, nearest: bool = False) -> np.ndarray:
         """Resample a panorama to this face; the panorama's left and right edges are joined."""

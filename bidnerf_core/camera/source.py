@@ -80,9 +80,7 @@ class Raster:
             return camera.resized(*self.size).upright(self.orientation)
         return camera.resized(*self.upright_size) if same_aspect(given, self.upright_size) else None
 
-    def turned(
-        self, image: Shaped[Tensor, "mh mw"], what: str, where: object = None
-    ) -> Shaped[Tensor, "h w"]:
+    def turned(self, image: Shaped[Tensor, "mh mw"], what: str, where: object = None) -> Shaped[Tensor, "h w"]:
         """Return the image's mask or depth upright, at its own resolution; it is turned if it has the stored image's aspect ratio.
 
         Raises ``InputError``, which names ``what`` and ``where``, if the aspect ratio fits neither orientation.
@@ -172,9 +170,7 @@ def folder_camera(
     """
     if isinstance(given, Path) and not given.exists():
         raise InputError("no such file", where=given, expected=f"the camera of {folder}: {ways}")
-    beside = next(
-        (file for name in ("camera.json", "cameras.txt") if (file := folder / name).is_file()), None
-    )
+    beside = next((file for name in ("camera.json", "cameras.txt") if (file := folder / name).is_file()), None)
     found = given or beside or published
     if found is None:
         expected = f"its camera: camera.json or cameras.txt in the folder, or --camera with {ways} (camera= in Python)"

@@ -120,9 +120,7 @@ def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
 
 def as_given(cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
     """Return the cameras at the poses given in the dataset, with names and intrinsics only."""
-    return tuple(
-        StoredCamera(c.name, c.intrinsics, c.given_T_world_camera or c.T_world_camera) for c in cameras
-    )
+    return tuple(StoredCamera(c.name, c.intrinsics, c.given_T_world_camera or c.T_world_camera) for c in cameras)
 
 
 def moved_from(
@@ -154,8 +152,7 @@ def pose_updates(cameras: Sequence[StoredCamera]) -> list[Float[Tensor, "6"] | N
     given = _pose([camera.given_T_world_camera or camera.T_world_camera for camera in cameras])
     updates = (given.inverse() @ poses_of(cameras)).log()
     return [
-        None if camera.given_T_world_camera is None else update
-        for camera, update in zip(cameras, updates, strict=True)
+        None if camera.given_T_world_camera is None else update for camera, update in zip(cameras, updates, strict=True)
     ]
 
 
@@ -179,10 +176,10 @@ def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> li
         metres, degrees, pixels = (
             median(getattr(m, name) for m in moved) for name in ("translation", "rotation_deg", "pixels")
         )
-        result = f"the poses are refined by {metres:.3g} and {degrees:.2g}° or {pixels:.1f} px (median), most for {moved[0]}"
-    lines = [
-        f"{cause} add {found.inconsistency:.2f} px to the {found.noise_after:.2f} px of keypoints; {result}"
-    ]
+        result = (
+            f"the poses are refined by {metres:.3g} and {degrees:.2g}° or {pixels:.1f} px (median), most for {moved[0]}"
+        )
+    lines = [f"{cause} add {found.inconsistency:.2f} px to the {found.noise_after:.2f} px of keypoints; {result}"]
     if len(motions):
         metres, radians = (median(part.norm(dim=-1).tolist()) for part in motions.split(3, dim=-1))
         lines.append(
@@ -263,9 +260,7 @@ def cameras_beside(path: Path, placement: Similarity) -> tuple[StoredCamera, ...
             width, height = entry["width"], entry["height"]
             fx, fy = float(entry["fx"]), float(entry["fy"])
             camera = Intrinsics(fx, fy, width / 2, height / 2, int(width), int(height))
-            rotation, position = (
-                torch.tensor(entry[key], dtype=torch.float64) for key in ("rotation", "position")
-            )
+            rotation, position = (torch.tensor(entry[key], dtype=torch.float64) for key in ("rotation", "position"))
             turned = placement.T_target_source.rotation.double() @ rotation
             rows = _rows(SE3(turned, placement.apply(position)))
             cameras.append(StoredCamera(str(entry["img_name"]), camera, rows))

@@ -57,9 +57,13 @@ def given_up(direction: Sequence[float]) -> UpDirection:
 
 
 def coverage(
-    views: Sequence[View], matched: TrackedKeypoints, seen: TrackedKeypoints, positions: Float[Tensor, "n 3"],
-    least_parallax: float, up: UpDirection | None = None,
-) -> CoverageRecord:  # fmt: skip
+    views: Sequence[View],
+    matched: TrackedKeypoints,
+    seen: TrackedKeypoints,
+    positions: Float[Tensor, "n 3"],
+    least_parallax: float,
+    up: UpDirection | None = None,
+) -> CoverageRecord:
     """Measure how well the views cover their scene.
 
     ``matched`` holds all matched keypoints, ``seen`` those consistent with a triangulated point, and ``positions`` these
@@ -87,9 +91,18 @@ def coverage(
         arrangement, open_side, gaps = "one place", None, ()
     views_of = torch.bincount(seen.point).double()
     return CoverageRecord(
-        arrangement, (*centre.tolist(),), (*upward.tolist(),), angle, seen.count, _median(views_of),
-        float((views_of == 2).double().mean()) if len(views_of) else 0.0, _median(_cones_deg(seen)), open_side, gaps, heights,
-    )  # fmt: skip
+        arrangement,
+        (*centre.tolist(),),
+        (*upward.tolist(),),
+        angle,
+        seen.count,
+        _median(views_of),
+        float((views_of == 2).double().mean()) if len(views_of) else 0.0,
+        _median(_cones_deg(seen)),
+        open_side,
+        gaps,
+        heights,
+    )
 
 
 def _around(
@@ -110,7 +123,9 @@ def _around(
     order = azimuths.argsort()
     steps = torch.diff(azimuths[order], append=azimuths[order[:1]] + 360)  # from each azimuth to the next
     names = [views[i].frame.name for i in flat[order].tolist()]
-    named = [Gap(round(step, 1), *ends) for step, *ends in zip(steps.tolist(), names, names[1:] + names[:1], strict=True)]  # fmt: skip
+    named = [
+        Gap(round(step, 1), *ends) for step, *ends in zip(steps.tolist(), names, names[1:] + names[:1], strict=True)
+    ]
     widest = steps.argsort(descending=True).tolist()
     is_open = float(steps[widest[0]]) >= 120
     # From the middle of a wider gap, SIFT matches neither side well.

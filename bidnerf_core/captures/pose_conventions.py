@@ -74,10 +74,7 @@ class PoseContradiction:
                 f"{found}, and no common mistake explains it; check that each pose belongs to its photo,"
                 " that the matrices are camera to world, and the camera's focal length and distortion"
             )
-        return (
-            f"{found}, but would agree with those of {self.agreeing} if {self.reading.clause};"
-            f" {self.reading.remedy}"
-        )
+        return f"{found}, but would agree with those of {self.agreeing} if {self.reading.clause}; {self.reading.remedy}"
 
 
 def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | None:
@@ -110,12 +107,7 @@ def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | 
     disputes = [{pair.first, pair.second} for pair, agreed in zip(pairs, agrees, strict=True) if not agreed]
     near = likely_pairs([image.T_ref_camera for image in images], 2).tolist()
     nearby = [matched_pair(images, i, j) for i, j in near if any({i, j} & both for both in disputes)]
-    sound = {
-        i
-        for pair in nearby
-        if pair and bool(pair.agreeing(poses[None])[0])
-        for i in (pair.first, pair.second)
-    }
+    sound = {i for pair in nearby if pair and bool(pair.agreeing(poses[None])[0]) for i in (pair.first, pair.second)}
     alike = sum(both <= sound for both in disputes)
     return PoseContradiction(len(pairs), as_given) if as_given < 0.5 * (len(pairs) - alike) else None
 
@@ -213,7 +205,7 @@ def matched_pair(images: Sequence[ImageKeypoints], i: int, j: int) -> MatchedPai
     cv2.setRNGSeed(0)
     found, mask = cv2.findEssentialMat(
         first[:, :2].numpy(), second[:, :2].numpy(), np.eye(3), cv2.RANSAC, prob=0.999, threshold=pixel
-    )  # fmt: skip
+    )
     if found is None or len(mask) != len(rows):
         return None
     kept = torch.from_numpy(mask[:, 0].astype(bool))
@@ -249,8 +241,9 @@ def _of_axes() -> Iterator[Reading]:
     yield Reading(
         "their cameras' y and z axes are reversed (OpenCV's and COLMAP's axes where OpenGL's and Blender's are expected, or the"
         " other way round)",
-        SWAP, partial(changed, axes=Y_AND_Z_REVERSED),
-    )  # fmt: skip
+        SWAP,
+        partial(changed, axes=Y_AND_Z_REVERSED),
+    )
     rotations = signed_permutations(1)  # as given first, then with y and z reversed
     for axes in rotations[2:]:
         yield Reading(
@@ -268,18 +261,53 @@ def _of_axes() -> Iterator[Reading]:
 
 Part = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 PARTS: tuple[tuple[Part, str, str], ...] = (
-    (lambda R, t: (R.mT, t), "their rotations are transposed, while their positions are right", "transpose the upper left 3x3 of each"),
-    (lambda R, t: (R, -t), "their positions are negated", "multiply the first three numbers of the fourth column of each by -1"),
-    (lambda R, t: (R, -R @ t), "their translations are those of inverses, while their rotations are not", "replace each translation t by -R t"),
-    (lambda R, t: (R.mT, -t), "their rotations are transposed and their positions negated", "transpose the upper left 3x3 of each, and negate the fourth column"),
-    (lambda R, t: (R.mT, R.mT @ t), "they are inverses whose translations lack the minus sign", "transpose each rotation R, and replace t by R^T t"),
-    (lambda R, t: (R, -R.mT @ t), "their translations are -R times the positions", "replace each translation t by -R^T t"),
-    (lambda R, t: (R, R @ t), "their translations are those of inverses without the minus sign, while their rotations are"
-                " not", "replace each translation t by R t"),
+    (
+        lambda R, t: (R.mT, t),
+        "their rotations are transposed, while their positions are right",
+        "transpose the upper left 3x3 of each",
+    ),
+    (
+        lambda R, t: (R, -t),
+        "their positions are negated",
+        "multiply the first three numbers of the fourth column of each by -1",
+    ),
+    (
+        lambda R, t: (R, -R @ t),
+        "their translations are those of inverses, while their rotations are not",
+        "replace each translation t by -R t",
+    ),
+    (
+        lambda R, t: (R.mT, -t),
+        "their rotations are transposed and their positions negated",
+        "transpose the upper left 3x3 of each, and negate the fourth column",
+    ),
+    (
+        lambda R, t: (R.mT, R.mT @ t),
+        "they are inverses whose translations lack the minus sign",
+        "transpose each rotation R, and replace t by R^T t",
+    ),
+    (
+        lambda R, t: (R, -R.mT @ t),
+        "their translations are -R times the positions",
+        "replace each translation t by -R^T t",
+    ),
+    (
+        lambda R, t: (R, R @ t),
+        "their translations are those of inverses without the minus sign, while their rotations are not",
+        "replace each translation t by R t",
+    ),
     (lambda R, t: (R, R.mT @ t), "their translations are R times the positions", "replace each translation t by R^T t"),
-    (lambda R, t: (R.mT, R @ t), "their rotations are transposed, and their translations rotated", "transpose each rotation R, and replace t by R t"),
-    (lambda R, t: (R.mT, -R @ t), "their rotations are transposed, and their translations rotated and negated", "transpose each rotation R, and replace t by -R t"),
-)  # fmt: skip
+    (
+        lambda R, t: (R.mT, R @ t),
+        "their rotations are transposed, and their translations rotated",
+        "transpose each rotation R, and replace t by R t",
+    ),
+    (
+        lambda R, t: (R.mT, -R @ t),
+        "their rotations are transposed, and their translations rotated and negated",
+        "transpose each rotation R, and replace t by -R t",
+    ),
+)
 """For each mistake, the true rotation and position (a column) as functions of the given ones, what is wrong, and the remedy."""
 
 
@@ -341,7 +369,12 @@ def _of_orders(count: int) -> Iterator[Reading]:
         unknown = torch.where(index >= 0, 0.0, torch.nan).to(T.translation)
         return SE3(T.rotation[index], T.translation[index] + unknown[:, None])
 
-    shifts = {1: "the next image", -1: "the image before", 2: "the image after next", -2: "the image before the previous one"}  # fmt: skip
+    shifts = {
+        1: "the next image",
+        -1: "the image before",
+        2: "the image after next",
+        -2: "the image before the previous one",
+    }
     orders = list[tuple[str, Sequence[int]]](
         (f"each is that of {words}", range(-by, count - by)) for by, words in shifts.items()
     )

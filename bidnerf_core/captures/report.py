@@ -35,7 +35,10 @@ PROBLEMS: dict[PhotoProblem, tuple[str, str]] = {
         "rotated against the pose",
         "rotate the image, or the pose, so that both agree on what is up",
     ),
-    "badly posed": ("not where the given pose says, according to the landmarks of other photos", "re-estimate such poses, or leave the photos out"),
+    "badly posed": (
+        "not where the given pose says, according to the landmarks of other photos",
+        "re-estimate such poses, or leave the photos out",
+    ),
     "apart": (
         "not linked to the rest by any landmark",
         "photos of another place need a map of their own; otherwise take more in between",
@@ -46,7 +49,7 @@ PROBLEMS: dict[PhotoProblem, tuple[str, str]] = {
     ),
     "blurred": ("blurred compared with nearby photos", "retake such photos with more light or a steadier camera"),
     "badly exposed": ("exposed differently from the rest", "retake such photos with locked exposure"),
-}  # fmt: skip
+}
 """For each problem, the words that follow "is" or "are", and advice."""
 
 
@@ -158,11 +161,17 @@ def sentences(report: CaptureReport) -> list[str]:
     errors = f", median error {trial.translation:.3g} and {trial.rotation_deg:.2g}°" if trial.found else ""
     remarks = [
         (True, f"{photos}, {ARRANGEMENTS[covered.arrangement]}{heights}; {landmarks}"),
-        (trial.images > 0, f"with the landmarks of the others alone, {trial.found} of {amount(trial.images, 'photo')} of the map"
-         f" {'was' if trial.found == 1 else 'were'} localized{errors}; expect similar results for new photos taken the same way"),
-        (covered.arrangement == "one place", f"rays to the same point differ by {covered.parallax_deg:.1f}°: photos from one place"
-         " do not determine distances; move by at least a tenth of the distance to the scene between photos"),
-    ]  # fmt: skip
+        (
+            trial.images > 0,
+            f"with the landmarks of the others alone, {trial.found} of {amount(trial.images, 'photo')} of the map"
+            f" {'was' if trial.found == 1 else 'were'} localized{errors}; expect similar results for new photos taken the same way",
+        ),
+        (
+            covered.arrangement == "one place",
+            f"rays to the same point differ by {covered.parallax_deg:.1f}°: photos from one place"
+            " do not determine distances; move by at least a tenth of the distance to the scene between photos",
+        ),
+    ]
     for problem, (what, advice) in PROBLEMS.items():
         names = [photo.name for photo in report.with_problem(problem)]
         more = f" and {len(names) - 6} more" if len(names) > 6 else ""
@@ -172,13 +181,27 @@ def sentences(report: CaptureReport) -> list[str]:
     dark = [photo.name for photo in report.photos if photo.exposure is None]
     unknown = bool(dark) and len(dark) < len(report.photos)
     remarks += [
-        (unknown, f"too few landmarks to compare the exposure of {', '.join(dark[:6])}{' ...' if len(dark) > 6 else ''}"),
+        (
+            unknown,
+            f"too few landmarks to compare the exposure of {', '.join(dark[:6])}{' ...' if len(dark) > 6 else ''}",
+        ),
         *((True, f"there are no photos {gap}: take some there, every 10 to 15°") for gap in covered.gaps),
-        (covered.open_side is not None, f"there are no photos {covered.open_side}: take some there if you expect queries from that"
-         " side"),
-        (is_outside and high - low < 10, "all photos were taken at the same height: add some from higher and lower"),  # degrees
-        (not few and covered.seen_by_two > 0.6, f"{covered.seen_by_two:.0%} of the landmarks are seen in only two photos: photos"
-         " in between would constrain them better"),
-        (report.exposure_range > 1, f"exposure varies by {report.exposure_range:.1f} stops: lock it if the camera allows"),
-    ]  # fmt: skip
+        (
+            covered.open_side is not None,
+            f"there are no photos {covered.open_side}: take some there if you expect queries from that side",
+        ),
+        (
+            is_outside and high - low < 10,
+            "all photos were taken at the same height: add some from higher and lower",
+        ),  # degrees
+        (
+            not few and covered.seen_by_two > 0.6,
+            f"{covered.seen_by_two:.0%} of the landmarks are seen in only two photos: photos"
+            " in between would constrain them better",
+        ),
+        (
+            report.exposure_range > 1,
+            f"exposure varies by {report.exposure_range:.1f} stops: lock it if the camera allows",
+        ),
+    ]
     return [text for holds, text in remarks if holds]

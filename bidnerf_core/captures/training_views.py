@@ -80,9 +80,12 @@ class TrainingViews:
 
 
 def prepared(
-    views: Sequence[View], refinement: RefinementChoice = "auto",
-    features: str = USUAL_FEATURES, trust_poses: bool = False, depth_unit: float | None = None,
-) -> TrainingViews:  # fmt: skip
+    views: Sequence[View],
+    refinement: RefinementChoice = "auto",
+    features: str = USUAL_FEATURES,
+    trust_poses: bool = False,
+    depth_unit: float | None = None,
+) -> TrainingViews:
     """Refine the poses of the views if requested, and find the landmarks visible in the views.
 
     ``features`` is the name of the keypoint detector. ``depth_unit`` is the unit with which depth images were read
@@ -96,9 +99,7 @@ def prepared(
             every = 5 * max(1, math.ceil(len(views) / 60))
             some = [view for number, view in enumerate(views) if number % every < 5]
             _check_poses(posed_keypoints(some, SIFT))
-        return TrainingViews(
-            seeing, tracked, stored_cameras(views), distances=shows_distances(views, tracked)
-        )
+        return TrainingViews(seeing, tracked, stored_cameras(views), distances=shows_distances(views, tracked))
     tracked = _tracked(views, features, trust_poses, depth_unit)
     found = training_poses(tracked, views, 0.0 if refinement == "always" else INCONSISTENT)
     poses, motion = found.tracked.T_world_camera, found.tracked.motion
@@ -146,9 +147,7 @@ def _lacks_distances(view: View) -> bool:
     return not (view.frame.has_dense_depth or has_outline(view))
 
 
-def _tracked(
-    views: Sequence[View], features: str, trust_poses: bool, depth_unit: float | None
-) -> TrackedViews:
+def _tracked(views: Sequence[View], features: str, trust_poses: bool, depth_unit: float | None) -> TrackedViews:
     """Track the keypoints of the views. Raises ``InputError`` if poses contradict the images or depth is in another unit.
 
     The unit is checked last, since triangulated distances are meaningless under wrong poses.
@@ -304,9 +303,7 @@ def _deviations(updates: Float[Tensor, "v 6"]) -> tuple[float, float]:
     return max(1e-9, mad_deviation(updates[:, :3])), max(1e-9, mad_deviation(updates[:, 3:]))
 
 
-def _image_motion(
-    seen: TrackedKeypoints, points: Float[Tensor, "n 3"], given: SE3, found: SE3
-) -> Float[Tensor, "v"]:
+def _image_motion(seen: TrackedKeypoints, points: Float[Tensor, "n 3"], given: SE3, found: SE3) -> Float[Tensor, "v"]:
     """Return the median shift (pixels) of each image's points between its given and estimated pose."""
     shown, image = points[seen.point], seen.image
     focal = seen.sightings.focal[:, None]

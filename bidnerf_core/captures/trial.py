@@ -54,9 +54,7 @@ def tried_landmarks(
     answers, updates = _answers(tracked, views, held_out, config, landmarks)
     if not answers:
         return replace(landmarks, trial=HeldOutTrial(wanted))
-    translation, rotation = (
-        torch.linalg.vector_norm(part, dim=-1).quantile(0.5) for part in updates.split(3, dim=-1)
-    )
+    translation, rotation = (torch.linalg.vector_norm(part, dim=-1).quantile(0.5) for part in updates.split(3, dim=-1))
     trial = HeldOutTrial(wanted, len(answers), float(translation), float(rotation.rad2deg()))
     landmarks = replace(landmarks, trial=trial)
     if len(answers) < 6:  # too few to estimate the scatter from
@@ -147,9 +145,7 @@ def _factors(matches: Sequence[int], landmarks: LandmarkMap) -> Float[Tensor, "n
     return torch.tensor([landmarks.correlation_of(count) for count in matches], dtype=torch.float64)
 
 
-def _calibration_scatter(
-    answers: Sequence[LandmarkAnswer], factors: Float[Tensor, "n"]
-) -> Float[Tensor, "4"]:
+def _calibration_scatter(answers: Sequence[LandmarkAnswer], factors: Float[Tensor, "n"]) -> Float[Tensor, "4"]:
     """Return the standard deviations of the corrections estimated for intrinsics that are in fact correct.
 
     They refer to the logarithm of the focal length, the principal point (u, v; in focal lengths) and the radial

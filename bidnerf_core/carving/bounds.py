@@ -19,9 +19,7 @@ AxisBox: TypeAlias = tuple[Float[Tensor, "3"], Float[Tensor, "3"]]
 """Lower and upper corner: metres, world, float64."""
 
 
-def grown(
-    lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], at_least: float = 0.0, share: float = 0.03
-) -> AxisBox:
+def grown(lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], at_least: float = 0.0, share: float = 0.03) -> AxisBox:
     """Return the box with a margin of ``share`` of its size at each end, or of ``at_least`` metres if that is more.
 
     A flat box is given some thickness.
@@ -104,9 +102,7 @@ OUTLIERS = 1e-3
 """Fraction of the measured points, at either end of each axis, that may be wrong."""
 
 
-def estimate_bounds(
-    views: Sequence[View], background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> SceneBounds:
+def estimate_bounds(views: Sequence[View], background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> SceneBounds:
     """Estimate the box of the scene that ``views`` show, its range of distances from their cameras, and how finely they resolve it.
 
     The poses of ``views`` are T_world_camera. With depth (dense in half of the views, or any if there are no silhouettes), the box holds

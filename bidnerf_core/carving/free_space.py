@@ -121,9 +121,7 @@ def _edges(camera: Intrinsics) -> Float[Tensor, "4 3"]:
     return functional.normalize(normals, dim=-1).float()
 
 
-def occupied_voxels(
-    views: Sequence[View], grid: VoxelGrid, device: torch.device = CPU
-) -> Bool[Tensor, "x y z"]:
+def occupied_voxels(views: Sequence[View], grid: VoxelGrid, device: torch.device = CPU) -> Bool[Tensor, "x y z"]:
     """Return which cells of ``grid`` may hold matter, see ``occupied_cells``.
 
     The relative tolerance of depth is 5 %, since sensors err by a few per cent, and an emptied cell is never filled again.

@@ -214,9 +214,7 @@ class Capture:
     shots: Sequence[Shot]
     background: Colour = BLACK  # behind images with an alpha channel
     unit: LengthUnit | None = None  # of the poses; None if the format does not specify it
-    up: Colour | None = (
-        None  # the upward direction in the world if the capture measured gravity, as phones do
-    )
+    up: Colour | None = None  # the upward direction in the world if the capture measured gravity, as phones do
     depth_unit: float | None = None  # metres per step of depth images, if the format accepts another unit
     largest: int | None = None  # longer side to which the user asked to downscale images, if any
     pose_file: Path | str | None = None  # what records the poses, for messages
@@ -231,10 +229,10 @@ class Capture:
     def __repr__(self) -> str:
         """A one-line description, for which no image is opened."""
         posed = sum(shot.T_world_camera is not None for shot in self.shots)
-        splits = ", ".join(
-            f"{name} {sum(name in shot.splits for shot in self.shots)}" for name in self.splits
+        splits = ", ".join(f"{name} {sum(name in shot.splits for shot in self.shots)}" for name in self.splits)
+        return (
+            f"<Capture {self.path}: {amount(len(self), 'image')}, {posed} with poses{f' ({splits})' if splits else ''}>"
         )
-        return f"<Capture {self.path}: {amount(len(self), 'image')}, {posed} with poses{f' ({splits})' if splits else ''}>"
 
     @cached_property
     def splits(self) -> tuple[str, ...]:
@@ -439,7 +437,9 @@ def hold_out(
 
 def of_views(views: Sequence[View], path: Path, splits: tuple[str, ...] = SPLITS) -> Capture:
     """Return views in memory as a capture in which each of the ``splits`` contains all of the views."""
-    return Capture(path, [_ViewShot(view=v, stem=v.frame.name, T_world_camera=v.T_ref_camera, splits=splits) for v in views])  # fmt: skip
+    return Capture(
+        path, [_ViewShot(view=v, stem=v.frame.name, T_world_camera=v.T_ref_camera, splits=splits) for v in views]
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

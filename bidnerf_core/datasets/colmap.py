@@ -105,9 +105,7 @@ class SparsePoints:
         Raises ``InputError`` if the name is ambiguous.
         """
         others = {"train", "val", "test"} - {split}
-        fits = [
-            (folders, image) for folders, image in self._images.get(name, []) if not others & set(folders)
-        ]
+        fits = [(folders, image) for folders, image in self._images.get(name, []) if not others & set(folders)]
         fits = [(folders, image) for folders, image in fits if split in folders] or fits
         if len(fits) > 1:
             found = f"frame {name!r} may be any of {', '.join(image.name for _, image in fits[:4])};"
@@ -117,9 +115,7 @@ class SparsePoints:
     @property
     def summary(self) -> str:
         """A one-line description of the model's unit."""
-        checked = (
-            f", positions agree to {self.misfit:.2%} of their spread" if self.cameras > 2 else ", unchecked"
-        )
+        checked = f", positions agree to {self.misfit:.2%} of their spread" if self.cameras > 2 else ", unchecked"
         unit = f"its unit is {self.metres:.4g} m according to {self.cameras} training cameras{checked}"
         return f"{self.folder}: {unit}"
 

@@ -125,9 +125,7 @@ def read_colmap_depth(path: Path) -> DepthImage:
     content = read_file(path, "a COLMAP depth map")
     *sizes, numbers = content.split(b"&", 3)
     if len(sizes) != 3 or not all(size.isdigit() and len(size) < 10 for size in sizes):
-        raise InputError(
-            "does not begin with width&height&channels&", where=path, expected="a COLMAP depth map"
-        )
+        raise InputError("does not begin with width&height&channels&", where=path, expected="a COLMAP depth map")
     width, height, channels = map(int, sizes)
     if channels != 1 or width * height < 1 or len(numbers) != 4 * width * height:
         raise InputError(
@@ -175,12 +173,12 @@ def _parameters(path: Path, numbers: Sequence[Any]) -> int:
 
 CAMERAS = _Columns("IiQQ", np.dtype([("parameter", "<f8")]), "", length=_parameters)
 IMAGES = _Columns(
-    "IdddddddI", np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")]),
-    "id, pose, camera and name of an image", "x, y, id of points",
-)  # fmt: skip
-POINTS = _Columns(
-    "qdddBBBd", np.dtype([("image", "<u4"), ("keypoint", "<u4")]), "id, x y z, r g b, error and a track"
+    "IdddddddI",
+    np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")]),
+    "id, pose, camera and name of an image",
+    "x, y, id of points",
 )
+POINTS = _Columns("qdddBBBd", np.dtype([("image", "<u4"), ("keypoint", "<u4")]), "id, x y z, r g b, error and a track")
 _Entry: TypeAlias = tuple[str, list[Any], str, np.ndarray]
 """Where an entry is, its numbers, the name of the image, and the last column of its list."""
 
@@ -248,9 +246,7 @@ def stored_keypoints(path: Path) -> Iterator[tuple[str, Keypoints]]:
     read = _of_features if path.suffix == ".h5" else _of_database
     for name, pixels, scales, descriptors in read(path):
         count = len(pixels)
-        if not (
-            len(scales) == len(descriptors) == count and np.isfinite(pixels).all() and (scales > 0).all()
-        ):
+        if not (len(scales) == len(descriptors) == count and np.isfinite(pixels).all() and (scales > 0).all()):
             raise InputError(
                 f"image {name!r} has {count} keypoints, {len(scales)} scales and {len(descriptors)} descriptors",
                 where=path,
@@ -310,9 +306,7 @@ def _of_features(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.n
         with h5py.File(path, "r") as opened:
             for name, group in images(opened, ()):
                 pixels = np.asarray(group["keypoints"], dtype=np.float32)[:, :2] + FIRST_CENTRE
-                scales = (
-                    np.asarray(group["scales"]) if "scales" in group else np.full(len(pixels), UNKNOWN_SCALE)
-                )
+                scales = np.asarray(group["scales"]) if "scales" in group else np.full(len(pixels), UNKNOWN_SCALE)
                 yield name, pixels, scales, np.asarray(group["descriptors"], dtype=np.float32).T
     except (OSError, KeyError, ValueError, IndexError, TypeError) as error:
         raise InputError(f"cannot be read: {error}", where=path, expected="features of hloc") from error

@@ -30,9 +30,7 @@ class FileNames:
         self._folders = [each for each in (folder, *others) if each == folder or each.is_dir()]
         self._listed: dict[Path, dict[str, str]] = {}
 
-    def find(
-        self, name: str | PurePosixPath, endings: tuple[str, ...] = ("",), moved: bool = False
-    ) -> Path | None:
+    def find(self, name: str | PurePosixPath, endings: tuple[str, ...] = ("",), moved: bool = False) -> Path | None:
         """Return the file named ``name`` plus one of the ``endings``, or None.
 
         The exact name is tried first, then names that differ in case, then the trailing parts of an absolute path.

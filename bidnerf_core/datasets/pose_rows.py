@@ -32,9 +32,7 @@ def camera_of(
     """
     fx, fy, cx, cy = numbers
     try:
-        return Intrinsics(
-            fx, fy, cx + first_centre, cy + first_centre, *size, tuple(lens) if any(lens) else ()
-        )
+        return Intrinsics(fx, fy, cx + first_centre, cy + first_centre, *size, tuple(lens) if any(lens) else ())
     except InputError as error:
         raise InputError(error, where=where) from error
 

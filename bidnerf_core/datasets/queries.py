@@ -71,9 +71,7 @@ class DepthPoints:
         rays = self.sparse.rays(views, split)
         names = [view.frame.name for view in views]
         blind = ", ".join(name for name in names if len(self.sparse.seen(name, split)) == 0)
-        log.info(
-            "%s: %s seen%s", names[-1], amount(len(rays), "point"), blind and f", but {blind} observes none"
-        )
+        log.info("%s: %s seen%s", names[-1], amount(len(rays), "point"), blind and f", but {blind} observes none")
         return rays
 
 

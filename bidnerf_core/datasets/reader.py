@@ -24,9 +24,7 @@ OpenQuestion = Literal["camera", "focal", "register_depth", "depth_unit"]
 """An option of ``DatasetOptions`` that a format may leave open."""
 
 
-def read_dataset(
-    options: DatasetOptions, path: str | Path, readers: Sequence[Reader] | None = None
-) -> Capture:
+def read_dataset(options: DatasetOptions, path: str | Path, readers: Sequence[Reader] | None = None) -> Capture:
     """Read the dataset in a folder, see ``DatasetOptions.open``."""
     folder = Path(path)
     if not folder.exists():
@@ -37,9 +35,7 @@ def read_dataset(
     return _read(options, reader, folder).require_poses()
 
 
-def read_sequence(
-    options: DatasetOptions, path: str | Path, readers: Sequence[Reader] | None = None
-) -> Capture:
+def read_sequence(options: DatasetOptions, path: str | Path, readers: Sequence[Reader] | None = None) -> Capture:
     """Read frames in chronological order, see ``DatasetOptions.open_sequence``."""
     # The readers of photos and videos are not registered: they find no poses.
     from bidnerf_core.datasets.formats.photos import reader as photos
@@ -69,8 +65,12 @@ def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
         ("camera", source.is_given, own_camera),
         ("register_depth", options.registration not in (None, False), registered),
         ("depth_unit", options.depth_unit is not None, fixed_unit),
-        ("focal", source.is_given and source.camera is None, "is a dataset; give a camera with all intrinsics (camera=)"),
-    ]  # fmt: skip
+        (
+            "focal",
+            source.is_given and source.camera is None,
+            "is a dataset; give a camera with all intrinsics (camera=)",
+        ),
+    ]
     for option, is_given, problem in given:
         if is_given and option not in reader.accepts:
             raise InputError(problem, where=path)
@@ -216,9 +216,23 @@ def _defects(reader: Any) -> Iterator[str]:
 
 
 ORDER = (
-    "transforms", "tum", "twelve-scenes", "seven-scenes", "record3d", "polycam", "stray-scanner", "euroc", "kitti",
-    "reality-capture", "scannet", "replica", "colmap", "llff", "opensfm", "metashape",
-)  # fmt: skip
+    "transforms",
+    "tum",
+    "twelve-scenes",
+    "seven-scenes",
+    "record3d",
+    "polycam",
+    "stray-scanner",
+    "euroc",
+    "kitti",
+    "reality-capture",
+    "scannet",
+    "replica",
+    "colmap",
+    "llff",
+    "opensfm",
+    "metashape",
+)
 """The bundled readers in the order in which they are tried; a folder may hold files of several formats."""
 
 READERS: Plugins[Reader] = Plugins("readers", _defects, first=ORDER)

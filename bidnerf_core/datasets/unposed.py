@@ -48,9 +48,7 @@ class Poser(Protocol):
         ...
 
 
-POSERS: Plugins[Poser] = Plugins(
-    "posers", lambda poser: interface_defects(poser, (), {"__call__": ("photos", "out")})
-)
+POSERS: Plugins[Poser] = Plugins("posers", lambda poser: interface_defects(poser, (), {"__call__": ("photos", "out")}))
 """The posers by name."""
 
 

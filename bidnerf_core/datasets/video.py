@@ -147,8 +147,7 @@ def require_av(path: Path) -> None:
         import av  # noqa: F401
     except ImportError as error:
         raise InputError(
-            "reading a video needs the extra 'video' (pip install 'bidnerf[video]'); or extract its frames"
-            " to a folder",
+            "reading a video needs the extra 'video' (pip install 'bidnerf[video]'); or extract its frames to a folder",
             where=path,
         ) from error
 

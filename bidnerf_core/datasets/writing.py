@@ -21,7 +21,7 @@ from bidnerf_core.io import png_bytes, write_file
 
 def write_transforms(
     folder: str | Path, splits: Mapping[str, Sequence[View]], background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> None:  # fmt: skip
+) -> None:
     """Write ``transforms_SPLIT.json``, ``images/SPLIT/NAME.png`` (8 bits) and ``depth/SPLIT/NAME.png`` (16 bits).
 
     ``background`` is the colour over which frames with an alpha channel were composited; it is removed from their colours.
@@ -42,9 +42,7 @@ def write_transforms(
         if not frames:  # readers reject a file without frames
             continue
         folder.mkdir(parents=True, exist_ok=True)
-        write_file(
-            folder / SPLIT_FILES[split], json.dumps({"frames": frames}, indent=1, allow_nan=False).encode()
-        )
+        write_file(folder / SPLIT_FILES[split], json.dumps({"frames": frames}, indent=1, allow_nan=False).encode())
 
 
 def _written(folder: Path, split: str, view: View, background: tuple[float, float, float]) -> dict[str, Any]:
@@ -79,9 +77,14 @@ def frame_entry(
         # The y and z axes of the camera are reversed in OpenGL.
         "transform_matrix": (matrix * matrix.new_tensor([1.0, -1.0, -1.0, 1.0])).tolist(),
         **({} if time is None else {"time": time}),
-        "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": camera.width, "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "w": camera.width,
+        "h": camera.height,
         **dict(zip(lens, camera.distortion, strict=False)),
-    }  # fmt: skip
+    }
 
 
 def _colours(frame: Frame, background: tuple[float, float, float]) -> np.ndarray:

@@ -83,9 +83,7 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
         unit = 1.0 if values.dtype.kind == "f" else MILLIMETRE
     given: Any = unit
     if not isinstance(given, Real) or not 0 < unit <= FARTHEST:
-        raise InputError(
-            f"depth_unit is {unit!r}", where=what, expected="a positive number of metres per step"
-        )
+        raise InputError(f"depth_unit is {unit!r}", where=what, expected="a positive number of metres per step")
     metres = values.astype(np.float64) * unit
     absent = _absent(values, metres)
     unmeasured = np.logical_or.reduce([metres == 0, *absent.values()])
@@ -93,9 +91,7 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
     absent |= limit
     unmeasured = np.logical_or.reduce([unmeasured, *limit.values()])
     counts = {name: int(mask.sum()) for name, mask in absent.items() if mask.any()}
-    return DepthImage(
-        torch.from_numpy(np.where(unmeasured, 0, metres).astype(np.float32)), float(unit), counts
-    )
+    return DepthImage(torch.from_numpy(np.where(unmeasured, 0, metres).astype(np.float32)), float(unit), counts)
 
 
 def _absent(values: np.ndarray, metres: np.ndarray) -> dict[str, np.ndarray]:
@@ -152,7 +148,5 @@ class DepthReader:
         if new:
             self._mentioned |= new.keys()
             dropped = replace(found, replaced=new).dropped
-            warnings.warn(
-                f"{path}: depth: {dropped}, here and in the images that follow", InputWarning, stacklevel=2
-            )
+            warnings.warn(f"{path}: depth: {dropped}, here and in the images that follow", InputWarning, stacklevel=2)
         return found

@@ -110,9 +110,7 @@ class FieldDerivatives:
 
     values: FieldValues
     by_position: Float[Tensor, "*p 4 3"]  # per metre
-    by_direction: Float[
-        Tensor, "*p 4 3"
-    ]  # in all three coordinates, as if directions need not be unit vectors
+    by_direction: Float[Tensor, "*p 4 3"]  # in all three coordinates, as if directions need not be unit vectors
 
 
 @runtime_checkable
@@ -143,7 +141,7 @@ class DifferentiatedField(RadianceField, Protocol):
 
     def jacobian(
         self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"], wanted: Bool[Tensor, "p"] | None = None
-    ) -> FieldDerivatives:  # fmt: skip
+    ) -> FieldDerivatives:
         """Return the values of ``query`` and their derivatives, without recording gradients.
 
         Points that are not ``wanted`` may be skipped: the numbers returned for them are not used, but must be finite.
@@ -209,9 +207,11 @@ def levels(field: RadianceField) -> tuple[RadianceField, ...]:
 
 
 def derivatives_of(
-    field: RadianceField, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"],
+    field: RadianceField,
+    positions: Float[Tensor, "p 3"],
+    directions: Float[Tensor, "p 3"],
     wanted: Bool[Tensor, "p"] | None = None,
-) -> FieldDerivatives:  # fmt: skip
+) -> FieldDerivatives:
     """Return a field's values and their derivatives at the ``wanted`` points, using the field's ``jacobian`` if it has one."""
     if isinstance(field, DifferentiatedField):
         return field.jacobian(positions, directions, wanted)
@@ -220,7 +220,7 @@ def derivatives_of(
 
 def backward_derivatives(
     query: Callable[[Tensor, Tensor], FieldValues], positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
-) -> FieldDerivatives:  # fmt: skip
+) -> FieldDerivatives:
     """Return the values of ``query`` at points and their derivatives, by one backward pass per channel.
 
     Points are independent, so the gradient of a channel's sum contains the gradients of all points. On an accelerator, where
@@ -293,16 +293,18 @@ class SceneBounds:
         checks = (
             (
                 all(low < high for low, high in zip(self.lower, self.upper, strict=True)),
-                f"lower corner {self.lower} is not below upper corner {self.upper}", None,
+                f"lower corner {self.lower} is not below upper corner {self.upper}",
+                None,
             ),
             (0 <= self.near < self.far, f"expected 0 <= near < far, got near {self.near}, far {self.far}", None),
             (self.footprint >= 0, f"footprint is {self.footprint}", "0 or more"),
             (
                 all(0 <= channel <= 1 for channel in self.background),
-                f"background is {self.background}", "three numbers in [0, 1]",
+                f"background is {self.background}",
+                "three numbers in [0, 1]",
             ),
             (largest <= LARGEST_LENGTH, f"{largest:g} m is too large", f"at most {LARGEST_LENGTH:g} m"),
-        )  # fmt: skip
+        )
         for holds, found, expected in checks:
             if not holds:
                 raise InputError(found, where="scene bounds", expected=expected)

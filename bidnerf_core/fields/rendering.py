@@ -63,9 +63,7 @@ class Observations:
     ) -> Observations:
         """Return rays with a measured distance (metres, > 0) but no colour. Raises ``InputError`` if there are no rays."""
         if len(distance) == 0:
-            raise InputError(
-                "nothing was measured", where="depth rays", expected="at least one finite point in front"
-            )
+            raise InputError("nothing was measured", where="depth rays", expected="at least one finite point in front")
         coloured = torch.zeros(len(distance), dtype=torch.bool, device=distance.device)
         return Observations(origins, directions, torch.zeros_like(directions), distance, coloured)
 
@@ -98,9 +96,7 @@ class Observations:
 
     def gathered(self, index: Int[Tensor, "k m"]) -> Observations:
         """Select m rays from each row of rays of shape (k p), by ``index`` along the second axis."""
-        return self._changed(
-            lambda part: part.take_along_dim(index.reshape(*index.shape, *(1,) * (part.ndim - 2)), 1)
-        )
+        return self._changed(lambda part: part.take_along_dim(index.reshape(*index.shape, *(1,) * (part.ndim - 2)), 1))
 
     def flattened(self) -> Observations:
         """Return these rays flattened to one axis."""
@@ -178,9 +174,7 @@ def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> Fiel
         directions = rays.directions[..., None, :].expand_as(positions)
         moving = torch.is_grad_enabled() and (rays.origins.requires_grad or rays.directions.requires_grad)
         if moving and not waiting and isinstance(field, DifferentiatedField) and is_frozen(field):
-            found = _Queried.apply(
-                positions.reshape(-1, 3), directions.reshape(-1, 3), valid.reshape(-1), field
-            )
+            found = _Queried.apply(positions.reshape(-1, 3), directions.reshape(-1, 3), valid.reshape(-1), field)
             density, rgb = found.view(*valid.shape, 4).split((1, 3), -1)
             return FieldValues(density[..., 0], rgb)
         found = field.query(positions, directions)
@@ -197,16 +191,12 @@ def points_of(
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Return the positions (metres, world) of the samples with these flat indices, and the directions of their rays."""
     ray = index // samples.valid.shape[-1]
-    origins, directions = (
-        part.reshape(-1, 3).index_select(0, ray) for part in (rays.origins, rays.directions)
-    )
+    origins, directions = (part.reshape(-1, 3).index_select(0, ray) for part in (rays.origins, rays.directions))
     middles = samples.middles.reshape(-1).index_select(0, index)
     return origins + middles[:, None] * directions, directions
 
 
-def query_packed(
-    field: RadianceField, rays: Rays, samples: RaySamples, room: int
-) -> tuple[FieldValues, RaySamples]:
+def query_packed(field: RadianceField, rays: Rays, samples: RaySamples, room: int) -> tuple[FieldValues, RaySamples]:
     """Return the field's values at the first ``room`` valid samples (r s), and the samples with only these left valid.
 
     The field is always queried at ``room`` points, so that the host need not wait for the number of valid samples.
@@ -234,9 +224,12 @@ class _Queried(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"], wanted: Bool[Tensor, "p"],
+        ctx: Any,
+        positions: Float[Tensor, "p 3"],
+        directions: Float[Tensor, "p 3"],
+        wanted: Bool[Tensor, "p"],
         field: DifferentiatedField,
-    ) -> Float[Tensor, "p 4"]:  # fmt: skip
+    ) -> Float[Tensor, "p 4"]:
         found = field.jacobian(positions, directions, wanted)
         ctx.save_for_backward(found.by_position, found.by_direction, wanted)
         values = torch.cat([found.values.density[:, None], found.values.rgb], -1)
@@ -252,9 +245,7 @@ class _Queried(torch.autograd.Function):
 
 def rendering_weights(density: Float[Tensor, "*r s"], samples: RaySamples) -> Float[Tensor, "*r s"]:
     """Return ``w_i = exp(-sum_{j<i} sigma_j dt_j) (1 - exp(-sigma_i dt_i))`` (eq. 3)."""
-    absorbed = torch.where(
-        samples.valid, density * (samples.ends - samples.starts), constant((0.0,), density)
-    )
+    absorbed = torch.where(samples.valid, density * (samples.ends - samples.starts), constant((0.0,), density))
     before = torch.cumsum(absorbed, dim=-1) - absorbed
     return torch.exp(-before) * -torch.expm1(-absorbed)
 
@@ -313,9 +304,13 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, density: Float[Tensor, "*r s"], rgb: Float[Tensor, "*r s 3"], starts: Float[Tensor, "*r s"],
-        ends: Float[Tensor, "*r s"], valid: Bool[Tensor, "*r s"],
-    ) -> tuple[Tensor, ...]:  # fmt: skip
+        ctx: Any,
+        density: Float[Tensor, "*r s"],
+        rgb: Float[Tensor, "*r s 3"],
+        starts: Float[Tensor, "*r s"],
+        ends: Float[Tensor, "*r s"],
+        valid: Bool[Tensor, "*r s"],
+    ) -> tuple[Tensor, ...]:
         samples = RaySamples(starts, ends, valid)
         weights = rendering_weights(density, samples)
         ctx.save_for_backward(density, rgb, weights, *samples.parts)
@@ -329,9 +324,7 @@ class _Composite(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         density, rgb, weights, starts, ends, valid = ctx.saved_tensors
         length, to_rgb = ends - starts, to_rgb[..., None, :]
-        by_weight = (
-            (to_rgb * rgb).sum(-1) + to_distance[..., None] * (starts + ends) / 2 + to_opacity[..., None]
-        )
+        by_weight = (to_rgb * rgb).sum(-1) + to_distance[..., None] * (starts + ends) / 2 + to_opacity[..., None]
         by_weight = by_weight + to_weights
         share = weights * by_weight
         behind = share.sum(-1, keepdim=True) - share.cumsum(-1)
@@ -342,9 +335,12 @@ class _Composite(torch.autograd.Function):
 
 
 def _over(
-    background: tuple[float, float, float] | Float[Tensor, "*#r 3"], colours: Float[Tensor, "*r s 3"],
-    weights: Float[Tensor, "*r s"], samples: RaySamples, density: Float[Tensor, "*r s"] | None,
-) -> Rendering:  # fmt: skip
+    background: tuple[float, float, float] | Float[Tensor, "*#r 3"],
+    colours: Float[Tensor, "*r s 3"],
+    weights: Float[Tensor, "*r s"],
+    samples: RaySamples,
+    density: Float[Tensor, "*r s"] | None,
+) -> Rendering:
     """Return the rendering of weighted samples with these colours in front of ``background``."""
     opacity = weights.sum(-1)
     behind = constant(background, weights) if isinstance(background, tuple) else background.to(weights)
@@ -354,9 +350,13 @@ def _over(
 
 @torch.no_grad()
 def render_image(
-    field: RadianceField, intrinsics: Intrinsics, T_world_camera: SE3, bounds: SceneBounds, chunk: int = 8192,
+    field: RadianceField,
+    intrinsics: Intrinsics,
+    T_world_camera: SE3,
+    bounds: SceneBounds,
+    chunk: int = 8192,
     motion: Float[Tensor, "6"] | None = None,
-) -> RenderedImage:  # fmt: skip
+) -> RenderedImage:
     """Render a whole image from a pose (``T_world_camera``), ``chunk`` rays at a time.
 
     ``motion`` is the camera's motion from the first row to the last (translation in metres, then rotation in
@@ -369,7 +369,7 @@ def render_image(
 @torch.no_grad()
 def render_picture(
     field: RadianceField, intrinsics: Intrinsics, T_world_camera: SE3, bounds: SceneBounds, chunk: int = 8192
-) -> RenderedImage:  # fmt: skip
+) -> RenderedImage:
     """Render an image for display: every second pixel of every second row, and those in between whose neighbours differ.
 
     All other pixels are interpolated. This misses only details smaller than two pixels, and saves up to half of the time.
@@ -397,9 +397,14 @@ def render_picture(
 
 
 def _rendered(
-    field: RadianceField, intrinsics: Intrinsics, T_world_camera: SE3, bounds: SceneBounds, pixels: Float[Tensor, "n 2"],
-    chunk: int, motion: Float[Tensor, "6"] | None = None,
-) -> Float[Tensor, "n 5"]:  # fmt: skip
+    field: RadianceField,
+    intrinsics: Intrinsics,
+    T_world_camera: SE3,
+    bounds: SceneBounds,
+    pixels: Float[Tensor, "n 2"],
+    chunk: int,
+    motion: Float[Tensor, "6"] | None = None,
+) -> Float[Tensor, "n 5"]:
     """Return the colour, planar depth (metres; 0 unless the opacity exceeds one half) and opacity of the given pixels."""
     ray, length = intrinsics.rays(pixels)
     device = device_of(field)
@@ -412,9 +417,7 @@ def _rendered(
         at = T if motion is None else T @ poses_of_rows(when, motion)
         turned = at.rotate(directions)
         rendering = render(field, bounds.rays(at.translation.expand_as(turned), turned), bounds.background)
-        parts.append(
-            torch.cat([rendering.rgb, rendering.distance[:, None], rendering.opacity[:, None]], -1).cpu()
-        )
+        parts.append(torch.cat([rendering.rgb, rendering.distance[:, None], rendering.opacity[:, None]], -1).cpu())
     rgb, distance, opacity = torch.cat(parts).split([3, 1, 1], dim=-1)
     hit = torch.where(opacity > 0.5, distance / opacity.clamp(min=0.5), 0) / length[:, None]
     return torch.cat([rgb.clamp(0, 1), hit, opacity], -1)

@@ -131,9 +131,7 @@ def depth_term(robust: Robust, weight: float, residual: DepthResidual = depth_re
 
 def free_space_term(robust: Robust, weight: float) -> Term:
     """Return the term for matter that lies in front of the measured distance by more than the scale of ``robust`` (metres)."""
-    return Term(
-        lambda seen, observed: free_space(seen, observed.distance, robust.scale)[..., None], robust, weight
-    )
+    return Term(lambda seen, observed: free_space(seen, observed.distance, robust.scale)[..., None], robust, weight)
 
 
 def opacity_term(weight: float) -> Term:

@@ -120,10 +120,7 @@ def inverse_transform(
     places = (torch.arange(count, dtype=cdf.dtype, device=cdf.device) + 0.5) / count
     places = places.expand(*cdf.shape[:-1], count).contiguous()
     if jitter is not None:
-        places = (
-            places
-            + (torch.rand(places.shape, generator=jitter, device=jitter.device).to(places) - 0.5) / count
-        )
+        places = places + (torch.rand(places.shape, generator=jitter, device=jitter.device).to(places) - 0.5) / count
     index = torch.searchsorted(cdf, places).clamp(max=cdf.shape[-1] - 1)
     below = torch.cat([torch.zeros_like(cdf[..., :1]), cdf], dim=-1).gather(-1, index)
     width = (cdf.gather(-1, index) - below).clamp(min=torch.finfo(cdf.dtype).tiny)
@@ -154,9 +151,7 @@ def _cut(rough: RaySamples, places: Float[Tensor, "*r n"], owner: Int[Tensor, "*
     owner = torch.cat([owner, first], dim=-1)
     valid = rough.valid.gather(-1, owner)
     # Places go first: if a place and a start coincide, the piece from the start is the longer one.
-    starts, order = (
-        torch.cat([places, rough.starts], dim=-1).where(valid, torch.inf).sort(dim=-1, stable=True)
-    )
+    starts, order = torch.cat([places, rough.starts], dim=-1).where(valid, torch.inf).sort(dim=-1, stable=True)
     owner, valid = owner.gather(-1, order), valid.gather(-1, order)
     following = torch.cat([starts[..., 1:], torch.full_like(starts[..., :1], torch.inf)], dim=-1)
     ends = torch.minimum(rough.ends.gather(-1, owner), following)
@@ -238,9 +233,7 @@ def concentrated(
     by_length = _levels(even, laid, jitter) * laid[..., -1:]
     border = torch.cat([by_weight, by_length], dim=-1).sort(dim=-1).values
     middle, half = (border[..., 1:] + border[..., :-1]) / 2, border.diff(dim=-1) / 2
-    owner = torch.searchsorted(laid[..., 1:].contiguous(), middle.contiguous()).clamp(
-        max=length.shape[-1] - 1
-    )
+    owner = torch.searchsorted(laid[..., 1:].contiguous(), middle.contiguous()).clamp(max=length.shape[-1] - 1)
     at = samples.starts.gather(-1, owner) + (middle - laid.gather(-1, owner))
     starts, ends = at - half, at + half
     # Neither rounding nor an interval that spans a gap may make two intervals overlap.
@@ -297,7 +290,7 @@ class ScaledField(nn.Module):
 
     def jacobian(
         self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"], wanted: Bool[Tensor, "p"] | None = None
-    ) -> FieldDerivatives:  # fmt: skip
+    ) -> FieldDerivatives:
         found = derivatives_of(self.trained, positions / self.scale, directions, wanted)
         unit = positions.new_full((4, 1), 1.0)
         unit[0] /= self.scale
@@ -359,9 +352,7 @@ class NoField(nn.Module):
     """The field of a landmark-only map. Sampling or querying it raises ``InputError``, whose message states how to add one."""
 
     def sampler(self, *_: object) -> NoReturn:
-        raise InputError(
-            "the map has no radiance field, which this needs; 'bidnerf train DATA --out MAP' adds one"
-        )
+        raise InputError("the map has no radiance field, which this needs; 'bidnerf train DATA --out MAP' adds one")
 
     query = sampler
 

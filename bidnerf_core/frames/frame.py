@@ -137,9 +137,7 @@ class Frame:
         camera = self.intrinsics
         recorded = [name for name in ("depth", "alpha", "hidden") if self.__dict__[name] is not None]
         kinds = ", ".join(["colour"] * self.has_colour + recorded)
-        return (
-            f"<Frame {self.name}: {camera.width}x{camera.height}, {kinds}, focal length {camera.fx:.4g} px>"
-        )
+        return f"<Frame {self.name}: {camera.width}x{camera.height}, {kinds}, focal length {camera.fx:.4g} px>"
 
     @staticmethod
     def open(
@@ -397,9 +395,7 @@ def _check_image(where: str, what: str, image: object, camera: Intrinsics) -> No
         )
     found, wanted = tuple(image.shape), (camera.height, camera.width, *((3,) if what == "rgb" else ()))
     if len(found) != len(wanted) or found[2:] != wanted[2:]:
-        expected = (
-            "(height, width, 3); Frame.from_numpy takes grey and RGBA" if what == "rgb" else "(height, width)"
-        )
+        expected = "(height, width, 3); Frame.from_numpy takes grey and RGBA" if what == "rgb" else "(height, width)"
         raise InputError(f"{what} has shape {found}", where=where, expected=expected)
     if found != wanted:
         expects = f"{camera.width}x{camera.height}"
@@ -413,13 +409,9 @@ def _check_image(where: str, what: str, image: object, camera: Intrinsics) -> No
         dtype = str(image.dtype).removeprefix("torch.")
         raise InputError(f"{what} has dtype {dtype}", where=where, expected=kinds.get(what, "floats"))
     if image.requires_grad:
-        raise InputError(
-            f"{what} requires a gradient", where=where, expected="measured values; detach() them"
-        )
+        raise InputError(f"{what} requires a gradient", where=where, expected="measured values; detach() them")
     if what != "depth" and not _is_finite(image):
-        raise InputError(
-            f"{what} has values that are NaN or infinite", where=where, expected="finite numbers"
-        )
+        raise InputError(f"{what} has values that are NaN or infinite", where=where, expected="finite numbers")
 
 
 def _is_finite(image: Tensor) -> bool:

@@ -39,9 +39,7 @@ class WhollyHidden(InputError):
     """Raised if a mask hides its entire image, which leaves nothing to use."""
 
 
-def read_mask(
-    path: Path, raster: Raster, size: tuple[int, int], hides: HiddenColour = "black"
-) -> Bool[Tensor, "h w"]:
+def read_mask(path: Path, raster: Raster, size: tuple[int, int], hides: HiddenColour = "black") -> Bool[Tensor, "h w"]:
     """Return which pixels of an image of ``size`` (width, height) the mask in file ``path`` hides.
 
     ``raster`` is the raster of the image file; a mask that fits the stored image is turned upright with it. A mask of another
@@ -88,9 +86,7 @@ class MaskFolder:
     def __init__(self, path: str | Path, hides: HiddenColour = "black") -> None:
         self.path, self.hides = Path(path), hides
         if hides not in get_args(HiddenColour):
-            raise InputError(
-                f"mask_hides is {hides!r}", expected=f"one of {', '.join(get_args(HiddenColour))}"
-            )
+            raise InputError(f"mask_hides is {hides!r}", expected=f"one of {', '.join(get_args(HiddenColour))}")
         if not self.path.is_dir():
             what = "is a file" if self.path.exists() else "no such folder"
             raise InputError(what, where=self.path, expected="a folder of masks")

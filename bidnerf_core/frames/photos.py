@@ -25,9 +25,7 @@ DEPTH_STEM = ".depth"
 def pinhole_of(camera: Camera, depth: Path) -> Intrinsics:
     """Return ``camera`` if depth can be registered to it. Raises ``InputError`` for a lens whose images are resampled."""
     if not isinstance(camera, Intrinsics):
-        raise InputError(
-            f"depth cannot be registered to {camera.sentence}", where=depth, expected="undistorted images"
-        )
+        raise InputError(f"depth cannot be registered to {camera.sentence}", where=depth, expected="undistorted images")
     return camera
 
 

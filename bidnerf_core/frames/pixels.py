@@ -70,9 +70,7 @@ def observe(
     origins = T.translation.expand_as(directions)
     there = frame.rgb_bytes.device if device is None else device
     coloured = torch.full((len(length),), frame.has_colour, device=length.device)
-    return Observations(origins, directions, frame.colours_at(rows, columns), depth * length, coloured).to(
-        there, dtype
-    )
+    return Observations(origins, directions, frame.colours_at(rows, columns), depth * length, coloured).to(there, dtype)
 
 
 def draw(

@@ -30,9 +30,7 @@ LOSSES: dict[RobustName, Callable[[Tensor, float], Tensor]] = {
     "huber": lambda r, c: torch.where(r.abs() <= c, 0.5 * r.abs() ** 2, c * (r.abs() - 0.5 * c)),
     "l2": lambda r, c: 0.5 * r**2,
     "l1": lambda r, c: c * r.abs(),  # its derivative at 0 is taken as 0
-    "cauchy": lambda r, c: (
-        c**2 * torch.log1p(0.5 * (r / c) ** 2)
-    ),  # the influence of large residuals decreases
+    "cauchy": lambda r, c: c**2 * torch.log1p(0.5 * (r / c) ** 2),  # the influence of large residuals decreases
     # bounded by 2 c^2: large residuals have almost no influence
     "geman-mcclure": lambda r, c: 2 * c**2 * (r / c) ** 2 / ((r / c) ** 2 + 4),
 }

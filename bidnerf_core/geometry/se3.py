@@ -43,9 +43,7 @@ class SE3:
         Raises ``InputError`` unless ``matrix`` is a tensor of 4x4 matrices.
         """
         if not isinstance(matrix, Tensor):
-            raise InputError(
-                f"matrix is a {type(matrix).__name__}", expected="a tensor; torch.as_tensor makes one"
-            )
+            raise InputError(f"matrix is a {type(matrix).__name__}", expected="a tensor; torch.as_tensor makes one")
         if matrix.shape[-2:] != (4, 4):
             raise InputError(f"the matrix has shape {tuple(matrix.shape)}", expected="(..., 4, 4)")
         return SE3(matrix[..., :3, :3], matrix[..., :3, 3])
@@ -197,9 +195,7 @@ class SE3:
 
     @staticmethod
     def stack(transforms: list[SE3]) -> SE3:
-        return SE3(
-            torch.stack([t.rotation for t in transforms]), torch.stack([t.translation for t in transforms])
-        )
+        return SE3(torch.stack([t.rotation for t in transforms]), torch.stack([t.translation for t in transforms]))
 
     @staticmethod
     def cat(batches: list[SE3]) -> SE3:
@@ -247,9 +243,7 @@ def pose_from_matrix(matrix: Float[Tensor, "..."], what: str, where: object = No
     has the last row 0 0 0 1, and has an orthonormal rotation.
     """
     if matrix.shape != (4, 4):
-        raise InputError(
-            f"{what} has shape {tuple(matrix.shape)}", where=where, expected="a 4x4 matrix T_world_camera"
-        )
+        raise InputError(f"{what} has shape {tuple(matrix.shape)}", where=where, expected="a 4x4 matrix T_world_camera")
     last = matrix[3].tolist()
     if not _is_last_row(last):
         transposed = _is_last_row(matrix[:, 3].tolist())

@@ -80,9 +80,7 @@ def look_at(
     return SE3(torch.stack([right, torch.linalg.cross(forward, right), forward], dim=-1), position)
 
 
-def turned_about(
-    T_world_camera: SE3, middle: Float[Tensor, "3"], up: Float[Tensor, "3"], angle_deg: float
-) -> SE3:
+def turned_about(T_world_camera: SE3, middle: Float[Tensor, "3"], up: Float[Tensor, "3"], angle_deg: float) -> SE3:
     """Return the camera's pose after a rotation by ``angle_deg`` about the axis ``up`` through ``middle``
     (metres, world).
     """
@@ -142,9 +140,7 @@ def fit_similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -
     source, target = source.double(), target.double()
     largest = max((float(x.abs().max()) for x in (source, target) if x.numel()), default=0.0)
     if not largest <= FARTHEST_CAMERA:
-        raise InputError(
-            f"a point is {largest:g} away from the origin", expected=f"at most {FARTHEST_CAMERA:g}"
-        )
+        raise InputError(f"a point is {largest:g} away from the origin", expected=f"at most {FARTHEST_CAMERA:g}")
     if len(source) < 2 or spread(source) == 0 or spread(target) == 0:
         raise InputError(f"{len(source)} pairs of points", expected="2 or more distinct ones")
     from_mean, to_mean = source - source.mean(0), target - target.mean(0)
@@ -154,9 +150,7 @@ def fit_similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -
     rotation = (u * sign) @ vh  # eq. 40
     scale = float((values * sign).sum() / from_mean.square().sum(-1).mean())  # eq. 42
     if not scale > 0:
-        raise InputError(
-            f"{len(source)} pairs of points, but no similarity maps one set to the other even roughly"
-        )
+        raise InputError(f"{len(source)} pairs of points, but no similarity maps one set to the other even roughly")
     translation = target.mean(0) - scale * rotation @ source.mean(0)  # eq. 41
     return Similarity(scale, SE3(rotation, translation))
 

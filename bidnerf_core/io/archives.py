@@ -19,9 +19,7 @@ DAMAGES = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueE
 class Archive:
     """The members of a zip archive by name. Raises ``InputError`` if the file is not a complete zip archive."""
 
-    def __init__(
-        self, path: Path, expected: str = "a zip archive", largest_member: int = LARGEST_MEMBER
-    ) -> None:
+    def __init__(self, path: Path, expected: str = "a zip archive", largest_member: int = LARGEST_MEMBER) -> None:
         """Open the archive at ``path``. ``largest_member`` limits the unpacked size of a member (bytes)."""
         self.path, self._expected, self._largest = path, expected, largest_member
         with open_binary(path, expected) as file:
@@ -56,9 +54,7 @@ class Archive:
         """Return the content of a member. Raises ``InputError`` if it is missing, damaged, encrypted or too large."""
         where, member = f"{self.path}/{name}", self._members.get(name)
         if member is None:
-            raise InputError(
-                f"not found in the archive, which holds {amount(len(self._members), 'file')}", where=where
-            )
+            raise InputError(f"not found in the archive, which holds {amount(len(self._members), 'file')}", where=where)
         try:
             with self._zip.open(member) as file:
                 content = file.read(min(member.file_size, self._largest) + 1)

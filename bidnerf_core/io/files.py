@@ -64,9 +64,7 @@ def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
         raise InputError(f"cannot be opened ({reason})", where=path, expected=expected) from error
     if file is None:
         kinds = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFCHR: "a device"}
-        raise InputError(
-            f"is {kinds.get(stat.S_IFMT(mode), 'no regular file')}", where=path, expected=expected
-        )
+        raise InputError(f"is {kinds.get(stat.S_IFMT(mode), 'no regular file')}", where=path, expected=expected)
     if is_pointer:
         file.close()
         raise InputError("is a pointer of Git LFS, not the file", where=path, expected="git lfs pull")
@@ -142,9 +140,7 @@ def locked(path: Path) -> Iterator[None]:
 
     Raises ``FileInUse`` if another process holds the lock, or held it and removed the file or folder.
     """
-    used = FileInUse(
-        "another bidnerf process is writing here; name another place, or wait until it ends", where=path
-    )
+    used = FileInUse("another bidnerf process is writing here; name another place, or wait until it ends", where=path)
     try:
         number = os.open(path, os.O_RDONLY)
     except FileNotFoundError as error:
@@ -179,9 +175,7 @@ def available_memory() -> int:
 
     available: int = psutil.virtual_memory().available
     with contextlib.suppress(OSError, ValueError):  # no container, or one without a limit
-        limit, used = (
-            int(Path("/sys/fs/cgroup", name).read_text()) for name in ("memory.max", "memory.current")
-        )
+        limit, used = (int(Path("/sys/fs/cgroup", name).read_text()) for name in ("memory.max", "memory.current"))
         available = min(available, max(0, limit - used))
     return available
 

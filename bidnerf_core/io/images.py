@@ -152,9 +152,7 @@ def to_numpy(array: np.ndarray | Tensor) -> np.ndarray:
         try:
             return np.asarray(array)
         except (TypeError, ValueError, OverflowError) as error:
-            raise InputError(
-                f"got an object of type {type(array).__name__}", expected="an array of numbers"
-            ) from error
+            raise InputError(f"got an object of type {type(array).__name__}", expected="an array of numbers") from error
     values = array.detach().cpu()
     return (values.float() if values.dtype == torch.bfloat16 else values).numpy()
 

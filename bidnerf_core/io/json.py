@@ -29,15 +29,28 @@ _T = TypeVar("_T")
 LARGEST_NUMBER = sys.float_info.max  # JSON can hold NaN, 1e999 and integers too large for a float
 LARGEST_INTEGER = 2**63 - 1  # the largest integer that tensors and files can hold
 EXPECTED = {
-    "bool_type": "bool", "int_type": "int", "float_type": "float", "finite_number": "float", "string_type": "str",
-    "dict_type": "an object", "dataclass_type": "an object", "list_type": "a list", "tuple_type": "a list", "missing": "a longer list",
-    "greater_than_equal": "an integer of at most 64 bits", "less_than_equal": "an integer of at most 64 bits",
-}  # fmt: skip
+    "bool_type": "bool",
+    "int_type": "int",
+    "float_type": "float",
+    "finite_number": "float",
+    "string_type": "str",
+    "dict_type": "an object",
+    "dataclass_type": "an object",
+    "list_type": "a list",
+    "tuple_type": "a list",
+    "missing": "a longer list",
+    "greater_than_equal": "an integer of at most 64 bits",
+    "less_than_equal": "an integer of at most 64 bits",
+}
 """What messages state as expected, by pydantic's error type; other types use pydantic's own text."""
 STRICT: dict[str, dict[str, Any]] = {
-    "bool": {"strict": True}, "str": {"strict": True}, "float": {"strict": True, "allow_inf_nan": False}, "list": {"fail_fast": True},
-    "int": {"strict": True, "ge": -LARGEST_INTEGER, "le": LARGEST_INTEGER}, "tuple": {"fail_fast": True},
-}  # fmt: skip
+    "bool": {"strict": True},
+    "str": {"strict": True},
+    "float": {"strict": True, "allow_inf_nan": False},
+    "list": {"fail_fast": True},
+    "int": {"strict": True, "ge": -LARGEST_INTEGER, "le": LARGEST_INTEGER},
+    "tuple": {"fail_fast": True},
+}
 """Settings added to the parts of pydantic's schemas, by type: text is not accepted as a number, but a list is as a tuple."""
 
 

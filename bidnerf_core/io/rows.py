@@ -81,10 +81,7 @@ def parse_rows(content: bytes, path: Path, expected: str, columns: str) -> list[
         lines = content.decode("utf-8-sig").split("\n")
     except UnicodeDecodeError as error:
         raise InputError(f"is not text ({error.reason})", where=path, expected=expected) from error
-    rows = (
-        Row(path, number, line.partition("#")[0].strip(), columns)
-        for number, line in enumerate(lines, start=1)
-    )
+    rows = (Row(path, number, line.partition("#")[0].strip(), columns) for number, line in enumerate(lines, start=1))
     return [row for row in rows if row.text]
 
 

@@ -81,9 +81,7 @@ def read_tensors(path: Path, expected: str = TENSOR_FILE) -> dict[str, Tensor]:
     return read_tensors_and_metadata(path, expected)[0]
 
 
-def read_tensors_and_metadata(
-    path: Path, expected: str = TENSOR_FILE
-) -> tuple[dict[str, Tensor], dict[str, str]]:
+def read_tensors_and_metadata(path: Path, expected: str = TENSOR_FILE) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read the tensors of a safetensors file, and the metadata in its header.
 
     Raises ``InputError`` if the file is not a safetensors file, or if its length contradicts its header.
@@ -132,18 +130,14 @@ def check_tensors(tensors: Mapping[str, Tensor], kinds: Mapping[str, TensorKind]
             raise ValueError(f"{name} holds NaN or infinity")
         least, most = (0, sizes[kind.index_of] - 1) if kind.index_of else (kind.least, kind.most)
         if value.numel() and not least <= float(value.min()) <= float(value.max()) <= most:
-            found = " to ".join(
-                f"{end:g}" for end in torch.stack([value.min(), value.max()]).unique().tolist()
-            )
+            found = " to ".join(f"{end:g}" for end in torch.stack([value.min(), value.max()]).unique().tolist())
             limits = "a positive number" if least == sys.float_info.min else f"{least:g} to {most:g}"
             raise ValueError(f"{name} is {found}, expected {limits}")
         if kind.is_unit and bool(((torch.linalg.vector_norm(value, dim=-1) - 1).abs() > 1e-3).any()):
             raise ValueError(f"{name} are not of unit length")
 
 
-def load_part(
-    path: Path, make: Callable[[dict[str, Tensor]], _Part], what: str, expected: str = TENSOR_FILE
-) -> _Part:
+def load_part(path: Path, make: Callable[[dict[str, Tensor]], _Part], what: str, expected: str = TENSOR_FILE) -> _Part:
     """Return the result of ``make`` for the tensors of a file. Raises ``InputError`` if ``make`` rejects the tensors."""
     tensors = read_tensors(path, expected)
     try:
@@ -176,24 +170,18 @@ def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
     cannot be mapped and are read. Raises a one-line ``InputError`` if the file is missing or damaged, would run code, or unpacks to
     more than its own size. Unless ``mapped``, a tensor whose storage is smaller than its shape (stride 0) is rejected as well.
     """
-    open_binary(
-        path, expected
-    ).close()  # errors here concern opening the file; all later ones concern its content
+    open_binary(path, expected).close()  # errors here concern opening the file; all later ones concern its content
     size = path.stat().st_size
     archive = Archive(path, expected) if zipfile.is_zipfile(path) else None
     if archive is not None and archive.unpacked_size > size:
         found = f"unpacks to {archive.unpacked_size / 2**20:,.0f} MiB"
-        raise InputError(
-            found, where=path, expected=f"{expected} that is not compressed, as torch.save writes it"
-        )
+        raise InputError(found, where=path, expected=f"{expected} that is not compressed, as torch.save writes it")
     try:
         arrays = [f"numpy.{core}.multiarray.scalar" for core in ("_core", "core")]
         kinds = [f"numpy.dtypes.Float{bits}DType" for bits in (64, 32)]
         names = [*arrays, *kinds, "numpy.dtype", "_codecs.encode"]
         with torch.serialization.safe_globals([(_Ignored, name) for name in names]):
-            content = torch.load(
-                path, map_location="cpu", weights_only=True, mmap=mapped and archive is not None
-            )
+            content = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped and archive is not None)
     except Exception as error:  # each kind of damage raises a different exception
         code = re.search(r"GLOBAL ([\w.]+)", str(error))  # how torch names what a file tried to call
         if isinstance(error, pickle.UnpicklingError) and code:

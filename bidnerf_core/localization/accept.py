@@ -80,10 +80,16 @@ LANDMARK_BOUNDS = (
     Bound("above_chance", 3.0, True, Outcome.AMBIGUOUS, "only {0:.1f} times as many landmarks match as by chance"),
     Bound("spread", 0.06, True, Outcome.UNDETERMINED, "the landmarks are all in {0:.0%} of the image"),
     Bound("other_place", 0.02, False, Outcome.AMBIGUOUS, "another place fits with a probability of {0:.0%}"),
-    Bound("credible", 0.5, True, Outcome.MISCALIBRATED, "the image contradicts the intrinsics: they are right with {0:.0%}"),
+    Bound(
+        "credible",
+        0.5,
+        True,
+        Outcome.MISCALIBRATED,
+        "the image contradicts the intrinsics: they are right with {0:.0%}",
+    ),
     Bound("precision", 0.03, False, Outcome.IMPRECISE, "the position is uncertain by {0:.1%} of the distance"),
     Bound("mass", 0.8, True, Outcome.UNCERTAIN, "the pose is within the tolerance with a probability of {0:.0%}"),
-)  # fmt: skip
+)
 """Bounds on the evidence for a landmark-based pose, most serious first. The first bound does not apply to a pose found by other means."""
 
 
@@ -158,9 +164,7 @@ def least_confidence(risk: float) -> float:
     levels: list[tuple[float, float]] = stored()["risk"]["least_confidence"]  # type: ignore[assignment]
     calibrated = Range(levels[0][0], levels[-1][0])
     if risk not in calibrated:
-        raise InputError(
-            f"risk is {risk!r}", expected=f"{calibrated}, for which the confidence was calibrated"
-        )
+        raise InputError(f"risk is {risk!r}", expected=f"{calibrated}, for which the confidence was calibrated")
     return min(confidence for level, confidence in levels if level <= risk)
 
 
@@ -172,28 +176,70 @@ It is about three times the largest standard deviation of position, relative to 
 SUPPORT_BOUNDS = (
     Bound("mean_loss", 0.02, False, Outcome.HIGH_LOSS, "mean loss {0:.3g}, must be below {1:.3g}"),
     Bound("on_surface", 0.85, True, Outcome.OFF_SURFACE, "only {0:.0%} of the measured points lie on the surface"),
-    Bound("colour_inliers", 0.42, True, Outcome.COLOUR_MISMATCH, "only {0:.0%} of the measured points have the surface's colour"),
-    Bound("free_space_violations", 0.15, False, Outcome.FREE_SPACE_VIOLATED, "{0:.0%} of the lines of sight pass through the surface"),
+    Bound(
+        "colour_inliers",
+        0.42,
+        True,
+        Outcome.COLOUR_MISMATCH,
+        "only {0:.0%} of the measured points have the surface's colour",
+    ),
+    Bound(
+        "free_space_violations",
+        0.15,
+        False,
+        Outcome.FREE_SPACE_VIOLATED,
+        "{0:.0%} of the lines of sight pass through the surface",
+    ),
     Bound("runner_up_margin", 0.15, True, Outcome.AMBIGUOUS, "another pose fits about as well"),
-    Bound("rendered_inliers", 0.8, True, Outcome.RENDERING_MISMATCH, "only {0:.0%} of the rendered rays agree with the measurements"),
+    Bound(
+        "rendered_inliers",
+        0.8,
+        True,
+        Outcome.RENDERING_MISMATCH,
+        "only {0:.0%} of the rendered rays agree with the measurements",
+    ),
     # Of the answers on record, 16 of the 17 right ones and 2 of the 15 wrong ones (most with wrong intrinsics) were more precise.
     Bound("precision", 0.015, False, Outcome.IMPRECISE, "the position is uncertain by {0:.1%} of the distance"),
     Bound("determined", 1.0, True, Outcome.UNDETERMINED, "the measurements do not determine the pose"),
-    Bound("new_inliers", 0.93, True, Outcome.RENDERING_MISMATCH, "{0:.0%} of newly drawn rays agree with the measurements, expected {1:.0%}"),
+    Bound(
+        "new_inliers",
+        0.93,
+        True,
+        Outcome.RENDERING_MISMATCH,
+        "{0:.0%} of newly drawn rays agree with the measurements, expected {1:.0%}",
+    ),
     Bound("confidence", 0.8, True, Outcome.UNDETERMINED, "{2} fits about as well"),
-    Bound("explained", 0.5, True, Outcome.RENDERING_MISMATCH, "the pose explains only {0:.0%} of the contrast of the image"),
+    Bound(
+        "explained",
+        0.5,
+        True,
+        Outcome.RENDERING_MISMATCH,
+        "the pose explains only {0:.0%} of the contrast of the image",
+    ),
     # At right poses in front of a weakly textured wall, seen from twelve places, the noise of the rays causes steps of up to 0.018.
-    Bound("further_step", 0.02, False, Outcome.NOT_SETTLED, "newly drawn rays give a further step of {0:.3g}, expected {1:g} at most"),
+    Bound(
+        "further_step",
+        0.02,
+        False,
+        Outcome.NOT_SETTLED,
+        "newly drawn rays give a further step of {0:.3g}, expected {1:g} at most",
+    ),
     # A wrong pose can be a local optimum whose nearby rivals are no better, but its colours differ more. On test images of
     # Lego and the room, the ratio was 0.8 to 1.4 at right poses, and 2.1 and more at wrong ones.
-    Bound("colour_ratio", 1.8, False, Outcome.RENDERING_MISMATCH, "the colours differ {0:.1f} times as much as in the map's own images"),
-)  # fmt: skip
+    Bound(
+        "colour_ratio",
+        1.8,
+        False,
+        Outcome.RENDERING_MISMATCH,
+        "the colours differ {0:.1f} times as much as in the map's own images",
+    ),
+)
 """The bounds of a pose without landmarks, the most serious reason first."""
 RIVALS = {
     "plain": (Outcome.UNDETERMINED, "a single-colour image"),
     "displaced": (Outcome.UNDETERMINED, f"a pose displaced by {DISPLACEMENT:.0%} of the distance to the scene"),
     "other": (Outcome.AMBIGUOUS, "another pose"),
-}  # fmt: skip
+}
 """The outcome and the description of each rival of a pose without landmarks, by the name of the log odds against it: a single-colour image,
 the best of the displaced poses, and the best different pose of a search."""
 Costs = Callable[[SE3], Float[Tensor, "h n"]]
@@ -276,9 +322,7 @@ def log_odds(rivals: Float[Tensor, "h n"], here: Float[Tensor, "n"]) -> Float[Te
     return torch.where(odds.isfinite(), odds, 0)
 
 
-def same_pose(
-    T: SE3, others: SE3, middle: Float[Tensor, "3"], within: float = DISPLACEMENT
-) -> Bool[Tensor, "h"]:
+def same_pose(T: SE3, others: SE3, middle: Float[Tensor, "3"], within: float = DISPLACEMENT) -> Bool[Tensor, "h"]:
     """Return a mask of the ``others`` (h) that differ from ``T`` by at most ``within``.
 
     ``within`` limits both the displacement of the ``middle`` of the visible scene (metres, last camera's frame), as a fraction of the

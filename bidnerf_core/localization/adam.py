@@ -90,9 +90,13 @@ class AdamSteps:
 
 
 def follow_gradient(
-    loss: Loss, pivot: Pivot, config: AdamSettings, start: SE3, device: torch.device,
+    loss: Loss,
+    pivot: Pivot,
+    config: AdamSettings,
+    start: SE3,
+    device: torch.device,
     generator: Generator | None = None,
-) -> tuple[list[SE3], list[float], bool, str]:  # fmt: skip
+) -> tuple[list[SE3], list[float], bool, str]:
     """Descend from ``start``; return all poses, the loss before each step, whether all steps were finite, and why the descent ended.
 
     Steps are taken on ``device``, ``WINDOW`` at a time; the host reads the results after each block. If a stopping criterion was met

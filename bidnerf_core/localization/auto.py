@@ -61,7 +61,7 @@ def localize_by_landmarks(problem: Problem, rays: int, seed: int) -> Localizatio
 
 def _on_surface(
     problem: Problem, config: AutoConfig, seed: int, loop: Loop | None, best: Localization | None, began: float
-) -> Localization:  # fmt: skip
+) -> Localization:
     """Localize on the surface by measured depth or images; failing that, return ``best``, the landmark-based answer so far."""
     surface = problem.surface
     if loop is None and surface is None:
@@ -133,8 +133,15 @@ def localization_of(problem: Problem, answer: LandmarkAnswer, began: float) -> L
     path = [T, T] if problem.start is None else [problem.start, T, T]
     losses = torch.full((len(path) - 1,), noise, dtype=torch.float64)
     found = Localization.of(
-        replace(answer.verdict, reason=reason), SE3.stack(path), losses, "auto", began, noise, answer.covariance, answer.evidence
-    )  # fmt: skip
+        replace(answer.verdict, reason=reason),
+        SE3.stack(path),
+        losses,
+        "auto",
+        began,
+        noise,
+        answer.covariance,
+        answer.evidence,
+    )
     factor = 1.0 if camera is None else float(camera[0].exp())
     return replace(found, intrinsics=corrected, focal_factor=factor)
 
@@ -164,8 +171,6 @@ AUTO = Method(
     AutoConfig,
     needs_start=False,
     uses_landmarks=True,
-    shared=lambda config: SharedSettings(
-        config.landmarks, config.depth_sensor, config.fused_rays, config.risk
-    ),
+    shared=lambda config: SharedSettings(config.landmarks, config.depth_sensor, config.fused_rays, config.risk),
     summary="landmarks, then search on the baked surface by depth or colour; no start needed",
 )

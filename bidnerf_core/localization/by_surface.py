@@ -60,9 +60,7 @@ DETAILED_STAGES = ((32, 0, 64), (32, 6, 16), (48, 8, 6), (96, 6, 2), (192, 4, 1)
 
 
 @torch.no_grad()
-def localize_by_depth(
-    problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int
-) -> Localization | None:
+def localize_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization | None:
     """Align measured points with the surface, in rounds until a pose is acceptable, then refine this pose with rendered rays as well.
 
     Returns None if too few points were measured.
@@ -150,16 +148,14 @@ def by_depth(problem: Problem, points: Surface, count: int, seed: int) -> Search
         noise = distance * surface.extent / 2 or surface.cell
         # Poses are compared on at least 200 points, even if fewer suffice for the steps.
         score = _score(points.first(max(n, 200))) if steps else None
-        stages.append(
-            Stage([replace(points.first(n), noise=noise, colour_weight=colour)], steps, keep, score)
-        )
+        stages.append(Stage([replace(points.first(n), noise=noise, colour_weight=colour)], steps, keep, score))
     start = hypotheses(surface, problem.start, middle, count, True, seed)
     return halve(states_at(start), stages, middle, surface.device)
 
 
 def by_images(
     problem: Problem, surface: SurfaceMap, count: int, seed: int, detailed: bool = False, later: Iterable[Stage] = ()
-) -> tuple[SearchResult, Float[Tensor, "3"]]:  # fmt: skip
+) -> tuple[SearchResult, Float[Tensor, "3"]]:
     """Compare the images with renderings of the surface from ``count`` hypotheses throughout the scene, then run ``later`` stages.
 
     Returns the result, best pose first, and the middle of the visible scene (metres, last camera's frame). Rays cast from keyframes give

@@ -108,11 +108,7 @@ class Explanations:
         If the focal length or the principal point changes, the camera is moved along its axis and turned to keep about the same view.
         """
         # These three are not tried by themselves at first, since they are similar to others.
-        kinds = [
-            i
-            for i, name in enumerate(self.names)
-            if name.removesuffix(MOVING) not in ("exact", "inexact", "map")
-        ]
+        kinds = [i for i, name in enumerate(self.names) if name.removesuffix(MOVING) not in ("exact", "inexact", "map")]
         kinds = kinds or list(range(len(self)))
         still = [i for i in kinds if not self.names[i].endswith(MOVING)]
         row = torch.tensor(still + [i for i in kinds if i not in still][:1])
@@ -126,9 +122,7 @@ class Explanations:
         along = proposal.distance * (1 - change[:, 0].exp())
         update = torch.stack([none, none, along, -change[:, 2], change[:, 1], none], -1)
         T = SE3(proposal.T.rotation.expand(k, 3, 3), proposal.T.translation.expand(k, 3)).retract(update)
-        return States(
-            T, z, mean, deviation, self.log_prior[row], none + noise, torch.full_like(row, mode), row
-        )
+        return States(T, z, mean, deviation, self.log_prior[row], none + noise, torch.full_like(row, mode), row)
 
     def about(self, free: States) -> States:
         """Return one state for each explanation of each mode, with the poses of ``free`` (g) and the nuisances at their prior means."""
@@ -164,9 +158,7 @@ def explanations(
                 similar = bool((c.abs() <= torch.tensor((0.16, 0.06, 0.06, 0.2, 0.02, 0.01))).all())
                 # The prior odds that the image is from the map's camera depend on how much the stated one differs from it.
                 odds = 0.5 if similar else 0.05
-                rows += [
-                    (name, c.tolist(), deviation, share * odds, True) for name, *deviation, share in OF_MAP
-                ]
+                rows += [(name, c.tolist(), deviation, share * odds, True) for name, *deviation, share in OF_MAP]
     else:
         rows.append(("exact", [0.0] * 6, [0.0] * 6, 1.0, True))
     single = moving and len(query.images) == 1  # views of a rig may be from different times
@@ -180,9 +172,7 @@ def explanations(
         for name, c, deviation, share, credible in rows
     ]
     names, means, deviations, shares, right = zip(*every, strict=True)
-    mean, deviation, prior = (
-        torch.tensor(values, dtype=torch.float64) for values in (means, deviations, shares)
-    )
+    mean, deviation, prior = (torch.tensor(values, dtype=torch.float64) for values in (means, deviations, shares))
     # Landmarks of this map suggest corrections even of right intrinsics; see ``calibration_scatter``.
     if query.has_one_camera:
         deviation[:, :4] = torch.hypot(deviation[:, :4], landmarks.calibration_scatter.double())
@@ -245,9 +235,7 @@ def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "6"
     # stated = factors real + shift + factors radial bend
     ratio = real.new_tensor([given.fy * true.fx / (given.fx * true.fy), 1.0])
     bend = bend * (ratio / ratio.prod().sqrt())
-    rows = torch.stack(
-        [*(real * step for step in steps), *(step.expand_as(real) for step in steps), bend], dim=-1
-    )
+    rows = torch.stack([*(real * step for step in steps), *(step.expand_as(real) for step in steps), bend], dim=-1)
     rows, target = torch.linalg.solve(slope, rows), torch.linalg.solve(slope, stated[..., None])
     # The default driver pivots, and its last bits differ from call to call.
     solved = torch.linalg.lstsq(rows.reshape(-1, 5), target.reshape(-1, 1), driver="gels").solution

@@ -205,9 +205,7 @@ class Localizer:
         with threads_at_most(1 if problem.device.type == "cpu" else 4):
             found = self._method.solve(problem, self.config, _checked_seed(seed))
         if not isinstance(found, Localization):
-            raise InputError(
-                f"method {self.method!r} returned a {type(found).__name__}", expected="a Localization"
-            )
+            raise InputError(f"method {self.method!r} returned a {type(found).__name__}", expected="a Localization")
         found = replace(found, unit=unit_of(self.scene))
         if self.scene.has_distances:
             return found
@@ -268,9 +266,7 @@ def _views(query: Any) -> list[View]:
     if all(isinstance(view, View) for view in views):
         return views
     if any(isinstance(view, Frame) for view in views):
-        raise InputError(
-            f"{len(views)} frames without relative poses", expected="views: View(frame, T_ref_camera)"
-        )
+        raise InputError(f"{len(views)} frames without relative poses", expected="views: View(frame, T_ref_camera)")
     raise InputError(
         f"query is a {type(query).__name__}",
         expected="the file of a photo, a Frame (Frame.from_numpy takes an array), a View, or a list of views",
@@ -341,9 +337,7 @@ def picture_at(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Floa
         return render_picture(scene.field, camera, T_world_camera, scene.bounds).rgb.cpu()
     image = torch.ones((camera.height, camera.width, 3))
     if scene.landmarks is not None:
-        local = (
-            T_world_camera.to("cpu", torch.float64).inverse().apply(scene.landmarks.positions.cpu().double())
-        )
+        local = T_world_camera.to("cpu", torch.float64).inverse().apply(scene.landmarks.positions.cpu().double())
         rows, columns, inside = camera.cells(local)
         # Green dots stand for the rendering in a map without a field.
         image[rows[inside], columns[inside]] = torch.tensor((0.0, 0.75, 0.43))

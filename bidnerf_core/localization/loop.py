@@ -124,9 +124,15 @@ class Loop:
     """Localizes the images of one problem in a map from landmarks, measured depth and rendered colours."""
 
     def __init__(
-        self, views: Sequence[View], matcher: LandmarkMatcher, problem: Problem | None = None, rays: int = 0, seed: int = 0,
-        features: Features | None = None, moving: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        views: Sequence[View],
+        matcher: LandmarkMatcher,
+        problem: Problem | None = None,
+        rays: int = 0,
+        seed: int = 0,
+        features: Features | None = None,
+        moving: bool = True,
+    ) -> None:
         """Detect keypoints of ``views``, whose poses are relative to the last view.
 
         Without a ``problem``, only landmarks are used. ``rays`` is the maximum number of rays to render if the map has a field,
@@ -163,9 +169,7 @@ class Loop:
         proposal = Proposal("elsewhere", T_world_rig, torch.zeros(6, dtype=torch.float64), distance)
         return self.answer(proposal, self.nearest(STRONGEST), 0.0, searched=False)
 
-    def answer(
-        self, proposal: Proposal, nearest: Nearest, nfa: float, searched: bool = True
-    ) -> LandmarkAnswer | None:
+    def answer(self, proposal: Proposal, nearest: Nearest, nfa: float, searched: bool = True) -> LandmarkAnswer | None:
         """Refine a proposal under all explanations, fuse all measurements, and judge the pose; None if too few matches agree."""
         scale = 0.0 if self.problem is None else DEPTH_WIDTH * self.problem.sensor.scale
         given = explanations(self.query, self.landmarks, proposal.distance, scale, self.moving)
@@ -222,15 +226,13 @@ class Loop:
             variance = point_variance(self.landmarks, found.landmark, here, focal)
             of_sights = sights.image, sights.times, sights.rotation, sights.translation
             parts.append((points, *of_sights, (index < count).double(), variance, focal))
-        points, image, times, R, t, valid, variance, focal = (
-            torch.stack(x) for x in zip(*parts, strict=True)
-        )
+        points, image, times, R, t, valid, variance, focal = (torch.stack(x) for x in zip(*parts, strict=True))
         counts = [self.landmarks.correlation_of(len(mode.matches)) for mode in modes]
         correlation, query = torch.tensor(counts, dtype=torch.float64), modes[0].query
         sights = Sights(image, times, R, t, query.sights.single)
         return Landmarks(
             points, sights, valid, variance, focal, correlation, 1 / correlation, query.area, query.threshold / 2
-        )  # fmt: skip
+        )
 
     def _modes(
         self, nearest: Nearest, proposal: Proposal, given: Explanations, nfa: float, searched: bool
@@ -384,9 +386,7 @@ class Loop:
         by_chance = searched and self._log10_nfa(modes[0], found.chosen) > LANDMARK_BOUNDS[0].limit
         if problem is not None and self.rays and found.mode == 0 and blurred and not by_chance:
             where = "cpu" if problem.device == self.device else None
-            rays = RenderedRays.of(
-                problem.views, problem.field, problem.bounds, self.rays, self.seed, device=where
-            )
+            rays = RenderedRays.of(problem.views, problem.field, problem.bounds, self.rays, self.seed, device=where)
             fused.append("rendering")
             best = States.cat([found.chosen, best[1:]])
             minima, by_rays = run_on(self.device, fit_with_rays, best, terms, rays, given)
@@ -426,9 +426,15 @@ class Loop:
         return Posterior.of(states, normal, quadratic, landmarks, scatter, systematic, log_odds, self.device)
 
     def _judged(
-        self, found: Posterior, mass: float, modes: list[Mode], term: Landmarks, given: Explanations, searched: bool,
+        self,
+        found: Posterior,
+        mass: float,
+        modes: list[Mode],
+        term: Landmarks,
+        given: Explanations,
+        searched: bool,
         others: dict[str, float | None],
-    ) -> LandmarkAnswer:  # fmt: skip
+    ) -> LandmarkAnswer:
         """Judge the most probable pose; ``others`` is the evidence from measurements other than landmarks."""
         mode, state = modes[found.mode], found.chosen
         query = mode.query
@@ -444,23 +450,24 @@ class Loop:
         row = found.states.row
         evidence = Evidence(
             log10_nfa=self._log10_nfa(mode, state) if searched else 0.0,
-            inliers=count, by_chance=chance, recall=count / max(1, min(seen.visible, len(query.view))),
+            inliers=count,
+            by_chance=chance,
+            recall=count / max(1, min(seen.visible, len(query.view))),
             spread=len(occupied.unique()) / CELLS**2 / len(query.images),
             noise_ratio=float(state.noise) / self.landmarks.noise,
             other_place=float(found.probability[found.states.mode != found.mode].sum()),
             credible=float(found.probability[given.credible[row]].sum()),
             replaced=float(found.probability[~given.usual[row]].sum()),
-            precision=min(position / distance, 1.0), mass=mass, searched=searched, **others,
-        )  # fmt: skip
+            precision=min(position / distance, 1.0),
+            mass=mass,
+            searched=searched,
+            **others,
+        )
         verdict = judge(evidence)
         if mode.name == MIRROR and verdict.outcome is not Outcome.TOO_FEW_MATCHES:
-            verdict = Verdict(
-                Outcome.MIRRORED, f"the mirror image has {count} landmark inliers", verdict.confidence
-            )
+            verdict = Verdict(Outcome.MIRRORED, f"the mirror image has {count} landmark inliers", verdict.confidence)
         # Many landmarks are visible, and hardly more match than by chance.
         contradicted = seen.visible >= 200 and count < 1.5 * chance + LEAST_AGREEING
         if (record := current_record()) is not None:
             record.add(f"refined on {count} landmarks", found.pose())
-        return LandmarkAnswer(
-            modes, found, given, term, covariance, distance, evidence, verdict, contradicted
-        )
+        return LandmarkAnswer(modes, found, given, term, covariance, distance, evidence, verdict, contradicted)

@@ -183,9 +183,7 @@ class LandmarkMatcher:
 
         Raises ``PluginError`` (an ``InputError``) if its plugin is not installed.
         """
-        return self._cached_features or find_features(
-            self.landmarks.features, "the detector of the map's landmarks"
-        )
+        return self._cached_features or find_features(self.landmarks.features, "the detector of the map's landmarks")
 
     def for_query(self) -> LandmarkMatcher:
         """Return a matcher for one query, whose ``features`` cache the keypoints of each image; everything else is shared."""
@@ -193,9 +191,7 @@ class LandmarkMatcher:
         found._cached_features = FoundOnce(lambda rgb: detected(self.features, rgb))
         return found
 
-    def nearest(
-        self, descriptors: UInt8[Tensor, "q d"], count: int
-    ) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
+    def nearest(self, descriptors: UInt8[Tensor, "q d"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
         """Return the squared distances and the indices of the ``count`` nearest landmarks, nearest first.
 
         With fewer landmarks, missing distances are infinite and missing indices 0. Both results are on the CPU. Raises ``InputError`` if
@@ -228,9 +224,7 @@ class _Products:
     def _unit(self, descriptors: UInt8[Tensor, "q d"]) -> Float[Tensor, "q d"]:
         return (descriptors.half() - self._zero) / NORM
 
-    def nearest(
-        self, descriptors: UInt8[Tensor, "q d"], count: int
-    ) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
+    def nearest(self, descriptors: UInt8[Tensor, "q d"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
         """Return the exact squared distances and the indices of the nearest landmarks, on the CPU."""
         found, n = [], len(self._half)
         # At most 2^26 products are computed at a time, which bounds the memory.
@@ -257,14 +251,10 @@ class _Cells:
         order = cell.argsort(stable=True)
         self._order = order
         self._descriptors = descriptors[order]
-        self._squares = torch.cat(
-            [part.float().square().sum(-1) for part in self._descriptors.split(BLOCK // 256)]
-        )
+        self._squares = torch.cat([part.float().square().sum(-1) for part in self._descriptors.split(BLOCK // 256)])
         self._last = torch.bincount(cell, minlength=count).cumsum(0).tolist()
 
-    def nearest(
-        self, descriptors: UInt8[Tensor, "q d"], count: int
-    ) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
+    def nearest(self, descriptors: UInt8[Tensor, "q d"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
         queries = len(descriptors)
         # Twelve cells are searched for each keypoint.
         probed = _smallest(squared_distances(descriptors, self._centres), 12)[1]
@@ -287,9 +277,7 @@ class _Cells:
             index[order[begin:end], :width] = found[1] + first
         best = distances.view(queries, -1).topk(count, dim=1, largest=False)
         squares = values.square().sum(-1, keepdim=True)
-        return (best.values + squares).clamp_(min=0), self._order[
-            index.view(queries, -1).gather(1, best.indices)
-        ]
+        return (best.values + squares).clamp_(min=0), self._order[index.view(queries, -1).gather(1, best.indices)]
 
 
 def _smallest(distances: Float[Tensor, "q n"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
@@ -319,9 +307,7 @@ class Nearest:
     keypoint: Int[Tensor, "k"]
     distance: Float[Tensor, "k n"]  # squared, ascending
     landmark: Int[Tensor, "k n"]
-    ambiguity: Float[
-        Tensor, "k"
-    ]  # ratio of the distances of the best landmark and the best one at another place
+    ambiguity: Float[Tensor, "k"]  # ratio of the distances of the best landmark and the best one at another place
 
     @staticmethod
     def of(query: QueryKeypoints, matcher: LandmarkMatcher, strongest: int) -> Nearest:
@@ -335,9 +321,7 @@ class Nearest:
         same = away <= 2 * torch.maximum(size, size[:, :1]) + 3 * landmarks.deviations[index].amax(-1)
         other = torch.where(same, torch.inf, distance).amin(1)
         other = torch.where(other.isfinite(), other, distance[:, -1])
-        return Nearest(
-            keypoint, distance, index, (distance[:, 0] / other.clamp(min=1)).sqrt().nan_to_num(1.0)
-        )
+        return Nearest(keypoint, distance, index, (distance[:, 0] / other.clamp(min=1)).sqrt().nan_to_num(1.0))
 
     @property
     def best(self) -> Matches:
@@ -350,9 +334,7 @@ class Nearest:
     def others(self, near: Bool[Tensor, "k n"]) -> Matches:
         """Return matches with landmarks about as similar as the nearest one, except those that a pose projects close by (``near``)."""
         ratio = self.distance / self.distance[:, :1].clamp(min=1)
-        row, column = (
-            ((ratio <= AMBIGUITY**-2) & ~near & self.distance.isfinite()).nonzero().unbind(-1)
-        )  # host
+        row, column = ((ratio <= AMBIGUITY**-2) & ~near & self.distance.isfinite()).nonzero().unbind(-1)  # host
         order = (self.distance[row, column]).argsort(stable=True)
         return Matches(self.keypoint[row[order]], self.landmark[row, column][order])
 
@@ -419,9 +401,7 @@ class Projected:
             alike = (expected[candidate] / query.keypoints.sizes[own[row]]).log2().abs() <= OCTAVES
             pairs.append(torch.stack([own[row], index[candidate]])[:, alike])
         keypoint, landmark = torch.cat([torch.zeros((2, 0), dtype=torch.long), *pairs], 1)
-        distance = paired_squared_distances(
-            query.keypoints.descriptors, landmarks.descriptors, keypoint, landmark
-        )
+        distance = paired_squared_distances(query.keypoints.descriptors, landmarks.descriptors, keypoint, landmark)
         # Descriptors of a match are at most 0.6 times as far from each other as unrelated ones.
         most = (0.6 * landmarks.unrelated_distance) ** 2
         q = len(query.view)
@@ -433,9 +413,7 @@ class Projected:
         keypoint, landmark, distance = keypoint[good], landmark[good], distance[good]
         # Each view observes a landmark at most once.
         key = query.view[keypoint] * len(landmarks) + landmark
-        least = torch.full((len(query.images) * len(landmarks),), torch.inf).scatter_reduce_(
-            0, key, distance, "amin"
-        )
+        least = torch.full((len(query.images) * len(landmarks),), torch.inf).scatter_reduce_(0, key, distance, "amin")
         once = distance == least[key]
         return Matches(keypoint[once], landmark[once])
 
@@ -452,7 +430,5 @@ def log10_nfa(matches: int, agreeing: int, probability: float) -> float:
     def log_binomial(n: int, k: int) -> float:
         return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
 
-    log = (
-        math.log(max(1, matches - SAMPLE)) + log_binomial(matches, agreeing) + log_binomial(agreeing, SAMPLE)
-    )
+    log = math.log(max(1, matches - SAMPLE)) + log_binomial(matches, agreeing) + log_binomial(agreeing, SAMPLE)
     return (log + (agreeing - SAMPLE) * math.log(probability)) / math.log(10)

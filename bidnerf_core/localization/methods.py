@@ -191,8 +191,13 @@ def inerf(problem: Problem, config: InerfConfig, seed: int = 0) -> Localization:
 
 
 def descended(
-    problem: Problem, config: BidConfig | InerfConfig, depth: DepthSettings | None, reach: ReachSettings, seed: int, method: str
-) -> Localization:  # fmt: skip
+    problem: Problem,
+    config: BidConfig | InerfConfig,
+    depth: DepthSettings | None,
+    reach: ReachSettings,
+    seed: int,
+    method: str,
+) -> Localization:
     """Descend with Adam from ``problem.start`` (Alg. 1), then accept or reject the pose.
 
     Low-contrast images have a small loss even at a wrong pose, so newly drawn rays must also support the pose.
@@ -207,9 +212,7 @@ def descended(
     poses, losses, finite, ending = follow_gradient(loss, about, config.adam, start, device, generator)
     T, mean = poses[-1], recent_loss(losses)
     # How well rays that were not used distinguish the pose from its rivals.
-    by_depth = (
-        None if depth is None else DepthLossSettings(depth.depth_weight, depth.depth_loss, depth.depth_scale)
-    )
+    by_depth = None if depth is None else DepthLossSettings(depth.depth_weight, depth.depth_loss, depth.depth_scale)
     rays = RayTerms(config.colour, by_depth, False).term(problem, RAYS, seed, config.descent.level)
     middle = middle_of_view(problem, T if bool(T.matrix().isfinite().all()) else None)
     measures = support(lambda T: rays.costs(states_at(T)), T, middle, rays.plain_costs())
@@ -294,8 +297,13 @@ def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localiza
 
 
 def _halved(
-    problem: Problem, config: BidLmConfig | InerfLmConfig, depth: DepthLossSettings | None, spread: tuple[float, float], seed: int, method: str
-) -> Localization:  # fmt: skip
+    problem: Problem,
+    config: BidLmConfig | InerfLmConfig,
+    depth: DepthLossSettings | None,
+    spread: tuple[float, float],
+    seed: int,
+    method: str,
+) -> Localization:
     """Refine poses around the start; ``spread`` holds their deviations, as a fraction of the scene's distance and in radians.
 
     Colours alone have a narrow basin of convergence, so images without depth are first compared with small renderings.

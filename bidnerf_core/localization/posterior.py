@@ -167,9 +167,7 @@ def _information(
     hessian, curvature, scatter = (
         unit[..., None] * (x + rest) * unit[..., None, :] for x in (hessian, curvature, scatter)
     )
-    factor, info = torch.linalg.cholesky_ex(
-        hessian + 1e-12 * torch.eye(P, dtype=hessian.dtype, device=hessian.device)
-    )
+    factor, info = torch.linalg.cholesky_ex(hessian + 1e-12 * torch.eye(P, dtype=hessian.dtype, device=hessian.device))
     half = torch.linalg.solve_triangular(factor, curvature, upper=False)
     curvature = torch.linalg.solve_triangular(factor, half.mT, upper=False)
     return landmarks.evidence(terms.here), (curvature, scatter, factor, unit, info == 0)

@@ -174,17 +174,22 @@ def rig(
     if not views:
         raise InputError("nothing to localize:", expected="at least one view")
     T_last_ref = views[-1].T_ref_camera.to("cpu", torch.float64).inverse()
-    relative = tuple(
-        View(v.frame, (T_last_ref @ v.T_ref_camera.to("cpu", torch.float64)).normalized()) for v in views
-    )
+    relative = tuple(View(v.frame, (T_last_ref @ v.T_ref_camera.to("cpu", torch.float64)).normalized()) for v in views)
     known = [] if start is None else [("start", start)]
     for what, pose in (*known, *((view.frame.name, view.T_ref_camera) for view in relative)):
         if not bool(pose.is_rigid().all()):
             raise InputError(f"pose of {what} is not a rigid transform: {pose.matrix().tolist()}")
     return Problem(
-        scene.field, scene.bounds, relative, None if start is None else start.to("cpu", torch.float64),
-        depth_rays, scene.surface, None if matcher is None else matcher.for_query(), scene.colour_noise, UNKNOWN,
-    )  # fmt: skip
+        scene.field,
+        scene.bounds,
+        relative,
+        None if start is None else start.to("cpu", torch.float64),
+        depth_rays,
+        scene.surface,
+        None if matcher is None else matcher.for_query(),
+        scene.colour_noise,
+        UNKNOWN,
+    )
 
 
 def window(sequence: Sequence[_Item], last: int, size: int, stride: int = 1) -> tuple[_Item, ...]:
@@ -246,9 +251,7 @@ def pivot(name: PivotName, problem: Problem) -> Pivot:
     """
     if name == "world":
         return Pivot(None)
-    return (
-        Pivot(SE3.identity()) if name == "camera" else Pivot.at_point(middle_of_view(problem, problem.start))
-    )
+    return Pivot(SE3.identity()) if name == "camera" else Pivot.at_point(middle_of_view(problem, problem.start))
 
 
 @torch.no_grad()
@@ -267,14 +270,10 @@ def middle_of_view(problem: Problem, T: SE3 | None) -> Float[Tensor, "3"]:
     found = rendered_middle(problem.level(0), problem.bounds, problem.views, T[None])[0].cpu().double()
     if bool(found.isfinite().all()):
         return found
-    return (
-        T.to("cpu", torch.float64).inverse().apply(torch.tensor(problem.bounds.centre, dtype=torch.float64))
-    )
+    return T.to("cpu", torch.float64).inverse().apply(torch.tensor(problem.bounds.centre, dtype=torch.float64))
 
 
-def rendered_middle(
-    field: RadianceField, bounds: SceneBounds, views: tuple[View, ...], T: SE3
-) -> Float[Tensor, "h 3"]:
+def rendered_middle(field: RadianceField, bounds: SceneBounds, views: tuple[View, ...], T: SE3) -> Float[Tensor, "h 3"]:
     """Return the median of the rendered points along each axis, in the last camera's frame; NaN if no ray hits anything."""
     device, generator = device_of(field), torch.Generator().manual_seed(0)
     # The renderings of 128 rays give the middle of the visible scene.

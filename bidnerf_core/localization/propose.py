@@ -22,9 +22,7 @@ LEAST_AGREEING = 6
 """Minimum number of matches that must agree on a pose."""
 
 
-def best_consensus(
-    query: QueryKeypoints, landmarks: LandmarkMap, matches: Matches
-) -> tuple[Proposal, float] | None:
+def best_consensus(query: QueryKeypoints, landmarks: LandmarkMap, matches: Matches) -> tuple[Proposal, float] | None:
     """Return the proposal with the fewest false alarms, and log10 of their number; None without a consensus.
 
     The stated camera, the map's cameras and a ladder of focal lengths are tried in turn, until a proposal is convincing.
@@ -72,18 +70,18 @@ def consensus(
     flat = rays_through(still, flat)[0, :, :2] if bool(camera.any()) else flat
     focal = query.focal[matches.keypoint] * math.exp(float(camera[0]))
     points, view = landmarks.positions[matches.landmark].double(), query.view[matches.keypoint]
-    parts = [
-        part for part in ((view == v).nonzero()[:, 0] for v in range(len(query.images))) if len(part) > SAMPLE
-    ]
+    parts = [part for part in ((view == v).nonzero()[:, 0] for v in range(len(query.images))) if len(part) > SAMPLE]
     options = {
-        "max_reproj_error": query.threshold, "seed": 0,  "progressive_sampling": True,
-        "min_iterations": 50, "max_iterations": 5_000, "max_prosac_iterations": 5_000,
-    }  # fmt: skip
+        "max_reproj_error": query.threshold,
+        "seed": 0,
+        "progressive_sampling": True,
+        "min_iterations": 50,
+        "max_iterations": 5_000,
+        "max_prosac_iterations": 5_000,
+    }
     found: list[SE3] = []
     of_view = [image.T_ref_camera for image in query.images]
-    data = [
-        ((flat[p] * focal[p, None]).numpy(), points[p].numpy(), pinhole(float(focal[p[0]]))) for p in parts
-    ]  # host
+    data = [((flat[p] * focal[p, None]).numpy(), points[p].numpy(), pinhole(float(focal[p[0]]))) for p in parts]  # host
     for part, (pixels, there, model) in zip(parts, data, strict=True):
         pose, _ = poselib.estimate_absolute_pose(pixels, there, model, options, {})
         found.append(from_poselib(pose).inverse() @ of_view[int(view[part[0]])].inverse())
@@ -91,13 +89,9 @@ def consensus(
         poses = [to_poselib(of_view[int(view[part[0]])].inverse()) for part in parts]
         all_pixels, all_points, models = (list(x) for x in zip(*data, strict=True))
         generalized = options | {"progressive_sampling": False}
-        pose, _ = poselib.estimate_generalized_absolute_pose(
-            all_pixels, all_points, poses, models, generalized, {}
-        )
+        pose, _ = poselib.estimate_generalized_absolute_pose(all_pixels, all_points, poses, models, generalized, {})
         found.append(from_poselib(pose).inverse())
-    scored = [
-        (T, inliers(query, landmarks, matches, States.known(T, camera))) for T in found if bool(T.is_rigid())
-    ]
+    scored = [(T, inliers(query, landmarks, matches, States.known(T, camera))) for T in found if bool(T.is_rigid())]
     if not scored:
         return None
     T, agreeing = max(scored, key=lambda pair: int(pair[1].sum()))

@@ -115,15 +115,31 @@ class Localization:
 
     @staticmethod
     def of(
-        verdict: Verdict, poses: SE3, losses: Float[Tensor, "s"], method: str, began: float, loss: float,
-        covariance: Float[Tensor, "6 6"] | None = None, diagnostics: Any = None,
-    ) -> Localization:  # fmt: skip
+        verdict: Verdict,
+        poses: SE3,
+        losses: Float[Tensor, "s"],
+        method: str,
+        began: float,
+        loss: float,
+        covariance: Float[Tensor, "6 6"] | None = None,
+        diagnostics: Any = None,
+    ) -> Localization:
         """Return the answer whose pose is the last of ``poses``; ``began`` is when the search started (``time.perf_counter``)."""
         count, seconds = len(poses.translation) - 1, time.perf_counter() - began
         return Localization(
-            poses[-1], verdict.outcome, verdict.reason, count, seconds, loss, method, poses, losses, covariance,
-            confidence=verdict.confidence, diagnostics=diagnostics,
-        )  # fmt: skip
+            poses[-1],
+            verdict.outcome,
+            verdict.reason,
+            count,
+            seconds,
+            loss,
+            method,
+            poses,
+            losses,
+            covariance,
+            confidence=verdict.confidence,
+            diagnostics=diagnostics,
+        )
 
     def covariance_in(self, convention: CovarianceConvention) -> Float[Tensor, "6 6"] | None:
         """Return the covariance in another convention, see ``CovarianceConvention``; None if the covariance is unknown.
@@ -193,11 +209,22 @@ class Localization:
         covariance = None if saved.covariance is None else _matrix(saved.covariance, 6, "covariance", where)
         loss = math.nan if saved.loss is None else saved.loss
         return Localization(
-            T, saved.outcome, saved.reason, saved.steps, saved.seconds, loss, saved.method, SE3.stack([T]),
-            torch.tensor([loss], dtype=torch.float64), covariance,
-            math.nan if saved.focal_factor is None else saved.focal_factor, saved.confidence, None,
-            saved.intrinsics, saved.unit,
-        )  # fmt: skip
+            T,
+            saved.outcome,
+            saved.reason,
+            saved.steps,
+            saved.seconds,
+            loss,
+            saved.method,
+            SE3.stack([T]),
+            torch.tensor([loss], dtype=torch.float64),
+            covariance,
+            math.nan if saved.focal_factor is None else saved.focal_factor,
+            saved.confidence,
+            None,
+            saved.intrinsics,
+            saved.unit,
+        )
 
 
 @dataclass(frozen=True)
@@ -221,9 +248,7 @@ class _Saved:
 
 def _matrix(rows: list[list[float]], size: int, what: str, where: str) -> Float[Tensor, "n n"]:
     if {len(row) for row in rows} != {size} or len(rows) != size:
-        raise InputError(
-            f"{what} has {len(rows)} rows", where=where, expected=f"{size} rows of {size} numbers"
-        )
+        raise InputError(f"{what} has {len(rows)} rows", where=where, expected=f"{size} rows of {size} numbers")
     return torch.tensor(rows, dtype=torch.float64)
 
 

@@ -90,9 +90,7 @@ def halve(
                 passing = torch.cat([passing[:-1], other[:1]])
         if (record := current_record()) is not None:
             taken = f"after {stage.steps} steps from each" if stage.steps else "as they were drawn"
-            record.add(
-                f"{amount(len(scores), 'pose')} {taken}; {len(passing)} kept", states.T, scores, len(passing)
-            )
+            record.add(f"{amount(len(scores), 'pose')} {taken}; {len(passing)} kept", states.T, scores, len(passing))
         poses += [T[None] for T, _ in path[1:]] + ([states.T[None]] if path else [])
         losses += [cost for _, cost in path]
         poses, losses = [T[:, passing] for T in poses], [values[passing] for values in losses]
@@ -103,9 +101,12 @@ def halve(
 
 
 def image_stages(
-    problem: Problem, renderer: Renderer, device: torch.device, scales: ColourScales,
+    problem: Problem,
+    renderer: Renderer,
+    device: torch.device,
+    scales: ColourScales,
     stages: Sequence[tuple[int, int, int]],
-) -> Iterator[Stage]:  # fmt: skip
+) -> Iterator[Stage]:
     """Yield the ``stages`` of a search with small images, given as pixels of the longer side, steps, and poses to keep."""
     for width, steps, keep in stages:
         thumbnails = [moved(Thumbnail.of(view, width), device) for view in problem.views]
@@ -140,9 +141,15 @@ class RayTerms:
     exposure: bool = True
 
     def term(
-        self, problem: Problem, count: int, seed: int, level: int | None = None, blur: int = 1,
-        wide: float = 1.0, sigma: float = 0.0,
-    ) -> RenderedRays:  # fmt: skip
+        self,
+        problem: Problem,
+        count: int,
+        seed: int,
+        level: int | None = None,
+        blur: int = 1,
+        wide: float = 1.0,
+        sigma: float = 0.0,
+    ) -> RenderedRays:
         """Draw ``count`` rays; return their residual term at a level of the field (0 is the coarsest, None the field itself).
 
         Observed colours are averaged over squares of ``blur`` pixels. ``wide`` multiplies the scales of the losses, and ``sigma``
@@ -158,9 +165,7 @@ class RayTerms:
         if depth is None:
             return found
         scale = depth.depth_scale or rendered_depth_scale(bounds) / 2
-        return replace(
-            found, depth_loss=Robust(depth.depth_loss, wide * scale), depth_weight=depth.depth_weight
-        )
+        return replace(found, depth_loss=Robust(depth.depth_loss, wide * scale), depth_weight=depth.depth_weight)
 
 
 def colour_stages(problem: Problem, terms: RayTerms, steps: RefinementSettings, seed: int) -> Iterator[Stage]:
@@ -184,9 +189,14 @@ def centred(problem: Problem, T: SE3, middle: Float[Tensor, "3"]) -> SE3:
 
 
 def localization_by_rays(
-    problem: Problem, found: SearchResult, fresh: RenderedRays, middle: Float[Tensor, "3"], least_inliers: float,
-    method: str, began: float,
-) -> Localization:  # fmt: skip
+    problem: Problem,
+    found: SearchResult,
+    fresh: RenderedRays,
+    middle: Float[Tensor, "3"],
+    least_inliers: float,
+    method: str,
+    began: float,
+) -> Localization:
     """Accept or reject the best pose of a search, using rays to which the pose was not fitted.
 
     The best poses of the last two stages are compared on these rays, and the better pose is judged. It must agree with the rays, lie at a

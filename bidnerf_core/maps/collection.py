@@ -59,8 +59,11 @@ class Placement:
         if self.runner_up is not None:
             name, other = self.runner_up
             runner_up = {
-                "map": name, "outcome": str(other.outcome), "converged": other.converged, "similarity": similarity[name],
-            }  # fmt: skip
+                "map": name,
+                "outcome": str(other.outcome),
+                "converged": other.converged,
+                "similarity": similarity[name],
+            }
         return {"map": self.map, "similarity": similarity[self.map], "runner_up": runner_up}
 
 
@@ -95,12 +98,9 @@ class MapCollection:
         self.method, self.config, self.asked = method, config, asked
         self._maps = _named([scenes] if isinstance(scenes, str | Path) else scenes)
         self._given_localizers = localizers or {}
-        self._localizer = functools.lru_cache(maxsize=6)(
-            self._loaded
-        )  # this many maps stay in memory after use
+        self._localizer = functools.lru_cache(maxsize=6)(self._loaded)  # this many maps stay in memory after use
         self._infos = {
-            name: scene.info if isinstance(scene, Map) else load_info(scene)
-            for name, scene in self._maps.items()
+            name: scene.info if isinstance(scene, Map) else load_info(scene) for name, scene in self._maps.items()
         }
         self._pooled: dict[str, Float[Tensor, "v p"]] = {}
         self._vocabularies: dict[tuple[str, int], Vocabulary] = {}
@@ -189,11 +189,7 @@ class MapCollection:
         count, landmarks = counter("reading", "maps"), dict[str, LandmarkMap]()
         for number, (name, scene) in enumerate(self._maps.items(), start=1):
             check_cancelled("reading maps")
-            found = (
-                scene.landmarks
-                if isinstance(scene, Map)
-                else read_part(scene, self._infos[name], "landmarks")
-            )
+            found = scene.landmarks if isinstance(scene, Map) else read_part(scene, self._infos[name], "landmarks")
             if found is not None and len(found):
                 landmarks[name] = found.to("cpu")
             count(number, len(self._maps))
@@ -235,9 +231,7 @@ def _named(maps: Sequence[Map | str | Path] | Mapping[str, Map]) -> Mapping[str,
         raise InputError("no maps", expected="at least one")
     for parts, scene in placed:
         alike = [others for others, _ in placed if others[-1] == parts[-1]]
-        counts = (
-            n for n in range(1, len(parts) + 2) if [others[-n:] for others in alike].count(parts[-n:]) == 1
-        )
+        counts = (n for n in range(1, len(parts) + 2) if [others[-n:] for others in alike].count(parts[-n:]) == 1)
         if (count := next(counts, None)) is None:
             raise InputError(f"two maps are named {parts[-1]!r}", expected="each map once")
         found[Path(*parts[-count:]).as_posix()] = scene
@@ -248,8 +242,16 @@ def _unrecognised(reason: str, method: str) -> Localization:
     """Return the answer for a map in which an image was not recognized at all; its pose is meaningless."""
     T = SE3.identity()
     return Localization(
-        T, Outcome.TOO_FEW_MATCHES, reason, 0, 0.0, math.nan, method, SE3.stack([T]), torch.zeros(0, dtype=torch.float64)
-    )  # fmt: skip
+        T,
+        Outcome.TOO_FEW_MATCHES,
+        reason,
+        0,
+        0.0,
+        math.nan,
+        method,
+        SE3.stack([T]),
+        torch.zeros(0, dtype=torch.float64),
+    )
 
 
 def _merit(found: Localization) -> tuple[bool, float, float]:

@@ -39,7 +39,12 @@ class Anchor(Settings):
     longitude: Annotated[float, Range(-180, 180)]
     height: Annotated[float, Range(-1e6, 1e6)]  # metres above the WGS 84 ellipsoid
     # rows of the 4x4 matrix that maps the map's coordinates, times ``metres_per_unit``, to the east-north-up frame
-    T_enu_world: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))  # fmt: skip
+    T_enu_world: tuple[tuple[float, ...], ...] = (
+        (1.0, 0.0, 0.0, 0.0),
+        (0.0, 1.0, 0.0, 0.0),
+        (0.0, 0.0, 1.0, 0.0),
+        (0.0, 0.0, 0.0, 1.0),
+    )
     metres_per_unit: Annotated[float, Above(0)] = 1.0
     position_sigma: NotNegative = 0.0  # of the anchor itself, along each axis; metres
     orientation_sigma: NotNegative = 0.0  # about each axis; degrees
@@ -89,9 +94,7 @@ class MapInfo:
     # resolves only decimetres in survey coordinates.
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     added: int = 0  # number of cameras added after training, at the end of ``cameras``
-    gravity_up: tuple[float, float, float] | None = (
-        None  # upward direction (world), if the capture measured gravity
-    )
+    gravity_up: tuple[float, float, float] | None = None  # upward direction (world), if the capture measured gravity
     field_frame: FieldFrame | None = None  # set if the map was scaled after training
     distances: bool = True  # False if all images are from one place and thus do not determine distances
     sparse_depth: int = 0  # number of training pixels whose depth came from structure from motion
@@ -159,9 +162,7 @@ def load_info(folder: Path) -> MapInfo:
         what = "is a file" if folder.exists() else "no such folder"
         raise InputError(what, where=folder, expected="a map: a folder as written by 'bidnerf train'")
     if not path.exists():
-        raise InputError(
-            f"no {DESCRIPTION} found", where=folder, expected="a map as written by 'bidnerf train'"
-        )
+        raise InputError(f"no {DESCRIPTION} found", where=folder, expected="a map as written by 'bidnerf train'")
     found = read_json(path, "the description of a map")
     if not isinstance(found, dict) or found.get("format") != "bidnerf map":
         raise InputError("not the description of a map", where=path, expected='"format": "bidnerf map"')

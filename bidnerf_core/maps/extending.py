@@ -233,8 +233,7 @@ def _extended(
     new, weighted = (seeing[len(old) :], seeing) if complete else (seeing, [*old, *seeing])
     if old and not complete:  # renderings have fewer pixels than photos, but should count as much
         pixels = [
-            sum(v.frame.intrinsics.width * v.frame.intrinsics.height for v in part) / len(part)
-            for part in (old, new)
+            sum(v.frame.intrinsics.width * v.frame.intrinsics.height for v in part) / len(part) for part in (old, new)
         ]
         weighted = [*old] * min(3, max(1, round(pixels[1] / pixels[0]))) + seeing
     grown = _trained_on(scene, weighted, steps, len(new) / max(1, len(everything)))
@@ -259,9 +258,7 @@ def _extended(
     else:
         check_cancelled("extending")
         try:
-            more = with_tracks_in(
-                info, tracked.landmarks(DEFAULT_LANDMARKS), [view.frame.name for view in new]
-            )
+            more = with_tracks_in(info, tracked.landmarks(DEFAULT_LANDMARKS), [view.frame.name for view in new])
         except InputError as error:  # one photo, or photos without overlap
             log.info(f"no new landmarks: {error}")
         else:

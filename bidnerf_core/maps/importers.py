@@ -118,11 +118,7 @@ def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
     known = "; ".join(f"{each} reads {importer.summary}" for each, importer in found)
     raise InputError(
         "no installed importer recognizes it"
-        + (
-            f" ({known})"
-            if known
-            else ", since none is installed (pip install bidnerf-gaussians adds one for splats)"
-        ),
+        + (f" ({known})" if known else ", since none is installed (pip install bidnerf-gaussians adds one for splats)"),
         where=path,
     )
 

@@ -135,10 +135,17 @@ def import_map(
             bounds = replace(bounds, background=read.background)  # over which its images were composited
         step = max(1, found.steps)  # 0 would mean a map without a field
         info = MapInfo(
-            found.backend, to_plain(found.config, "config"), bounds, step, True, path.name,
-            landmark_features=options.features, unit=unit, origin=origin,
+            found.backend,
+            to_plain(found.config, "config"),
+            bounds,
+            step,
+            True,
+            path.name,
+            landmark_features=options.features,
+            unit=unit,
+            origin=origin,
             gravity_up=None if read is None else read.gravity_up,
-        )  # fmt: skip
+        )
         scene = Map(info, frozen_field(info, found.tensors, None)).to(device)
         cameras = found.cameras if read is None else read.with_files(stored_cameras(views))
         if read is None and cameras:
@@ -180,9 +187,17 @@ def _of_structure(
     bounds = bounds_about(structure.positions[structure.positions.isfinite().all(-1)] + offset)
     _report_extent(found, str(capture.path), unit)
     info = MapInfo(
-        "", {}, bounds, 0, True, capture.path.name, cameras=read.with_files(stored_cameras(read.views)),
-        landmark_features=features, unit=unit, origin=origin,
-    )  # fmt: skip
+        "",
+        {},
+        bounds,
+        0,
+        True,
+        capture.path.name,
+        cameras=read.with_files(stored_cameras(read.views)),
+        landmark_features=features,
+        unit=unit,
+        origin=origin,
+    )
     scene = Map(info, NoField()).to(working_device(options.device))
     if place is not None:
         scene = replace(scene, info=write_parts(place, info, TrainingState(0, {}, {})), folder=place)
@@ -191,9 +206,7 @@ def _of_structure(
     if tracked is None:
         points = [of_image[of_image >= 0].unique() for of_image in structure.observed]
         positions = structure.positions + offset
-        tracked = tracked_views(
-            read.views, features, known=lambda images: matches_of_points(images, points, positions)
-        )
+        tracked = tracked_views(read.views, features, known=lambda images: matches_of_points(images, points, positions))
     scene, _ = scene.with_landmarks(read.views, tracked=tracked)
     if scene.landmarks is None:
         raise InputError("its images give no landmarks", where=capture.path)
@@ -209,15 +222,14 @@ def _described(structure: Structure, features: str, origin: Origin) -> tuple[Rea
     Raises ``InputError`` if the descriptors are not those of the detector ``features``.
     """
     capture, offset = structure.capture, -torch.tensor(origin, dtype=torch.float64)
-    probe = detected(
-        find_features(features), torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0))
-    )
+    probe = detected(find_features(features), torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0)))
     channels = structure.keypoints[0].descriptors.shape[1]
     if probe.descriptors.shape[1] != channels:
         raise InputError(
             f"its descriptors have {channels} channels, those of {features!r} {probe.descriptors.shape[1]}",
-            where=capture.path, expected="the detector that made them (--landmark-features)",
-        )  # fmt: skip
+            where=capture.path,
+            expected="the detector that made them (--landmark-features)",
+        )
     views, images, labels = list[View](), list[ImageKeypoints](), list[Tensor]()
     for shot, keypoints, observed in zip(capture.shots, structure.keypoints, structure.observed, strict=True):
         stored, T = shot.camera, shot.T_world_camera
@@ -333,9 +345,7 @@ def viewpoints(
 
 
 @torch.no_grad()
-def _distances(
-    field: RadianceField, bounds: SceneBounds, places: Float[Tensor, "p 3"]
-) -> Float[Tensor, "p d"]:
+def _distances(field: RadianceField, bounds: SceneBounds, places: Float[Tensor, "p 3"]) -> Float[Tensor, "p d"]:
     """Return the distance at which each ray from ``places``, in evenly spread directions, hits geometry; 0 without a hit."""
     device = device_of(field)
     origins = places[:, None].expand(-1, DIRECTIONS, 3).reshape(-1, 3).to(device)
@@ -347,9 +357,7 @@ def _distances(
     return found.cpu().reshape(len(places), -1)
 
 
-def _within(
-    places: Float[Tensor, "p 3"], distance: Float[Tensor, "p d"], up: tuple[float, float, float]
-) -> list[SE3]:
+def _within(places: Float[Tensor, "p 3"], distance: Float[Tensor, "p d"], up: tuple[float, float, float]) -> list[SE3]:
     """Return poses at free positions far from each other, facing the directions with the most distant geometry."""
     directions, vertical = sphere(DIRECTIONS), torch.tensor(up, dtype=torch.float64)
     level = (directions @ vertical).abs() < 0.75  # neither the ceiling nor the floor

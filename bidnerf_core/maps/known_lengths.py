@@ -39,7 +39,9 @@ class ScaleFit:
     error: float  # root mean square distance of the cameras from their known positions, in the unit of these
 
     def __str__(self) -> str:
-        return f"factor {self.factor:.6g} from {self.cameras} cameras, which fit to {self.error:.3g} m (root mean square)"
+        return (
+            f"factor {self.factor:.6g} from {self.cameras} cameras, which fit to {self.error:.3g} m (root mean square)"
+        )
 
 
 def factor_of_distance(scene: Map, first: Place, second: Place, metres: float) -> float:
@@ -80,8 +82,7 @@ def factor_of_poses(scene: Map, known: Mapping[str, SE3 | Position]) -> ScaleFit
     # A misfit that is large relative to the spread of the positions indicates another capture.
     if off > 0.2 * spread(target):
         raise InputError(
-            f"the cameras are {off:.3g} m (root mean square) from their known positions after the best"
-            " scaling",
+            f"the cameras are {off:.3g} m (root mean square) from their known positions after the best scaling",
             expected="known positions of the same capture",
         )
     return ScaleFit(fit.scale, len(found), off)
@@ -154,7 +155,5 @@ def _seen_at(scene: Map, camera: StoredCamera, u: float, v: float) -> Float[Tens
     rays = scene.bounds.rays(origin.float().to(device), direction.float().to(device))
     shown = render(scene.field, rays, scene.bounds.background)
     if float(shown.opacity[0]) < 0.5:
-        raise InputError(
-            f"{camera.name}@{u:g},{v:g} shows the background", expected="a pixel that shows the scene"
-        )
+        raise InputError(f"{camera.name}@{u:g},{v:g} shows the background", expected="a pixel that shows the scene")
     return origin[0] + float(shown.distance[0] / shown.opacity[0]) * direction[0]

@@ -97,9 +97,7 @@ class Map:
         info = self.info
         trained = "no field"
         if self.has_field:
-            trained = (
-                f"{info.backend}, {amount(info.step, 'step')}{'' if info.complete else ' (not complete)'}"
-            )
+            trained = f"{info.backend}, {amount(info.step, 'step')}{'' if info.complete else ' (not complete)'}"
         surfels = amount(0 if self.surface is None else len(self.surface.surfels), "surfel")
         landmarks = amount(0 if self.landmarks is None else len(self.landmarks), "landmark")
         return f"<Map {self.name}: {trained}, {surfels}, {landmarks}>"
@@ -203,14 +201,10 @@ class Map:
         if self.info.interruption is not None:
             raise InputError(f"cannot be scaled: {self.info.interruption}", where=self.name)
         if self.unit == unit == "metres" and factor != 1:
-            log.info(
-                f"{self.name}: was in metres before; its lengths are multiplied by {factor:.6g} all the same"
-            )
+            log.info(f"{self.name}: was in metres before; its lengths are multiplied by {factor:.6g} all the same")
         extent = max(map(abs, (*self.bounds.lower, *self.bounds.upper, self.bounds.far)))
         if not extent * factor <= LARGEST_LENGTH or not factor >= 1 / LARGEST_LENGTH:
-            raise InputError(
-                f"factor is {factor:g}, which makes the lengths of {self.name} too large or too small"
-            )
+            raise InputError(f"factor is {factor:g}, which makes the lengths of {self.name} too large or too small")
         whole, capture = self.whole(), self.capture
         info = whole.info.scaled(factor, unit)
         return Map(
@@ -262,9 +256,7 @@ class Map:
         kept.
         """
         if rendered_landmarks and data is not None:
-            raise InputError(
-                "rendered_landmarks uses no photos, but data gives some;", expected="only one of them"
-            )
+            raise InputError("rendered_landmarks uses no photos, but data gives some;", expected="only one of them")
         scene = self
         if features is not None and features != self.info.landmark_features:
             find_features(features)
@@ -336,9 +328,7 @@ class Map:
                 except InputError as error:  # damaged, so that they are replaced
                     log.info(str(error))
             if photos is not None:
-                log.info(
-                    f"{self.name}: its landmarks from photos are kept; --rendered-landmarks replaces them"
-                )
+                log.info(f"{self.name}: its landmarks from photos are kept; --rendered-landmarks replaces them")
                 return replace(self, landmarks=photos), None
         began, info, landmarks = time.monotonic(), self.info, None
         source: LandmarkSource = "photos" if views else "rendered images"
@@ -370,9 +360,7 @@ class Map:
             )
         return replace(self, info=info).with_parts(None, landmarks), tracked
 
-    def with_surface(
-        self, views: Sequence[View], config: BakeConfig, surface: SurfaceMap | None = None
-    ) -> Map:
+    def with_surface(self, views: Sequence[View], config: BakeConfig, surface: SurfaceMap | None = None) -> Map:
         """Return the map with a new surface: ``surface``, or a newly baked one if that is None.
 
         Baking uses the measured depth of the views, or else depth rendered by the field from the map's cameras or,
@@ -398,9 +386,7 @@ class Map:
         return self.with_parts(surface)
 
     def _no_cameras(self) -> InputError:
-        return InputError(
-            "holds no cameras to render from; give a dataset of its views with --data", where=self.name
-        )
+        return InputError("holds no cameras to render from; give a dataset of its views with --data", where=self.name)
 
     def with_survey(self, views: Sequence[View], tracked: TrackedViews | None) -> Map:
         """Return the map with the capture record of the photos ``views`` and the field's colour error on them.

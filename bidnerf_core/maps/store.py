@@ -56,9 +56,7 @@ log = logging.getLogger("bidnerf")
 NEEDED = "a safetensors file, without which the map is incomplete"
 BAKED = "a safetensors file, which 'bidnerf bake' can recreate"
 RECORDED = "a capture record, which 'bidnerf bake' with --data can recreate"
-_NAMES = (
-    r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|capture-\d{8,}-[0-9a-f]{8}\.json)"
-)
+_NAMES = r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|capture-\d{8,}-[0-9a-f]{8}\.json)"
 OURS = re.compile(rf"{_NAMES}|\.({_NAMES}|map\.json)\.[0-9a-f]{{8}}")
 """Pattern of the names of files that saving, also by earlier versions, may leave behind. Other files are never removed."""
 
@@ -92,9 +90,7 @@ PARTS = {
         lambda landmarks: tensors_to_bytes(landmark_tensors(landmarks)),
         lambda path: load_part(path, landmarks_from_tensors, "landmarks", BAKED),
     ),
-    "capture": PartFile(
-        _json, lambda path: from_plain(CaptureReport, read_json(path, RECORDED), str(path)), "json"
-    ),
+    "capture": PartFile(_json, lambda path: from_plain(CaptureReport, read_json(path, RECORDED), str(path)), "json"),
 }
 """The parts of a map, by the keys of ``map.json`` that name their files."""
 
@@ -134,9 +130,7 @@ def write_parts(
     else:
         stored = load_info(folder)
         if stored.weights != info.weights:
-            raise InputError(
-                f"was retrained while its {next(iter(contents))} was built; bake it again", where=folder
-            )
+            raise InputError(f"was retrained while its {next(iter(contents))} was built; bake it again", where=folder)
         info, given = stored, info
         if landmarks is not None:
             names |= {"landmark_features": landmarks.features, "landmark_source": given.landmark_source}
@@ -171,18 +165,14 @@ def read_parts(
     for _ in range(5):
         try:
             weights = read_part(folder, info, "weights") or {}
-            surface, landmarks = (
-                read_part(folder, info, part) if baked else None for part in ("surface", "landmarks")
-            )
+            surface, landmarks = (read_part(folder, info, part) if baked else None for part in ("surface", "landmarks"))
             return info, weights, surface, landmarks
         except InputError as error:
             before, info = info, load_info(folder)
             if replace(before, bidnerf="") == replace(info, bidnerf=""):
                 raise
             latest = error
-    raise InputError(
-        "is being replaced faster than it can be read; try again later", where=folder
-    ) from latest
+    raise InputError("is being replaced faster than it can be read; try again later", where=folder) from latest
 
 
 class Checkpoints:
@@ -251,9 +241,7 @@ class Checkpoints:
 def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingState:
     """Return the state from which to resume the training of ``field``. Raises ``InputError`` if training is complete."""
     if info.training is None:
-        raise InputError(
-            f"training is complete ({amount(info.step, 'step')}), nothing to resume", where=folder
-        )
+        raise InputError(f"training is complete ({amount(info.step, 'step')}), nothing to resume", where=folder)
     weights = checked_weights(trained_field(field), read_part(folder, info, "weights"), folder / info.weights)
     return TrainingState(info.step, weights, read_part(folder, info, "training"))
 
@@ -309,9 +297,7 @@ def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path
             above = f" or numbers above {largest:g}" if name in trained else ""
             raise InputError(f"tensor {name!r} holds NaN{above}", where=path, expected="trained weights")
     if surplus := sorted(tensors.keys() - expected.keys()):
-        raise InputError(
-            f"tensor {surplus[0]!r} is not part of the field that map.json describes", where=path
-        )
+        raise InputError(f"tensor {surplus[0]!r} is not part of the field that map.json describes", where=path)
     return tensors
 
 

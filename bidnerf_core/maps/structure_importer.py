@@ -90,13 +90,17 @@ class StructureImporter:
         scaled = [SE3(T.rotation, placement.scale * T.translation) for T in poses]
         names = unique_names([shots[number].parts for number in kept])
         posed = [
-            replace(shots[number], name=name, T_world_camera=placement.T_target_source @ scaled[number], splits=("train",))
+            replace(
+                shots[number], name=name, T_world_camera=placement.T_target_source @ scaled[number], splits=("train",)
+            )
             for number, name in zip(kept, names, strict=True)
-        ]  # fmt: skip
+        ]
         structure = Structure(
-            Capture(path, posed), positions, tuple(observed[number] for number in kept),
+            Capture(path, posed),
+            positions,
+            tuple(observed[number] for number in kept),
             tuple(known[images[number].name] for number in kept) if known else (),
-        )  # fmt: skip
+        )
         bounds = bounds_about(positions[sound])
         return ImportedField("", None, {}, bounds, found=tuple(found), steps=0, structure=structure)
 

@@ -23,9 +23,19 @@ if TYPE_CHECKING:
     from bidnerf_core.maps.map import Map
 
 DESCRIBED = (
-    "backend", "data", "added", "unit", "distances", "step", "complete", "bounds", "origin", "config", "bidnerf",
+    "backend",
+    "data",
+    "added",
+    "unit",
+    "distances",
+    "step",
+    "complete",
+    "bounds",
+    "origin",
+    "config",
+    "bidnerf",
     "colour_noise",
-)  # fmt: skip
+)
 """The attributes of a map's description that its summary includes."""
 
 
@@ -92,9 +102,7 @@ class MapSummary:
             training = f"{info.step} steps of backend {info.backend} in {time}, {state}"
             field = f"{amount(facts['parameters'], 'parameter')} in {amount(facts['levels'], 'level')}"
             if info.colour_noise is not None:
-                field += (
-                    f", off by {info.colour_noise:.1%} of the range of colours on its training images (RMS)"
-                )
+                field += f", off by {info.colour_noise:.1%} of the range of colours on its training images (RMS)"
             built = "none; 'bidnerf bake MAP' builds it"
         if surface is not None:
             cells = f"{amount(surface['cells'], 'cell')} with a side of {surface['cell']:.3g}"

@@ -164,9 +164,7 @@ def train(
     with (
         job_context(progress, cancel),
         finished_parts(place),
-        contextlib.nullcontext()
-        if place is None
-        else map_folder(place, options.overwrite or known is not None),
+        contextlib.nullcontext() if place is None else map_folder(place, options.overwrite or known is not None),
         posed_images(data, options.images, place, options.overwrite) as (posed, images),
     ):
         if known is not None and place is not None:
@@ -195,11 +193,22 @@ def train(
             )
         counter("finding the bounds of the scene", "stage")(0, 1)
         info = MapInfo(
-            backend, to_plain(settings, "config"), estimate_bounds(taken.views, read.background), 0, False, read.source,
-            cameras=read.with_files(taken.cameras), pose_refinement=taken.refinement, distances=taken.distances,
-            sparse_depth=read.sparse_depth, hidden=read.hidden, landmark_features=options.features, unit=read.unit,
-            origin=origin, gravity_up=read.gravity_up,
-        )  # fmt: skip
+            backend,
+            to_plain(settings, "config"),
+            estimate_bounds(taken.views, read.background),
+            0,
+            False,
+            read.source,
+            cameras=read.with_files(taken.cameras),
+            pose_refinement=taken.refinement,
+            distances=taken.distances,
+            sparse_depth=read.sparse_depth,
+            hidden=read.hidden,
+            landmark_features=options.features,
+            unit=read.unit,
+            origin=origin,
+            gravity_up=read.gravity_up,
+        )
         build_field(info, str(place or read.place))  # raises before anything is written
         scene = Map(info, NoField())
         # A map that is already there stays until the first checkpoint.
@@ -314,9 +323,7 @@ def interrupted(folder: Path, baking: bool = True) -> MapInfo:
         raise InputError(f"{error}; nothing to resume, train without --resume") from error
     if info.complete and not (baking and (info.surface is None or info.capture is None)):
         baked = " and baked" if info.surface is not None else ""
-        raise InputError(
-            f"training is complete ({amount(info.step, 'step')}){baked}, nothing to resume", where=folder
-        )
+        raise InputError(f"training is complete ({amount(info.step, 'step')}){baked}, nothing to resume", where=folder)
     return info
 
 
@@ -342,12 +349,8 @@ def posed_images(
         return
     camera = options.camera
     if not (camera is None or isinstance(camera, Intrinsics | str | Path)):
-        raise InputError(
-            f"camera is a {type(camera).__name__}", where=data, expected="intrinsics or a file of them"
-        )
-    with (
-        tempfile.TemporaryDirectory() if out is None else contextlib.nullcontext(poses_folder(out)) as folder
-    ):
+        raise InputError(f"camera is a {type(camera).__name__}", where=data, expected="intrinsics or a file of them")
+    with tempfile.TemporaryDirectory() if out is None else contextlib.nullcontext(poses_folder(out)) as folder:
         found = POSERS.load(USUAL_POSER, str(data))(data, folder, camera, overwrite, reuse=True)
         if options.split == "train":
             tested = len(range(0, found.placed, HOLD_OUT_EVERY))
@@ -442,15 +445,11 @@ def train_field(
         backend.train(field, views, config, report)
     except TrainingStopped as stopped:
         kept, advice = (
-            ("cancelled", ", nothing is stored")
-            if out is None
-            else ("saved", "; --resume continues from there")
+            ("cancelled", ", nothing is stored") if out is None else ("saved", "; --resume continues from there")
         )
         raise Cancelled(f"{where}: {kept} after step {stopped.step}{advice}") from stopped
     report.finish(field)
-    log.info(
-        f"{where}: field trained for {amount(report.info.step, 'step')}, {duration_text(report.info.seconds)}"
-    )
+    log.info(f"{where}: field trained for {amount(report.info.step, 'step')}, {duration_text(report.info.seconds)}")
     frozen = frozen_field(report.info, packed(cast(nn.Module, field).state_dict()), out)
     return Map(report.info, frozen, None, scene.landmarks, out, scene.record).to(device)
 

@@ -132,22 +132,16 @@ def read_views(
     if isinstance(data, str | Path):
         data, background = options.open(data), None
     elif options.camera is not None:
-        raise InputError(
-            "camera is given for images that have cameras; it is only for the path to images without"
-        )
+        raise InputError("camera is given for images that have cameras; it is only for the path to images without")
     if isinstance(data, Capture):
         if background is not None and background_colour(background) != data.background:
-            raise InputError(
-                f"was opened with background {data.background}, got {background!r}", where=data.path
-            )
+            raise InputError(f"was opened with background {data.background}, got {background!r}", where=data.path)
         read = _read_dataset(data, split, largest, folder)
     else:
         given: Sequence[object] = data if isinstance(data, Sequence) else [data]
         views = [view for view in given if isinstance(view, View)]
         if odd := [type(other).__name__ for other in given if not isinstance(other, View)]:
-            raise InputError(
-                f"data is or holds a {odd[0]}", expected="a dataset, a path, or views with poses"
-            )
+            raise InputError(f"data is or holds a {odd[0]}", expected="a dataset, a path, or views with poses")
         if not views:
             raise InputError("data holds no views", expected="at least one")
         colour = BLACK if background is None else background_colour(background)
@@ -182,9 +176,7 @@ def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path |
                 small = view.frame.at_most(limit)
                 store = PixelStore(len(shots) * bytes_of(small), folder)
                 if small is not view.frame:
-                    before, after = (
-                        f"{f.intrinsics.width}x{f.intrinsics.height}" for f in (view.frame, small)
-                    )
+                    before, after = (f"{f.intrinsics.width}x{f.intrinsics.height}" for f in (view.frame, small))
                     log.info(
                         f"{place}: {amount(len(shots), 'image')} of {before} read at {after},"
                         f" {len(shots) * bytes_of(small) / 1e6:.0f} MB; --largest (largest=) sets another size"
@@ -207,11 +199,7 @@ def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path |
         data.unit or _unit_of(views),
         data.up,
         depth_unit=data.depth_unit,
-        files={
-            name: Path(os.path.relpath(file, folder)).as_posix()
-            for name, file in files.items()
-            if once[file] == 1
-        },
+        files={name: Path(os.path.relpath(file, folder)).as_posix() for name, file in files.items() if once[file] == 1},
     )
 
 

@@ -237,8 +237,12 @@ def _state(
 
 
 def _restore(
-    state: TrainingState | None, field: nn.Module, optimizer: torch.optim.Optimizer, generator: Generator, beside: nn.Module | None
-) -> int:  # fmt: skip
+    state: TrainingState | None,
+    field: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    generator: Generator,
+    beside: nn.Module | None,
+) -> int:
     if state is None:
         return 0
     field.load_state_dict(state.field)

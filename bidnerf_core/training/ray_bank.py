@@ -54,9 +54,7 @@ class RayBank:
     explain the background as matter of one colour (as in the code of Mueller et al. 2022).
     """
 
-    def __init__(
-        self, views: Sequence[View], bounds: SceneBounds, device: torch.device | str = "cpu"
-    ) -> None:
+    def __init__(self, views: Sequence[View], bounds: SceneBounds, device: torch.device | str = "cpu") -> None:
         self.bounds, self.device = bounds, torch.device(device)
         frames = [view.frame for view in views]
         self.home = home = _home_of(frames, self.device)
@@ -229,9 +227,7 @@ def _landmark_pixels(
 
     Views with dense depth have none, since their own measurements are better.
     """
-    parts: list[tuple[Tensor, Tensor, Tensor]] = [
-        (torch.zeros(0, dtype=torch.long), torch.zeros(0), torch.zeros(0))
-    ]
+    parts: list[tuple[Tensor, Tensor, Tensor]] = [(torch.zeros(0, dtype=torch.long), torch.zeros(0), torch.zeros(0))]
     for view, first in zip(views, offsets.tolist(), strict=True):
         seen, camera = view.landmarks, view.frame.intrinsics
         if seen is None or view.frame.has_dense_depth:

@@ -42,7 +42,7 @@ class Supervision:
 
     def __init__(
         self, views: Sequence[View], bounds: SceneBounds, config: SupervisionConfig, device: torch.device | str = "cpu"
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.config = config
         self.bank = RayBank(views, bounds, device)
         self.side = bounds.side

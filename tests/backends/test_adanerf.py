@@ -26,9 +26,21 @@ from bidnerf_core.training import RayBank, TrainingBatch
 from tiny import black_batch
 
 SMALL = AdaNerfConfig(
-    width=32, layers=2, position_frequencies=4, oracle_width=32, oracle_layers=2, ray_points=4, ray_frequencies=2,
-    bins=16, max_samples=5, steps=60, samples_per_step=4096, rays_at_most=256, learning_rate=0.02, room_resolution=16,
-)  # fmt: skip
+    width=32,
+    layers=2,
+    position_frequencies=4,
+    oracle_width=32,
+    oracle_layers=2,
+    ray_points=4,
+    ray_frequencies=2,
+    bins=16,
+    max_samples=5,
+    steps=60,
+    samples_per_step=4096,
+    rays_at_most=256,
+    learning_rate=0.02,
+    room_resolution=16,
+)
 
 
 class TestAdaNerf(BackendContract):
@@ -106,9 +118,7 @@ def test_the_best_bins_are_chosen_nearest_first() -> None:
     assert few.starts[few.valid].tolist() == [1.0]
 
 
-def test_the_pose_is_felt_through_positions_and_not_through_the_choice(
-    field: AdaNerfField, rays: Rays
-) -> None:
+def test_the_pose_is_felt_through_positions_and_not_through_the_choice(field: AdaNerfField, rays: Rays) -> None:
     """Gradients are the same when the choice is made beforehand and put on the moving ray."""
     origins = rays.origins.clone().requires_grad_()
     samples = field.sampler(rays)
@@ -173,9 +183,7 @@ def test_gradients_of_soft_rendering_are_finite_where_all_is_opaque(rays: Rays) 
     assert bool(density.grad.isfinite().all() and scores.grad.isfinite().all())
 
 
-def test_bins_without_room_for_matter_are_shaded_now_and_then(
-    field: AdaNerfField, generator: Generator
-) -> None:
+def test_bins_without_room_for_matter_are_shaded_now_and_then(field: AdaNerfField, generator: Generator) -> None:
     views = list(rgbd_views())
     room = room_for_matter(views, BOUNDS, 16)
     rays = RayBank(views, BOUNDS).draw(512, generator).rays

@@ -71,9 +71,7 @@ def test_neither_unit_nor_origin_of_the_world_matters(backend: Any, scale: float
     shift = torch.tensor([3.0, -2.0, 5.0]) * scale
     lower, upper = (tuple((torch.tensor(c) * scale + shift).tolist()) for c in (BOUNDS.lower, BOUNDS.upper))
     bounds = SceneBounds(lower, upper, BOUNDS.near * scale, BOUNDS.far * scale)  # type: ignore[arg-type]
-    here, there = (
-        backend.build(quick_config(backend), box).requires_grad_(False) for box in (BOUNDS, bounds)
-    )
+    here, there = (backend.build(quick_config(backend), box).requires_grad_(False) for box in (BOUNDS, bounds))
     positions, directions = points(50)
     one, other = here.query(positions, directions), there.query(positions * scale + shift, directions)
     torch.testing.assert_close(other.density * scale, one.density, rtol=1e-3, atol=1e-3)

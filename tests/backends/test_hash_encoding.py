@@ -22,9 +22,7 @@ both_interpolations = pytest.mark.parametrize("interpolation", ["linear", "smoot
 PRIMES = (1, 2654435761, 805459861)
 
 
-def make(
-    features: int = 2, interpolation: Interpolation = "linear", log2_table_size: int = 7
-) -> HashEncoding:
+def make(features: int = 2, interpolation: Interpolation = "linear", log2_table_size: int = 7) -> HashEncoding:
     """A small encoding with a dense level (5^3 vertices in 2^7 entries) and three hashed ones, all of order one."""
     config = HashEncodingConfig(4, features, log2_table_size, 4, 32, interpolation)
     encoding = HashEncoding(config).double()
@@ -193,9 +191,7 @@ def test_clamps_positions_to_the_cube() -> None:
 
 
 @both_interpolations
-def test_chunks_do_not_change_the_result(
-    interpolation: Interpolation, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_chunks_do_not_change_the_result(interpolation: Interpolation, monkeypatch: pytest.MonkeyPatch) -> None:
     encoding = make(interpolation=interpolation)
     positions = inner_points(encoding, 50)
 
@@ -212,9 +208,7 @@ def test_chunks_do_not_change_the_result(
 
 
 @pytest.mark.parametrize("inference", [False, True])
-def test_the_number_of_threads_does_not_change_the_result(
-    monkeypatch: pytest.MonkeyPatch, inference: bool
-) -> None:
+def test_the_number_of_threads_does_not_change_the_result(monkeypatch: pytest.MonkeyPatch, inference: bool) -> None:
     encoding, points, usual = make(), torch.rand(50, 3, dtype=torch.float64), torch.get_num_threads()
     results = []
     for threads in (1, 3):

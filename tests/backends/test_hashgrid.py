@@ -255,9 +255,11 @@ def test_a_scene_of_another_size_is_the_same_scene() -> None:
     opacity = []
     for unit in (1.0, 1000.0):
         scaled = SceneBounds(
-            tuple(unit * x for x in BOUNDS.lower), tuple(unit * x for x in BOUNDS.upper), unit * BOUNDS.near,
+            tuple(unit * x for x in BOUNDS.lower),
+            tuple(unit * x for x in BOUNDS.upper),
+            unit * BOUNDS.near,
             unit * BOUNDS.far,
-        )  # fmt: skip
+        )
         made = backend.build(tiny.config(), scaled)
         rays = random_rays()
         moved = scaled.rays((rays.origins * unit).float(), rays.directions.float())
@@ -287,9 +289,7 @@ def test_a_ray_has_no_more_samples_than_the_limit_once_density_was_observed(fiel
 
 
 def test_the_limit_holds_from_the_beginning_where_the_scene_is_contracted(field: HashGridField) -> None:
-    opened = backend.build(
-        replace(field.config, samples_per_ray=12), replace(BOUNDS, far=90.0, contracted=True)
-    )
+    opened = backend.build(replace(field.config, samples_per_ray=12), replace(BOUNDS, far=90.0, contracted=True))
     rays = opened.bounds.rays(*(getattr(random_rays(), part).float() for part in ("origins", "directions")))
     for level in opened.levels:
         assert int(level.occupancy(rays).valid.sum(-1).max()) > 12

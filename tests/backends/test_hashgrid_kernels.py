@@ -50,9 +50,14 @@ def made(interpolation: Interpolation = "linear", contracted: bool = False, laye
         levels=5, features=3, log2_table_size=13, finest_resolution=64, interpolation=interpolation
     )
     config = FieldConfig(
-        encoding=encoding, width=24, colour_layers=layers, geometry_features=6, coarse_levels=2,
-        grid_resolution=16, cells_per_pixel=0,
-    )  # fmt: skip
+        encoding=encoding,
+        width=24,
+        colour_layers=layers,
+        geometry_features=6,
+        coarse_levels=2,
+        grid_resolution=16,
+        cells_per_pixel=0,
+    )
     found = HashGridField(config, bounds(contracted))
     assert {level.hashed for level in found.encoding.levels} == {False, True}
     for table in found.encoding.tables:
@@ -70,7 +75,7 @@ def points(count: int, spread: float, generator: Generator) -> tuple[Tensor, Ten
 @pytest.mark.parametrize(("contracted", "layers"), [(False, 2), (True, 1)])
 def test_the_field_and_its_derivatives_are_those_of_torch(
     monkeypatch: pytest.MonkeyPatch, generator: Generator, interpolation: Interpolation, contracted: bool, layers: int
-) -> None:  # fmt: skip
+) -> None:
     field = made(interpolation, contracted, layers)
     at, along = points(100, 3.0 if contracted else 1.0, generator)
     for level in field.levels:
@@ -103,17 +108,13 @@ def test_rays_are_differentiated_without_a_backward_pass_of_the_field(
     field = made()
     at, along = points(40, 1.0, generator)
     near = torch.rand((40, 6), generator=generator).to(DEVICE).cumsum(-1)
-    samples = RaySamples(
-        near[:, :-1], near[:, 1:] - 0.05, torch.rand((40, 5), generator=generator).to(DEVICE) < 0.7
-    )
+    samples = RaySamples(near[:, :-1], near[:, 1:] - 0.05, torch.rand((40, 5), generator=generator).to(DEVICE) < 0.7)
     monkeypatch.setattr("bidnerf_core.fields.rendering.may_wait", lambda device: False)
 
     def gradients() -> tuple[Tensor, ...]:
         rays = Rays(at.clone().requires_grad_(), along.clone().requires_grad_(), near[:, 0], near[:, -1])
         seen = render_samples(field, rays, samples)
-        loss = (
-            seen.rgb.square().sum() + seen.distance.sum() + (seen.weights**2).sum() + seen.opacity.exp().sum()
-        )
+        loss = seen.rgb.square().sum() + seen.distance.sum() + (seen.weights**2).sum() + seen.opacity.exp().sum()
         return torch.autograd.grad(loss, (rays.origins, rays.directions))
 
     expected = by_torch(monkeypatch, gradients)

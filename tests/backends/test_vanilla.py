@@ -30,9 +30,19 @@ from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
 from bidnerf_vanilla.recipe import step_outcome
 
 SMALL = VanillaConfig(
-    layers=3, width=32, skip=1, position_frequencies=4, direction_frequencies=1, coarse_samples=24, fine_samples=8,
-    room_resolution=16, steps=60, samples_per_step=2048, rays_at_most=256, learning_rate=0.01,
-)  # fmt: skip
+    layers=3,
+    width=32,
+    skip=1,
+    position_frequencies=4,
+    direction_frequencies=1,
+    coarse_samples=24,
+    fine_samples=8,
+    room_resolution=16,
+    steps=60,
+    samples_per_step=2048,
+    rays_at_most=256,
+    learning_rate=0.01,
+)
 
 
 class TestVanilla(BackendContract):

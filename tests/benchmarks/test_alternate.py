@@ -36,5 +36,8 @@ def test_refusals_are_compared_with_accepted_answers_of_the_same_scene(alternate
     foreign = alternate.summary([{"old": row(9.0, None, False), "new": row(0.75, None, False)}])
     found = alternate.overall({"room, RGB": own, "room, RGB, other scenes": foreign})
     assert found == {
-        "mean_cpu_ratio": 0.5, "largest_cpu_ratio": 0.5, "slowest_cpu_seconds": 0.75, "refusal_to_answer": 1.5,
-    }  # fmt: skip
+        "mean_cpu_ratio": 0.5,
+        "largest_cpu_ratio": 0.5,
+        "slowest_cpu_seconds": 0.75,
+        "refusal_to_answer": 1.5,
+    }

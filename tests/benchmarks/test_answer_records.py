@@ -38,9 +38,14 @@ def answered(T: SE3, converged: bool = True) -> Any:
     """Return what the script reads from an answer."""
     covariance = torch.eye(6, dtype=torch.float64) / 3
     return SimpleNamespace(
-        T_world_camera=T, covariance=covariance, converged=converged, outcome="converged", reason="said so",
-        confidence=0.9, diagnostics=None,
-    )  # fmt: skip
+        T_world_camera=T,
+        covariance=covariance,
+        converged=converged,
+        outcome="converged",
+        reason="said so",
+        confidence=0.9,
+        diagnostics=None,
+    )
 
 
 def row(translation: float | None, converged: bool, squared: float | None = 1.0, seconds: float = 1.0) -> Any:
@@ -151,9 +156,7 @@ def test_a_run_resumes_after_a_torn_line_and_refuses_another_map(
         answers.run(["room"], out, 1.0)
 
 
-def test_two_files_are_compared(
-    answers: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_files_are_compared(answers: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # Right and accepted, strictly right but rejected, wrong and accepted, and accepted without a right answer.
     rows = [row(0.03, True), row(0.01, False, seconds=3.0), row(9.0, True, 99.0), row(None, True, None)]
     first = written(tmp_path / "a.jsonl", rows)
@@ -168,8 +171,7 @@ def test_two_files_are_compared(
     assert "| accepted | 0 | 0 | 1 |" in lines
     assert "| silent | 0 | 10 | 0.00195 |" in lines
     assert lines[-1] == (
-        "Changed answers: any 10, pose 0, covariance 0, outcome 0, reason 0, confidence 0,"
-        " pose beyond rounding 0"
+        "Changed answers: any 10, pose 0, covariance 0, outcome 0, reason 0, confidence 0, pose beyond rounding 0"
     )  # rows of this test have no poses; their errors differ
     with pytest.raises(InputError, match="no answers that all files have"):
         answers.compare([first, written(tmp_path / "d.jsonl", [])])

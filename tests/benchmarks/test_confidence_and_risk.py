@@ -41,9 +41,16 @@ def test_the_fit_recovers_probabilities(learning: ModuleType) -> None:
 
 def row(confidence: float, right: bool, fault: str, scene: str = "a", inliers: int = 50) -> dict[str, Any]:
     return {
-        "scene": scene, "mode": "RGB", "fault": fault, "frame": "0", "converged": True, "confidence": confidence,
-        "translation": 0.01 if right else 1.0, "rotation_deg": 0.1, "diagnostics": {"inliers": inliers},
-    }  # fmt: skip
+        "scene": scene,
+        "mode": "RGB",
+        "fault": fault,
+        "frame": "0",
+        "converged": True,
+        "confidence": confidence,
+        "translation": 0.01 if right else 1.0,
+        "rotation_deg": 0.1,
+        "diagnostics": {"inliers": inliers},
+    }
 
 
 def falling(confidence: np.ndarray) -> np.ndarray:

@@ -92,9 +92,12 @@ def test_triangulated_points_are_those_of_the_scene_and_locate_an_image(
 
 def row(error: float | None, accepted: bool | None = True, seconds: float = 1.0) -> dict[str, Any]:
     return {
-        "translation": error, "rotation_deg": error, "converged": accepted, "cpu_seconds": seconds,
+        "translation": error,
+        "rotation_deg": error,
+        "converged": accepted,
+        "cpu_seconds": seconds,
         "normalized_error_squared": None,
-    }  # fmt: skip
+    }
 
 
 def test_answers_are_counted_alone_and_in_pairs(script: Script) -> None:

@@ -71,7 +71,14 @@ def test_presets_become_settings_of_each_method(script: Script) -> None:
     settings_of_preset = script("paper_tables").preset_settings
     bid = settings_of_preset("paper", {"rays": 7}, "bid")
     assert bid == {
-        "rays": 7, "pivot": "camera", "max_steps": 1000, "learning_rate": 0.02, "decay": 0.8, "decay_steps": 100,
-        "depth_scale": 0.1, "candidates": 1, "box_weight": 0.0,
-    }  # fmt: skip
+        "rays": 7,
+        "pivot": "camera",
+        "max_steps": 1000,
+        "learning_rate": 0.02,
+        "decay": 0.8,
+        "decay_steps": 100,
+        "depth_scale": 0.1,
+        "candidates": 1,
+        "box_weight": 0.0,
+    }
     assert settings_of_preset("paper-scene", {}, "inerf") == {"max_steps": 1000}

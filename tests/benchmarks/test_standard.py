@@ -117,8 +117,13 @@ def test_another_folder_is_refused(standard: ModuleType, tmp_path: Path) -> None
 
 def test_medians_and_shares_count_every_query_and_coverage_the_accepted(standard: ModuleType) -> None:
     def row(translation: float | None, converged: bool, squared: float | None = 1.0) -> dict[str, Any]:
-        return {"translation": translation, "rotation_deg": translation, "converged": converged,
-                "normalized_error_squared": squared, "cpu_seconds": 1.0}  # fmt: skip
+        return {
+            "translation": translation,
+            "rotation_deg": translation,
+            "converged": converged,
+            "normalized_error_squared": squared,
+            "cpu_seconds": 1.0,
+        }
 
     rows = [row(0.01, True), row(0.03, True, 20.0), row(0.4, True, None), row(0.04, False), row(None, False)]
     found = standard.summary(rows, (0.05, 5.0))
@@ -136,12 +141,8 @@ def test_a_scene_is_trained_asked_and_recorded(
 ) -> None:
     folder = published(tmp_path, "12-Scenes", seen(8), seen(2, seed=1))
     monkeypatch.setattr(standard, "RESULTS", tmp_path)
-    monkeypatch.setattr(
-        standard, "record", lambda name, results: (tmp_path / name).write_text(json.dumps(results))
-    )
-    monkeypatch.setattr(
-        "sys.argv", ["standard.py", str(folder), "--maps", str(tmp_path / "maps"), "--steps", "5"]
-    )
+    monkeypatch.setattr(standard, "record", lambda name, results: (tmp_path / name).write_text(json.dumps(results)))
+    monkeypatch.setattr("sys.argv", ["standard.py", str(folder), "--maps", str(tmp_path / "maps"), "--steps", "5"])
     standard.main()
     found = json.loads((tmp_path / "standard").read_text())
     assert {name: list(modes) for name, modes in found.items()} == {"kitchen, dslam": ["RGB", "RGB-D"]}

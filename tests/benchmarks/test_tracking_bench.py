@@ -80,8 +80,6 @@ def test_carrying_leaves_no_trace_in_the_times(tracking: Any) -> None:
 
 
 @pytest.mark.parametrize(("accepted", "expected"), [("1101", 2), ("1011", 1), ("1000", 3)])
-def test_recovery_counts_from_the_frame_in_which_sight_returns(
-    tracking: Any, accepted: str, expected: int
-) -> None:
+def test_recovery_counts_from_the_frame_in_which_sight_returns(tracking: Any, accepted: str, expected: int) -> None:
     rows: list[dict[str, Any]] = [{"accepted": letter == "1"} for letter in accepted]
     assert tracking.frames_until_accepted(rows, 2) == expected

@@ -98,9 +98,7 @@ def open3d(camera: Intrinsics) -> dict[str, object]:
 
 def splats(*cameras: Intrinsics) -> str:
     named = zip(("a", "b.png"), cameras, strict=False)
-    return json.dumps(
-        [{"img_name": x, "width": 640, "height": 480, "fx": c.fx, "fy": c.fy} for x, c in named]
-    )
+    return json.dumps([{"img_name": x, "width": 640, "height": 480, "fx": c.fx, "fy": c.fy} for x, c in named])
 
 
 NAMES = ("camera_matrix", "distortion_coefficients")
@@ -128,9 +126,7 @@ CAMERAS = st.builds(
 
 @pytest.mark.parametrize("name", FILES)
 @given(camera=CAMERAS)
-def test_camera_files_of_other_programs_give_their_camera_back(
-    name: str, camera: Intrinsics, tmp_path: Path
-) -> None:
+def test_camera_files_of_other_programs_give_their_camera_back(name: str, camera: Intrinsics, tmp_path: Path) -> None:
     write, kept = FILES[name]
     (tmp_path / name).write_text(write(camera))
     found = read_camera(tmp_path / name, SIZE, "elsewhere/a.jpg")
@@ -203,9 +199,7 @@ def test_no_coefficients_are_no_distortion(nothing: str, tmp_path: Path) -> None
 @pytest.mark.parametrize(
     "content",
     [
-        ros_info(replace(CAMERA, distortion=D[:4]))
-        .replace("plumb_bob", "equidistant")
-        .replace("cols: 5", "cols: 4"),
+        ros_info(replace(CAMERA, distortion=D[:4])).replace("plumb_bob", "equidistant").replace("cols: 5", "cols: 4"),
         kalibr(CAMERA).replace("radtan", "equidistant"),
         orb_slam(CAMERA).replace("PinHole", "KannalaBrandt8").replace("p1", "k3").replace("p2", "k4"),
     ],
@@ -250,9 +244,7 @@ def test_the_camera_of_a_photo_is_chosen_by_its_name(tmp_path: Path) -> None:
         ("x: !!python/object/apply:os.system ['true']", "no camera matrix", None),
     ],
 )
-def test_calibrations_that_are_none(
-    content: str, found: str | None, expected: str | None, tmp_path: Path
-) -> None:
+def test_calibrations_that_are_none(content: str, found: str | None, expected: str | None, tmp_path: Path) -> None:
     (tmp_path / "c.yaml").write_text(content)
     with refused(where=tmp_path / "c.yaml", found=found, expected=expected):
         read_camera(tmp_path / "c.yaml", SIZE)

@@ -75,9 +75,7 @@ def test_a_portrait_photo_is_as_wide_as_it_was_high() -> None:
 def test_a_photo_that_was_cropped_since_is_refused() -> None:
     for taken in (SIZE, SIZE[::-1]):
         assert found(Exif(size=taken, equivalent_mm=26)).fx > 0
-    with refused(
-        where="a.jpg", found=f"4032x3024, but was 4032x2268 when EXIF was written; give its camera: {WAYS}"
-    ):
+    with refused(where="a.jpg", found=f"4032x3024, but was 4032x2268 when EXIF was written; give its camera: {WAYS}"):
         found(Exif(size=(4032, 2268), equivalent_mm=26))
 
 
@@ -203,9 +201,7 @@ def test_several_cameras_are_refused(arguments: dict[str, Any]) -> None:
         ({"hfov": 0.01}, "px for an image of 4032x3024", "1000 times its longer side"),
     ],
 )
-def test_numbers_that_no_camera_has_are_refused(
-    arguments: dict[str, float], value: object, expected: str
-) -> None:
+def test_numbers_that_no_camera_has_are_refused(arguments: dict[str, float], value: object, expected: str) -> None:
     with refused(where="a.jpg", found=value, expected=expected):
         found(**arguments)
 
@@ -213,9 +209,7 @@ def test_numbers_that_no_camera_has_are_refused(
 def test_a_camera_of_another_resolution_is_scaled() -> None:
     given = Intrinsics(1500.0, 1510.0, 1000.0, 760.0, 2016, 1512, (0.1, 0, 0, 0))
     assert found(camera=given) == Intrinsics(3000.0, 3020.0, 2000.0, 1520.0, *SIZE, (0.1, 0, 0, 0))
-    with refused(
-        where="a.jpg", found="4032x3024, but its camera is for 1512x1512", expected="same aspect ratio"
-    ):
+    with refused(where="a.jpg", found="4032x3024, but its camera is for 1512x1512", expected="same aspect ratio"):
         found(camera=Intrinsics(1500.0, 1500.0, 700.0, 700.0, 1512, 1512))
 
 
@@ -244,9 +238,13 @@ def test_json_of_a_dataset_and_json_of_a_camera(tmp_path: Path) -> None:
 
 
 MODELS = {
-    "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fx fy cx cy", "SIMPLE_RADIAL": "f cx cy k1", "RADIAL": "f cx cy k1 k2",
-    "OPENCV": "fx fy cx cy k1 k2 p1 p2", "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
-}  # fmt: skip
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+}
 """COLMAP's models by the names of their parameters, of which ``f`` is both focal lengths."""
 LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 FOCAL, CENTRE, COEFFICIENT = st.floats(1000, 5000), st.floats(1000, 3000), st.floats(-0.05, 0.05)
@@ -290,9 +288,7 @@ def test_models_of_colmap_are_those_of_pycolmap(model: str, data: st.DataObject,
         ('{"fl_x": 3, "k1": 1e308}', "", "1e+308", "coefficients of a real lens"),
     ],
 )
-def test_files_that_hold_no_camera(
-    content: str, where: str, why: str, expected: object, tmp_path: Path
-) -> None:
+def test_files_that_hold_no_camera(content: str, where: str, why: str, expected: object, tmp_path: Path) -> None:
     path = tmp_path / "camera"
     path.write_text(content)
     with refused(where=f"{path}{where}", found=why, expected=expected):

@@ -104,9 +104,7 @@ def test_colmap_reads_our_images_txt(lens: tuple[float, ...], tmp_path: Path) ->
     camera = Intrinsics(400.0, 410.0, 321.5, 238.0, 640, 480, lens)
     files = [write_photo(tmp_path / "photos" / name, noise(12, 16), 1) for name in ("a/one.png", "b/one.png")]
     poses = [FOUND, TRUE @ SE3.exp(random(6))]
-    images = [
-        PosedImage(f"{n}", n, camera, T, file) for n, (T, file) in enumerate(zip(poses, files, strict=True))
-    ]
+    images = [PosedImage(f"{n}", n, camera, T, file) for n, (T, file) in enumerate(zip(poses, files, strict=True))]
     (tmp_path / "model").mkdir()
     bn.write_poses(tmp_path / "model" / "images.txt", images)
     model = pycolmap.Reconstruction(str(tmp_path / "model"))

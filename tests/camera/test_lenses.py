@@ -70,9 +70,7 @@ def photo_of(lens: Lens) -> np.ndarray:
 def panorama(width: int) -> np.ndarray:
     v, u = np.mgrid[: width // 2, :width] + 0.5
     longitude, latitude = (u / width - 0.5) * 2 * np.pi, (0.5 - 2 * v / width) * np.pi
-    rays = np.stack(
-        [np.sin(longitude) * np.cos(latitude), -np.sin(latitude), np.cos(longitude) * np.cos(latitude)], -1
-    )
+    rays = np.stack([np.sin(longitude) * np.cos(latitude), -np.sin(latitude), np.cos(longitude) * np.cos(latitude)], -1)
     return scene(rays).round().astype(np.uint8)
 
 
@@ -156,9 +154,16 @@ def write_fisheye(folder: Path, **changes: object) -> Path:
     lens = lens_of("OPENCV_FISHEYE")
     fx, fy, cx, cy, *k = PARAMETERS["OPENCV_FISHEYE"]
     content = {
-        "camera_model": "OPENCV_FISHEYE", "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": SIZE[0], "h": SIZE[1],
-        **dict(zip(("k1", "k2", "k3", "k4"), k, strict=True)), **changes,
-    }  # fmt: skip
+        "camera_model": "OPENCV_FISHEYE",
+        "fl_x": fx,
+        "fl_y": fy,
+        "cx": cx,
+        "cy": cy,
+        "w": SIZE[0],
+        "h": SIZE[1],
+        **dict(zip(("k1", "k2", "k3", "k4"), k, strict=True)),
+        **changes,
+    }
     frames = []
     for number in range(2):
         pose = np.eye(4)
@@ -195,9 +200,7 @@ def test_fisheye_in_transforms_has_masks_of_the_images_as_stored(
 
 
 @pytest.mark.parametrize(("size", "factor"), [((400, 320), 2), ((100, 80), 0.5)])
-def test_cameras_are_scaled_to_images_that_were_resized(
-    size: tuple[int, int], factor: float, tmp_path: Path
-) -> None:
+def test_cameras_are_scaled_to_images_that_were_resized(size: tuple[int, int], factor: float, tmp_path: Path) -> None:
     folder = write_fisheye(tmp_path, camera_model="PINHOLE", k1=None, k2=None, k3=None, k4=None)
     for number in range(2):
         with Image.open(folder / f"{number}.png") as image:
@@ -242,14 +245,10 @@ def test_lenses_and_panoramas_in_models_of_colmap(tmp_path: Path) -> None:
     Image.fromarray(photo_of(lens)).save(tmp_path / "images/a.png")
     Image.fromarray(panorama(240)).save(tmp_path / "images/b.png")
     model = pycolmap.Reconstruction()
-    for number, (name, size, kind) in enumerate(
-        [("a.png", SIZE, lens), ("b.png", (240, 120), None)], start=1
-    ):
+    for number, (name, size, kind) in enumerate([("a.png", SIZE, lens), ("b.png", (240, 120), None)], start=1):
         parameters = PARAMETERS["SIMPLE_RADIAL_FISHEYE"] if kind else [240.0, 120.0]
         title = "SIMPLE_RADIAL_FISHEYE" if kind else "EQUIRECTANGULAR"
-        camera = pycolmap.Camera(
-            model=title, width=size[0], height=size[1], params=parameters, camera_id=number
-        )
+        camera = pycolmap.Camera(model=title, width=size[0], height=size[1], params=parameters, camera_id=number)
         model.add_camera_with_trivial_rig(camera)
         image = pycolmap.Image(name=name, camera_id=number, image_id=number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
@@ -275,9 +274,7 @@ def test_lenses_and_panoramas_in_models_of_colmap(tmp_path: Path) -> None:
         ("EQUIRECTANGULAR", [200.0, 160.0], "200x160", "twice as many columns as rows"),
     ],
 )
-def test_what_is_no_lens_is_refused(
-    model: str, parameters: list[float], found: str, expected: object
-) -> None:
+def test_what_is_no_lens_is_refused(model: str, parameters: list[float], found: str, expected: object) -> None:
     with refused(where="here", found=found, expected=expected):
         colmap_camera("here", model, *SIZE, parameters)
 

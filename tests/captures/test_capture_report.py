@@ -46,9 +46,7 @@ def photos() -> tuple[View, ...]:
     fine = torch.tensor([1.0, 3.0]).repeat(12)  # half of the waves are short, so that there is detail to lose
     field.waves, field.sampler = field.waves * fine, Stratified(40)
     images = [render_image(field, CAMERA, T, BOUNDS).rgb for T in poses]
-    return tuple(
-        View(Frame(f"{i:02d}", rgb, CAMERA), T) for i, (rgb, T) in enumerate(zip(images, poses, strict=True))
-    )
+    return tuple(View(Frame(f"{i:02d}", rgb, CAMERA), T) for i, (rgb, T) in enumerate(zip(images, poses, strict=True)))
 
 
 def survey(views: list[View]) -> CaptureReport:
@@ -64,9 +62,7 @@ def damaged() -> CaptureReport:
     """The record of the photos with one damage of each kind."""
     views = list(photos())
     T = views[2].T_ref_camera
-    views[2] = replace(
-        views[2], T_ref_camera=T @ SE3.exp(torch.tensor([0.1, 0, 0, 0, 0.15, 0], dtype=torch.float64))
-    )
+    views[2] = replace(views[2], T_ref_camera=T @ SE3.exp(torch.tensor([0.1, 0, 0, 0, 0.15, 0], dtype=torch.float64)))
     changed(views, 5, views[5].frame.rgb.flip(0, 1))
     changed(views, 8, views[8].frame.rgb.flip(1))
     changed(views, 11, torch.from_numpy(cv2.blur(views[11].frame.rgb.numpy(), (7, 1))))
@@ -142,15 +138,11 @@ def towards(eye: tuple[float, float, float], forward: tuple[float, float, float]
     return look_at(eye, [e + f for e, f in zip(eye, forward, strict=True)])
 
 
-def surroundings(
-    poses: list[SE3], stretch: float, up: UpDirection | None = None, count: int = 300
-) -> CaptureReport:
+def surroundings(poses: list[SE3], stretch: float, up: UpDirection | None = None, count: int = 300) -> CaptureReport:
     """Survey photos of points in a box, which is long along x."""
     points = Points(count)
     points.positions = points.positions * points.positions.new_tensor([stretch, 1, 1])
-    views = [
-        replace(view := points.view(T), frame=replace(view.frame, name=f"{i}")) for i, T in enumerate(poses)
-    ]
+    views = [replace(view := points.view(T), frame=replace(view.frame, name=f"{i}")) for i, T in enumerate(poses)]
     return surveyed(tracked_views(views, points), views, up=up)
 
 
@@ -158,8 +150,7 @@ def test_photos_from_inside_a_room_have_no_open_side() -> None:
     """All look to one half of the room, from its middle, and down."""
     angles = [math.pi * (i / 23 - 0.5) for i in range(24)]
     poses = [
-        towards((0.4 * math.cos(3 * a), 0.4 * math.sin(3 * a), 0.2), (math.cos(a), math.sin(a), -0.4))
-        for a in angles
+        towards((0.4 * math.cos(3 * a), 0.4 * math.sin(3 * a), 0.2), (math.cos(a), math.sin(a), -0.4)) for a in angles
     ]
     report = surroundings(poses, 1, count=600)
     assert report.coverage.arrangement == "inside"
@@ -170,9 +161,7 @@ def test_photos_from_inside_a_room_have_no_open_side() -> None:
 
 
 def test_photos_along_a_corridor_are_inside_although_their_axes_meet_far_ahead() -> None:
-    poses = [
-        towards((-7.5 + 0.5 * i, 0.1 * (-1) ** i, 0.0), (1.0, -0.01 * (-1) ** i, 0.05)) for i in range(24)
-    ]
+    poses = [towards((-7.5 + 0.5 * i, 0.1 * (-1) ** i, 0.0), (1.0, -0.01 * (-1) ** i, 0.05)) for i in range(24)]
     report = surroundings(poses, 8)
     assert report.coverage.arrangement == "inside"
     assert report.coverage.open_side is None
@@ -223,9 +212,7 @@ def test_few_photos_are_recorded_and_more_are_asked_for(count: int) -> None:
 
 
 def test_photos_without_texture_are_recorded() -> None:
-    plain = [
-        replace(view, frame=replace(view.frame, rgb=torch.full((120, 160, 3), 0.5))) for view in photos()[:9]
-    ]
+    plain = [replace(view, frame=replace(view.frame, rgb=torch.full((120, 160, 3), 0.5))) for view in photos()[:9]]
     report = survey(plain)
     assert report.coverage.landmarks == 0
     assert "no landmark" in sentences(report)[0]
@@ -234,17 +221,14 @@ def test_photos_without_texture_are_recorded() -> None:
 def test_a_dark_scene_and_a_light_one_have_the_same_sharpness() -> None:
     halves = [view.frame.rgb_bytes // 2 for view in photos()[:4]]
     views, dark = (
-        [replace(v, frame=v.frame.replace(rgb=n * h)) for v, h in zip(photos(), halves, strict=False)]
-        for n in (2, 1)
+        [replace(v, frame=v.frame.replace(rgb=n * h)) for v, h in zip(photos(), halves, strict=False)] for n in (2, 1)
     )
     assert torch.allclose(photo_measures(views)[0], photo_measures(dark)[0], atol=1e-3)
 
 
 @pytest.mark.parametrize("size", [(5, 1), (1, 5), (5, 5)])
 @pytest.mark.parametrize("hidden", [False, True])
-def test_blur_in_any_direction_costs_sharpness(
-    size: tuple[int, int], hidden: bool, generator: torch.Generator
-) -> None:
+def test_blur_in_any_direction_costs_sharpness(size: tuple[int, int], hidden: bool, generator: torch.Generator) -> None:
     """Also if all but the middle is hidden, is not blurred, and has twice the contrast."""
     noise = torch.rand((120, 160, 3), generator=generator).numpy() / 2
     images, around = [noise, cv2.blur(noise, size)], torch.zeros((120, 160), dtype=torch.bool)

@@ -102,9 +102,7 @@ def test_motions_are_estimated_and_the_poses_become_more_accurate() -> None:
     true, estimated, none = (last_row(poses, m) for m in (motions(1.0), found.tracked.motion, motions(0.0)))
     assert float((estimated - true).norm(dim=-1).median()) < 0.35 * float((true - none).norm(dim=-1).median())
     given = SE3.stack([view.T_ref_camera for view in views])
-    assert float(turned(found.tracked.T_world_camera, poses).median()) < 0.5 * float(
-        turned(given, poses).median()
-    )
+    assert float(turned(found.tracked.T_world_camera, poses).median()) < 0.5 * float(turned(given, poses).median())
 
 
 def test_motions_are_noticed_though_the_poses_are_right() -> None:
@@ -227,10 +225,7 @@ def test_the_columns_of_a_portrait_image_are_the_rows_of_its_sensor() -> None:
     upright = replace(PINHOLE, cx=PINHOLE.cy, cy=PINHOLE.cx, width=PINHOLE.height, height=PINHOLE.width)
     points = Points(noise=NOISE)
     moved = motions(1.0)
-    views = [
-        points.view(looking_in(0.105 * i, 0.3 * (i % 3)), upright, seed=i, motion=moved[i])
-        for i in range(VIEWS)
-    ]
+    views = [points.view(looking_in(0.105 * i, 0.3 * (i % 3)), upright, seed=i, motion=moved[i]) for i in range(VIEWS)]
     assert evidence_prior(tracked_views(views, points)) != STILL
 
 

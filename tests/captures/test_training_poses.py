@@ -49,9 +49,7 @@ def inaccurate() -> tuple[TrainingPoses, list[View], SE3]:
 
 def test_exact_poses_do_not_move_at_all() -> None:
     found, views, _ = refined(0.0, NOTHING, least=0.0)
-    moved = torch.cat(
-        [(found.tracked.T_world_camera[i].inverse() @ v.T_ref_camera).log() for i, v in enumerate(views)]
-    )
+    moved = torch.cat([(found.tracked.T_world_camera[i].inverse() @ v.T_ref_camera).log() for i, v in enumerate(views)])
     assert float(moved.abs().max()) < 1e-5  # the keypoints are float32
     assert found.consistency is not None
     assert found.consistency.inconsistency == pytest.approx(0, abs=1e-3)
@@ -74,9 +72,7 @@ def test_known_errors_are_taken_back() -> None:
     assert found.consistency is not None
     assert found.consistency.inconsistency > 0.5
     assert found.consistency.noise_after == pytest.approx(0.4, rel=0.2)
-    assert float(turned(found.tracked.T_world_camera, true).median()) < 0.4 * float(
-        turned(given, true).median()
-    )
+    assert float(turned(found.tracked.T_world_camera, true).median()) < 0.4 * float(turned(given, true).median())
     assert 0.5 < float(found.pixels.median()) < 4
     motion = found.tracked.T_world_camera.translation - given.translation
     assert float(motion.mean(0).norm()) < 0.2 * float(motion.norm(dim=-1).median())
@@ -123,9 +119,7 @@ def test_nothing_in_common_leaves_the_poses_alone() -> None:
     points = Points()
     views = [points.view(looking_in(0.1 * i)) for i in range(12)]
     named = torch.tensor([12, 0, 0], dtype=torch.uint8)
-    blank = [
-        replace(view, frame=view.frame.replace(rgb=named.expand_as(view.frame.rgb_bytes))) for view in views
-    ]
+    blank = [replace(view, frame=view.frame.replace(rgb=named.expand_as(view.frame.rgb_bytes))) for view in views]
     points.seen.append(points.seen[0][torch.zeros(0, dtype=torch.long)])
     found = training_poses(tracked_views(blank, points), blank)
     assert (found.refined, found.consistency, found.replaced) == (False, None, [])
@@ -151,10 +145,7 @@ def test_stored_cameras_hold_both_poses_and_how_far_they_are_apart() -> None:
     cameras = moved_from(views, stored_cameras(moved), found.pixels.tolist())
     assert as_given(cameras) == stored_cameras(views)
     again = at_stored_poses(views, cameras)
-    assert all(
-        torch.equal(a.T_ref_camera.matrix(), b.T_ref_camera.matrix())
-        for a, b in zip(again, moved, strict=True)
-    )
+    assert all(torch.equal(a.T_ref_camera.matrix(), b.T_ref_camera.matrix()) for a, b in zip(again, moved, strict=True))
     others = at_stored_poses(moved, cameras)  # other poses than the dataset's are those of another dataset
     assert all(a.T_ref_camera is b.T_ref_camera for a, b in zip(others, moved, strict=True))
     update = (views[3].T_ref_camera.inverse() @ poses[3]).log()

@@ -14,9 +14,7 @@ WORLD = SE3.exp(torch.tensor([0.0, 0, 0, 0.7, -1.1, 0.4], dtype=torch.float64)).
 UP = WORLD @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
-def looking(
-    azimuths: torch.Tensor, down_deg: float, roll_deg: float = 0.0, sideways: bool = False
-) -> list[SE3]:
+def looking(azimuths: torch.Tensor, down_deg: float, roll_deg: float = 0.0, sideways: bool = False) -> list[SE3]:
     """Cameras that look down by an angle in a world whose vertical is ``UP``."""
     generator, poses = torch.Generator().manual_seed(4), []
     for azimuth in azimuths.tolist():
@@ -35,8 +33,9 @@ def looking(
 def normals(floor: int, wall: int, clutter: int) -> torch.Tensor:
     generator = torch.Generator().manual_seed(5)
     axes = torch.eye(3)[[2] * floor + [0] * wall]
-    directions = torch.cat([axes + 0.03 * torch.randn(axes.shape, generator=generator),
-                            torch.randn((clutter, 3), generator=generator)])  # fmt: skip
+    directions = torch.cat(
+        [axes + 0.03 * torch.randn(axes.shape, generator=generator), torch.randn((clutter, 3), generator=generator)]
+    )
     directions = torch.nn.functional.normalize(directions, dim=-1)
     flipped = directions * torch.randn((len(directions), 1), generator=generator).sign()
     return flipped @ WORLD.float().mT

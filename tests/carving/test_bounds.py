@@ -79,9 +79,7 @@ def test_bounds_by_landmarks_have_no_unit() -> None:
 
 def test_a_few_landmarks_give_no_box() -> None:
     few = [
-        replace(
-            view, landmarks=replace(view.landmarks, **{k: v[:3] for k, v in vars(view.landmarks).items()})
-        )
+        replace(view, landmarks=replace(view.landmarks, **{k: v[:3] for k, v in vars(view.landmarks).items()}))
         for view in captured()
         if view.landmarks is not None
     ]

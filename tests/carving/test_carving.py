@@ -38,9 +38,7 @@ def looking_at(place: Sequence[float], target: Sequence[float]) -> SE3:
     """A camera (OpenCV axes) upright in a world whose z is up."""
     start = torch.tensor(place).double()
     forward = torch.nn.functional.normalize(torch.tensor(target).double() - start, dim=0)
-    right = torch.nn.functional.normalize(
-        torch.linalg.cross(forward, torch.tensor([0.0, 0, 1]).double()), dim=0
-    )
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0, 1]).double()), dim=0)
     return SE3(torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1), start)
 
 
@@ -67,9 +65,7 @@ def ball_view(
 ) -> View:
     z = ball_depth(place, camera, radius).clone()
     hit = (z > 0).float()
-    frame = Frame(
-        "ball", hit[..., None].expand(*hit.shape, 3), camera, z if depth else None, hit if alpha else None
-    )
+    frame = Frame("ball", hit[..., None].expand(*hit.shape, 3), camera, z if depth else None, hit if alpha else None)
     return View(frame, looking_at(place, (0, 0, 0)))
 
 
@@ -88,17 +84,12 @@ def ball_views(**options: bool) -> list[View]:
 
 
 def middles(shape: tuple[int, int, int]) -> Float[Tensor, "nx ny nz 3"]:
-    axes = [
-        low + (torch.arange(n) + 0.5) * (high - low) / n
-        for n, low, high in zip(shape, LOWER, UPPER, strict=True)
-    ]
+    axes = [low + (torch.arange(n) + 0.5) * (high - low) / n for n, low, high in zip(shape, LOWER, UPPER, strict=True)]
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
 
 
 def half_diagonal(shape: tuple[int, int, int]) -> float:
-    return (
-        math.dist(LOWER, [low + (up - low) / n for n, low, up in zip(shape, LOWER, UPPER, strict=True)]) / 2
-    )
+    return math.dist(LOWER, [low + (up - low) / n for n, low, up in zip(shape, LOWER, UPPER, strict=True)]) / 2
 
 
 def on_surface(shape: tuple[int, int, int] = SHAPE) -> Tensor:
@@ -185,9 +176,7 @@ def test_a_far_and_large_world_is_the_same_world() -> None:
     """Metres or millimetres, here or a thousand kilometres away."""
     scale, shift = 1000.0, torch.tensor([1e9, -2e9, 3e8], dtype=torch.float64)
     moved = [in_other_units(view, scale, shift) for view in ball_views()]
-    lower, upper = (
-        [x * scale + s for x, s in zip(end, shift.tolist(), strict=True)] for end in (LOWER, UPPER)
-    )
+    lower, upper = ([x * scale + s for x, s in zip(end, shift.tolist(), strict=True)] for end in (LOWER, UPPER))
     far = occupied_cells(moved, (lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2]), SHAPE)
     here = occupied_cells(ball_views(), LOWER, UPPER, SHAPE)
     assert (far != here).double().mean() < 1e-3
@@ -215,9 +204,7 @@ def test_large_images_are_shrunk_and_still_safe() -> None:
     radius=st.floats(0.001, 0.29),
     lens=st.booleans(),
 )
-def test_a_freed_sphere_is_wholly_in_the_free(
-    x: float, y: float, z: float, radius: float, lens: bool
-) -> None:
+def test_a_freed_sphere_is_wholly_in_the_free(x: float, y: float, z: float, radius: float, lens: bool) -> None:
     """Points all over the sphere are seen on free pixels, and before what those measured."""
     view = ball_view((4, 0, 0), LENS if lens else CAMERA)
     space = FreeSpace.seen_by(view, tolerance=0.02)
@@ -297,10 +284,7 @@ def test_opaque_alpha_is_no_silhouette() -> None:
 
 def test_cameras_that_look_outward_are_in_the_box() -> None:
     views = ball_views(depth=False, alpha=False)
-    outward = [
-        replace(v, T_ref_camera=looking_at(p, [2 * x for x in p]))
-        for v, p in zip(views, around(), strict=True)
-    ]
+    outward = [replace(v, T_ref_camera=looking_at(p, [2 * x for x in p])) for v, p in zip(views, around(), strict=True)]
     bounds = estimate_bounds(outward)
     places = torch.tensor(around()).double()
     assert holds(bounds, places) == 1

@@ -43,9 +43,23 @@ from commands import Run, assert_refused, strict
 from trainings import assert_same_map, stop_at
 
 LOCALIZE_KEYS = {
-    "frame", "T_world_camera", "converged", "outcome", "reason", "steps", "seconds", "covariance", "loss", "backend",
-    "method", "focal_factor", "intrinsics", "confidence", "error", "unit",
-}  # fmt: skip
+    "frame",
+    "T_world_camera",
+    "converged",
+    "outcome",
+    "reason",
+    "steps",
+    "seconds",
+    "covariance",
+    "loss",
+    "backend",
+    "method",
+    "focal_factor",
+    "intrinsics",
+    "confidence",
+    "error",
+    "unit",
+}
 QUICK = ["--method", "bid", "--perturb", "0.1", "5", "--max-steps", "3", "--rays", "64"]
 Edit = Callable[[Path], Any]
 
@@ -103,9 +117,7 @@ BAD_DATA: dict[str, tuple[Edit, str]] = {
 
 
 @pytest.mark.parametrize("case", BAD_DATA)
-def test_a_dataset_that_cannot_be_used_is_told_in_a_line(
-    case: str, bidnerf: Run, data: Path, tmp_path: Path
-) -> None:
+def test_a_dataset_that_cannot_be_used_is_told_in_a_line(case: str, bidnerf: Run, data: Path, tmp_path: Path) -> None:
     edit, fault = BAD_DATA[case]
     edit(data)
     before = contents(tmp_path)
@@ -114,9 +126,7 @@ def test_a_dataset_that_cannot_be_used_is_told_in_a_line(
     assert contents(tmp_path) == before
 
 
-@pytest.mark.parametrize(
-    ("command", "damaged"), [("localize", IMAGE), ("localize", DEPTH), ("render", DEPTH)]
-)
+@pytest.mark.parametrize(("command", "damaged"), [("localize", IMAGE), ("localize", DEPTH), ("render", DEPTH)])
 def test_the_frames_that_are_asked_for_are_judged_and_no_others(
     command: str, damaged: str, bidnerf: Run, shared: Path, data: Path, tmp_path: Path
 ) -> None:
@@ -128,9 +138,7 @@ def test_the_frames_that_are_asked_for_are_judged_and_no_others(
     assert bidnerf(*arguments, "r_0000").status == 0
 
 
-def test_without_depth_colour_alone_is_used_and_that_is_said(
-    bidnerf: Run, photos_only: Path, tmp_path: Path
-) -> None:
+def test_without_depth_colour_alone_is_used_and_that_is_said(bidnerf: Run, photos_only: Path, tmp_path: Path) -> None:
     trained = bidnerf("train", photos_only, "--out", tmp_path / "map", *tiny.options(2))
     assert (trained.status, trained.out) == (0, "")
     assert "training: 2/2 steps, loss " in trained.err
@@ -139,9 +147,7 @@ def test_without_depth_colour_alone_is_used_and_that_is_said(
     ]
 
 
-def test_values_that_are_no_depth_are_mentioned_once(
-    bidnerf: Run, shared: Path, data: Path, tmp_path: Path
-) -> None:
+def test_values_that_are_no_depth_are_mentioned_once(bidnerf: Run, shared: Path, data: Path, tmp_path: Path) -> None:
     for file in (data / "depth").glob("t_*.png"):
         depth = iio.imread(file)
         depth[0, :3] = 65535
@@ -151,9 +157,7 @@ def test_values_that_are_no_depth_are_mentioned_once(
     assert f"{data}/depth/t_0000.png: depth: treated as not measured: 3 x 65535" in outcome.err
 
 
-def test_names_that_do_not_exist_are_told_with_those_that_do(
-    bidnerf: Run, shared: Path, tmp_path: Path
-) -> None:
+def test_names_that_do_not_exist_are_told_with_those_that_do(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     data, place, out = shared / "data", shared / "map", ["--out", tmp_path / "out"]
     known = ", ".join(sorted(info.name for info in list_plugins("backends")))
     train, localize, render = ["train", data, *out], ["localize", place, data], ["render", place, data, *out]
@@ -245,7 +249,7 @@ FAULTS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     "weight of another shape": (weighted(lambda t: t.update({BIAS: torch.ones(3)})), (BIAS, "[3]", "[16]")),
     "weight missing": (weighted(lambda t: t.pop(BIAS)), ("weights-", BIAS, "expected one of shape [16]")),
     "weight too many": (weighted(lambda t: t.update(more=torch.ones(3))), ("weights-", "'more'")),
-}  # fmt: skip
+}
 """Faults of maps that tests of their storage leave out."""
 
 
@@ -286,9 +290,7 @@ def test_what_cannot_be_resumed_is_told_in_a_line(
 
 
 @pytest.mark.parametrize("command", ["train", "render", "demo"])
-def test_what_exists_is_not_overwritten_unasked(
-    command: str, bidnerf: Run, shared: Path, tmp_path: Path
-) -> None:
+def test_what_exists_is_not_overwritten_unasked(command: str, bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
     (out / "precious").write_text("x")
@@ -299,9 +301,7 @@ def test_what_exists_is_not_overwritten_unasked(
     }[command]
     before = contents(tmp_path)
     assert_refused(bidnerf(*arguments, "--out", out), 1, out, "exists already", "--overwrite")
-    assert_refused(
-        bidnerf(*arguments, "--out", out / "precious", "--overwrite"), 1, out / "precious", "a file"
-    )
+    assert_refused(bidnerf(*arguments, "--out", out / "precious", "--overwrite"), 1, out / "precious", "a file")
     assert contents(tmp_path) == before
     if command != "demo":
         assert bidnerf(*arguments, "--out", out, "--overwrite").status == 0
@@ -334,9 +334,7 @@ def test_a_gpu_without_memory_left_is_said_in_a_line(
 ) -> None:
     monkeypatch.setattr(torch.optim.Adam, "step", no_memory)
     trained = bidnerf("train", shared / "data", "--out", tmp_path / "map", *tiny.options(2))
-    assert_refused(
-        trained, 1, "bidnerf train: ", "the GPU's memory is full", "--device cpu", after_remarks=True
-    )
+    assert_refused(trained, 1, "bidnerf train: ", "the GPU's memory is full", "--device cpu", after_remarks=True)
 
 
 def test_a_full_disk_leaves_nothing_behind(
@@ -420,9 +418,7 @@ WRONG_USAGE = """
 
 
 @pytest.mark.parametrize("line", [line.strip() for line in WRONG_USAGE.strip().splitlines()])
-def test_wrong_usage_has_status_2_and_no_output(
-    line: str, bidnerf: Run, shared: Path, tmp_path: Path
-) -> None:
+def test_wrong_usage_has_status_2_and_no_output(line: str, bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     places = {"data": shared / "data", "map": shared / "map", "out": tmp_path / "out"}
     outcome = bidnerf(*[word.format(**places) for word in line.split()])
     assert (outcome.status, outcome.out) == (2, "")
@@ -463,9 +459,7 @@ POSES = {
 
 
 @pytest.mark.parametrize("case", POSES)
-def test_a_start_that_is_no_pose_is_told_in_a_line(
-    case: str, bidnerf: Run, shared: Path, tmp_path: Path
-) -> None:
+def test_a_start_that_is_no_pose_is_told_in_a_line(case: str, bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     text, fault = POSES[case]
     path = tmp_path / "pose.json"
     if text is not None:
@@ -500,9 +494,16 @@ def test_localize_prints_the_object_that_was_agreed_on(
     assert set(found["error"]) == {"translation", "rotation_deg"}
     assert (found["frame"], found["backend"]) == (frames[-1], "hashgrid")
     kinds = {
-        "converged": bool, "outcome": str, "reason": str, "steps": int, "seconds": float, "loss": float,
-        "backend": str, "method": str, "focal_factor": float,
-    }  # fmt: skip
+        "converged": bool,
+        "outcome": str,
+        "reason": str,
+        "steps": int,
+        "seconds": float,
+        "loss": float,
+        "backend": str,
+        "method": str,
+        "focal_factor": float,
+    }
     assert {key: type(found[key]) for key in kinds} == kinds
     # What it prints is a start that it takes.
     (tmp_path / "pose.json").write_text(outcome.out)
@@ -565,9 +566,7 @@ def test_localize_without_json_prints_to_stdout_too(bidnerf: Run, shared: Path) 
     assert re.match(r"t_0001: error \d\.\d{4} m, \d+\.\d{3} deg; NOT converged", found.out)
 
 
-def test_an_answer_that_is_not_finite_is_no_answer(
-    bidnerf: Run, shared: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_answer_that_is_not_finite_is_no_answer(bidnerf: Run, shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = Localizer.__call__
     nowhere = SE3(torch.eye(3).double(), torch.full((3,), math.nan).double())
     monkeypatch.setattr(Localizer, "__call__", lambda *given: replace(real(*given), T_world_camera=nowhere))
@@ -598,9 +597,13 @@ def test_info_describes_a_map(bidnerf: Run, shared: Path) -> None:
     assert (facts["cameras"], facts["step"], facts["complete"], facts["levels"]) == (6, tiny.STEPS, True, 2)
     shown = bidnerf("info", shared / "map").out
     for part in (
-        f"{facts['step']} steps of backend hashgrid", "data, 6 images", "surface:     none; 'bidnerf bake MAP'",
-        "landmarks:   none; 'bidnerf bake MAP --data DATA'", "levels 3", "nothing beyond it",
-    ):  # fmt: skip
+        f"{facts['step']} steps of backend hashgrid",
+        "data, 6 images",
+        "surface:     none; 'bidnerf bake MAP'",
+        "landmarks:   none; 'bidnerf bake MAP --data DATA'",
+        "levels 3",
+        "nothing beyond it",
+    ):
         assert part in shown
     assert "distances" not in shown  # which are known
 
@@ -613,9 +616,7 @@ def test_a_scaled_map_replaces_another_only_if_told(bidnerf: Run, shared: Path, 
     assert sides[1] == pytest.approx([2 * side for side in sides[0]])
 
 
-def test_render_refuses_names_whose_files_would_collide(
-    bidnerf: Run, shared: Path, data: Path, tmp_path: Path
-) -> None:
+def test_render_refuses_names_whose_files_would_collide(bidnerf: Run, shared: Path, data: Path, tmp_path: Path) -> None:
     path = data / "transforms.json"
     first, second = json.loads(path.read_text())["test_filenames"][:2]
     other = str(Path(first).with_name(f"{Path(first).stem}.depth.png"))
@@ -648,16 +649,12 @@ def test_render_writes_the_images_that_were_agreed_on(bidnerf: Run, shared: Path
 # Training that is interrupted.
 
 
-def test_a_stopped_training_goes_on_as_if_nothing_had_happened(
-    bidnerf: Run, shared: Path, interrupted: Path
-) -> None:
+def test_a_stopped_training_goes_on_as_if_nothing_had_happened(bidnerf: Run, shared: Path, interrupted: Path) -> None:
     info = load_info(interrupted)
     assert (info.step, info.complete) == (tiny.STEPS // 2, False)
     assert bidnerf("info", interrupted).status == 0
     # A setting that is given again is compared with its own value alone, not with defaults of the others.
-    resumed = bidnerf(
-        "train", shared / "data", "--out", interrupted, "--resume", "--no-bake", "--base-resolution", "4"
-    )
+    resumed = bidnerf("train", shared / "data", "--out", interrupted, "--resume", "--no-bake", "--base-resolution", "4")
     assert (resumed.status, resumed.out) == (0, "")
     assert f"resuming from step {tiny.STEPS // 2}" in resumed.err
     assert load_info(interrupted).complete
@@ -727,8 +724,7 @@ def test_a_reader_that_goes_away_and_an_output_that_is_full() -> None:
     os.close(reading)
     with open(gone, "w") as pipe, open("/dev/full", "w") as full:
         ran = [
-            subprocess.run([*PROGRAM, "--help"], stdout=out, stderr=subprocess.PIPE, text=True)
-            for out in (pipe, full)
+            subprocess.run([*PROGRAM, "--help"], stdout=out, stderr=subprocess.PIPE, text=True) for out in (pipe, full)
         ]
     assert [(each.stderr, each.returncode) for each in ran] == [
         ("", 141),
@@ -770,9 +766,7 @@ def test_the_demo_leaves_a_map_and_the_data_that_it_was_made_from(
     bidnerf: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = Intrinsics(87.5, 87.5, 32.0, 32.0, 64, 64)
-    monkeypatch.setattr(
-        scenes, "views", lambda scene, camera, poses, seen=scenes.views: seen(scene, small, poses)
-    )
+    monkeypatch.setattr(scenes, "views", lambda scene, camera, poses, seen=scenes.views: seen(scene, small, poses))
     for name, less in (("TRAINING_VIEWS", 12), ("ANIMATED", 2), ("DESCENT", {"rays": 64, "max_steps": 5})):
         monkeypatch.setattr(f"bidnerf.cli.demo.{name}", less)
     monkeypatch.setattr("bidnerf_core.maps.training.USUAL_BAKE", BakeConfig(cells=20_000))

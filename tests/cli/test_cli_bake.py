@@ -149,9 +149,7 @@ def test_a_map_that_was_imported_is_baked_from_where_a_dataset_was_seen(
 
 
 @pytest.mark.usefixtures("_ball")
-def test_a_map_is_baked_from_what_it_renders_and_anew_if_its_surface_is_damaged(
-    folder: Path, bidnerf: Run
-) -> None:
+def test_a_map_is_baked_from_what_it_renders_and_anew_if_its_surface_is_damaged(folder: Path, bidnerf: Run) -> None:
     bake = ["bake", folder, "--rays", "20000", "--cells", "20000"]
     for again in (False, True):
         status, out, err = bidnerf(*bake)
@@ -198,9 +196,7 @@ def test_training_bakes_unless_told_otherwise(
         ("{map} --rendered-landmarks --data {data}", 2, "--rendered-landmarks"),
     ],
 )
-def test_mistakes_are_told(
-    line: str, status: int, named: str, shared: Path, tmp_path: Path, bidnerf: Run
-) -> None:
+def test_mistakes_are_told(line: str, status: int, named: str, shared: Path, tmp_path: Path, bidnerf: Run) -> None:
     places = {"none": tmp_path / "none", "map": shared / "map", "data": shared / "data"}
     assert_refused(bidnerf("bake", *(word.format(**places) for word in line.split())), status, named)
 

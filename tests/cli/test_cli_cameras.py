@@ -34,9 +34,7 @@ def given(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_recording_is_trained_on_with_a_camera_that_is_known(
-    bidnerf: Run, given: Path, tmp_path: Path
-) -> None:
+def test_a_recording_is_trained_on_with_a_camera_that_is_known(bidnerf: Run, given: Path, tmp_path: Path) -> None:
     train = ["train", given / "data", "--out", tmp_path / "map", *tiny.options(1)]
     assert_refused(bidnerf(*train), 1, "--camera", PRESETS, "a file")
     assert_refused(bidnerf(*train, "--camera", "freiburg9"), 1, "freiburg9: no such file", PRESETS, "a file")
@@ -54,9 +52,7 @@ def test_localize_takes_the_camera_and_the_registration(bidnerf: Run, shared: Pa
     assert json.loads(as_stored.out.splitlines()[0])["loss"] == first["loss"]
 
 
-def test_render_compares_with_registered_depth(
-    bidnerf: Run, shared: Path, given: Path, tmp_path: Path
-) -> None:
+def test_render_compares_with_registered_depth(bidnerf: Run, shared: Path, given: Path, tmp_path: Path) -> None:
     render = ["render", shared / "map", given / "data", "--camera", given / "camera.json"]
     plain = bidnerf(*render, "--out", tmp_path / "plain")
     moved = bidnerf(*render, "--out", tmp_path / "moved", "--register-depth", given / "sensor.json")
@@ -68,14 +64,17 @@ def test_render_compares_with_registered_depth(
 @pytest.mark.parametrize(
     "line",
     [
-        "train {data} --out {out}", "localize {map} {data}", "render {map} {data} --out {out}", "bake {map} --data {data}",
-        "track {map} {data} --out {out}.txt", "evaluate {map} {data} --out {out}.jsonl", "compare {map} {data}",
+        "train {data} --out {out}",
+        "localize {map} {data}",
+        "render {map} {data} --out {out}",
+        "bake {map} --data {data}",
+        "track {map} {data} --out {out}.txt",
+        "evaluate {map} {data} --out {out}.jsonl",
+        "compare {map} {data}",
         "extend {map} {data}",
     ],
-)  # fmt: skip
-def test_a_sensor_that_is_missing_is_named(
-    line: str, bidnerf: Run, shared: Path, given: Path, tmp_path: Path
-) -> None:
+)
+def test_a_sensor_that_is_missing_is_named(line: str, bidnerf: Run, shared: Path, given: Path, tmp_path: Path) -> None:
     places = {"map": shared / "map", "data": given / "data", "out": tmp_path / "out"}
     cameras = ["--camera", given / "camera.json", "--register-depth", tmp_path / "none.json"]
     found = bidnerf(*(word.format(**places) for word in line.split()), *cameras)

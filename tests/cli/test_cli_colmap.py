@@ -48,9 +48,7 @@ def test_training_takes_depth_from_the_points(bidnerf: Run, given: Path, tmp_pat
     assert 0 < load_info(tmp_path / "fewer").sparse_depth < info.sparse_depth
 
 
-def test_images_with_depth_of_their_own_keep_it(
-    bidnerf: Run, shared: Path, given: Path, tmp_path: Path
-) -> None:
+def test_images_with_depth_of_their_own_keep_it(bidnerf: Run, shared: Path, given: Path, tmp_path: Path) -> None:
     train = ["train", shared / "data", "--out", tmp_path / "map", *tiny.options()]
     assert_refused(bidnerf(*train, "--depth-points", given / "sparse"), 1, "no depth to split 'train'")
     assert not (tmp_path / "map").exists()
@@ -68,9 +66,7 @@ def test_a_training_is_resumed_with_the_depth_that_it_began_with(
     assert bidnerf(*train, *points, "--resume").status == 0
 
 
-def test_localization_takes_the_points_that_the_frames_observe(
-    bidnerf: Run, shared: Path, given: Path
-) -> None:
+def test_localization_takes_the_points_that_the_frames_observe(bidnerf: Run, shared: Path, given: Path) -> None:
     place = ["localize", shared / "map", given / "data", *QUICK, "--frame", "t_0001", "--window", 2]
     without, with_points = bidnerf(*place), bidnerf(*place, "--depth-points", given / "sparse")
     assert (without.status, with_points.status) == (0, 0)
@@ -138,9 +134,7 @@ def test_a_bench_takes_them_too(bidnerf: Run, shared: Path, given: Path, tmp_pat
     assert_refused(demo, 1, "no training cameras")
 
 
-def test_a_model_that_is_of_no_use_is_told_in_a_line(
-    bidnerf: Run, shared: Path, given: Path, tmp_path: Path
-) -> None:
+def test_a_model_that_is_of_no_use_is_told_in_a_line(bidnerf: Run, shared: Path, given: Path, tmp_path: Path) -> None:
     place = ["localize", shared / "map", given / "data", *QUICK, "--frame", "t_0001", "--depth-points"]
     assert_refused(bidnerf(*place, given / "data"), 1, given / "data", "no COLMAP sparse model")
     assert_refused(bidnerf(*place, given / "strangers"), 1, "0 of the 6 training cameras")

@@ -22,9 +22,7 @@ from bidnerf_core.settings import EXPERT, Settings
 from commands import Run
 
 CHOICES = {
-    "train": [
-        ["--backend", info.name] for info in list_plugins("backends") if info.distribution == "bidnerf"
-    ],
+    "train": [["--backend", info.name] for info in list_plugins("backends") if info.distribution == "bidnerf"],
     "localize": [["--method", name] for name in METHODS],
     "compare": [["--method", "bid-lm"]],
 }
@@ -33,9 +31,30 @@ PAGES = pytest.mark.parametrize(
     "words", [[c, *choice] for c in COMMANDS for choice in CHOICES.get(c, [[]])], ids=" ".join
 )
 NO_BEGINNING = {
-    "about", "among", "and", "as", "at", "between", "by", "for", "from", "in", "of", "on", "or", "over", "per", "than",
-    "that", "to", "which", "with", "within", "without", "...",
-}  # fmt: skip
+    "about",
+    "among",
+    "and",
+    "as",
+    "at",
+    "between",
+    "by",
+    "for",
+    "from",
+    "in",
+    "of",
+    "on",
+    "or",
+    "over",
+    "per",
+    "than",
+    "that",
+    "to",
+    "which",
+    "with",
+    "within",
+    "without",
+    "...",
+}
 """Words with which a description does not begin: it would go on with the option's name."""
 
 
@@ -142,14 +161,15 @@ class Outer:
         ("- --share None", Outer(Path("-"), share=None)),
         ("here --other 2", Outer(Path("here"), other=2)),  # and not the inner one
     ],
-)  # fmt: skip
+)
 def test_arguments_are_fields(line: str, expected: Outer) -> None:
     assert parse("x", Outer, line.split()) == expected
 
 
 @pytest.mark.parametrize(
-    "line", ["", "here --another 1", "here --point 1", "here --share nan", "here --plain 1.5", "--lou here", "here --plain"]
-)  # fmt: skip
+    "line",
+    ["", "here --another 1", "here --point 1", "here --share nan", "here --plain 1.5", "--lou here", "here --plain"],
+)
 def test_what_no_field_takes_is_refused(line: str) -> None:
     with pytest.raises(UsageError, match="'bidnerf x --help' describes all arguments"):
         parse("x", Outer, line.split())

@@ -108,9 +108,7 @@ def test_an_answer_is_the_same_alone_among_others_and_as_a_frame(
     assert without["loss"] != alone["loss"]
 
 
-def test_a_broken_photo_does_not_stop_the_others(
-    bidnerf: Run, given: Path, place: list[Any], tmp_path: Path
-) -> None:
+def test_a_broken_photo_does_not_stop_the_others(bidnerf: Run, given: Path, place: list[Any], tmp_path: Path) -> None:
     photos = Path(shutil.copytree(given / "photos", tmp_path / "photos"))
     (photos / "t_0001.png").write_bytes((photos / "t_0001.png").read_bytes()[:80])
     status, out, err = bidnerf(*place, photos, *FOCAL, "--json", "--out", tmp_path / "poses.json")
@@ -142,9 +140,7 @@ def test_what_is_no_query_is_refused_in_a_line(
 
 
 @pytest.mark.parametrize("command", ["localize", "view", "evaluate"])
-def test_a_frame_of_another_split_is_told_where_it_is(
-    bidnerf: Run, shared: Path, tmp_path: Path, command: str
-) -> None:
+def test_a_frame_of_another_split_is_told_where_it_is(bidnerf: Run, shared: Path, tmp_path: Path, command: str) -> None:
     out = {"view": ["--save", tmp_path / "page.html"], "evaluate": ["--out", tmp_path / "r.jsonl"]}
     words = [command, shared / "map", shared / "data", "--frame", "r_0000", *out.get(command, [])]
     assert_refused(bidnerf(*words), 1, "no frame 'r_0000'", "split 'train'", after_remarks=True)
@@ -200,9 +196,14 @@ def test_without_an_accepted_pose_no_file_is_written(
 
 @pytest.mark.parametrize(("name", "kept"), [("found.json", True), ("found.txt", False), (None, False)])
 def test_an_interrupted_run_keeps_its_answers(
-    bidnerf: Run, given: Path, place: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    name: str | None, kept: bool,
-) -> None:  # fmt: skip
+    bidnerf: Run,
+    given: Path,
+    place: list[Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    name: str | None,
+    kept: bool,
+) -> None:
     """Two of the three photos are answered; two steps from a start do not converge, so a trajectory would be empty."""
 
     def stopping(photos: Photos, place: int) -> Query:

@@ -44,9 +44,7 @@ FOUND = Localization(
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_flight(
-        tmp_path_factory.mktemp("outputs") / "data", [(f, T) for _, f, T in flight()[:FRAMES]]
-    )
+    return write_flight(tmp_path_factory.mktemp("outputs") / "data", [(f, T) for _, f, T in flight()[:FRAMES]])
 
 
 @pytest.fixture(autouse=True)
@@ -97,9 +95,7 @@ def raising(error: BaseException) -> Callable[[], None]:
 @pytest.fixture
 def no_signal_ignored() -> Iterator[None]:
     """Signals as in a terminal, also where the tests run in the background, which ignores some of them."""
-    usual = {
-        signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL
-    }  # fmt: skip
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
     before = {number: signal.signal(number, handler) for number, handler in usual.items()}
     yield
     for number, handler in before.items():
@@ -120,9 +116,14 @@ def no_signal_ignored() -> Iterator[None]:
     ids=["SIGTERM", "SIGHUP", "SIGINT", "closed pipe", "full disk"],
 )
 def test_any_end_of_a_run_keeps_the_poses(
-    bidnerf: Run, data: Path, tmp_path: Path, third: Callable[[Any], None],
-    command: str, end: Callable[[], None], status: int,
-) -> None:  # fmt: skip
+    bidnerf: Run,
+    data: Path,
+    tmp_path: Path,
+    third: Callable[[Any], None],
+    command: str,
+    end: Callable[[], None],
+    status: int,
+) -> None:
     third(end)
     found = bidnerf(command, "MAP", data, "--out", tmp_path / "poses.txt")
     assert found.status == status, found.err
@@ -211,9 +212,7 @@ def test_a_frame_that_is_not_finite_is_null_and_the_others_are_written(
 ) -> None:
     odd = [
         FOUND,
-        replace(
-            FOUND, T_world_camera=SE3(T.rotation, T.translation * torch.tensor([1.0, math.nan, math.inf]))
-        ),
+        replace(FOUND, T_world_camera=SE3(T.rotation, T.translation * torch.tensor([1.0, math.nan, math.inf]))),
         replace(FOUND, covariance=torch.eye(6).double() * math.inf),
         replace(FOUND, loss=math.nan, confidence=math.inf, focal_factor=math.nan),
     ]
@@ -258,8 +257,16 @@ def files(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize(
     "out",
-    ["map/poses.json", "map/map.json", "photo.png", "start.json", "data/images/a.png", "link.json", "data/../photo.png"],
-)  # fmt: skip
+    [
+        "map/poses.json",
+        "map/map.json",
+        "photo.png",
+        "start.json",
+        "data/images/a.png",
+        "link.json",
+        "data/../photo.png",
+    ],
+)
 def test_a_file_that_is_read_or_of_a_map_is_no_output(files: Path, out: str) -> None:
     (files / "link.json").symlink_to(files / "start.json")
     with pytest.raises(UsageError, match=re.escape(str(files / out))):
@@ -282,9 +289,7 @@ def test_a_folder_in_which_no_file_can_be_created_is_refused_before_any_work(
         assert_refused(bidnerf(*words), 1, words[-1], "Read-only file system")
 
 
-def test_a_map_and_a_model_that_exist_are_refused_before_any_work(
-    bidnerf: Run, data: Path, files: Path
-) -> None:
+def test_a_map_and_a_model_that_exist_are_refused_before_any_work(bidnerf: Run, data: Path, files: Path) -> None:
     with pytest.raises(UsageError, match="exists already"):
         check_folder(files / "map", ())
     (files / "points3D.txt").write_text("of another program")

@@ -61,9 +61,7 @@ def test_a_map_holds_refined_and_given_poses(bidnerf: Run, refined: Path, views:
     for view, (_, T) in zip(views, cameras_of(info), strict=True):
         torch.testing.assert_close((view.T_ref_camera.inverse() @ T).log(), UPDATE, rtol=0, atol=1e-9)
     shown = bidnerf("info", refined).out
-    assert (
-        f"0.60 px to the 0.36 px of keypoints; the poses are refined by {UPDATE[:3].norm():.3g} and" in shown
-    )
+    assert f"0.60 px to the 0.36 px of keypoints; the poses are refined by {UPDATE[:3].norm():.3g} and" in shown
     assert f"by the landmarks of the other images: {views[1].frame.name} by" in shown
     facts = json.loads(bidnerf("info", refined, "--json").out)
     assert [moved["name"] for moved in facts["moved"]] == [view.frame.name for view in views]
@@ -144,8 +142,7 @@ def test_a_training_checks_axes_and_units_of_depth(monkeypatch: pytest.MonkeyPat
     prepared(views, points, monkeypatch)
     reversed_axes = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
     flipped = [
-        replace(v, T_ref_camera=SE3(v.T_ref_camera.rotation @ reversed_axes, v.T_ref_camera.translation))
-        for v in views
+        replace(v, T_ref_camera=SE3(v.T_ref_camera.rotation @ reversed_axes, v.T_ref_camera.translation)) for v in views
     ]
     with pytest.raises(InputError, match="the poses contradict the photos"):
         prepared(flipped, points, monkeypatch)

@@ -41,13 +41,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_flight(tmp_path_factory.mktemp("track") / "data", frames)
 
 
-def test_accepted_poses_are_written_as_a_trajectory_and_drawn(
-    bidnerf: Run, data: Path, tmp_path: Path
-) -> None:
+def test_accepted_poses_are_written_as_a_trajectory_and_drawn(bidnerf: Run, data: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    status, out, err = bidnerf(
-        "track", "MAP", data, "--out", tmp_path / "p.txt", "--plot", tmp_path / "p.png"
-    )
+    status, out, err = bidnerf("track", "MAP", data, "--out", tmp_path / "p.txt", "--plot", tmp_path / "p.png")
     assert status == 0, err
     path = read_trajectory(tmp_path / "p.txt")
     assert path.times.tolist() == [0, 1, 2, 4, 5]
@@ -131,9 +127,7 @@ def test_one_split_of_a_dataset_is_tracked(bidnerf: Run, tmp_path: Path) -> None
     assert_refused(bidnerf(*track, "val"), 1, tmp_path / "data", "'val'", "train, test", after_remarks=True)
 
 
-def test_a_sequence_is_given_up_if_the_first_frames_cannot_be_read(
-    bidnerf: Run, data: Path, tmp_path: Path
-) -> None:
+def test_a_sequence_is_given_up_if_the_first_frames_cannot_be_read(bidnerf: Run, data: Path, tmp_path: Path) -> None:
     broken = Path(shutil.copytree(data, tmp_path / "data"))
     for image in broken.rglob("*.png"):
         image.write_bytes(b"")
@@ -174,9 +168,14 @@ def test_a_dataset_of_poses_can_be_read_again(bidnerf: Run, data: Path) -> None:
     ],
 )
 def test_wrong_options_are_refused_before_any_work(
-    line: str, status: int, named: str, bidnerf: Run, data: Path, tmp_path: Path,
+    line: str,
+    status: int,
+    named: str,
+    bidnerf: Run,
+    data: Path,
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     monkeypatch.chdir(tmp_path)
     found = bidnerf("track", "MAP", *line.format(data=data).split())
     assert_refused(found, status, named, after_remarks="--hfov" in line)
@@ -248,9 +247,7 @@ def test_a_folder_is_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     found = [next(arriving) for _ in range(2)]
     iio.imwrite(tmp_path / "11.png", image)
     found.append(next(arriving))
-    pairs = [
-        (Path(r.image).name, r.depth and Path(r.depth).name) for r in found if isinstance(r, FrameRequest)
-    ]
+    pairs = [(Path(r.image).name, r.depth and Path(r.depth).name) for r in found if isinstance(r, FrameRequest)]
     assert pairs == [("2.png", "2.depth.png"), ("10.png", "10.npy"), ("11.png", None)]
 
 

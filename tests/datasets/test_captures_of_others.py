@@ -44,9 +44,7 @@ def moved(to: str) -> Write:
     def write(root: Path) -> Path:
         folder = write_nerfstudio(root, small_views(COUNT))
         for number in range(COUNT):
-            edit_frame(
-                folder / JSON, number, file_path=f"./data/desk/images/r_{number}.png", depth_file_path=None
-            )
+            edit_frame(folder / JSON, number, file_path=f"./data/desk/images/r_{number}.png", depth_file_path=None)
         (folder / to).mkdir(exist_ok=True)
         for image in (folder / "images").iterdir():
             image.rename(folder / to / image.name)
@@ -124,10 +122,11 @@ READ: dict[str, tuple[Write, str]] = {
     "reduced copies alone, COLMAP": (reduced_only(write_colmap), ""),
     "reduced copies alone, LLFF": (reduced_only(write_llff), ""),
     "masks beside a model": (
-        lambda root: [write_colmap(root, small_views(COUNT)), (root / "masks").mkdir()][0] or root, "masks lies beside the images",
+        lambda root: [write_colmap(root, small_views(COUNT)), (root / "masks").mkdir()][0] or root,
+        "masks lies beside the images",
     ),
     "times in nanoseconds": (nanoseconds, ""),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", READ)
@@ -227,9 +226,7 @@ def test_pointers_of_git_lfs_are_named(tmp_path: Path) -> None:
         ("transforms.json", lambda file: open_dataset(file.parent)),
     ):
         (tmp_path / name).write_text(pointer)
-        with refused(
-            where=tmp_path / name, found="is a pointer of Git LFS, not the file", expected="git lfs pull"
-        ):
+        with refused(where=tmp_path / name, found="is a pointer of Git LFS, not the file", expected="git lfs pull"):
             read(tmp_path / name)
 
 

@@ -109,9 +109,7 @@ def test_every_truncation_of_a_binary_model_is_refused(model: Path) -> None:
 
 
 @pytest.mark.parametrize("length", [100, 2**64 - 1])
-def test_an_image_that_declares_more_keypoints_than_its_file_holds_is_refused(
-    model: Path, length: int
-) -> None:
+def test_an_image_that_declares_more_keypoints_than_its_file_holds_is_refused(model: Path, length: int) -> None:
     pytest.importorskip("pycolmap")
     sparse_model.to_binary(model)
     pose = struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 1)
@@ -125,17 +123,47 @@ def test_an_image_that_declares_more_keypoints_than_its_file_holds_is_refused(
     ("file", "text", "where", "found", "expected"),
     [
         ("images.txt", "1 1 0 0 0 0 0 0 1\n\n", "images.txt", "line 1 has 9 entries", IMAGE),
-        ("images.txt", "1 1 0 0 x 0 0 0 1 a.png\n\n", "images.txt", "line 1: could not convert string to float: 'x'", IMAGE),
-        ("images.txt", "1 0 0 0 0 0 0 0 1 a.png\n\n", "images.txt: line 1", "'a.png' has an invalid pose", "a unit quaternion"),
-        ("images.txt", "1 nan 0 0 0 0 0 0 1 a.png\n\n", "images.txt", "line 1: '1 nan 0 0 0 0 0 0 1 a.png' is not finite", IMAGE),
+        (
+            "images.txt",
+            "1 1 0 0 x 0 0 0 1 a.png\n\n",
+            "images.txt",
+            "line 1: could not convert string to float: 'x'",
+            IMAGE,
+        ),
+        (
+            "images.txt",
+            "1 0 0 0 0 0 0 0 1 a.png\n\n",
+            "images.txt: line 1",
+            "'a.png' has an invalid pose",
+            "a unit quaternion",
+        ),
+        (
+            "images.txt",
+            "1 nan 0 0 0 0 0 0 1 a.png\n\n",
+            "images.txt",
+            "line 1: '1 nan 0 0 0 0 0 0 1 a.png' is not finite",
+            IMAGE,
+        ),
         ("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n1 2\n", "images.txt", "line 2 has 2 entries", "x, y, id of points"),
-        ("images.txt", f"1 1 0 0 0 0 0 0 1 a.png\n1 2 {10**30}\n", "images.txt", f"line 2: {10**30} has more than 64 bits", "x, y, id"),
-        ("points3D.txt", "1 0 0 0 1 2 3 0.5 1\n", "points3D.txt", "line 1 has 9 entries", "x y z, r g b, error and a track"),
+        (
+            "images.txt",
+            f"1 1 0 0 0 0 0 0 1 a.png\n1 2 {10**30}\n",
+            "images.txt",
+            f"line 2: {10**30} has more than 64 bits",
+            "x, y, id",
+        ),
+        (
+            "points3D.txt",
+            "1 0 0 0 1 2 3 0.5 1\n",
+            "points3D.txt",
+            "line 1 has 9 entries",
+            "x y z, r g b, error and a track",
+        ),
         ("points3D.txt", "1 0 0 0 1 2 3 0.5\n1 0 0 0 1 2 3 0.5\n", "points3D.txt", "the same id", "unique ids"),
         ("points3D.txt", "", "", "none of its 0 points", None),
         ("images.txt", "", "", "has 0 of the 6 training cameras", "at least 2"),
     ],
-)  # fmt: skip
+)
 def test_files_that_are_wrong_are_told(
     model: Path, scene: Known, file: str, text: str, where: str, found: str, expected: str | None
 ) -> None:
@@ -169,9 +197,7 @@ def test_what_is_left_out_is_a_setting(model: Path, scene: Known) -> None:
     usual = count(CHOICE)
     all_of_them = count(SparseChoice(points_error=100, points_views=1))
     assert all_of_them > usual > count(SparseChoice(points_views=3)) > 0
-    with refused(
-        where=model, found=f"none of its {len(scene.points)} points has a reprojection error of 0.1 pixels"
-    ):
+    with refused(where=model, found=f"none of its {len(scene.points)} points has a reprojection error of 0.1 pixels"):
         opened(model, scene, SparseChoice(points_error=0.1))
     for name, value, expected in (
         ("points_error", 0.0, "a positive number of pixels"),
@@ -198,8 +224,10 @@ def test_no_pose_of_another_split_is_looked_at(model: Path, scene: Known) -> Non
 
 
 def test_a_few_misplaced_cameras_do_not_change_the_unit(model: Path, scene: Known) -> None:
-    wrong = [(name, T @ SE3.exp(torch.tensor([2.0, 0, 0, 0, 0, 0], dtype=torch.float64)) if i == 3 else T)
-             for i, (name, T) in enumerate(places(scene))]  # fmt: skip
+    wrong = [
+        (name, T @ SE3.exp(torch.tensor([2.0, 0, 0, 0, 0, 0], dtype=torch.float64)) if i == 3 else T)
+        for i, (name, T) in enumerate(places(scene))
+    ]
     sparse = SparsePoints(model, wrong, CHOICE)
     assert sparse.cameras < len(wrong)
     assert sparse.metres == pytest.approx(sparse_model.UNIT, rel=0.02)

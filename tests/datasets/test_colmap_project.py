@@ -82,9 +82,14 @@ def names(folder: Path) -> set[str]:
 
 
 PLACES = {  # of the model and of the images
-    "sparse": "images", "colmap/sparse/0": "images", "colmap": "colmap/images", ".": ".", "dense/0/sparse": "dense/0/images",
-    "sparse/0": "input", "dense/sparse": "dense/images",
-}  # fmt: skip
+    "sparse": "images",
+    "colmap/sparse/0": "images",
+    "colmap": "colmap/images",
+    ".": ".",
+    "dense/0/sparse": "dense/0/images",
+    "sparse/0": "input",
+    "dense/sparse": "dense/images",
+}
 
 
 @pytest.mark.parametrize("place", PLACES)

@@ -71,11 +71,7 @@ def measured(view: View) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
 def interpolated(image: Float[Tensor, "h w c"], pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n c"]:
     height, width, channels = image.shape
     places = (pixels / torch.tensor([width, height]) * 2 - 1).float().reshape(1, 1, -1, 2)
-    return (
-        functional.grid_sample(image.permute(2, 0, 1)[None], places, align_corners=False)
-        .reshape(channels, -1)
-        .T
-    )
+    return functional.grid_sample(image.permute(2, 0, 1)[None], places, align_corners=False).reshape(channels, -1).T
 
 
 @cache
@@ -137,9 +133,7 @@ def test_views_agree(data_dir: Path, scene: str) -> None:
     assert found.colour < colour
 
 
-@pytest.mark.parametrize(
-    "mistake", [flipped(1, -1, -1), flipped(1, -1, 1), inverted], ids=["axes", "y", "inverse"]
-)
+@pytest.mark.parametrize("mistake", [flipped(1, -1, -1), flipped(1, -1, 1), inverted], ids=["axes", "y", "inverse"])
 @pytest.mark.parametrize("scene", SCENES)
 def test_other_axes_are_worse(data_dir: Path, scene: str, mistake: Mistake) -> None:
     good = of_right(data_dir / scene)

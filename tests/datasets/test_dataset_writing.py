@@ -54,9 +54,7 @@ def test_views_come_back(seen: list[View], unseen: list[View], tmp_path: Path) -
         for view, found in zip(expected, dataset.views(split) if expected else [], strict=True):
             assert found.frame.name == view.frame.name
             assert found.frame.intrinsics == view.frame.intrinsics
-            torch.testing.assert_close(
-                found.T_ref_camera.matrix(), view.T_ref_camera.matrix(), atol=1e-12, rtol=0
-            )
+            torch.testing.assert_close(found.T_ref_camera.matrix(), view.T_ref_camera.matrix(), atol=1e-12, rtol=0)
             far = 0 if view.frame.depth is None else float(view.frame.depth.max())
             for what, bar in (
                 ("rgb", 1.01 / 255),

@@ -30,9 +30,7 @@ from scan_layouts import edit_frame, edit_keys, small_views, write_nerfstudio
 NAMES = ("b_10", "b_2", "a_3", "b_1")
 
 
-VIEWS = [
-    replace(view, frame=replace(view.frame, name=n)) for view, n in zip(small_views(4), NAMES, strict=True)
-]
+VIEWS = [replace(view, frame=replace(view.frame, name=n)) for view, n in zip(small_views(4), NAMES, strict=True)]
 
 
 def write_file(folder: Path, extra: Sequence[dict[str, Any]], **lists: list[str]) -> Path:
@@ -162,9 +160,7 @@ def test_places_without_a_sequence(tmp_path: Path) -> None:
     with refused(where=tmp_path, found="no images in it", expected="image files or a dataset"):
         open_sequence(tmp_path)
     (tmp_path / "notes.txt").write_text("x")
-    with refused(
-        where=tmp_path / "notes.txt", found="is a file", expected="the folder of a dataset, or a video (.mp4"
-    ):
+    with refused(where=tmp_path / "notes.txt", found="is a file", expected="the folder of a dataset, or a video (.mp4"):
         open_sequence(tmp_path / "notes.txt")
     write_transforms(tmp_path, {"train": tiny.views(1)})
     with refused(where=tmp_path, found="a dataset with its own cameras; leave out the camera"):

@@ -84,14 +84,18 @@ def nerfstudio_converter(folder: Path) -> None:
     applied = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]
     edit_keys(
         folder / "transforms.json",
-        **nothing, orientation_override="none", ply_file_path="sparse_pc.ply", applied_transform=applied,
-    )  # fmt: skip
+        **nothing,
+        orientation_override="none",
+        ply_file_path="sparse_pc.ply",
+        applied_transform=applied,
+    )
 
 
 DIALECTS: dict[str, tuple[Edit, str]] = {
     "Windows separators": (paths(lambda path: path.replace("/", "\\")), "is taken for images/r_"),
     "absolute on Windows": (
-        paths(lambda path: "C:\\Users\\me\\capture\\" + path.replace("/", "\\")), "is taken for images/r_",
+        paths(lambda path: "C:\\Users\\me\\capture\\" + path.replace("/", "\\")),
+        "is taken for images/r_",
     ),
     "absolute elsewhere": (paths(lambda path: "/home/somebody/capture/" + path), "is taken for images/r_"),
     "upper case, no extension": (upper_case, ""),
@@ -100,14 +104,16 @@ DIALECTS: dict[str, tuple[Edit, str]] = {
         "'Images/r_0.png' is taken for images/r_0.png",
     ),
     "homogeneous": (
-        each_frame(lambda frame: scaled(frame, 4, 0.00118)), "all 10 matrices have a scale (frame images/r_0.png: 0.00118)",
+        each_frame(lambda frame: scaled(frame, 4, 0.00118)),
+        "all 10 matrices have a scale (frame images/r_0.png: 0.00118)",
     ),
     "scaled rotation": (
-        each_frame(lambda frame: scaled(frame, 3, 3.5)), "all 10 matrices have a scale (frame images/r_0.png: 3.5)",
+        each_frame(lambda frame: scaled(frame, 3, 3.5)),
+        "all 10 matrices have a scale (frame images/r_0.png: 3.5)",
     ),
     "instant-ngp": (instant_ngp(enable_depth_loading=True), ""),
     "nerfstudio's converter": (nerfstudio_converter, ""),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
@@ -125,9 +131,7 @@ def test_dialects_give_the_same_views(dialect: str, capture: Path) -> None:
         assert view.frame.intrinsics == usual[name].frame.intrinsics
         depth, expected_depth = view.frame.depth, usual[name].frame.depth
         torch.testing.assert_close(depth * 2 if dialect == "instant-ngp" else depth, expected_depth)
-        torch.testing.assert_close(
-            view.T_ref_camera.matrix(), usual[name].T_ref_camera.matrix(), atol=1e-9, rtol=0
-        )
+        torch.testing.assert_close(view.T_ref_camera.matrix(), usual[name].T_ref_camera.matrix(), atol=1e-9, rtol=0)
 
 
 def test_depth_has_the_unit_of_either_program(capture: Path) -> None:

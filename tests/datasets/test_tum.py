@@ -73,9 +73,7 @@ def test_the_name_of_a_sensor_says_the_camera(name: str, sensor: str, folder: Pa
 
 
 def test_a_camera_of_another_shape_is_refused(folder: Path) -> None:
-    with refused(
-        where=folder / "rgb/1305031102.175304.png", found="image is 16x12, but its camera is for 20x12"
-    ):
+    with refused(where=folder / "rgb/1305031102.175304.png", found="image is 16x12, but its camera is for 20x12"):
         next(iter(open_sequence(folder, camera=Intrinsics(20, 20, 10, 6, 20, 12))))
 
 
@@ -154,9 +152,7 @@ def test_names_with_blanks_and_windows_separators(folder: Path) -> None:
     (folder / "rgb").rename(folder / "my rgb")
     (folder / "depth").rename(folder / "my depth")
     for name, kind in (("rgb.txt", "rgb"), ("depth.txt", "depth")):
-        edit_rows(
-            folder / name, lambda rows, kind=kind: [row.replace(f" {kind}/", f" my {kind}\\") for row in rows]
-        )
+        edit_rows(folder / name, lambda rows, kind=kind: [row.replace(f" {kind}/", f" my {kind}\\") for row in rows])
     assert not remarks_of(folder)
     for timed, rgb in zip(open_sequence(folder), expected, strict=True):
         assert torch.equal(timed.frame.rgb, rgb)
@@ -174,14 +170,15 @@ def w_first(T: SE3) -> list[float]:
 
 TRAJECTORIES: dict[str, tuple[str, Callable[[float, SE3], str]]] = {
     "header with wxyz": (
-        "# timestamp tx ty tz qw qx qy qz", lambda time, T: f"{time:.6f} {numbers(w_first(T))}",
+        "# timestamp tx ty tz qw qx qy qz",
+        lambda time, T: f"{time:.6f} {numbers(w_first(T))}",
     ),
     "EuRoC": (
         "#timestamp, p_RS_R_x [m], p_RS_R_y [m]",
         lambda time, T: ",".join([str(round(time * 1e6) * 1000), *numbers(w_first(T)).split(), *"000000000"]),
     ),
     "KITTI": ("", lambda time, T: numbers(T.matrix()[:3].flatten())),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", TRAJECTORIES)
@@ -233,9 +230,7 @@ def test_interpolation_is_scipys_slerp(tmp_path: Path) -> None:
         found = path.at(time, largest_gap=1.0)
         assert found is not None
         np.testing.assert_allclose(found.rotation, slerp(time).as_matrix(), atol=1e-9)
-        np.testing.assert_allclose(
-            found.translation, [np.interp(time, times, p) for p in places.T], atol=1e-9
-        )
+        np.testing.assert_allclose(found.translation, [np.interp(time, times, p) for p in places.T], atol=1e-9)
     for time in times:
         assert path.at(float(time)) is not None
     assert path.at(times[0] - 1e-3) is None

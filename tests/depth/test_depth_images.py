@@ -68,9 +68,7 @@ def test_units_that_are_none(unit: Any) -> None:
         depth_image(np.ones((2, 2)), unit, "depth")
 
 
-@pytest.mark.parametrize(
-    "raw", [np.ones((2, 2, 3)), np.ones(3), np.ones((2, 2), bool), np.ones((2, 2), "U1")]
-)
+@pytest.mark.parametrize("raw", [np.ones((2, 2, 3)), np.ones(3), np.ones((2, 2), bool), np.ones((2, 2), "U1")])
 def test_arrays_that_are_no_depth(raw: np.ndarray) -> None:
     with refused(found="depth is", expected="one channel of integer or floating-point numbers"):
         depth_image(raw, 1.0, "depth")

@@ -38,18 +38,14 @@ def relative(noise: DepthNoise | None, z: float) -> float:
 
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "distorted"])
 @pytest.mark.parametrize("share", [0.001, 0.01, 0.03])
-def test_relative_noise_is_found_on_slanted_walls(
-    share: float, camera: Intrinsics, generator: Generator
-) -> None:
+def test_relative_noise_is_found_on_slanted_walls(share: float, camera: Intrinsics, generator: Generator) -> None:
     found = estimated_depth_noise(noisy(corridor(camera), lambda z: share * z, generator), camera)
     for z in (1.5, 2.5, 3.5):
         assert relative(found, z) == pytest.approx(share, rel=0.2)
 
 
 @pytest.mark.parametrize("quadratic", [find_depth_sensor("kinect").noise.quadratic, 0.005])
-def test_noise_that_grows_with_the_square_of_the_distance_is_found(
-    quadratic: float, generator: Generator
-) -> None:
+def test_noise_that_grows_with_the_square_of_the_distance_is_found(quadratic: float, generator: Generator) -> None:
     found = estimated_depth_noise(noisy(corridor(), lambda z: quadratic * z**2, generator), CAMERA)
     for z in (1.5, 2.5, 3.5):
         assert relative(found, z) == pytest.approx(quadratic * z, rel=0.25)
@@ -121,11 +117,7 @@ def test_real_sensors_have_the_noise_that_the_literature_states(
     frames = dataset.frame_names("test")
     for view in dataset.views("test", [frames[1], frames[6]]):
         assert view.frame.depth is not None
-        assert (
-            least
-            <= relative(estimated_depth_noise(view.frame.depth, view.frame.intrinsics), distance)
-            <= most
-        )
+        assert least <= relative(estimated_depth_noise(view.frame.depth, view.frame.intrinsics), distance) <= most
 
 
 def test_noise_does_not_depend_on_the_unit_of_length(generator: Generator) -> None:

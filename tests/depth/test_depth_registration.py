@@ -42,9 +42,7 @@ def seen(camera: Intrinsics, T_depth_camera: SE3) -> Float[Tensor, "h w"]:
     rays = camera.unproject(camera.pixel_centres(torch.float64))
     origin, direction = T_depth_camera.translation, T_depth_camera.rotate(rays)
     wall = (WALL - origin[2]) / direction[..., 2]
-    ends = (
-        BOX[:, None, None] - origin
-    ) / direction  # (2 h w 3); rays have z = 1, so that lengths are planar z
+    ends = (BOX[:, None, None] - origin) / direction  # (2 h w 3); rays have z = 1, so that lengths are planar z
     first, last = ends.amin(0).amax(-1), ends.amax(0).amin(-1)
     return torch.where((first < last) & (first > 0), first, wall).float()
 
@@ -70,9 +68,7 @@ def uniform(mask: Tensor, radius: int) -> Bool[Tensor, "h w"]:
 
 @pytest.mark.parametrize("camera", [COLOUR, BARREL], ids=["pinhole", "barrel"])
 @pytest.mark.parametrize("size", [(160, 120), (80, 60)], ids=["same resolution", "half the resolution"])
-def test_registered_depth_is_what_the_colour_camera_would_measure(
-    camera: Intrinsics, size: tuple[int, int]
-) -> None:
+def test_registered_depth_is_what_the_colour_camera_would_measure(camera: Intrinsics, size: tuple[int, int]) -> None:
     """Occlusions included: depth of the wall never shows through the box, and what the box hides stays empty."""
     sensor = DepthCamera(DEPTH.resized(*size), T_COLOUR_DEPTH)
     measured = seen(sensor.camera, SE3.identity())
@@ -168,9 +164,7 @@ def test_a_recording_like_tums_is_registered_from_a_sensor(recording: Path, tmp_
         ({"fl_x": None}, "no focal length"),
     ],
 )
-def test_broken_files_of_sensors_are_refused(
-    changes: dict[str, object], message: str, tmp_path: Path
-) -> None:
+def test_broken_files_of_sensors_are_refused(changes: dict[str, object], message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=rf"sensor\.json: .*{message}"):
         DepthCamera.read(write_sensor(tmp_path / "sensor.json", **changes))
 

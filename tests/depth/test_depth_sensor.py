@@ -36,9 +36,7 @@ def test_the_kinects_noise_is_that_of_half_a_pixel_of_disparity() -> None:
 def test_the_realsenses_noise_is_about_that_of_intels_formula() -> None:
     focal = 848 / 2 / math.tan(math.radians(90) / 2)
     for z in (1.0, 2.0, 3.0):
-        assert DEPTH_SENSORS["realsense"].noise.deviation(z) == pytest.approx(
-            0.08 * z**2 / (focal * 0.050), rel=0.6
-        )
+        assert DEPTH_SENSORS["realsense"].noise.deviation(z) == pytest.approx(0.08 * z**2 / (focal * 0.050), rel=0.6)
 
 
 @pytest.mark.parametrize("name", DEPTH_SENSORS)
@@ -70,9 +68,7 @@ def test_another_name_is_an_error_that_lists_the_names() -> None:
 
 def test_localize_compares_a_named_sensor_with_the_image(generator: Generator) -> None:
     camera = Intrinsics.from_focal(100.0, 120, 90)
-    depth = torch.linspace(1.0, 1.3, 120).expand(90, 120) * (
-        1 + 0.02 * torch.randn((90, 120), generator=generator)
-    )
+    depth = torch.linspace(1.0, 1.3, 120).expand(90, 120) * (1 + 0.02 * torch.randn((90, 120), generator=generator))
     remark = noise_remark(depth, camera, "kinect")
     assert remark is not None
     assert re.search(r"is about (1\.[6-9]|2\.[0-4])\d%; 'kinect' usually has 0\.\d+%", remark)

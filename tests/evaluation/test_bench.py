@@ -107,9 +107,7 @@ def test_a_plan_is_its_protocol_for_each_size() -> None:
 def test_shards_share_all_trials_between_them(shards: int) -> None:
     few = {"trials": 4}
     parts = [trials_of(shard=number, shards=shards, **few) for number in range(shards)]
-    assert sorted((t.seed, t.size) for p in parts for t in p) == sorted(
-        (t.seed, t.size) for t in trials_of(**few)
-    )
+    assert sorted((t.seed, t.size) for p in parts for t in p) == sorted((t.seed, t.size) for t in trials_of(**few))
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
     with refused(found=f"shard is {shards}", expected=f"0 to {shards - 1}"):
         Plan(shard=shards, shards=shards)
@@ -260,9 +258,7 @@ def test_a_half_written_last_line_is_dropped_and_nothing_else(tmp_path: Path, ke
         (b"\xff\xfe\n", "line 1: not JSON"),
     ],
 )
-def test_a_file_of_something_else_is_left_alone(
-    tmp_path: Path, evaluate: Evaluate, content: bytes, said: str
-) -> None:
+def test_a_file_of_something_else_is_left_alone(tmp_path: Path, evaluate: Evaluate, content: bytes, said: str) -> None:
     path = tmp_path / "r.jsonl"
     path.write_bytes(content)
     status, err = evaluate("--trials", 1)
@@ -291,9 +287,7 @@ def test_results_come_in_the_order_of_the_plan(tmp_path: Path) -> None:
 def test_more_trials_and_other_methods_go_into_the_same_file(
     tmp_path: Path, evaluate: Evaluate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        sys, "argv", [str(Path(__file__).parents[2] / ".venv/bin/bidnerf"), "evaluate", BLOBS]
-    )
+    monkeypatch.setattr(sys, "argv", [str(Path(__file__).parents[2] / ".venv/bin/bidnerf"), "evaluate", BLOBS])
     assert evaluate("--trials", 2, "--size", 0.3)[0] == 0
     before = (tmp_path / "r.jsonl").read_bytes()
     status, err = evaluate("--trials", 3, "--size", 0.3)
@@ -318,9 +312,7 @@ def test_another_training_of_the_map_is_not_mixed_in(tmp_path: Path, evaluate: E
     assert "was made with depth_weight 0.5, expected 1.0" in evaluate("--trials", 1, "--size", 0.3)[1]
 
 
-def test_results_of_other_images_are_refused(
-    tmp_path: Path, data: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_results_of_other_images_are_refused(tmp_path: Path, data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Folders are known by name, so the content decides: a moved copy is the same data, a changed one is not."""
 
     def run(photos: Path) -> tuple[int, str]:

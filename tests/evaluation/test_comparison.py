@@ -69,9 +69,7 @@ def usual(maps: list[Path], data: Path) -> Trial:
 
 
 @pytest.fixture(scope="module")
-def compared(
-    maps: list[Path], data: Path, plan: Plan, tmp_path_factory: pytest.TempPathFactory
-) -> Comparison:
+def compared(maps: list[Path], data: Path, plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> Comparison:
     """Run from a folder with a file that bears the name of a module of Python's; one process serves both maps."""
     folder = tmp_path_factory.mktemp("user")
     (folder / "statistics.py").write_text("raise SystemExit('a file of the user was run')")
@@ -89,12 +87,8 @@ def result(times: float, trace: list[float], seconds: float = 1.0) -> TrialResul
 
 def test_every_map_is_tried_on_the_same_frames_from_the_same_starts(compared: Comparison) -> None:
     first, second = compared.results
-    assert [(r.frame, r.seed, r.start_error) for r in first] == [
-        (r.frame, r.seed, r.start_error) for r in second
-    ]
-    assert [r.errors.translation[0] for r in first] == pytest.approx(
-        [0.5, 0.5], abs=0.02
-    )  # the chord of a screw
+    assert [(r.frame, r.seed, r.start_error) for r in first] == [(r.frame, r.seed, r.start_error) for r in second]
+    assert [r.errors.translation[0] for r in first] == pytest.approx([0.5, 0.5], abs=0.02)  # the chord of a screw
     assert first[0].T_world_camera != second[0].T_world_camera
 
 
@@ -107,9 +101,7 @@ def test_a_process_elsewhere_finds_what_this_one_finds(
             compared.results[place],
         )
         again, found = run_trial(trials[place]), found[place]
-        assert replace(again, seconds=0.0, peak_memory_bytes=0) == replace(
-            found, seconds=0.0, peak_memory_bytes=0
-        )
+        assert replace(again, seconds=0.0, peak_memory_bytes=0) == replace(found, seconds=0.0, peak_memory_bytes=0)
 
 
 def test_a_process_elsewhere_takes_no_file_of_the_folder_for_a_module(compared: Comparison) -> None:
@@ -252,7 +244,21 @@ def test_the_command_prints_a_table_and_writes_what_it_says(
 
 @pytest.mark.usefixtures("no_processes")
 def test_the_command_prints_json(maps: list[Path], data: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["--method", "bid", "--rays", "32", "--max-steps", "2", "--size", "0.3", "--frame", "t_0001", "--trials", "1", "--json"]  # fmt: skip
+    words = [
+        "--method",
+        "bid",
+        "--rays",
+        "32",
+        "--max-steps",
+        "2",
+        "--size",
+        "0.3",
+        "--frame",
+        "t_0001",
+        "--trials",
+        "1",
+        "--json",
+    ]
     assert main(["compare", str(maps[0]), str(data), *words]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["size"] == [0.3]

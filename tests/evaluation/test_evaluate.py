@@ -70,9 +70,7 @@ def timeless(rows: Any) -> list[TrialResult]:
 
 def placeless(rows: Any) -> list[TrialResult]:
     """The results without the names of their map and data too."""
-    return [
-        dataclasses.replace(row, trial=dataclasses.replace(row.trial, map="", data="")) for row in timeless(rows)
-    ]  # fmt: skip
+    return [dataclasses.replace(row, trial=dataclasses.replace(row.trial, map="", data="")) for row in timeless(rows)]
 
 
 @pytest.fixture
@@ -93,9 +91,7 @@ def masks(shared: Path, tmp_path: Path) -> Callable[[Callable[[int], Any]], Path
 Masks = Callable[[Callable[[int], Any]], Path]
 
 
-def test_a_table_has_what_the_command_writes(
-    shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_table_has_what_the_command_writes(shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene, data = shared / "map", shared / "data"
     words = ["evaluate", str(scene), str(data), "--out", str(tmp_path / "command.jsonl"), "--trials", "3"]
     assert main([*words, *WORDS, "--fault", "none", "blur:1"]) == 0
@@ -192,9 +188,11 @@ def test_results_say_where_a_map_in_memory_computed(monkeypatch: pytest.MonkeyPa
 
     for module, name in (("run", "run_trial"), ("comparison", "measured")):
         monkeypatch.setattr(import_module(f"bidnerf.evaluation.{module}"), name, stop)
-    for begin in (lambda: bn.evaluate(elsewhere, tiny.views(2), quick(trials=1)),
-                  lambda: bn.compare([elsewhere], tiny.views(2), quick(trials=1)),
-                  lambda: bn.compare([BLOBS], tiny.views(2), quick(trials=1))):  # fmt: skip
+    for begin in (
+        lambda: bn.evaluate(elsewhere, tiny.views(2), quick(trials=1)),
+        lambda: bn.compare([elsewhere], tiny.views(2), quick(trials=1)),
+        lambda: bn.compare([BLOBS], tiny.views(2), quick(trials=1)),
+    ):
         with pytest.raises(LookupError):
             begin()
     assert seen == ["meta", "meta", "cpu"]
@@ -354,9 +352,7 @@ def test_maps_in_memory_and_in_folders_are_compared(shared: Path, tmp_path: Path
 @pytest.fixture
 def trial(shared: Path) -> Trial:
     folders = str(shared / "map"), str(shared / "data")
-    return Trial(
-        *folders, ("t_0001",), (0.5,), 3, protocol="bid", method="bid", config='{"max_steps": 4, "rays": 64}'
-    )
+    return Trial(*folders, ("t_0001",), (0.5,), 3, protocol="bid", method="bid", config='{"max_steps": 4, "rays": 64}')
 
 
 def test_a_line_has_what_localize_prints_and_more(
@@ -364,8 +360,28 @@ def test_a_line_has_what_localize_prints_and_more(
 ) -> None:
     line = to_plain(run_trial(trial))
     capsys.readouterr()
-    assert main(["localize", str(shared / "map"), str(shared / "data"), "--frame", "t_0001", "--json",
-                 "--method", "bid", "--perturb", "0.1", "5", "--max-steps", "2", "--rays", "32"]) == 0  # fmt: skip
+    assert (
+        main(
+            [
+                "localize",
+                str(shared / "map"),
+                str(shared / "data"),
+                "--frame",
+                "t_0001",
+                "--json",
+                "--method",
+                "bid",
+                "--perturb",
+                "0.1",
+                "5",
+                "--max-steps",
+                "2",
+                "--rays",
+                "32",
+            ]
+        )
+        == 0
+    )
     assert json.loads(capsys.readouterr().out).keys() <= line.keys()
     assert json.loads(json.dumps(line, allow_nan=False)) == line
     assert line["frame"] == "t_0001"
@@ -468,8 +484,6 @@ def test_a_scheduler_that_is_not_there_is_named(
     pytest.importorskip("distributed")
     monkeypatch.setattr("bidnerf.evaluation.run.PATIENCE", "1s")
     out = tmp_path / "r.jsonl"
-    assert (
-        main(["evaluate", "demo:blobs", "--out", str(out), "--dask", "tcp://127.0.0.1:9", *WORDS[:-2]]) == 1
-    )
+    assert main(["evaluate", "demo:blobs", "--out", str(out), "--dask", "tcp://127.0.0.1:9", *WORDS[:-2]]) == 1
     said = capsys.readouterr().err.splitlines()
     assert "no dask scheduler at tcp://127.0.0.1:9" in said[-1]

@@ -53,9 +53,7 @@ def test_a_plan_tries_each_fault_on_the_same_frames() -> None:
     assert [t.fault for t in trials] == [fault for fault in faults for _ in range(3)]
     assert len({(t.frames, t.seed) for t in trials}) == 3
     assert len({key_of(t) for t in trials}) == 9
-    with refused(
-        found="fault depth-scale:1.02 changes the measured depth, which the method does not receive"
-    ):
+    with refused(found="fault depth-scale:1.02 changes the measured depth, which the method does not receive"):
         trials_of(depth=False, faults=faults)
     with refused(found="no fault 'blurr', did you mean 'blur'?"):
         Plan(faults=["blurr:1"])
@@ -77,9 +75,13 @@ def test_results_notice_when_a_fault_has_changed(tmp_path: Path, monkeypatch: py
     words += ["--fault", "exposure:0.7"]
     assert main(words) == 0
     trials = trials_of(
-        protocol="bid", sizes=[0.3], trials=1, method="bid", faults=["exposure:0.7"],
+        protocol="bid",
+        sizes=[0.3],
+        trials=1,
+        method="bid",
+        faults=["exposure:0.7"],
         config='{"max_steps": 2, "rays": 16}',
-    )  # fmt: skip
+    )
     with ResultsFile(tmp_path / "r.jsonl") as file:
         assert left_to_do(trials, file) == []
         other = dataclasses.replace(FAULTS["exposure"], change=FAULTS["blur"].change)
@@ -100,9 +102,12 @@ def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 def row(right: bool, converged: bool, squared: float | None = None) -> dict[str, Any]:
     error = 0.01 if right else 1.0
     return {
-        "translation": error, "rotation_deg": error, "converged": converged, "normalized_error_squared": squared,
+        "translation": error,
+        "rotation_deg": error,
+        "converged": converged,
+        "normalized_error_squared": squared,
         "cpu_seconds": 2.0,
-    }  # fmt: skip
+    }
 
 
 def test_a_cell_counts_silent_and_rejected_answers(script: ModuleType) -> None:
@@ -116,8 +121,13 @@ def test_a_cell_counts_silent_and_rejected_answers(script: ModuleType) -> None:
     rows.append(row(False, False) | {"translation": None, "rotation_deg": None})  # of another scene
     found = script.summary(rows)
     assert {name: found[name] for name in ("n", "right", "strict", "converged", "silent", "right_but_rejected")} == {
-        "n": 5, "right": 3, "strict": 3, "converged": 3, "silent": 1, "right_but_rejected": 1,
-    }  # fmt: skip
+        "n": 5,
+        "right": 3,
+        "strict": 3,
+        "converged": 3,
+        "silent": 1,
+        "right_but_rejected": 1,
+    }
     assert found["inside_95_of_converged"] == [1, 2]
     assert "silent    1" in script.line("cell", rows)
 
@@ -173,9 +183,7 @@ def test_an_interrupted_run_goes_on_with_rows_of_the_same_content(
     def run(jobs: int, *faults: str) -> dict[str, Any]:
         words = [scene, "--faults", *faults, "--rgbd", "--frames", "3", "--jobs", str(jobs)]
         with script.RowStore(tmp_path / "rows.jsonl") as store:
-            found: dict[str, Any] = script.measured(
-                given(script, monkeypatch, *words), store, InThisProcess()
-            )
+            found: dict[str, Any] = script.measured(given(script, monkeypatch, *words), store, InThisProcess())
             return found
 
     assert run(1, "none")["all"]["n"] == 3

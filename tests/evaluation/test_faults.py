@@ -96,10 +96,24 @@ def test_a_fault_of_depth_changes_depth_alone(name: str, view: View) -> None:
 
 @pytest.mark.parametrize(
     "fault",
-    ["depth-noise:0.02", "depth-noise-squared:0.01", "depth-holes:0.5", "depth-hole:0.5", "depth-shift:4", "depth-rows:1",
-     "depth-window:9", "principal-point:5", "rolling-shutter:2", "occluder:0.2", "occluder-unmeasured:0.2", "moved:0.2",
-     "added:0.2", "vanished:0.2", "covered"],
-)  # fmt: skip
+    [
+        "depth-noise:0.02",
+        "depth-noise-squared:0.01",
+        "depth-holes:0.5",
+        "depth-hole:0.5",
+        "depth-shift:4",
+        "depth-rows:1",
+        "depth-window:9",
+        "principal-point:5",
+        "rolling-shutter:2",
+        "occluder:0.2",
+        "occluder-unmeasured:0.2",
+        "moved:0.2",
+        "added:0.2",
+        "vanished:0.2",
+        "covered",
+    ],
+)
 def test_random_choices_depend_on_seed_and_frame(fault: str, view: View) -> None:
     first = faulty(view, fault, 0).frame
     assert not same(faulty(view, fault, 1).frame, first)
@@ -180,9 +194,7 @@ def test_composed_faults_are_applied_in_turn_with_the_same_random_choices(view: 
     both = faulty(view, "exposure:0.5+depth-noise:0.01", 5)
     assert torch.equal(depth_of(one), depth_of(both))
     assert torch.equal(both.frame.rgb, faulty(view, "exposure:0.5", 5).frame.rgb)
-    darker = faulty(
-        view, "exposure:2+vignetting:0.5", 0
-    ).frame.rgb  # white is cut off before the corners darken
+    darker = faulty(view, "exposure:2+vignetting:0.5", 0).frame.rgb  # white is cut off before the corners darken
     brighter = faulty(view, "vignetting:0.5+exposure:2", 0).frame.rgb
     assert bool((darker <= brighter + BYTE).all())
     assert bool((darker < brighter - 0.01).any())
@@ -339,9 +351,7 @@ def test_a_rolling_shutter_sees_what_a_turning_camera_would() -> None:
     assert float(inside.float().mean()) > 0.8
     for what in ("rgb", "depth"):
         truth = torch.stack([getattr(f, what)[row] for row, f in zip(sample.tolist(), frames, strict=True)])
-        error, without = (
-            (getattr(f, what)[sample] - truth)[inside].abs().mean() for f in (rolled, still.frame)
-        )
+        error, without = ((getattr(f, what)[sample] - truth)[inside].abs().mean() for f in (rolled, still.frame))
         assert float(error) < 0.25 * float(without)
 
 
@@ -370,15 +380,11 @@ def test_blur_has_its_standard_deviation() -> None:
         assert float(weights.sum()) == pytest.approx(1)
         variance = float((weights * offsets.square()).sum())
         assert math.sqrt(variance) == pytest.approx(pixels, rel=0.03)  # the kernel ends at three deviations
-    assert torch.allclose(
-        faulty(plain(), "blur:1000", 0).frame.rgb, plain().frame.rgb
-    )  # wider than the image
+    assert torch.allclose(faulty(plain(), "blur:1000", 0).frame.rgb, plain().frame.rgb)  # wider than the image
 
 
 def test_jpeg_loses_more_at_a_lower_quality(view: View) -> None:
-    errors = [
-        float((faulty(view, f"jpeg:{q}", 0).frame.rgb - view.frame.rgb).square().mean()) for q in (95, 50, 5)
-    ]
+    errors = [float((faulty(view, f"jpeg:{q}", 0).frame.rgb - view.frame.rgb).square().mean()) for q in (95, 50, 5)]
     assert errors[0] < errors[1] < errors[2] < 0.05
 
 
@@ -387,9 +393,7 @@ def test_grey_has_one_value(view: View) -> None:
     assert torch.allclose(grey[..., 0], grey[..., 1], atol=1e-6)
     assert torch.allclose(grey[..., 0], grey[..., 2], atol=1e-6)
     half = faulty(view, "grey:0.5", 0).frame.rgb
-    torch.testing.assert_close(
-        half, (grey + view.frame.rgb) / 2, atol=0.75 * BYTE, rtol=0
-    )  # grey is rounded, too
+    torch.testing.assert_close(half, (grey + view.frame.rgb) / 2, atol=0.75 * BYTE, rtol=0)  # grey is rounded, too
 
 
 def test_vignetting_darkens_corners() -> None:
@@ -420,11 +424,11 @@ def test_an_occluder_is_one_piece_in_front(seed: int, view: View) -> None:
         assert bool((depth_of(blind) <= before).all())
         gone = (blind.frame.rgb != view.frame.rgb).any(-1)
         assert not bool(depth_of(blind)[gone].any())
-        assert torch.equal(depth_of(blind)[~gone & (before > 0)] > 0, torch.ones(int((~gone & (before > 0)).sum()), dtype=torch.bool))  # fmt: skip
+        assert torch.equal(
+            depth_of(blind)[~gone & (before > 0)] > 0, torch.ones(int((~gone & (before > 0)).sum()), dtype=torch.bool)
+        )
         masks.append(filled)
-    assert not bool(
-        (masks[0] & ~masks[1]).any() or (masks[1] & ~masks[2]).any()
-    )  # larger ones cover smaller ones
+    assert not bool((masks[0] & ~masks[1]).any() or (masks[1] & ~masks[2]).any())  # larger ones cover smaller ones
 
 
 def test_a_moved_thing_is_a_copy_from_elsewhere() -> None:
@@ -439,9 +443,7 @@ def test_a_moved_thing_is_a_copy_from_elsewhere() -> None:
         moves = (centres - places("moved:0.2", seed))[copied]
         move = moves.median(dim=0).values
         assert 0.15 * 60 - 0.1 <= float(move.norm()) <= 0.3 * 60 + 0.1
-        assert (
-            float(((moves - move).norm(dim=-1) < 0.05).float().mean()) > 0.5
-        )  # the rest is mirrored at a border
+        assert float(((moves - move).norm(dim=-1) < 0.05).float().mean()) > 0.5  # the rest is mirrored at a border
 
 
 def test_things_are_added_and_vanish_in_one_piece_of_the_surface(view: View) -> None:
@@ -487,10 +489,12 @@ def test_an_image_upside_down_shows_the_same_points_from_its_own_pose(view: View
     turned = faulty(view, "upside-down", 0)
     points = [
         v.T_ref_camera.apply(
-            (v.frame.intrinsics.unproject(v.frame.intrinsics.pixel_centres(torch.float64)) * depth_of(v)[..., None]).double()
+            (
+                v.frame.intrinsics.unproject(v.frame.intrinsics.pixel_centres(torch.float64)) * depth_of(v)[..., None]
+            ).double()
         )
         for v in (view, turned)
-    ]  # fmt: skip
+    ]
     torch.testing.assert_close(points[1].flip([0, 1]), points[0], rtol=0, atol=1e-5)
     assert torch.equal(turned.frame.rgb.flip([0, 1]), view.frame.rgb)
 

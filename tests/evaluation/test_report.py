@@ -52,9 +52,7 @@ def result(seed: int, reached: int | None, size: float = 0.5, **settings: Any) -
     turned = [12.0] * far + [0.1] * (STEPS + 1 - far)
     protocol, images = settings.pop("protocol", "bid"), settings.pop("images", 1)
     sizes, config = () if protocol == "none" else (size,), json.dumps(settings)
-    trial = Trial(
-        "house", "photos", ("a",) * images, sizes, seed, protocol=protocol, method="bid", config=config
-    )
+    trial = Trial("house", "photos", ("a",) * images, sizes, seed, protocol=protocol, method="bid", config=config)
     found = trial_result(trial, moved, turned, converged=reached is not None)
     start = None if protocol == "none" else found.start_error
     return dataclasses.replace(found, start_error=start, settings={"rays": 64, "level": 0, **settings})
@@ -69,17 +67,20 @@ def write(path: Path, *results: TrialResult) -> Path:
 def results() -> list[TrialResult]:
     """Two conditions at two sizes; the second is slower and fails at the larger size."""
     quick = [result(s, 2 + s % 3, size) for size in (1.2, 0.5) for s in range(6)]
-    slow = [
-        result(s, None if size > 1 else 6 + s % 4, size, level=None) for size in (0.5, 1.2) for s in range(6)
-    ]
+    slow = [result(s, None if size > 1 else 6 + s % 4, size, level=None) for size in (0.5, 1.2) for s in range(6)]
     return [*quick, *slow]
 
 
 def test_groups_are_named_by_what_differs(results: list[TrialResult]) -> None:
     groups = grouped(results)
     assert [g.situation.start for g in groups] == [
-        "bid 0.5", "bid 0.5", "bid 1.2", "bid 1.2", "bid, all sizes", "bid, all sizes",
-    ]  # fmt: skip
+        "bid 0.5",
+        "bid 0.5",
+        "bid 1.2",
+        "bid 1.2",
+        "bid, all sizes",
+        "bid, all sizes",
+    ]
     assert {g.label for g in groups} == {"bid, level 0", "bid, level none"}
     assert [len(g.results) for g in groups] == [6, 6, 6, 6, 12, 12]
     assert [g.label for g in grouped(results[:6])] == ["bid"]
@@ -120,9 +121,7 @@ class Page(HTMLParser):
         self.open += tag not in ("meta", "img", "br")
         for name, value in attributes:
             if name in ("src", "href"):
-                kind = (
-                    self.pictures if (value or "").startswith("data:image/svg+xml;base64,") else self.fetched
-                )
+                kind = self.pictures if (value or "").startswith("data:image/svg+xml;base64,") else self.fetched
                 kind.append(value or "")
 
     def handle_endtag(self, tag: str) -> None:
@@ -153,9 +152,14 @@ def test_the_page_needs_nothing_beside_it(
     for picture in page.pictures:
         ET.fromstring(base64.b64decode(picture.partition(",")[2]))
     for said in (
-        "Mine & yours", "24 trials", "bidnerf evaluate 'a <map>' photos", "2 local processes", "bid, level none",
-        "100.0 %6/6 on 1 frame, 21 to 100 %", "50.0 %6/12 on 1 frame, 5 to 95 %",
-    ):  # fmt: skip
+        "Mine & yours",
+        "24 trials",
+        "bidnerf evaluate 'a <map>' photos",
+        "2 local processes",
+        "bid, level none",
+        "100.0 %6/6 on 1 frame, 21 to 100 %",
+        "50.0 %6/12 on 1 frame, 5 to 95 %",
+    ):
         assert said in page.text
     for name in ("errors", "convergence"):
         assert (tmp_path / "out" / f"{name}.png").is_file()
@@ -259,9 +263,7 @@ def test_datasets_and_maps_are_named_where_they_differ() -> None:
     assert titles(first, other) == ["photos/test: no start", "scans/val: no start"]
     assert titles(first, moved) == ["house: no start", "garden: no start"]
     assert titles(first, retrained) == ["house (weights-1): no start", "house (weights-2): no start"]
-    assert titles(
-        first, dataclasses.replace(other, trial=dataclasses.replace(other.trial, map="garden"))
-    ) == [
+    assert titles(first, dataclasses.replace(other, trial=dataclasses.replace(other.trial, map="garden"))) == [
         "house on photos/test: no start",
         "garden on scans/val: no start",
     ]
@@ -287,10 +289,7 @@ def test_a_report_without_starts_uses_no_share_of_their_error(
 
 @pytest.mark.usefixtures("undrawn")
 def test_nothing_is_said_or_drawn_of_steps_that_there_are_not(tmp_path: Path) -> None:
-    results = [
-        trial_result(Trial("house", "photos", (f"{n}",), (), n), [0.01 * n], start_error=None)
-        for n in range(4)
-    ]
+    results = [trial_result(Trial("house", "photos", (f"{n}",), (), n), [0.01 * n], start_error=None) for n in range(4)]
     assert main(["report", str(write(tmp_path / "r.jsonl", *results)), "--out", str(tmp_path / "out")]) == 0
     assert {path.stem for path in (tmp_path / "out").glob("*.svg")} == {"errors"}
     for text in ("ms per step", "steps to", "10 %"):
@@ -300,9 +299,7 @@ def test_nothing_is_said_or_drawn_of_steps_that_there_are_not(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("values", "expected"), [([1, 4], 2.5), ([3, 1, 2], 2), ([1, None], None), ([1, 2, None], 2), ([], None)]
 )
-def test_a_median_counts_what_is_unknown_as_infinite(
-    values: list[float | None], expected: float | None
-) -> None:
+def test_a_median_counts_what_is_unknown_as_infinite(values: list[float | None], expected: float | None) -> None:
     assert median(values) == expected
 
 
@@ -331,9 +328,24 @@ def test_a_recorded_command_has_no_local_paths(monkeypatch: pytest.MonkeyPatch) 
 
 
 HOSTILE = (
-    r"$\frac{$", "$x^{y$", r"$\badmacro{1}$", "$$", "\x1b[31mred", "nul\0", "\x07bell", "\u202eesrever", "\u2028line",
-    "<script>alert(1)</script>", "<img src=x onerror=alert(1)>", "{{ 7 * 7 }}", "{% raw %}", "a\nb", "&amp;", "]]>", "x" * 5000,
-)  # fmt: skip
+    r"$\frac{$",
+    "$x^{y$",
+    r"$\badmacro{1}$",
+    "$$",
+    "\x1b[31mred",
+    "nul\0",
+    "\x07bell",
+    "\u202eesrever",
+    "\u2028line",
+    "<script>alert(1)</script>",
+    "<img src=x onerror=alert(1)>",
+    "{{ 7 * 7 }}",
+    "{% raw %}",
+    "a\nb",
+    "&amp;",
+    "]]>",
+    "x" * 5000,
+)
 
 
 def hostile_result(place: int) -> TrialResult:
@@ -386,9 +398,7 @@ def test_hostile_names_are_harmless_everywhere(tmp_path: Path, capfd: pytest.Cap
         assert drawing.stat().st_size > 2000
 
 
-def test_a_name_that_no_folder_can_have_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_name_that_no_folder_can_have_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = json.dumps(to_plain(result(0, 2)))
     for name in ("map", "data", "depth_points"):
         plain = json.loads(line)

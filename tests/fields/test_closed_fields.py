@@ -33,15 +33,19 @@ def rays_towards_the_middle(count: int, generator: torch.Generator) -> Rays:
 
 @pytest.mark.parametrize(
     "check",
-    [check_shapes, check_ranges, check_intervals, check_repeatable, check_rays_alone,
-     check_background, check_levels, lambda field: check_precision(field, field)],
-)  # fmt: skip
-@pytest.mark.parametrize(
-    "field", [GaussianBlobs.random(), HomogeneousBall(0.7, 2.0)], ids=lambda f: type(f).__name__
+    [
+        check_shapes,
+        check_ranges,
+        check_intervals,
+        check_repeatable,
+        check_rays_alone,
+        check_background,
+        check_levels,
+        lambda field: check_precision(field, field),
+    ],
 )
-def test_closed_fields_keep_the_contract(
-    field: RadianceField, check: Callable[[RadianceField], None]
-) -> None:
+@pytest.mark.parametrize("field", [GaussianBlobs.random(), HomogeneousBall(0.7, 2.0)], ids=lambda f: type(f).__name__)
+def test_closed_fields_keep_the_contract(field: RadianceField, check: Callable[[RadianceField], None]) -> None:
     check(field)
 
 
@@ -83,9 +87,7 @@ def test_chord_of_rays_that_start_within_or_point_away() -> None:
     ball = HomogeneousBall(0.5, 1.0)
     origins = torch.tensor([[0.0, 0, 0], [2.0, 0, 0], [2.0, 0, 0], [0.0, 0.6, 0]], dtype=torch.float64)
     directions = torch.tensor([[1.0, 0, 0], [-1.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0]], dtype=torch.float64)
-    enter, leave = chord(
-        ball, Rays(origins, directions, torch.zeros(4).double(), torch.full((4,), 5.0).double())
-    )
+    enter, leave = chord(ball, Rays(origins, directions, torch.zeros(4).double(), torch.full((4,), 5.0).double()))
     assert (leave - enter).tolist() == pytest.approx([0.5, 1.0, 0.0, 0.0])
 
 

@@ -73,9 +73,7 @@ def test_images_with_a_background_have_no_exposure_to_learn(alpha: bool) -> None
     supervision = Supervision(views, demo_object().bounds, SupervisionConfig())
     assert (supervision.colours is None) == alpha
     assert isinstance(supervision.bank, RayBank)
-    assert (
-        Supervision(views, demo_object().bounds, replace(SupervisionConfig(), exposure=False)).colours is None
-    )
+    assert Supervision(views, demo_object().bounds, replace(SupervisionConfig(), exposure=False)).colours is None
 
 
 def test_an_even_image_is_fitted_by_its_mean() -> None:

@@ -24,9 +24,7 @@ def test_near_points_stay_and_far_ones_keep_their_direction() -> None:
     near = points(0.1).clamp(-1, 1)
     assert torch.equal(contract_points(near), near)
     far, drawn = points(50.0), contract_points(points(50.0))
-    torch.testing.assert_close(
-        torch.nn.functional.normalize(drawn, dim=-1), torch.nn.functional.normalize(far, dim=-1)
-    )
+    torch.testing.assert_close(torch.nn.functional.normalize(drawn, dim=-1), torch.nn.functional.normalize(far, dim=-1))
 
 
 def test_contraction_has_the_derivative_that_differences_show() -> None:

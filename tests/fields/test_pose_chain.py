@@ -67,8 +67,13 @@ def test_gradient_by_the_pose_is_the_numerical_one(views: int, wide: float) -> N
 
 
 SETTINGS = {
-    "rays": 128, "max_steps": 200, "learning_rate": 0.08, "decay_steps": 80, "depth_weight": 1.0, "level": None,
-}  # fmt: skip
+    "rays": 128,
+    "max_steps": 200,
+    "learning_rate": 0.08,
+    "decay_steps": 80,
+    "depth_weight": 1.0,
+    "level": None,
+}
 
 
 @pytest.mark.slow

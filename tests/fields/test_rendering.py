@@ -67,9 +67,7 @@ class Fog:
         return FieldValues(density.abs(), torch.sigmoid(positions * directions))
 
 
-def render_slowly(
-    field: RadianceField, rays: Rays, samples: RaySamples, background: tuple[float, float, float]
-):
+def render_slowly(field: RadianceField, rays: Rays, samples: RaySamples, background: tuple[float, float, float]):
     """Equation 3, one ray and one sample at a time, in numpy."""
     results = []
     for r in range(len(rays.near)):
@@ -127,8 +125,10 @@ def test_what_is_not_valid_changes_nothing(leading: tuple[int, ...]) -> None:
     """Rendering with gaps equals rendering the whole rays with a field that has no density in the gaps."""
     flat, field = some_rays(12), Fog(Gaps(), [])
     parts = (flat.origins, flat.directions, flat.near, flat.far)
-    rays = Rays(*(part.reshape(*leading, *part.shape[1:]).requires_grad_() for part in parts[:2]),
-                *(part.reshape(leading) for part in parts[2:]))  # fmt: skip
+    rays = Rays(
+        *(part.reshape(*leading, *part.shape[1:]).requires_grad_() for part in parts[:2]),
+        *(part.reshape(leading) for part in parts[2:]),
+    )
     samples = field.sampler(rays)
     values = field.query(rays.at(samples.middles), rays.directions[..., None, :].expand(*leading, 12, 3))
     everywhere = replace(samples, valid=torch.ones_like(samples.valid))
@@ -212,9 +212,7 @@ def test_box_clips_rays_as_a_slow_march_does() -> None:
     rays = bounds.rays(some_rays(40).origins, some_rays(40).directions)
     march = torch.linspace(0.1, 6.0, 20001, dtype=torch.float64)
     points = rays.at(march.expand(40, -1))
-    inside = (
-        (points > torch.tensor(bounds.lower).double()) & (points < torch.tensor(bounds.upper).double())
-    ).all(-1)
+    inside = ((points > torch.tensor(bounds.lower).double()) & (points < torch.tensor(bounds.upper).double())).all(-1)
     step = float(march[1] - march[0])
     for r in range(40):
         hit = march[inside[r]]

@@ -34,9 +34,7 @@ COUNT = 9
 def shell(rays: Rays, jitter: Generator | None = None) -> RaySamples:
     """Invalid samples amid valid ones: nothing within half a metre of the middle."""
     samples = Stratified(12)(rays, jitter)
-    return RaySamples(
-        samples.starts, samples.ends, samples.valid & (rays.at(samples.middles).norm(dim=-1) > 0.5)
-    )
+    return RaySamples(samples.starts, samples.ends, samples.valid & (rays.at(samples.middles).norm(dim=-1) > 0.5))
 
 
 def apart(rays: Rays, jitter: Generator | None = None) -> RaySamples:
@@ -57,9 +55,12 @@ def nothing(rays: Rays, jitter: Generator | None = None) -> RaySamples:
 
 
 SAMPLERS: dict[str, Callable[[], RaySampler]] = {
-    "contiguous": lambda: Stratified(12), "invalid": lambda: shell, "gaps": lambda: apart, "grid": grid,
+    "contiguous": lambda: Stratified(12),
+    "invalid": lambda: shell,
+    "gaps": lambda: apart,
+    "grid": grid,
     "none": lambda: nothing,
-}  # fmt: skip
+}
 
 
 def rays(count: int = 200) -> Rays:
@@ -101,16 +102,12 @@ def test_stratified_intervals_tile_the_ray(jittered: bool) -> None:
 def test_what_was_covered_stays_covered_and_nothing_else(name: str, jittered: bool) -> None:
     """At any distance along a ray, the cut intervals say what the rough ones say."""
     sampler, where = SAMPLERS[name](), rays()
-    rough, cut = (
-        s(where, Generator().manual_seed(2) if jittered else None) for s in (sampler, finer(sampler))
-    )
+    rough, cut = (s(where, Generator().manual_seed(2) if jittered else None) for s in (sampler, finer(sampler)))
     share = torch.rand((200, 300), generator=Generator().manual_seed(3))
     distances = where.near[:, None] + share * (where.far - where.near)[:, None]
 
     def covers(samples: RaySamples) -> torch.Tensor:
-        inside = (samples.starts[:, None] <= distances[..., None]) & (
-            distances[..., None] < samples.ends[:, None]
-        )
+        inside = (samples.starts[:, None] <= distances[..., None]) & (distances[..., None] < samples.ends[:, None])
         return (inside & samples.valid[:, None]).sum(-1)
 
     assert int(covers(cut).max()) == 1
@@ -181,9 +178,7 @@ def test_concentrated_samples_are_few_and_as_long_as_those_they_replace(name: st
 def test_few_samples_are_kept_as_they_are() -> None:
     where, rough = rays(), Stratified(COUNT)
     kept = fewer(rough)(where)
-    assert all(
-        torch.equal(getattr(kept, part), getattr(rough(where), part)) for part in ("starts", "ends", "valid")
-    )
+    assert all(torch.equal(getattr(kept, part), getattr(rough(where), part)) for part in ("starts", "ends", "valid"))
 
 
 class TwoWalls:

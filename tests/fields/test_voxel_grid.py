@@ -79,9 +79,7 @@ def test_a_filling_grid_covers_the_box_with_at_most_so_many_cells(
     assert math.prod(grid.shape) <= cells
     assert grid.lower == bounds.lower
     assert all(high >= side * (1 - 1e-12) for high, side in zip(grid.upper, sides, strict=True))
-    smaller = (
-        grid.cell / 1.02
-    )  # one that is a little finer would have too many, or this is the first that was tried
+    smaller = grid.cell / 1.02  # one that is a little finer would have too many, or this is the first that was tried
     finer = math.prod(math.ceil(side / smaller) for side in sides)
     assert finer > cells or grid.cell == (math.prod(bounds.size) / cells) ** (1 / 3)
 

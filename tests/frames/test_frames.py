@@ -42,10 +42,7 @@ WRONG: list[tuple[dict[str, Any], str, str | None]] = [
     ({"rgb": NO_VALUES.to_sparse()}, "rgb is a sparse tensor", "a dense one"),
     ({"rgb": NO_VALUES.to("meta")}, "has no values", "a dense one"),
     ({"rgb": NO_VALUES.clone().requires_grad_()}, "rgb requires a gradient", MEASURED),
-    *(
-        ({"rgb": x}, "rgb has shape", "(height, width, 3)")
-        for x in (NO_VALUES[..., 0], torch.zeros(16, 24, 4))
-    ),
+    *(({"rgb": x}, "rgb has shape", "(height, width, 3)") for x in (NO_VALUES[..., 0], torch.zeros(16, 24, 4))),
     ({"rgb": torch.zeros(16, 24, 1)}, "rgb has shape", "(height, width, 3)"),
     ({"rgb": torch.zeros(24, 16, 3)}, "rgb is 16x24, but its camera expects 24x16", None),
     ({"depth": torch.zeros(8, 12)}, "depth is 12x8, but its camera expects 24x16", None),
@@ -82,9 +79,7 @@ def test_depth_that_is_no_number_was_not_measured() -> None:
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("camera", [None, np.eye(3), (20.0, 20.0, 12.0, 8.0), "camera.json"])
 def test_arrays_need_intrinsics(camera: Any) -> None:
-    with refused(
-        where="frame image", found=f"camera is a {type(camera).__name__}", expected="Intrinsics(fx="
-    ):
+    with refused(where="frame image", found=f"camera is a {type(camera).__name__}", expected="Intrinsics(fx="):
         Frame.from_numpy(np.zeros((16, 24, 3), np.uint8), camera)
 
 

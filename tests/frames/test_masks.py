@@ -56,10 +56,16 @@ def covering(white: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     "stored",
     [
-        left(), left() // 255, left() == 255, left().astype(np.uint16) * 257, np.dstack([left()] * 3), covering(left()),
-        left(24, 16), left(6 * 4, 4 * 4),
+        left(),
+        left() // 255,
+        left() == 255,
+        left().astype(np.uint16) * 257,
+        np.dstack([left()] * 3),
+        covering(left()),
+        left(24, 16),
+        left(6 * 4, 4 * 4),
     ],
-)  # fmt: skip
+)
 def test_masks_of_every_kind_hide_what_is_black(tmp_path: Path, stored: np.ndarray) -> None:
     path = saved(tmp_path / "mask.png", stored)
     hidden = read_mask(path, Raster(*SIZE), SIZE)
@@ -85,9 +91,7 @@ def test_unusable_masks_are_refused(
         read_mask(path, Raster(*SIZE), SIZE)
 
 
-@pytest.mark.parametrize(
-    "name", ["a.png", "a.jpg.png", "a_mask.png", "dynamic_mask_a.png", "cam/a.png", "a.mask.jpg"]
-)
+@pytest.mark.parametrize("name", ["a.png", "a.jpg.png", "a_mask.png", "dynamic_mask_a.png", "cam/a.png", "a.mask.jpg"])
 def test_masks_are_found_by_the_name_of_their_photo(tmp_path: Path, name: str) -> None:
     path = saved(tmp_path / name, left())
     saved(tmp_path / "other.png", left())
@@ -261,9 +265,7 @@ def test_one_visible_pixel_is_enough_for_rays() -> None:
     (view,) = views(1)
     hidden = torch.ones(view.frame.rgb.shape[:2], dtype=torch.bool)
     hidden[7, 3] = False
-    bank = RayBank(
-        [replace(view, frame=replace(view.frame, alpha=None, hidden=hidden))], demo_object().bounds
-    )
+    bank = RayBank([replace(view, frame=replace(view.frame, alpha=None, hidden=hidden))], demo_object().bounds)
     drawn = bank.draw(50, torch.Generator().manual_seed(0)).observed
     assert torch.equal(drawn.rgb, view.frame.rgb[7, 3].expand(50, 3))
 

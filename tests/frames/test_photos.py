@@ -135,9 +135,7 @@ def test_photos_of_a_phone_show_what_the_dataset_shows(data_dir: Path) -> None:
         known = capture.views("test", [frame.name])[0].frame
         assert frame.rgb.shape == known.rgb.shape
         assert float((frame.rgb - known.rgb).abs().mean()) < 0.02
-        assert (
-            Frame.open(path, camera=doll / "transforms_test.json", largest=504).intrinsics == known.intrinsics
-        )
+        assert Frame.open(path, camera=doll / "transforms_test.json", largest=504).intrinsics == known.intrinsics
 
 
 # Depth.

@@ -112,9 +112,7 @@ def test_a_portrait_photo_in_a_map_of_landscape_ones_has_their_camera() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("factor", "has_landmarks"), [(0.7, True), (1.0, False), (1.15, False)])
-def test_colours_alone_do_not_tell_an_approximate_focal_length(
-    photo: Path, factor: float, has_landmarks: bool
-) -> None:
+def test_colours_alone_do_not_tell_an_approximate_focal_length(photo: Path, factor: float, has_landmarks: bool) -> None:
     """Neither landmarks of unknown cameras nor colours: the ground looks nearly flat."""
     wrong = replace(CAMERA, fx=CAMERA.fx * factor, fy=CAMERA.fy * factor)
     frame = Frame.read(photo, CameraSource(assumed=(wrong,)))

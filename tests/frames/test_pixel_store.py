@@ -104,9 +104,7 @@ def test_reducing_a_frame_keeps_colours_rays_and_what_is_hidden() -> None:
 
 
 @pytest.mark.parametrize("expected", [0, 2**40], ids=["memory", "file"])
-def test_a_store_returns_what_is_put_into_it(
-    expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_returns_what_is_put_into_it(expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(storage, "BLOCK", 9000)
     views = some_views(8)
     depth = torch.rand(16, 24)
@@ -127,9 +125,7 @@ def test_a_full_disk_is_an_error_in_a_line(tmp_path: Path, monkeypatch: pytest.M
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(storage.os, "posix_fallocate", full)
-    with pytest.raises(
-        InputError, match=rf"^{tmp_path}: no room for 5000 MB of images \(No space left on device\)"
-    ):
+    with pytest.raises(InputError, match=rf"^{tmp_path}: no room for 5000 MB of images \(No space left on device\)"):
         PixelStore(5_000_000_000, tmp_path).stored(byte_frame())
 
 

@@ -67,9 +67,7 @@ def test_adjoint_moves_a_tangent_to_the_other_side(a: torch.Tensor, b: torch.Ten
     A, small = SE3.exp(a), b / (1 + b.norm())
     left = A @ SE3.exp(small)
     right = SE3.exp(A.adjoint() @ small) @ A
-    torch.testing.assert_close(
-        left.matrix(), right.matrix(), atol=1e-9 * (1 + float(a.abs().max())), rtol=1e-8
-    )
+    torch.testing.assert_close(left.matrix(), right.matrix(), atol=1e-9 * (1 + float(a.abs().max())), rtol=1e-8)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-9, 1e-4, 0.0099, 0.0101, 1.0, 3.0])

@@ -170,11 +170,36 @@ def refused(read: Callable[[], object]) -> bool:
     return True
 
 
-WORDS = st.text(max_size=6) | st.sampled_from([
-    "info", "train", "render", "localize", "evaluate", "compare", "report", "bake", "backends", "--out", "--seed", "--json",
-    "--size", "--trials", "--nothing", "--frame", "--help", "--split", "--method", "--level", "\x1b[2J", "�", "1e400",
-    "-1", "nan", "a/b",
-])  # fmt: skip
+WORDS = st.text(max_size=6) | st.sampled_from(
+    [
+        "info",
+        "train",
+        "render",
+        "localize",
+        "evaluate",
+        "compare",
+        "report",
+        "bake",
+        "backends",
+        "--out",
+        "--seed",
+        "--json",
+        "--size",
+        "--trials",
+        "--nothing",
+        "--frame",
+        "--help",
+        "--split",
+        "--method",
+        "--level",
+        "\x1b[2J",
+        "�",
+        "1e400",
+        "-1",
+        "nan",
+        "a/b",
+    ]
+)
 
 
 @settings(max_examples=30)
@@ -208,17 +233,20 @@ NO_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
     "4 GB": (hollow, "expected"),
 }
 FILES: dict[str, Callable[[Path], object]] = {
-    "record": read_record, "pose": read_pose, "results": lambda p: read_results([p]), "tensors": read_tensors,
-    "camera": lambda p: read_camera(p, (24, 24)), "array": lambda p: read_array(p, "an array"),
-    "archive": lambda p: read_archive(p, ["points"], "an archive"), "points": read_depth_points,
-}  # fmt: skip
+    "record": read_record,
+    "pose": read_pose,
+    "results": lambda p: read_results([p]),
+    "tensors": read_tensors,
+    "camera": lambda p: read_camera(p, (24, 24)),
+    "array": lambda p: read_array(p, "an array"),
+    "archive": lambda p: read_archive(p, ["points"], "an archive"),
+    "points": read_depth_points,
+}
 
 
 @pytest.mark.parametrize("kind", FILES)
 @pytest.mark.parametrize("what", NO_FILES)
-def test_what_is_no_file_of_a_usable_size_is_refused_before_it_is_read(
-    kind: str, what: str, tmp_path: Path
-) -> None:
+def test_what_is_no_file_of_a_usable_size_is_refused_before_it_is_read(kind: str, what: str, tmp_path: Path) -> None:
     make, said = NO_FILES[what]
     make(tmp_path / "x")
     with pytest.raises(InputError, match=said):
@@ -227,9 +255,15 @@ def test_what_is_no_file_of_a_usable_size_is_refused_before_it_is_read(
 
 @pytest.mark.parametrize(
     ("kind", "shape"),
-    [("<f8", "(100000, 100000)"), ("<f8", "(1000000000000,)"), ("<f8", "(-1, 3)"), ("<f8", "(1, 2"), ("<f8", "(" * 500),
-     ("O", "(2,)")],
-)  # fmt: skip
+    [
+        ("<f8", "(100000, 100000)"),
+        ("<f8", "(1000000000000,)"),
+        ("<f8", "(-1, 3)"),
+        ("<f8", "(1, 2"),
+        ("<f8", "(" * 500),
+        ("O", "(2,)"),
+    ],
+)
 def test_arrays_are_judged_by_their_header(kind: str, shape: str, tmp_path: Path) -> None:
     content = array_file(kind, shape)
     (tmp_path / "a.npy").write_bytes(content)
@@ -265,9 +299,7 @@ def test_a_field_that_is_larger_than_its_weights_takes_no_memory(folder: Path, t
         load_map(tmp_path)
 
 
-def test_a_field_that_needs_numbers_to_be_built_is_loaded_too(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_field_that_needs_numbers_to_be_built_is_loaded_too(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def build(self: Any, config: Any, bounds: Any) -> Any:
         made = real(self, config, bounds)
         float(next(iter(made.parameters())).flatten()[0])  # fails where there are shapes only
@@ -294,12 +326,20 @@ ENTRY = {"dtype": "F32", "shape": [2], "data_offsets": [0, 8]}
 @pytest.mark.parametrize(
     "header",
     [
-        {"a": ENTRY, "b": ENTRY}, {"a": ENTRY | {"data_offsets": [-8, 8]}}, {"a": ENTRY | {"data_offsets": ["0", "8"]}},
-        {"a": ENTRY | {"data_offsets": [0, 2**70]}}, {"a": ENTRY | {"shape": [10**30]}}, {"a": ENTRY | {"shape": [1] * 65 + [2]}},
-        {"a": [1]}, {"__metadata__": [1], "a": ENTRY}, {"__metadata__": {"x": 1}, "a": ENTRY}, [], 3,
+        {"a": ENTRY, "b": ENTRY},
+        {"a": ENTRY | {"data_offsets": [-8, 8]}},
+        {"a": ENTRY | {"data_offsets": ["0", "8"]}},
+        {"a": ENTRY | {"data_offsets": [0, 2**70]}},
+        {"a": ENTRY | {"shape": [10**30]}},
+        {"a": ENTRY | {"shape": [1] * 65 + [2]}},
+        {"a": [1]},
+        {"__metadata__": [1], "a": ENTRY},
+        {"__metadata__": {"x": 1}, "a": ENTRY},
+        [],
+        3,
     ],
     ids=lambda header: json.dumps(header)[:40],
-)  # fmt: skip
+)
 def test_a_header_of_tensors_that_contradicts_itself_is_refused(header: Any, tmp_path: Path) -> None:
     text = json.dumps(header).encode()
     (tmp_path / "t").write_bytes(struct.pack("<Q", len(text)) + text + bytes(8))

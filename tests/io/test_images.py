@@ -105,9 +105,7 @@ def test_sixteen_bits_have_the_range_that_the_sensor_used(
     values.flat[0] = 2**bits - 1
     path = tmp_path / "a.png"
     cv2.imwrite(str(path), values if values.ndim == 2 else values[..., ::-1])
-    expected = torch.from_numpy(values.reshape(20, 30, -1).astype(np.float32) / (2**bits - 1)).expand(
-        20, 30, 3
-    )
+    expected = torch.from_numpy(values.reshape(20, 30, -1).astype(np.float32) / (2**bits - 1)).expand(20, 30, 3)
     monkeypatch.setattr("bidnerf_core.io.images.STRIP", 90)
     for read in (read_image, read_compact_image):
         found, alpha = read(path)
@@ -209,9 +207,7 @@ def test_only_formats_of_images_are_decoded_and_no_program_is_started(
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA"])
-def test_strips_give_what_the_whole_image_gives(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
-) -> None:
+def test_strips_give_what_the_whole_image_gives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str) -> None:
     path = tmp_path / "a.png"
     image = Image.fromarray(noise(50, 41, 4))
     (image.convert("RGB").quantize(16) if mode == "P" else image.convert(mode)).save(path)
@@ -248,9 +244,7 @@ def test_a_jpeg_of_endless_segments_or_scans_is_refused(
 ) -> None:
     path = tmp_path / "a.jpg"
     image = Image.fromarray(noise(40, 60))
-    image.save(
-        path, progressive=True, comment=b"\xff\xda" * 300, exif=b"Exif\0\0" + b"\xff\xe1\xff\xd9" * 3000
-    )
+    image.save(path, progressive=True, comment=b"\xff\xda" * 300, exif=b"Exif\0\0" + b"\xff\xe1\xff\xd9" * 3000)
     read(path)  # nothing within a segment counts
     content = path.read_bytes()
     path.write_bytes(content + repeated * 5000)  # nor what follows the image, where phones store a video

@@ -18,9 +18,7 @@ from commands import Run
 BAKE = ["--cells", "2000"]
 
 
-def test_a_training_killed_before_its_first_checkpoint_begins_anew(
-    bidnerf: Run, shared: Path, tmp_path: Path
-) -> None:
+def test_a_training_killed_before_its_first_checkpoint_begins_anew(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     out = tmp_path / "map"
     out.mkdir()
     for left in (
@@ -35,9 +33,7 @@ def test_a_training_killed_before_its_first_checkpoint_begins_anew(
     assert {path.name for path in out.iterdir()} == whole
 
 
-def test_files_of_others_and_of_whole_maps_are_not_overwritten(
-    bidnerf: Run, shared: Path, tmp_path: Path
-) -> None:
+def test_files_of_others_and_of_whole_maps_are_not_overwritten(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "weights.txt").touch()
     for out in (tmp_path / "notes", shared / "map"):
@@ -53,9 +49,7 @@ def test_a_map_that_another_process_writes_is_not_baked(bidnerf: Run, shared: Pa
     assert "another bidnerf process is writing here" in err
 
 
-def test_a_folder_is_not_removed_from_under_another_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_is_not_removed_from_under_another_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One that fails removes the folder that it made, in which another one may have begun to work meanwhile."""
     out, remove = tmp_path / "map", Path.rmdir
     refused: list[bool] = []

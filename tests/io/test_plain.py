@@ -50,11 +50,21 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
 integers = st.integers(-LARGEST_INTEGER, LARGEST_INTEGER)
 inners = st.builds(Inner, st.text(alphabet="abc"), st.lists(integers).map(tuple))
 outers = st.builds(
-    Outer, integers, finite, st.booleans(), st.sampled_from(["a", "b"]), st.none() | integers,
-    integers | finite | st.text(), st.tuples(finite, st.text()), st.lists(integers).map(tuple), inners,
-    st.lists(inners, max_size=3).map(tuple), st.lists(st.lists(finite)),
-    st.dictionaries(st.text(), st.lists(integers).map(tuple)), st.none() | st.booleans(),
-)  # fmt: skip
+    Outer,
+    integers,
+    finite,
+    st.booleans(),
+    st.sampled_from(["a", "b"]),
+    st.none() | integers,
+    integers | finite | st.text(),
+    st.tuples(finite, st.text()),
+    st.lists(integers).map(tuple),
+    inners,
+    st.lists(inners, max_size=3).map(tuple),
+    st.lists(st.lists(finite)),
+    st.dictionaries(st.text(), st.lists(integers).map(tuple)),
+    st.none() | st.booleans(),
+)
 
 
 @settings(max_examples=20)

@@ -44,18 +44,14 @@ def test_an_element_without_properties_holds_nothing(tmp_path: Path, form: str) 
 
 @pytest.mark.parametrize("count", ["3", "9" * 18, "9" * 4000])
 @pytest.mark.parametrize("lists", [[], ["property list uchar int vertex_indices"]])
-def test_more_elements_than_the_file_has_room_for_are_refused(
-    tmp_path: Path, count: str, lists: list[str]
-) -> None:
+def test_more_elements_than_the_file_has_room_for_are_refused(tmp_path: Path, count: str, lists: list[str]) -> None:
     lines = [f"element vertex {count}", *XYZ, *lists]
     path = ply(tmp_path / "a.ply", *lines, content=POINTS.tobytes())
     with refused(where=path, found="is the file truncated?"):
         read_ply(path)
 
 
-@pytest.mark.parametrize(
-    "line", ["element vertex -1", "element vertex " + "9" * 5000, "property float x", "noise"]
-)
+@pytest.mark.parametrize("line", ["element vertex -1", "element vertex " + "9" * 5000, "property float x", "noise"])
 def test_a_line_of_the_header_that_means_nothing_is_named(tmp_path: Path, line: str) -> None:
     with refused(where=tmp_path / "a.ply", found=f"its header has the line {line[:60]!r}"):
         read_ply(ply(tmp_path / "a.ply", line))
@@ -69,9 +65,7 @@ def test_a_text_row_that_does_not_fit_its_properties_is_refused(tmp_path: Path, 
         read_ply(path)
 
 
-@pytest.mark.parametrize(
-    ("number", "is_byte"), [("255.0", True), ("0", True), ("256", False), ("0.5", False)]
-)
+@pytest.mark.parametrize(("number", "is_byte"), [("255.0", True), ("0", True), ("256", False), ("0.5", False)])
 def test_a_byte_in_a_text_may_be_written_as_a_float(tmp_path: Path, number: str, is_byte: bool) -> None:
     lines = ["element vertex 1", "property float x", "property uchar red"]
     path = ply(tmp_path / "a.ply", *lines, form="ascii", content=f"0.5 {number}\n".encode())

@@ -37,5 +37,8 @@ def test_the_size_of_the_text_is_bounded() -> None:
 def test_values_are_text_and_tags_are_ignored() -> None:
     text = "%YAML:1.0\n---\na: [1, 2.5, -3e2]\nb: !!opencv-matrix {rows: 2}\nc: 1:2:3\nd: !!python/none x\n"
     assert parse_yaml(text.encode(), "here", "a camera") == {
-        "a": ["1", "2.5", "-3e2"], "b": {"rows": "2"}, "c": "1:2:3", "d": "x",
-    }  # fmt: skip
+        "a": ["1", "2.5", "-3e2"],
+        "b": {"rows": "2"},
+        "c": "1:2:3",
+        "d": "x",
+    }

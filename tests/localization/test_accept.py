@@ -30,9 +30,19 @@ from localizations import answer
 from refusals import refused
 
 SOUND = Evidence(
-    log10_nfa=-80.0, inliers=200, by_chance=2.0, recall=0.8, spread=0.6, noise_ratio=1.0, other_place=0.0,
-    credible=1.0, replaced=0.0, precision=0.002, mass=1.0, searched=True,
-)  # fmt: skip
+    log10_nfa=-80.0,
+    inliers=200,
+    by_chance=2.0,
+    recall=0.8,
+    spread=0.6,
+    noise_ratio=1.0,
+    other_place=0.0,
+    credible=1.0,
+    replaced=0.0,
+    precision=0.002,
+    mass=1.0,
+    searched=True,
+)
 UNSURE, SURE = LogisticModel({}, -1.0), LogisticModel({}, 8.0)
 LEVELS = {"risk": {"least_confidence": [[0.01, 0.97], [0.05, 0.9], [0.1, 0.8]]}}
 
@@ -163,9 +173,7 @@ def levels(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("levels")
-@pytest.mark.parametrize(
-    ("risk", "least"), [(0.01, 0.97), (0.03, 0.97), (0.05, 0.9), (0.07, 0.9), (0.1, 0.8)]
-)
+@pytest.mark.parametrize(("risk", "least"), [(0.01, 0.97), (0.03, 0.97), (0.05, 0.9), (0.07, 0.9), (0.1, 0.8)])
 def test_the_largest_calibrated_risk_below_the_tolerated_one_counts(risk: float, least: float) -> None:
     assert least_confidence(risk) == least
     assert AutoConfig(risk=risk).risk == risk

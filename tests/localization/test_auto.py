@@ -162,12 +162,8 @@ def test_the_field_refines_what_the_surface_found() -> None:
     """A soft field's surface lies before what it shows."""
     (view,) = module_fields.shown(1, seed=5)
     scene = FieldMap(module_fields.field(), baked.BOUNDS, module_fields.surface())
-    answers = [
-        localize(rig(scene, [view], None), "auto", replace(QUICK, refine_steps=steps)) for steps in (0, 4)
-    ]
-    before, after = (
-        float(pose_error(found.T_world_camera, view.T_ref_camera).translation) for found in answers
-    )
+    answers = [localize(rig(scene, [view], None), "auto", replace(QUICK, refine_steps=steps)) for steps in (0, 4)]
+    before, after = (float(pose_error(found.T_world_camera, view.T_ref_camera).translation) for found in answers)
     assert after < min(0.01, before)
     assert answers[1].converged, answers[1].reason
     assert answers[1].steps > answers[0].steps

@@ -65,9 +65,7 @@ def until(condition: Callable[[], object]) -> None:
 
 
 def test_an_accepted_answer_corrects_the_odometry_of_its_frame(corrector: Callable[..., Any]) -> None:
-    localizer, mine = corrector(
-        FOUND, replace(FOUND, outcome=Outcome.AMBIGUOUS, T_world_camera=pose(*[9.0] * 6))
-    )
+    localizer, mine = corrector(FOUND, replace(FOUND, outcome=Outcome.AMBIGUOUS, T_world_camera=pose(*[9.0] * 6)))
     assert mine.T_world_odom is None
     assert mine.corrected(T_ODOM_CAMERA) is None
     assert mine.give(FRAME, T_ODOM_CAMERA)

@@ -46,9 +46,7 @@ def reprojection(states: States) -> Normal:
 
 def starts(count: int, spread: float = 0.2) -> States:
     generator = torch.Generator().manual_seed(1)
-    return states_at(
-        SE3.exp(XI_TRUE + spread * torch.randn((count, 6), generator=generator, dtype=torch.float64))
-    )
+    return states_at(SE3.exp(XI_TRUE + spread * torch.randn((count, 6), generator=generator, dtype=torch.float64)))
 
 
 @pytest.mark.parametrize("pivot", [None, torch.tensor([0.3, -0.2, 4.0], dtype=torch.float64)])

@@ -44,18 +44,14 @@ def ground() -> MapWithLandmarks:
 
 def same(here: Localization, there: Localization, tolerance: float = 1e-6) -> None:
     assert there.T_world_camera.device == torch.device("cpu")
-    torch.testing.assert_close(
-        there.T_world_camera.matrix(), here.T_world_camera.matrix(), rtol=0, atol=tolerance
-    )
+    torch.testing.assert_close(there.T_world_camera.matrix(), here.T_world_camera.matrix(), rtol=0, atol=tolerance)
     assert there.outcome is here.outcome
     assert abs(there.steps - here.steps) <= 1  # rounding may end a descent a step earlier
     tensors = (there.losses, there.poses.matrix(), there.covariance)
     assert all(part is None or part.device == torch.device("cpu") for part in tensors)
 
 
-def on_both(
-    map: Any, frame: Frame, method: str = "auto", start: SE3 | None = None, **settings: Any
-) -> Localization:
+def on_both(map: Any, frame: Frame, method: str = "auto", start: SE3 | None = None, **settings: Any) -> Localization:
     """Return what a method finds with the map on the CPU, after comparing it with what it finds on the simulated device."""
     config = settings_of(method, settings)
     here = Localizer(map, method, config)(frame, start)

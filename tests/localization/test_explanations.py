@@ -61,9 +61,7 @@ def given(*cameras: Intrinsics, of_map: tuple[Intrinsics, ...] = (), **options: 
 def odds(found: Explanations, names: set[str]) -> float:
     """Return the prior odds of the explanations of these names, moving or not, against all others."""
     share = found.log_prior.softmax(0)
-    own = sum(
-        float(p) for p, name in zip(share, found.names, strict=True) if name.removesuffix(MOVING) in names
-    )
+    own = sum(float(p) for p, name in zip(share, found.names, strict=True) if name.removesuffix(MOVING) in names)
     return own / (1 - own)
 
 
@@ -73,9 +71,13 @@ def odds(found: Explanations, names: set[str]) -> float:
 @pytest.mark.parametrize(
     "correction",
     [
-        (), (-0.03,), (0.02, 0.01, -0.02), (0.01, 0.0, 0.0, 0.04), (-0.02, 0.01, 0.0, 0.0, 0.1),
+        (),
+        (-0.03,),
+        (0.02, 0.01, -0.02),
+        (0.01, 0.0, 0.0, 0.04),
+        (-0.02, 0.01, 0.0, 0.0, 0.1),
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("stated", [PINHOLE, BENT], ids=["pinhole", "bent"])
 def test_the_correction_between_cameras_is_the_one_that_was_applied(
     stated: Intrinsics, correction: tuple[float, ...]
@@ -221,9 +223,7 @@ def test_states_of_another_camera_begin_where_they_see_about_the_same(stated: In
     """A longer focal length is farther away, and a shifted principal point looks aside."""
     found = given(stated, of_map=(PINHOLE,))
     points = torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.1, 0.0], [-0.2, 0.2, 0.1]], dtype=torch.float64)
-    proposal = Proposal(
-        "s", POSES[0], torch.zeros(6, dtype=torch.float64), float(POSES[0].translation.norm())
-    )
+    proposal = Proposal("s", POSES[0], torch.zeros(6, dtype=torch.float64), float(POSES[0].translation.norm()))
     first = found.first(proposal, 0, 1.0)
     assert len(first) == len(set(first.row.tolist()))
     eye, zero = torch.eye(3, dtype=torch.float64).expand(3, 3, 3), torch.zeros((3, 3), dtype=torch.float64)
@@ -235,9 +235,15 @@ def test_each_mode_is_compared_under_every_explanation() -> None:
     found = given(PINHOLE, of_map=(scaled(1.05),))
     zero = torch.zeros((2, len(NUISANCES)), dtype=torch.float64)
     free = States(
-        SE3.stack([POSES[0], POSES[1]]), zero, zero, zero + 1, zero[:, 0], zero[:, 0] + 1, torch.arange(2),
+        SE3.stack([POSES[0], POSES[1]]),
+        zero,
+        zero,
+        zero + 1,
+        zero[:, 0],
+        zero[:, 0] + 1,
+        torch.arange(2),
         torch.zeros(2, dtype=torch.long),
-    )  # fmt: skip
+    )
     about = found.about(free)
     assert about.row.tolist() == [*range(len(found))] * 2
     assert about.mode.tolist() == [0] * len(found) + [1] * len(found)

@@ -102,18 +102,23 @@ def test_the_learning_rate_is_inerfs(problem: Problem) -> None:
 def test_bid_is_inerf_with_other_settings(problem: Problem) -> None:
     few = {"rays": 64, "max_steps": 4, "pixels": "interest-regions"}
     same = {
-        **few, "learning_rate": 0.01, "decay": 0.8, "decay_steps": 100, "colour_loss": "l2", "pivot": "world",
-        "level": None, "depth_weight": 0.0, "candidates": 1,
-    }  # fmt: skip
+        **few,
+        "learning_rate": 0.01,
+        "decay": 0.8,
+        "decay_steps": 100,
+        "colour_loss": "l2",
+        "pivot": "world",
+        "level": None,
+        "depth_weight": 0.0,
+        "candidates": 1,
+    }
     one, other = localize(problem, "inerf", few), localize(problem, "bid", same)
     assert torch.equal(one.poses.matrix(), other.poses.matrix())
 
 
 def test_updates_are_written_where_the_pivot_is(problem: Problem) -> None:
     torch.testing.assert_close(pivot("camera", problem).moved(TRUTH, XI).matrix(), TRUTH.retract(XI).matrix())
-    torch.testing.assert_close(
-        pivot("world", problem).moved(TRUTH, XI).matrix(), (SE3.exp(XI) @ TRUTH).matrix()
-    )
+    torch.testing.assert_close(pivot("world", problem).moved(TRUTH, XI).matrix(), (SE3.exp(XI) @ TRUTH).matrix())
     about = pivot("scene", problem)
     assert about.T_camera_pivot is not None
     middle = about.T_camera_pivot.translation
@@ -148,9 +153,7 @@ def test_updates_are_those_of_torch() -> None:
     """Steps on a quadratic loss of the translation, beside torch's own Adam on the same gradients."""
     goal = torch.tensor([0.5, -2.0, 1.0], dtype=torch.float64)
     config = AdamSettings(learning_rate=0.1, decay=0.5, decay_steps=10)
-    steps = AdamSteps(
-        lambda T: (T.translation - goal).square().sum(), Pivot(SE3.identity()), config, SE3.identity()
-    )
+    steps = AdamSteps(lambda T: (T.translation - goal).square().sum(), Pivot(SE3.identity()), config, SE3.identity())
     place = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     optimizer = torch.optim.Adam([place])
     for number in range(2 * WINDOW):
@@ -173,9 +176,7 @@ def test_each_step_of_a_descent_follows_from_the_one_before(problem: Problem) ->
 
 
 def test_a_step_that_is_not_finite_leaves_the_pose() -> None:
-    steps = AdamSteps(
-        lambda T: T.translation.sum() / 0, Pivot(SE3.identity()), AdamSettings(), SE3.identity()
-    )
+    steps = AdamSteps(lambda T: T.translation.sum() / 0, Pivot(SE3.identity()), AdamSettings(), SE3.identity())
     steps()
     _, _, finite = steps.block()
     assert torch.equal(steps.T.matrix(), SE3.identity().matrix())
@@ -215,9 +216,13 @@ def problem_at(frame: Frame, shift: float) -> Problem:
 
 def loss_of(problem: Problem, **reach: float) -> SampledLoss:
     return SampledLoss(
-        problem, objective_of(ColourSettings(), DepthSettings(depth_scale=0.1)), 0, DescentSettings(rays=64),
-        ReachSettings(**reach), torch.Generator().manual_seed(0),
-    )  # fmt: skip
+        problem,
+        objective_of(ColourSettings(), DepthSettings(depth_scale=0.1)),
+        0,
+        DescentSettings(rays=64),
+        ReachSettings(**reach),
+        torch.Generator().manual_seed(0),
+    )
 
 
 def gradient(loss: SampledLoss, problem: Problem) -> torch.Tensor:

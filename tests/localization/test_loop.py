@@ -116,10 +116,12 @@ POINTS: dict[str, tuple[dict[str, Any], Expected]] = {
     "focal 1.05, indistinguishable": ({"stated": scaled(1.05), "scatter": 0.1}, REJECTED),
     "principal point 12, -12": ({"pose": 1, "stated": shifted(12, -12)}, MAP),
     "lower left corner": (
-        {"true": (corner := part(100, 75, 1, 0)), "stated": centred(corner)}, ESTIMATED._replace(metres=0.0099),
+        {"true": (corner := part(100, 75, 1, 0)), "stated": centred(corner)},
+        ESTIMATED._replace(metres=0.0099),
     ),
     "left part, 120 columns fewer": (
-        {"true": (half := part(120, 0, 1)), "stated": centred(half)}, Right("estimated", metres=0.03, degrees=1.5),
+        {"true": (half := part(120, 0, 1)), "stated": centred(half)},
+        Right("estimated", metres=0.03, degrees=1.5),
     ),
     "right part, approximate, 35 columns fewer": (
         {"true": (half := part(35, 0, 0)), "stated": centred(half, 1.05), "approximate": True},
@@ -129,37 +131,44 @@ POINTS: dict[str, tuple[dict[str, Any], Expected]] = {
     "resized 1.33": ({"pose": 1, "stated": resized(1.33)}, MAP),
     "resized 1.33, unknown cameras": ({"stated": resized(1.33), "known": False}, REJECTED),
     "resized 0.95, moving rows": (
-        {"stated": resized(0.95), "motion": SLIGHT}, Right("map", None, 0.0082, 0.25),
+        {"stated": resized(0.95), "motion": SLIGHT},
+        Right("map", None, 0.0082, 0.25),
     ),
     "another camera, 5 % narrower, moving rows": (
-        {"true": resized(1.05), "motion": SLIGHT}, Right("given", None, 0.0082),
+        {"true": resized(1.05), "motion": SLIGHT},
+        Right("given", None, 0.0082),
     ),
     "another camera 1.05": ({"pose": 1, "true": scaled(1.05)}, Right()),
     "focal 1.02, unknown cameras": ({"stated": scaled(1.02), "known": False}, ESTIMATED._replace(camera="given")),
     "focal 1.2, unknown cameras": ({"stated": scaled(1.2), "known": False}, ESTIMATED),
     "approximate 0.7, unknown cameras": (
-        {"pose": 1, "stated": scaled(0.7), "approximate": True, "known": False}, Right("estimated", False, 0.031),
+        {"pose": 1, "stated": scaled(0.7), "approximate": True, "known": False},
+        Right("estimated", False, 0.031),
     ),
     "approximate 1.4, unknown cameras": (
-        {"pose": 1, "stated": scaled(1.4), "approximate": True, "known": False}, Right("estimated", False, 0.031),
+        {"pose": 1, "stated": scaled(1.4), "approximate": True, "known": False},
+        Right("estimated", False, 0.031),
     ),
     "approximate 1.15": ({"stated": scaled(1.15), "approximate": True}, MAP),
     "approximate 1.1, most keypoints wrong": (
-        {"stated": scaled(1.1), "approximate": True, "wrong": 0.8}, Right("map", None, 0.02, 0.5),
+        {"stated": scaled(1.1), "approximate": True, "wrong": 0.8},
+        Right("map", None, 0.02, 0.5),
     ),
     "approximate 1.1, most keypoints wrong, unknown cameras": (
         {"stated": scaled(1.1), "approximate": True, "wrong": 0.8, "known": False},
         Right("estimated", None, 0.05, 0.8),
     ),
     "approximate, another camera 1.2": (
-        {"pose": 1, "true": scaled(1.2), "stated": scaled(1.0), "approximate": True}, Right("estimated", False, 0.026),
+        {"pose": 1, "true": scaled(1.2), "stated": scaled(1.0), "approximate": True},
+        Right("estimated", False, 0.026),
     ),
     "moving rows": ({"motion": MOTION}, MOVED),
     "moving rows, focal 0.95": ({"motion": MOTION, "stated": scaled(0.95)}, MOVED._replace(camera="map")),
     "two rooms": ({"repeated": 1.0}, Outcome.AMBIGUOUS),
     "two rooms, start": ({"pose": 1, "repeated": 1.0, "start": near(POSES[1])}, Right()),
     "two rooms, start in the other": (
-        {"pose": 1, "repeated": 1.0, "start": near(COPY @ POSES[1]), "elsewhere": True}, Right(),
+        {"pose": 1, "repeated": 1.0, "start": near(COPY @ POSES[1]), "elsewhere": True},
+        Right(),
     ),
     "two rooms that share little": ({"repeated": 0.4}, Right()),
     "two thirds of the keypoints wrong": ({"wrong": 0.67}, Right(metres=0.018, degrees=0.32)),
@@ -176,7 +185,7 @@ POINTS: dict[str, tuple[dict[str, Any], Expected]] = {
         ESTIMATED,
     ),
     "sheared": ({"true": PINHOLE, "sheared": 0.1, "known": False}, REJECTED),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", POINTS)
@@ -260,15 +269,18 @@ GROUND: dict[str, tuple[Any, Expected]] = {
         MAP._replace(metres=0.03, degrees=1.0),
     ),
     "focal 1.02, not rendered": (
-        lambda: {"views": stated(unseen(), 1.02), "config": NOT_RENDERED}, Right(None, metres=0.04, degrees=0.6),
+        lambda: {"views": stated(unseen(), 1.02), "config": NOT_RENDERED},
+        Right(None, metres=0.04, degrees=0.6),
     ),
     "focal 1.02, rendered": (
-        lambda: {"views": stated(unseen(), 1.02), "config": SHARP}, MAP._replace(metres=0.02),
+        lambda: {"views": stated(unseen(), 1.02), "config": SHARP},
+        MAP._replace(metres=0.02),
     ),
     "another camera 0.97, rendered": (
-        lambda: {"views": other_camera(0.97), "config": SHARP}, Right(metres=0.02),
+        lambda: {"views": other_camera(0.97), "config": SHARP},
+        Right(metres=0.02),
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", GROUND)
@@ -292,9 +304,7 @@ def matcher() -> LandmarkMatcher:
     return LandmarkMatcher(replace(ground_landmarks(), cameras=()))
 
 
-def solved(
-    *views: View, rays: int = 0, matching: LandmarkMatcher | None = None, **changes: Any
-) -> LandmarkAnswer:
+def solved(*views: View, rays: int = 0, matching: LandmarkMatcher | None = None, **changes: Any) -> LandmarkAnswer:
     scene = replace(textured_map(surface=True), **changes)
     matching = (matching or matcher()).for_query()
     problem = rig(scene, views, None, matcher=matching)
@@ -308,12 +318,8 @@ def alone() -> LandmarkAnswer:
     return solved(colour_only(unseen()))
 
 
-@pytest.mark.parametrize(
-    ("depth", "rays"), [(True, 0), (False, 256), (True, 256)], ids=["depth", "rays", "both"]
-)
-def test_each_further_measurement_brings_the_pose_nearer_and_makes_it_more_certain(
-    depth: bool, rays: int
-) -> None:
+@pytest.mark.parametrize(("depth", "rays"), [(True, 0), (False, 256), (True, 256)], ids=["depth", "rays", "both"])
+def test_each_further_measurement_brings_the_pose_nearer_and_makes_it_more_certain(depth: bool, rays: int) -> None:
     found = solved(unseen() if depth else colour_only(unseen()), rays=rays)
     assert ("depth" in found.fused) is depth
     assert alone().fused == ()
@@ -330,9 +336,7 @@ def test_each_further_measurement_brings_the_pose_nearer_and_makes_it_more_certa
 def test_another_exposure_does_not_mislead_rendering(gain: float) -> None:
     """Half of the exposure, or one at which bright colours are clipped."""
     view = colour_only(unseen())
-    found = solved(
-        replace(view, frame=replace(view.frame, rgb=(gain * view.frame.rgb).clamp(max=1))), rays=256
-    )
+    found = solved(replace(view, frame=replace(view.frame, rgb=(gain * view.frame.rgb).clamp(max=1))), rays=256)
     assert "rendering" in found.fused
     assert_near(found.T_world_rig, TRUTH, 0.005, 0.1)
 
@@ -466,9 +470,7 @@ DEGENERATE = {
         *((name, POSES[0]) for name in ("5 landmarks", "no keypoints", "collinear")),
     ],
 )
-def test_degenerate_input_has_a_finite_answer_that_is_not_accepted_or_none(
-    name: str, start: SE3 | None
-) -> None:
+def test_degenerate_input_has_a_finite_answer_that_is_not_accepted_or_none(name: str, start: SE3 | None) -> None:
     given, seen, known = DEGENERATE[name], points(), point_landmarks()[slice(0, DEGENERATE[name].landmarks)]
     factors = torch.tensor(given.squeezed)
     view = point_view(seen, POSES[0], most=given.keypoints)

@@ -55,10 +55,16 @@ def many(count: int) -> LandmarkMap:
     descriptors = (middles.repeat_interleave(20, 0) + spread).clamp(0, 255).byte()
     ones = torch.ones(count)
     return LandmarkMap(
-        torch.rand(count, 3, generator=generator), torch.ones(count, 2), descriptors,
-        torch.tensor([[0.0, 0.0, 1.0]]).repeat(count, 1), ones, ones, ones.int(), 0.5,
+        torch.rand(count, 3, generator=generator),
+        torch.ones(count, 2),
+        descriptors,
+        torch.tensor([[0.0, 0.0, 1.0]]).repeat(count, 1),
+        ones,
+        ones,
+        ones.int(),
+        0.5,
         torch.zeros((6, 6), dtype=torch.float64),
-    )  # fmt: skip
+    )
 
 
 def test_few_landmarks_are_compared_exactly() -> None:
@@ -147,9 +153,7 @@ def test_landmarks_of_another_place_that_look_the_same_are_the_other_matches() -
 # By projection
 
 
-def projected(
-    image: QueryKeypoints, landmarks: LandmarkMap, T: SE3 = TRUE, margin: float = 10.0
-) -> Projected:
+def projected(image: QueryKeypoints, landmarks: LandmarkMap, T: SE3 = TRUE, margin: float = 10.0) -> Projected:
     return Projected(image, landmarks, States.known(T, NO_CORRECTION), margin)
 
 
@@ -183,9 +187,7 @@ def test_a_landmark_that_two_keypoints_claim_goes_to_the_more_similar_one() -> N
     before = projected(query(view, seen=seen), landmarks).matches(5.0)
     own = seen.seen[-1]
     nearby = replace(own[slice(0, 20)], pixels=own.pixels[:20] + 1)
-    worse = (
-        (nearby.descriptors.int() + 6 * torch.randint(-1, 2, nearby.descriptors.shape)).clamp(0, 255).byte()
-    )
+    worse = (nearby.descriptors.int() + 6 * torch.randint(-1, 2, nearby.descriptors.shape)).clamp(0, 255).byte()
     parts = [
         torch.cat([getattr(own, n), value])
         for n, value in (("pixels", nearby.pixels), ("sizes", nearby.sizes), ("descriptors", worse))
@@ -244,16 +246,12 @@ def test_descriptors_of_a_mirrored_image_are_permuted_ones() -> None:
     nearest, other = torch.where(sizes < 0.1, distance, torch.inf).min(1)
     same = nearest < 0.7
     assert float(same.double().mean()) > 0.7
-    difference = (
-        found.keypoints.descriptors[same].float() - expected.keypoints.descriptors[other[same]].float()
-    ).norm(dim=-1)
-    unrelated = (found.keypoints.descriptors.float() - expected.keypoints.descriptors.float().mean(0)).norm(
+    difference = (found.keypoints.descriptors[same].float() - expected.keypoints.descriptors[other[same]].float()).norm(
         dim=-1
     )
+    unrelated = (found.keypoints.descriptors.float() - expected.keypoints.descriptors.float().mean(0)).norm(dim=-1)
     assert float((difference < 0.5 * unrelated.median()).double().mean()) > 0.7
-    torch.testing.assert_close(
-        found.sights.image[same], expected.sights.image[other[same]], rtol=0, atol=0.01
-    )
+    torch.testing.assert_close(found.sights.image[same], expected.sights.image[other[same]], rtol=0, atol=0.01)
 
 
 # By chance

@@ -23,12 +23,19 @@ from tiny import depth_rays_of
 
 FEW: dict[str, dict[str, Any]] = {
     "auto": {"points": 800, "hypotheses": 24, "rounds": 1, "refine_steps": 2, "fine_rays": 128},
-    "bid": {"rays": 256, "max_steps": 60, "learning_rate": 0.08, "decay": 0.5, "decay_steps": 20,
-            "depth_weight": 0.3, "level": None},
+    "bid": {
+        "rays": 256,
+        "max_steps": 60,
+        "learning_rate": 0.08,
+        "decay": 0.5,
+        "decay_steps": 20,
+        "depth_weight": 0.3,
+        "level": None,
+    },
     "bid-lm": {"poses": 8, "fine_rays": 512},
     "inerf": {"rays": 128, "max_steps": 60, "learning_rate": 0.04, "decay": 0.5, "decay_steps": 20},
     "inerf-lm": {"poses": 8, "fine_rays": 256},
-}  # fmt: skip
+}
 """Settings for small images, by method."""
 FEWEST: dict[str, dict[str, Any]] = {
     "auto": {"points": 200, "hypotheses": 8},
@@ -45,9 +52,7 @@ REMAINING = {"auto": 0.25, "bid": 0.35, "bid-lm": 0.15, "inerf": 0.4, "inerf-lm"
 @functools.cache
 def scene(surface: bool = False) -> FieldMap:
     seen = [(replace(CAMERA, fx=60.0, fy=60.0), T) for T in orbit(4.0, 16, elevation=(-10.0, 80.0), seed=0)]
-    return FieldMap(
-        FIELD, BOUNDS, bake(FIELD, BOUNDS, seen, config=BakeConfig(cells=100_000)) if surface else None
-    )
+    return FieldMap(FIELD, BOUNDS, bake(FIELD, BOUNDS, seen, config=BakeConfig(cells=100_000)) if surface else None)
 
 
 def found_by(
@@ -91,9 +96,7 @@ def rig(depth: bool) -> list[View]:
         for rig in (False, True)
     ],
 )
-def test_a_descent_from_a_start_leads_to_the_truth_and_tells_its_way(
-    method: str, depth: bool, count: int
-) -> None:
+def test_a_descent_from_a_start_leads_to_the_truth_and_tells_its_way(method: str, depth: bool, count: int) -> None:
     start = perturb(TRUTH, 0.15, 4.0, seed=2)
     query = photograph(depth=depth) if count == 1 else rig(depth)
     if method == "inerf" and count > 1:

@@ -79,9 +79,14 @@ def test_a_lidar_alone_tells_how_far_the_scene_is() -> None:
     dark = replace(FRAME, rgb=torch.zeros(40, 48, 3), depth=None)
     start = TRUTH.retract(torch.tensor([0, 0, -0.2, 0, 0, 0], dtype=torch.float64))
     config = {
-        "rays": 1, "depth_rays": 200, "max_steps": 60, "learning_rate": 0.03, "level": None, "depth_weight": 1e3,
+        "rays": 1,
+        "depth_rays": 200,
+        "max_steps": 60,
+        "learning_rate": 0.03,
+        "level": None,
+        "depth_weight": 1e3,
         "pivot": "camera",
-    }  # fmt: skip
+    }
     found = localize(single(FIELD, BOUNDS, dark, start, lidar()), "bid", config)
     backward = TRUTH.inverse().apply(found.T_world_camera.translation)[2]
     assert abs(float(backward)) < 0.03
@@ -91,8 +96,7 @@ def test_weight_zero_leaves_depth_rays_out() -> None:
     start = perturb(TRUTH, 0.3, 6.0, seed=3)
     few = {"rays": 32, "max_steps": 3, "depth_weight": 0.0, "level": None, "pivot": "camera"}
     with_rays, without = (
-        localize(single(FIELD, BOUNDS, photograph(depth=False), start, rays), "bid", few)
-        for rays in (lidar(), None)
+        localize(single(FIELD, BOUNDS, photograph(depth=False), start, rays), "bid", few) for rays in (lidar(), None)
     )
     assert torch.equal(with_rays.poses.matrix(), without.poses.matrix())
 
@@ -122,9 +126,7 @@ def test_sparse_depth_images_become_rays() -> None:
     seen = T.inverse().apply(rays.points)
     torch.testing.assert_close(seen[:, 2].float(), depth[index])
     rows, columns = index // 48, index % 48
-    torch.testing.assert_close(
-        CAMERA.project(seen), torch.stack([columns, rows], -1).double() + 0.5, atol=1e-6, rtol=0
-    )
+    torch.testing.assert_close(CAMERA.project(seen), torch.stack([columns, rows], -1).double() + 0.5, atol=1e-6, rtol=0)
 
 
 def test_nothing_measured_is_told() -> None:

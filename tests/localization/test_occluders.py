@@ -195,7 +195,5 @@ def test_what_is_behind_the_surface_was_no_occluder() -> None:
     depth = depth.clone()
     depth[:, far] = torch.where(depth[:, far] > 0, 3 * depth[:, far], 0)
     rgb[:, far] = torch.rand((SIZE, SIZE // 2, 3), generator=torch.Generator().manual_seed(0))
-    found = found_for(
-        replace(view, frame=replace(view.frame, depth=depth, rgb=rgb)), replace(QUICK, rounds=1)
-    )
+    found = found_for(replace(view, frame=replace(view.frame, depth=depth, rgb=rgb)), replace(QUICK, rounds=1))
     assert "on an occluder" not in found.reason

@@ -173,10 +173,21 @@ def test_the_explanation_that_fits_is_the_most_probable_one_and_the_mixture_hold
 def test_prior_odds_and_evidence_of_landmarks_decide_between_places() -> None:
     term = matches(0)
     both = Landmarks(
-        term.points.repeat(2, 1, 1), Sights(*(getattr(term.sights, n).expand(2, *getattr(term.sights, n).shape[1:])
-        for n in ("image", "times", "rotation", "translation"))), term.valid.repeat(2, 1), term.variance.repeat(2, 1),
-        term.focal.repeat(2, 1), term.correlation.repeat(2), term.share.repeat(2), term.area, term.most_noise,
-    )  # fmt: skip
+        term.points.repeat(2, 1, 1),
+        Sights(
+            *(
+                getattr(term.sights, n).expand(2, *getattr(term.sights, n).shape[1:])
+                for n in ("image", "times", "rotation", "translation")
+            )
+        ),
+        term.valid.repeat(2, 1),
+        term.variance.repeat(2, 1),
+        term.focal.repeat(2, 1),
+        term.correlation.repeat(2),
+        term.share.repeat(2),
+        term.area,
+        term.most_noise,
+    )
     away = SE3.exp(torch.tensor([9.0, 0.0, 0.0, 0.0, 1.0, 0.0], dtype=torch.float64))
     both.points[1] = away.apply(both.points[1])
     few = both.valid.clone()

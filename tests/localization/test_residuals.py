@@ -27,9 +27,7 @@ from bidnerf_core.localization import METHODS, BidConfig, ColourSettings, DepthS
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0)
 
 
-def objective(
-    colour: RobustName, depth: RobustName, depth_weight: float, free_space_weight: float = 0.0
-) -> Objective:
+def objective(colour: RobustName, depth: RobustName, depth_weight: float, free_space_weight: float = 0.0) -> Objective:
     """Return the objective of robust losses with a scale of 0.1."""
     settings = DepthSettings(depth_weight, depth, 0.1, free_space_weight=free_space_weight)
     return objective_of(ColourSettings(colour, 0.1), settings)

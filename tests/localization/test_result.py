@@ -18,14 +18,32 @@ from bidnerf_core.localization import Localization, Outcome, Verdict
 
 T = SE3.exp(torch.tensor([0.1, -2.0, 3.0, 0.4, -0.5, 0.6], dtype=torch.float64))
 FOUND = Localization(
-    T_world_camera=T, outcome=Outcome.CONVERGED, reason="all is well", steps=2, seconds=0.25, loss=0.125,
-    method="bid", poses=SE3.stack([T, T, T]), losses=torch.tensor([0.5, 0.25], dtype=torch.float64),
+    T_world_camera=T,
+    outcome=Outcome.CONVERGED,
+    reason="all is well",
+    steps=2,
+    seconds=0.25,
+    loss=0.125,
+    method="bid",
+    poses=SE3.stack([T, T, T]),
+    losses=torch.tensor([0.5, 0.25], dtype=torch.float64),
     covariance=torch.eye(6, dtype=torch.float64),
-)  # fmt: skip
+)
 KEYS = [
-    "T_world_camera", "converged", "outcome", "reason", "steps", "seconds", "covariance", "loss", "method",
-    "focal_factor", "intrinsics", "confidence", "unit",
-]  # fmt: skip
+    "T_world_camera",
+    "converged",
+    "outcome",
+    "reason",
+    "steps",
+    "seconds",
+    "covariance",
+    "loss",
+    "method",
+    "focal_factor",
+    "intrinsics",
+    "confidence",
+    "unit",
+]
 
 
 def test_the_file_holds_the_answer_to_the_last_digit(tmp_path: Path) -> None:
@@ -52,9 +70,12 @@ def test_a_later_rejection_comes_with_its_own_confidence() -> None:
 @pytest.mark.parametrize("loss", [math.nan, math.inf, -math.inf])
 def test_numbers_that_are_not_finite_are_null(loss: float, tmp_path: Path) -> None:
     broken = replace(
-        FOUND, loss=loss, T_world_camera=SE3(T.rotation * torch.nan, T.translation), covariance=None,
+        FOUND,
+        loss=loss,
+        T_world_camera=SE3(T.rotation * torch.nan, T.translation),
+        covariance=None,
         outcome=Outcome.DIVERGED,
-    )  # fmt: skip
+    )
     broken.save(tmp_path / "pose.json")
     stored = json.loads((tmp_path / "pose.json").read_text())
     assert stored["loss"] is stored["T_world_camera"] is stored["covariance"] is None

@@ -48,9 +48,7 @@ def drawn(h: int = 3, seed: int = 0, moving: bool = True, about: SE3 | None = No
         z[:, MOTION] = 0
     number, zero = torch.arange(h), torch.zeros(h, dtype=torch.float64)
     T = SE3.identity().to("cpu", torch.float64) if about is None else about
-    T = SE3(T.rotation.expand(h, 3, 3), T.translation.expand(h, 3)).retract(
-        0.01 * random(h, 6, seed=seed + 1)
-    )
+    T = SE3(T.rotation.expand(h, 3, 3), T.translation.expand(h, 3)).retract(0.01 * random(h, 6, seed=seed + 1))
     return States(T, z, 0 * z, DEVIATION.expand_as(z), zero, zero + 1, 0 * number, number)
 
 
@@ -177,9 +175,7 @@ def term_of_the_surface(rig: bool) -> tuple[Surface, States]:
     term = Surface.of(views, None, replace(surface, surfels=exact), 0, 300)
     assert term is not None
     at = drawn(2, moving=False, about=truth)
-    term = replace(
-        term, rgb=term.rgb.double(), coloured=term.coloured.double(), colour_weight=0.7, noise=0.05
-    )
+    term = replace(term, rgb=term.rgb.double(), coloured=term.coloured.double(), colour_weight=0.7, noise=0.05)
     return term, replace(at, z=0.1 * at.z)
 
 

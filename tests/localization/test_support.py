@@ -53,9 +53,7 @@ class Wall:
 
     def query(self, positions: Tensor, directions: Tensor) -> FieldValues:
         x, y, z = positions.unbind(-1)
-        waves = torch.stack(
-            [(5 * x + 2 * y).sin() * (3 * y).cos(), (4 * y - x).sin(), (3 * x + 4 * y).cos()], -1
-        )
+        waves = torch.stack([(5 * x + 2 * y).sin() * (3 * y).cos(), (4 * y - x).sin(), (3 * x + 4 * y).cos()], -1)
         uneven = 0.004 * (2.2 * x + 1.3 * y).sin()[..., None]
         return FieldValues(150 * torch.sigmoid(-z / 0.01), 0.7 + uneven + self.texture * waves)
 
@@ -70,9 +68,7 @@ def photograph(T: SE3, texture: float, depth: bool = False) -> View:
     seen = render_image(Wall(texture), CAMERA, T, BOUNDS)
     noise = 0.01 * torch.randn(seen.rgb.shape, generator=Generator().manual_seed(1))
     rgb = (seen.rgb + noise).clamp(0, 1)
-    return View(
-        Frame("frame", rgb, CAMERA, torch.where(seen.opacity > 0.9, seen.depth, 0) if depth else None), T
-    )
+    return View(Frame("frame", rgb, CAMERA, torch.where(seen.opacity > 0.9, seen.depth, 0) if depth else None), T)
 
 
 def found(view: View, texture: float, method: str = "auto") -> Localization:
@@ -92,9 +88,7 @@ def foreign(kind: str) -> View:
         rgb[:, 30:32] = 0.1
     if kind == "gradient":
         rgb += 0.05 * torch.linspace(-1, 1, CAMERA.width)[None, :, None]
-    return View(
-        Frame(kind, rgb + 0.01 * torch.randn(rgb.shape, generator=Generator().manual_seed(2)), CAMERA), QUERY
-    )
+    return View(Frame(kind, rgb + 0.01 * torch.randn(rgb.shape, generator=Generator().manual_seed(2)), CAMERA), QUERY)
 
 
 @pytest.mark.parametrize("depth", [False, True], ids=["RGB", "RGB-D"])
@@ -173,9 +167,7 @@ def test_only_poses_farther_away_than_the_displacement_are_rivals() -> None:
 
 
 def test_odds_are_antisymmetric_and_grow_with_the_number_of_measurements(generator: Generator) -> None:
-    one, other = torch.rand((2, 4000), generator=generator, dtype=torch.float64) + torch.tensor(
-        [[0.0], [0.1]]
-    )
+    one, other = torch.rand((2, 4000), generator=generator, dtype=torch.float64) + torch.tensor([[0.0], [0.1]])
     assert float(log_odds(other[None], one)) == pytest.approx(-float(log_odds(one[None], other)))
     assert float(log_odds(other[None], one)) > 1.5 * float(log_odds(other[None, :1000], one[:1000]))
     assert float(log_odds(one[None], one)) == 0

@@ -113,9 +113,7 @@ def test_the_gradient_by_rays_is_the_numerical_one(
     rays = terms.term(problem(field), 100, 0)
     normal = rays(near())
     expected = numerical(lambda states: rays(states).cost, near(), 2e-3)
-    torch.testing.assert_close(
-        normal.gradient[:, :6], expected, rtol=0.05, atol=0.03 * float(expected.abs().max())
-    )
+    torch.testing.assert_close(normal.gradient[:, :6], expected, rtol=0.05, atol=0.03 * float(expected.abs().max()))
     assert float(torch.linalg.eigvalsh(normal.hessian).min()) > -1e-6 * float(normal.hessian.abs().max())
 
 
@@ -125,9 +123,7 @@ def test_derivatives_of_rays_are_those_of_autograd_ray_by_ray(
 ) -> None:
     monkeypatch.setattr(rendering, "LEAST_WEIGHT", 0.0)
     generator = torch.Generator().manual_seed(0)
-    directions = T0.to(torch.float32).rotate(
-        CAMERA.rays(CAMERA.pixel_centres().reshape(-1, 2)[::97])[0].float()
-    )
+    directions = T0.to(torch.float32).rotate(CAMERA.rays(CAMERA.pixel_centres().reshape(-1, 2)[::97])[0].float())
     origins = T0.translation.float() + 0.1 * torch.rand(directions.shape, generator=generator)
     rays = BOUNDS.rays(origins, directions)
     value, *gradients = differentiate(field, rays, BOUNDS.background)
@@ -159,9 +155,7 @@ def test_measured_rays_of_another_sensor_join_pixels(monkeypatch: pytest.MonkeyP
     assert float(rays.coloured.sum()) == 0
     normal = rays(near())
     expected = numerical(lambda states: rays(states).cost, near(), 2e-3)
-    torch.testing.assert_close(
-        normal.gradient[:, :6], expected, rtol=0.05, atol=0.05 * float(expected.abs().max())
-    )
+    torch.testing.assert_close(normal.gradient[:, :6], expected, rtol=0.05, atol=0.05 * float(expected.abs().max()))
     costs = rays(States.cat([near(), states_at(T0[None])])).cost
     assert int(costs.argmin()) == 2
 

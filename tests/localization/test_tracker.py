@@ -86,9 +86,7 @@ def test_a_covered_camera_is_reported_at_once_and_the_way_is_found_again(depth: 
     assert [answer.converged for answer in answers] == [True] * 2 + [False] * 4
     assert tracker.lost_frames == 4
     assert "lost for 4 frames" in answers[-1].reason
-    sizes = [
-        float(answer.covariance.diagonal().sum()) for answer in answers[1:] if answer.covariance is not None
-    ]
+    sizes = [float(answer.covariance.diagonal().sum()) for answer in answers[1:] if answer.covariance is not None]
     assert sizes == sorted(sizes)
     assert len(sizes) == 5
     assert_right(tracked(frames[6:], tracker)[2:], frames[8:])
@@ -192,9 +190,9 @@ def test_a_changed_image_size_is_no_obstacle() -> None:
     frames = flight()[:6]
     small = frames[3][1]
     camera = small.intrinsics.scaled(0.75)
-    rgb = torch.nn.functional.interpolate(
-        small.rgb.permute(2, 0, 1)[None], (camera.height, camera.width), mode="area"
-    )[0].permute(1, 2, 0)
+    rgb = torch.nn.functional.interpolate(small.rgb.permute(2, 0, 1)[None], (camera.height, camera.width), mode="area")[
+        0
+    ].permute(1, 2, 0)
     frames[3] = (frames[3][0], replace(small, rgb=rgb, depth=None, intrinsics=camera), frames[3][2])
     answers = tracked(frames)
     assert_honest(answers, frames)
@@ -260,9 +258,13 @@ def test_a_state_with_damaged_numbers_or_tensors_is_refused_and_changes_nothing(
     for name, part in tensors.items():
         if name.startswith(("points.", "motion.")) and "T_world" not in name:
             place = ": ".join(["", *name.split(".")])
-            changed.append((
-                {name: part[None].contiguous()}, place, f"found {part.dtype} {[1, *part.shape]}",
-            ))  # fmt: skip
+            changed.append(
+                (
+                    {name: part[None].contiguous()},
+                    place,
+                    f"found {part.dtype} {[1, *part.shape]}",
+                )
+            )
 
     def refuses(tensors: dict[str, torch.Tensor], state: Any, field: str, found: str) -> None:
         save_file(tensors, path, {"bidnerf": json.dumps(content | {"state": state})})
@@ -393,9 +395,7 @@ def test_a_corrected_camera_is_corrected_alike_at_another_focus_and_size() -> No
     assert (found.fx, found.fy, found.cx, found.cy) == pytest.approx((true.fx, true.fy, true.cx, true.cy))
     refocused = state.corrected(replace(frame, intrinsics=replace(stated, fx=154.0))).intrinsics
     assert refocused.fx == pytest.approx(154 * 133 / 140)
-    small = state.corrected(
-        replace(frame, rgb=torch.zeros((48, 64, 3)), depth=None, intrinsics=stated.scaled(0.5))
-    )
+    small = state.corrected(replace(frame, rgb=torch.zeros((48, 64, 3)), depth=None, intrinsics=stated.scaled(0.5)))
     assert small.intrinsics.cx == pytest.approx(true.scaled(0.5).cx)
     other = replace(frame, focal_is_approximate=True)  # of another source
     assert state.corrected(other) is other

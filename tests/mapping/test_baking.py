@@ -197,9 +197,7 @@ def test_few_points_make_cells_coarser_but_no_coarser_than_their_spacing(generat
     assert chosen_grid(few[:1], baked.BOUNDS, 0.02, 0.1, 200.0).cell == 0.1
 
 
-def test_memory_is_bounded_and_a_warning_says_so(
-    generator: Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_memory_is_bounded_and_a_warning_says_so(generator: Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     points = scattered(20_000, generator)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -240,8 +238,6 @@ def test_a_room_in_a_box_of_a_hundred_times_its_volume_takes_little_more_memory(
 
 def test_a_baked_surface_stays_within_its_memory() -> None:
     with pytest.warns(InputWarning, match="0\\.2 MB"):
-        surface = bake(
-            baked.FIELD, baked.BOUNDS, [], baked.images(SCENE, 12, seed=0), BakeConfig(megabytes=0.2)
-        )
+        surface = bake(baked.FIELD, baked.BOUNDS, [], baked.images(SCENE, 12, seed=0), BakeConfig(megabytes=0.2))
     assert surface.mebibytes < 0.25e6 / 2**20  # surfels move a little when planes are fitted
     assert (surface.surfels.positions.abs().amax(-1) < 0.6 + surface.cell).all()

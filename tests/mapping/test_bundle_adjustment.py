@@ -55,9 +55,7 @@ class Capture:
 
     def adjusted(self, given: SE3, prior: PosePrior, tolerance: float = SMALL_DECREASE) -> Adjustment:
         """What an adjustment finds, from the ``given`` poses and the true points."""
-        return adjusted(
-            self.seen(given), at_rest(given, self.points), prior, self.accuracy, tolerance=tolerance
-        )
+        return adjusted(self.seen(given), at_rest(given, self.points), prior, self.accuracy, tolerance=tolerance)
 
     @property
     def accuracy(self) -> float:
@@ -182,9 +180,7 @@ def test_motions_are_found_with_the_poses() -> None:
     assert moving.cost < 0.7 * still.cost
     true, found, none = (capture.shifts(m) for m in (motions(), moving.motion, AT_REST_ALL))
     assert float((found - true).norm(dim=-1).median()) < 0.2 * float((true - none).norm(dim=-1).median())
-    of_moving, of_still = (
-        off(relative(found.T_world_camera), relative(capture.poses)) for found in (moving, still)
-    )
+    of_moving, of_still = (off(relative(found.T_world_camera), relative(capture.poses)) for found in (moving, still))
     assert of_moving[1] < 0.5 * of_still[1]
 
 
@@ -240,10 +236,7 @@ def test_points_without_parallax_do_no_harm() -> None:
     """Cameras that only turn about their centre show nothing of distances."""
     capture = Capture(noise=0.3)
     turned = SE3.stack(
-        [
-            looking_in(0.0, 0.3, 3.0).retract(torch.tensor([0, 0, 0, 0, 0.01 * i, 0]).double())
-            for i in range(VIEWS)
-        ]
+        [looking_in(0.0, 0.3, 3.0).retract(torch.tensor([0, 0, 0, 0, 0.01 * i, 0]).double()) for i in range(VIEWS)]
     )
     image = torch.arange(VIEWS).repeat_interleave(POINTS)
     local = turned[image].inverse().apply(capture.points.repeat(VIEWS, 1))

@@ -28,10 +28,7 @@ def test_a_square_is_met_where_a_plane_is(generator: Generator) -> None:
     assert bool(found.met.all())
     assert float((found.along - length).abs().max()) < 1.5 * surface.surfel_radius
     touched = surface.surfels.positions[found.index]
-    assert (
-        float(torch.linalg.vector_norm(touched - aims, dim=-1).max())
-        < 2 * surface.surfel_radius + surface.cell
-    )
+    assert float(torch.linalg.vector_norm(touched - aims, dim=-1).max()) < 2 * surface.surfel_radius + surface.cell
 
 
 def test_what_passes_by_is_told_where_and_of_what() -> None:

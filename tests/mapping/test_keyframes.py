@@ -46,9 +46,7 @@ def test_keyframes_are_as_many_and_as_large_as_is_useful_at_most() -> None:
     assert len(found) <= 100
     assert torch.equal(found[1].T_ref_camera.matrix(), cameras[3][1].matrix())
     large = Intrinsics(2400.0, 2400.0, 1200.0, 5.0, 2400, 10)
-    small = rendered_views(
-        HomogeneousBall(0.5, 1.0, sampler=Stratified(1)), CUBE, [(large, orbit(2.0, 1)[0])]
-    )
+    small = rendered_views(HomogeneousBall(0.5, 1.0, sampler=Stratified(1)), CUBE, [(large, orbit(2.0, 1)[0])])
     camera = small[0].frame.intrinsics
     assert camera.width == 400
     assert camera.width / camera.fx == pytest.approx(large.width / large.fx)

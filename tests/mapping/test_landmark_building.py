@@ -96,10 +96,7 @@ def test_the_order_of_the_views_does_not_matter() -> None:
 
 def test_without_parallax_measured_depth_places_the_points() -> None:
     points = Points()
-    turned = [
-        looking_in(0.0) @ SE3.exp(torch.tensor([0, 0, 0, 0, 0.05 * i, 0], dtype=torch.float64))
-        for i in range(4)
-    ]
+    turned = [looking_in(0.0) @ SE3.exp(torch.tensor([0, 0, 0, 0, 0.05 * i, 0], dtype=torch.float64)) for i in range(4)]
     with pytest.raises(InputError, match="no landmark"):
         build_landmarks([points.view(T) for T in turned], points)
     found = build_landmarks([points.view(T, depth=1.0) for T in turned], points)
@@ -192,9 +189,7 @@ def test_a_match_that_would_join_two_keypoints_of_an_image_is_left_out() -> None
     def match(a: int, b: int, ambiguity: float) -> Matches:
         return Matches(torch.tensor([[a, b]]), torch.tensor([ambiguity]))
 
-    track = joined_tracks(
-        [(0, 1, match(0, 0, 0.1)), (1, 2, match(0, 0, 0.2)), (0, 2, match(1, 0, 0.5))], [2, 1, 1]
-    )
+    track = joined_tracks([(0, 1, match(0, 0, 0.1)), (1, 2, match(0, 0, 0.2)), (0, 2, match(1, 0, 0.5))], [2, 1, 1])
     assert track[0] == track[2] == track[3]
     assert track[1] != track[0]
 
@@ -234,13 +229,9 @@ def test_scatter_of_updates_is_that_of_the_images_that_moved_if_most_did() -> No
 
 
 @pytest.mark.parametrize("zero", [0, 128])
-def test_descriptors_of_one_point_are_averaged_to_their_usual_length(
-    zero: int, generator: torch.Generator
-) -> None:
+def test_descriptors_of_one_point_are_averaged_to_their_usual_length(zero: int, generator: torch.Generator) -> None:
     true = normalize(
-        torch.randn(300, 64, generator=generator).abs()
-        if not zero
-        else torch.randn(300, 64, generator=generator)
+        torch.randn(300, 64, generator=generator).abs() if not zero else torch.randn(300, 64, generator=generator)
     )
     point = torch.arange(300).repeat(8)
     seen = normalize(true[point] + 0.05 * torch.rand(2400, 64, generator=generator))
@@ -269,9 +260,7 @@ def poses(count: int) -> SE3:
     return SE3(SE3.exp(torch.cat([torch.zeros_like(turn), turn], dim=-1)).rotation, place)
 
 
-def shown(
-    T: SE3, slopes: Tensor, positions: Tensor, directions: Tensor, cones: Tensor, sizes: Tensor
-) -> Tensor:
+def shown(T: SE3, slopes: Tensor, positions: Tensor, directions: Tensor, cones: Tensor, sizes: Tensor) -> Tensor:
     """Return which landmarks an image shows, from the definition."""
     local = T.inverse().to(torch.float32).apply(positions)
     towards = torch.nn.functional.normalize(T.translation.float() - positions, dim=-1)

@@ -48,14 +48,16 @@ def seen(
         flat = there[:, :2] / there[:, 2:]
         times = flat[:, 1] * FOCAL / HEIGHT
     m, given = images * count, TRUE.retract(off)
-    image = flat.repeat(images, 1) + noise / FOCAL * torch.randn(
-        (m, 2), generator=random, dtype=torch.float64
-    )
+    image = flat.repeat(images, 1) + noise / FOCAL * torch.randn((m, 2), generator=random, dtype=torch.float64)
     found = Sightings(
-        torch.arange(count).repeat(images), torch.arange(images).repeat_interleave(count),
-        given.rotation.mT.expand(m, 3, 3), given.translation.expand(m, 3), image,
-        torch.full((m,), FOCAL, dtype=torch.float64), times.repeat(images),
-    )  # fmt: skip
+        torch.arange(count).repeat(images),
+        torch.arange(images).repeat_interleave(count),
+        given.rotation.mT.expand(m, 3, 3),
+        given.translation.expand(m, 3),
+        image,
+        torch.full((m,), FOCAL, dtype=torch.float64),
+        times.repeat(images),
+    )
     return found, TRUE.apply(local)
 
 
@@ -147,9 +149,7 @@ def test_a_motion_is_evident_where_there_was_one(motion: Tensor, moved: bool, co
 
 def test_true_intrinsics_project_as_the_states_do() -> None:
     stated = Intrinsics(FOCAL, FOCAL, 320.0, 240.0, 640, 480)
-    states = States.known(
-        SE3.identity(), torch.tensor([0.05, 0.01, -0.02, 0.03, 0.04, 0.0], dtype=torch.float64)
-    )
+    states = States.known(SE3.identity(), torch.tensor([0.05, 0.01, -0.02, 0.03, 0.04, 0.0], dtype=torch.float64))
     points = torch.tensor([[0.3, -0.2, 1.0], [-1.0, 0.8, 2.0]], dtype=torch.float64)
     rotation, zero = torch.eye(3, dtype=torch.float64).expand(2, 3, 3), torch.zeros_like(points)
     flat = project(states, points, Sights(points[:, :2], zero[:, 0], rotation, zero)).image[0]

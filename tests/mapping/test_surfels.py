@@ -158,9 +158,7 @@ def test_a_whole_number_of_cells_further_everything_is_the_same(generator: Gener
     x, y, z = (torch.tensor(GRID.lower, dtype=torch.float64) + shift).tolist()
     here = SurfelIndex.of(positions, GRID)(points)
     there = SurfelIndex.of(positions + shift, replace(GRID, lower=(x, y, z)))(points + shift)
-    assert (
-        float((here == there).double().mean()) > 0.999
-    )  # rounding moves a point across a border now and then
+    assert float((here == there).double().mean()) > 0.999  # rounding moves a point across a border now and then
 
 
 def test_memory_grows_with_the_surface_and_not_with_the_volume() -> None:

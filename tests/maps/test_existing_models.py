@@ -56,17 +56,13 @@ class Model:
         with contextlib.closing(sqlite3.connect(path)) as opened, opened:
             opened.execute("CREATE TABLE images (image_id INTEGER, name TEXT, camera_id INTEGER)")
             for name in ("keypoints", "descriptors"):
-                opened.execute(
-                    f"CREATE TABLE {name} (image_id INTEGER, rows INTEGER, cols INTEGER, data BLOB)"
-                )
+                opened.execute(f"CREATE TABLE {name} (image_id INTEGER, rows INTEGER, cols INTEGER, data BLOB)")
             for number, found in enumerate(self.keypoints):
                 count = len(found) - drop
                 scale = (found.sizes[:count, None] / 2).numpy()
                 rows = np.concatenate([found.pixels[:count].numpy(), scale * shape], axis=1).astype("<f4")
                 opened.execute("INSERT INTO images VALUES (?, ?, 1)", (number, f"{number:03d}.png"))
-                opened.execute(
-                    "INSERT INTO keypoints VALUES (?, ?, ?, ?)", (number, *rows.shape, rows.tobytes())
-                )
+                opened.execute("INSERT INTO keypoints VALUES (?, ?, ?, ?)", (number, *rows.shape, rows.tobytes()))
                 descriptors = found.descriptors[:count].numpy().tobytes()
                 opened.execute("INSERT INTO descriptors VALUES (?, ?, 128, ?)", (number, count, descriptors))
 
@@ -84,8 +80,7 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Model:
     (folder / "sparse").mkdir()
     write_photos(folder / "images", poses)
     views = [
-        View(Frame.open(folder / "images" / f"{number:03d}.png", camera=CAMERA), T)
-        for number, T in enumerate(poses)
+        View(Frame.open(folder / "images" / f"{number:03d}.png", camera=CAMERA), T) for number, T in enumerate(poses)
     ]
     tracked = tracked_views(views)
     seen, positions = tracked.triangulated(DEFAULT_LANDMARKS)
@@ -102,9 +97,7 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Model:
                 tracks[point].append(f"{number + 1} {place}")
         images += [row_of(number, T), " ".join(observed)]
     c = CAMERA
-    (folder / "sparse" / "cameras.txt").write_text(
-        f"1 PINHOLE {c.width} {c.height} {c.fx} {c.fy} {c.cx} {c.cy}\n"
-    )
+    (folder / "sparse" / "cameras.txt").write_text(f"1 PINHOLE {c.width} {c.height} {c.fx} {c.fy} {c.cx} {c.cy}\n")
     (folder / "sparse" / "images.txt").write_text("\n".join(images) + "\n")
     (folder / "sparse" / "points3D.txt").write_text(
         "".join(
@@ -139,9 +132,7 @@ def unseen() -> Frame:
 
 
 @pytest.mark.parametrize("shape", [(1.0, 0.3), (2.0, 1.0, 0.5, 0.75), (0.0, -1.0, 1.0, 0.0)])
-def test_an_affine_shape_has_the_scale_of_a_circle_of_its_area(
-    shape: tuple[float, ...], tmp_path: Path
-) -> None:
+def test_an_affine_shape_has_the_scale_of_a_circle_of_its_area(shape: tuple[float, ...], tmp_path: Path) -> None:
     keypoints = Keypoints(
         torch.tensor([[3.0, 4.0], [5.0, 6.0]]),
         torch.tensor([4.0, 7.0]),
@@ -214,11 +205,12 @@ def test_features_of_hloc_are_read_with_their_detector(
         bn.import_map(model.folder, None, {"keypoints": str(file)})
     groups: dict[str, Any] = {
         f"{number:03d}.png": {
-            "keypoints": (found.pixels - 0.5).numpy(), "scales": (found.sizes / 2).numpy(),
+            "keypoints": (found.pixels - 0.5).numpy(),
+            "scales": (found.sizes / 2).numpy(),
             "descriptors": (found.descriptors.float() / 512).T.numpy(),
         }
         for number, found in enumerate(model.keypoints)
-    }  # fmt: skip
+    }
     fake = types.SimpleNamespace(File=lambda path, mode: contextlib.nullcontext(groups))
     monkeypatch.setitem(sys.modules, "h5py", fake)
     scene = bn.import_map(model.folder, None, {"keypoints": str(file)})
@@ -278,9 +270,7 @@ def test_what_needs_a_field_says_so_in_one_sentence(imported: Path) -> None:
         bn.extend(scene, [view.frame])
 
 
-def test_training_adds_a_field_and_keeps_landmarks_and_cameras(
-    original: Model, imported: Path, tmp_path: Path
-) -> None:
+def test_training_adds_a_field_and_keeps_landmarks_and_cameras(original: Model, imported: Path, tmp_path: Path) -> None:
     shutil.copytree(imported, tmp_path / "map")
     before = bn.load_map(tmp_path / "map")
     after = bn.train(original.folder, out=tmp_path / "map", config=tiny.config(), bake=False)
@@ -294,9 +284,7 @@ def test_training_adds_a_field_and_keeps_landmarks_and_cameras(
         bn.train(original.folder, out=tmp_path / "map", config=tiny.config())
 
 
-def test_damaged_landmarks_are_named_before_a_field_is_added(
-    original: Model, imported: Path, tmp_path: Path
-) -> None:
+def test_damaged_landmarks_are_named_before_a_field_is_added(original: Model, imported: Path, tmp_path: Path) -> None:
     shutil.copytree(imported, tmp_path / "map")
     (file,) = (tmp_path / "map").glob("landmarks-*")
     file.write_bytes(file.read_bytes()[:100])

@@ -91,9 +91,7 @@ def test_photos_found_too_imprecisely_are_not_called_another_scene(
     stored: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     solved = bn.Localizer.solved
-    monkeypatch.setattr(
-        bn.Localizer, "solved", lambda *given: replace(solved(*given), outcome=bn.Outcome.IMPRECISE)
-    )
+    monkeypatch.setattr(bn.Localizer, "solved", lambda *given: replace(solved(*given), outcome=bn.Outcome.IMPRECISE))
     with refused(found="localizes 0 of 1 photo, and 1 more, but too imprecisely", expected="from as near"):
         locate(bn.load_map(stored), [training_views()[7].frame], [])
 
@@ -102,9 +100,13 @@ def test_a_cancelled_extension_leaves_the_map(map_folder: Path) -> None:
     before, steps = files(map_folder), []
     with pytest.raises(Cancelled):
         bn.extend(
-            map_folder, training_views()[7:], steps=STEPS, config=BAKE,
-            progress=lambda p: steps.append(p) if p.stage == "training" else None, cancel=lambda: len(steps) > 3,
-        )  # fmt: skip
+            map_folder,
+            training_views()[7:],
+            steps=STEPS,
+            config=BAKE,
+            progress=lambda p: steps.append(p) if p.stage == "training" else None,
+            cancel=lambda: len(steps) > 3,
+        )
     assert files(map_folder) == before
     with job_context(cancel=lambda: True), pytest.raises(Cancelled, match="rendering"):
         bn.load_map(map_folder).render(training_views()[0])
@@ -113,8 +115,14 @@ def test_a_cancelled_extension_leaves_the_map(map_folder: Path) -> None:
 def test_the_images_of_the_map_may_be_given(map_folder: Path) -> None:
     """In a map in metres as well, whose field keeps the unit of its training."""
     large = bn.load_map(map_folder).scaled(2.0)
-    old = [replace(v, frame=replace(v.frame, depth=None), T_ref_camera=bn.SE3(v.T_ref_camera.rotation, 2 * v.T_ref_camera.translation))
-           for v in training_views()[:7]]  # fmt: skip
+    old = [
+        replace(
+            v,
+            frame=replace(v.frame, depth=None),
+            T_ref_camera=bn.SE3(v.T_ref_camera.rotation, 2 * v.T_ref_camera.translation),
+        )
+        for v in training_views()[:7]
+    ]
     new = training_views()[7]
     assert new.frame.depth is not None
     new = replace(new, frame=replace(new.frame, depth=2 * new.frame.depth))

@@ -113,9 +113,7 @@ def test_photos_that_the_file_names(
     write_transforms(tmp_path / "photos", {"train": tiny.views(5, seed=2)}, demo_object().bounds.background)
     read = TinyImporter.read
     for folder, names in (("photos", [view.frame.name for view in tiny.views(5, seed=2)]), ("none", None)):
-        monkeypatch.setattr(
-            TinyImporter, "read", lambda *given, f=tmp_path / folder: replace(read(*given), photos=f)
-        )
+        monkeypatch.setattr(TinyImporter, "read", lambda *given, f=tmp_path / folder: replace(read(*given), photos=f))
         with caplog.at_level(logging.INFO, "bidnerf"):
             found = [camera.name for camera in import_map(file, bake=False).info.cameras]
         assert found == names or (names is None and len(found) == FEW)

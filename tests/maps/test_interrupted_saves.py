@@ -37,17 +37,13 @@ from trial_results import trial_result
 
 CAMERA = bn.Intrinsics(8.0, 8.0, 4.0, 3.0, 8, 6)
 POSE = bn.SE3.identity().to("cpu", torch.float64)
-FOUND = bn.Localization(
-    POSE, bn.Outcome.CONVERGED, "", 1, 0.1, 0.0, "auto", bn.SE3.stack([POSE]), torch.zeros(1)
-)
+FOUND = bn.Localization(POSE, bn.Outcome.CONVERGED, "", 1, 0.1, 0.0, "auto", bn.SE3.stack([POSE]), torch.zeros(1))
 
 Saver: TypeAlias = tuple[Callable[[Path, int], object], Callable[[Path], object]]
 """A function that saves content 1 or 2 into a folder, and one that reads it there; None where there is none."""
 
 
-def file(
-    name: str, save: Callable[[Path, int], object], read: Callable[[Path], object] = Path.read_bytes
-) -> Saver:
+def file(name: str, save: Callable[[Path, int], object], read: Callable[[Path], object] = Path.read_bytes) -> Saver:
     def content(folder: Path) -> object:
         return read(folder / name) if (folder / name).exists() else None
 
@@ -85,17 +81,21 @@ SAVERS: dict[str, Saver] = {
     **{name: part_of_a_map(name) for name in PARTS},
     "bytes": file("x", lambda path, n: write_file(path, bytes(n))),
     **{f"poses{ending}": file(f"poses{ending}", posed) for ending in POSE_WRITERS if "scanner" not in ending},
-    "localization": file("found.json", lambda path, n: bn.Localization.save(FOUND.rejected(FOUND) if n > 1 else FOUND, path)),
+    "localization": file(
+        "found.json", lambda path, n: bn.Localization.save(FOUND.rejected(FOUND) if n > 1 else FOUND, path)
+    ),
     "answers": file("found.json", answers),
     "results": file("r.jsonl", results),
     "comparison": file("c.json", lambda path, n: Comparison("d", "test", "none", (), "auto", {}, 0, n, ()).save(path)),
-    "runs": (lambda folder, n: note_run(folder / "r.jsonl", provenance("bidnerf evaluate", f"{n}")),
-             lambda folder: [run.workers for run in read_runs(folder / "r.jsonl")] or None),
+    "runs": (
+        lambda folder, n: note_run(folder / "r.jsonl", provenance("bidnerf evaluate", f"{n}")),
+        lambda folder: [run.workers for run in read_runs(folder / "r.jsonl")] or None,
+    ),
     "figure": file("a.png", lambda path, n: write_figure(new_figure(n, 1), path)),
     "animation": file("a.gif", lambda path, n: save_gif(path, [np.zeros((4, 4, 3))] * n)),
     "tracker": file("state", lambda path, n: save_state(path, TrackerState(Clock(None, float(n))), "map")),
     "cameras": file("cameras.json", lambda path, n: write_inria_cameras(path.parent, CAMERAS[:n])),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("error", [FULL, Stopped()], ids=["full", "stop"])

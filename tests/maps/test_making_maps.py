@@ -123,9 +123,7 @@ def test_cancelled_and_resumed_equals_uninterrupted(whole: bn.Map, tmp_path: Pat
     assert_same_field(resumed, whole)
     with refused(where=tmp_path / "half", found="complete (12 steps), nothing to resume"):
         bn.resume(tmp_path / "half", tiny.views(), bake=False)
-    with pytest.raises(
-        bn.Cancelled, match=r"has its landmarks, field and surface so far; --resume continues"
-    ):
+    with pytest.raises(bn.Cancelled, match=r"has its landmarks, field and surface so far; --resume continues"):
         bn.resume(
             tmp_path / "half",
             tiny.views(),
@@ -147,9 +145,7 @@ def stopping_at(stage: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("stage", ["training", "baking"])
-def test_what_was_finished_is_kept_when_a_stage_is_cancelled_and_finish_ends_it(
-    stage: str, tmp_path: Path
-) -> None:
+def test_what_was_finished_is_kept_when_a_stage_is_cancelled_and_finish_ends_it(stage: str, tmp_path: Path) -> None:
     out, views = tmp_path / "map", [replace(v, frame=v.frame.replace(depth=None)) for v in training_views()]
     with pytest.raises(bn.Cancelled) as stopped:
         bn.train(views, out=out, config=tiny.config(), bake=BAKE, **stopping_at(stage))
@@ -186,9 +182,7 @@ class Failed(Exception):
     pass
 
 
-def test_an_error_of_a_callback_ends_the_training_and_leaves_the_checkpoint(
-    whole: bn.Map, tmp_path: Path
-) -> None:
+def test_an_error_of_a_callback_ends_the_training_and_leaves_the_checkpoint(whole: bn.Map, tmp_path: Path) -> None:
     def fail(now: Progress) -> None:
         if now.stage == "training" and now.done == 7:
             raise Failed("the caller's own")

@@ -44,11 +44,15 @@ def names(folder: Path) -> set[str]:
 @settings(max_examples=20)
 @given(
     anchor=record(
-        Anchor, latitude=st.floats(-89, 89), longitude=st.floats(-180, 180), metres_per_unit=st.floats(1e-3, 1e3),
-        T_enu_world=poses().map(lambda T: tuple(map(tuple, T.matrix().tolist()))), position_sigma=shares,
+        Anchor,
+        latitude=st.floats(-89, 89),
+        longitude=st.floats(-180, 180),
+        metres_per_unit=st.floats(1e-3, 1e3),
+        T_enu_world=poses().map(lambda T: tuple(map(tuple, T.matrix().tolist()))),
+        position_sigma=shares,
         orientation_sigma=shares,
     )
-)  # fmt: skip
+)
 def test_any_anchor_comes_back_as_it_was(anchor: Anchor, trained: Map, tmp_path: Path) -> None:
     save(tmp_path, trained, 5, anchor)
     assert load_info(tmp_path).anchor == anchor

@@ -42,9 +42,7 @@ def grounds() -> list[Map]:
     """Two grounds of other textures, of six images each, and one of which no landmarks are known."""
     found = []
     for seed in SEEDS:
-        images = [
-            view(T, f"{n:04d}", seed) for n, T in enumerate(orbit(1.8, 10, elevation=(45, 75), seed=0)[:6])
-        ]
+        images = [view(T, f"{n:04d}", seed) for n, T in enumerate(orbit(1.8, 10, elevation=(45, 75), seed=0)[:6])]
         info = MapInfo(
             "ground", {}, BOUNDS, 1, True, f"ground{seed}", weights=f"g{seed}", cameras=stored_cameras(images)
         )
@@ -104,9 +102,7 @@ def test_a_map_without_a_field_is_found_by_its_landmarks(grounds: list[Map]) -> 
 @pytest.mark.slow
 def test_the_service_finds_the_map_of_a_photo(grounds: list[Map], tmp_path: Path) -> None:
     """Under the names by which the maps are served, and with the localizers that serve them."""
-    localizers = {
-        name: bn.Localizer(scene, warm_up=False) for name, scene in zip("ab", grounds, strict=False)
-    }
+    localizers = {name: bn.Localizer(scene, warm_up=False) for name, scene in zip("ab", grounds, strict=False)}
     worker = Worker(localizers, 1e6)
     assert worker.together is not None
     assert worker.together.localizer("b") is localizers["b"]
@@ -128,9 +124,7 @@ def test_landmarks_that_a_camera_sees(grounds: list[Map]) -> None:
     camera = grounds[0].info.cameras[0]
     seen = visible(landmarks, CAMERA, camera.pose)
     assert 0.2 * len(landmarks) < len(seen.unique()) == len(seen) <= len(landmarks)
-    away = bn.SE3(
-        camera.pose.rotation @ torch.diag(torch.tensor([1.0, -1, -1]).double()), camera.pose.translation
-    )
+    away = bn.SE3(camera.pose.rotation @ torch.diag(torch.tensor([1.0, -1, -1]).double()), camera.pose.translation)
     assert not len(visible(landmarks, CAMERA, away))
 
 
@@ -168,9 +162,7 @@ def test_folders_of_one_name_are_told_apart_by_those_around_them(
         bn.MapCollection([folders[0], folders[1], folders[0]])
 
 
-def test_the_command(
-    bidnerf: Run, grounds: list[Map], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command(bidnerf: Run, grounds: list[Map], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Folders of maps, whose landmarks are read, and of which only those that are asked are loaded."""
     known = dict(zip(("m0", "m4", "bare"), grounds, strict=True))
     loaded = []
@@ -180,9 +172,7 @@ def test_the_command(
         return known[folder.name]
 
     monkeypatch.setattr(collections_module, "load_info", lambda folder: known[folder.name].info)
-    monkeypatch.setattr(
-        collections_module, "read_part", lambda folder, info, part: known[folder.name].landmarks
-    )
+    monkeypatch.setattr(collections_module, "read_part", lambda folder, info, part: known[folder.name].landmarks)
     monkeypatch.setattr(collections_module, "load_map", load)
     for name in known:
         (tmp_path / "maps" / name).mkdir(parents=True)

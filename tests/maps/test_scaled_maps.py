@@ -30,8 +30,7 @@ def ground() -> Map:
     known, view = textured_map(surface=True), unseen()
     moves = torch.eye(3, 6, dtype=torch.float64)
     views = [
-        bn.View(replace(view.frame, name=f"c{n}"), view.T_ref_camera.retract(move))
-        for n, move in enumerate(moves)
+        bn.View(replace(view.frame, name=f"c{n}"), view.T_ref_camera.retract(move)) for n, move in enumerate(moves)
     ]
     info = MapInfo("ground", {}, BOUNDS, 1, True, "data", weights="ground", cameras=stored_cameras(views))
     return Map(info, known.field, known.surface, known.landmarks)
@@ -73,9 +72,7 @@ def test_a_known_length_gives_the_factor(ground: Map) -> None:
     low, high = (f"c0@{0.25 * CAMERA.width},{y * CAMERA.height}" for y in (0.4, 0.6))
     apart = factor_of_distance(ground, low, high, 1.0)
     assert factor_of_distance(ground.scaled(0.5), low, high, 1.0) == pytest.approx(2 * apart, rel=1e-3)
-    assert factor_of_distance(ground, "0", "1.png", 2.8284271247) == pytest.approx(
-        2
-    )  # endings of one name each
+    assert factor_of_distance(ground, "0", "1.png", 2.8284271247) == pytest.approx(2)  # endings of one name each
     for bad, found, instead in (
         ("nobody", "no place 'nobody' in the map: none of its 3 cameras", "a name such as 'c0'"),
         ("1,2", "no place '1,2' in the map: none of its 3 cameras", "coordinates X,Y,Z"),
@@ -114,9 +111,7 @@ def test_known_poses_give_the_factor(ground: Map) -> None:
         factor_of_poses(ground, wrong)
 
 
-def test_a_map_in_metres_that_is_scaled_again_is_remarked(
-    ground: Map, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_map_in_metres_that_is_scaled_again_is_remarked(ground: Map, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO", "bidnerf")
     metric = ground.scaled(2.0)
     metric.scaled(1.0)
@@ -172,9 +167,7 @@ def test_saving_takes_the_anchor_along(tmp_path: Path) -> None:
     assert load_info(tmp_path / "b").anchor == replace(anchor, metres_per_unit=1.0)
 
 
-def test_a_map_that_is_being_changed_is_not_read(
-    bidnerf: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_map_that_is_being_changed_is_not_read(bidnerf: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What another process writes between reading and writing would be lost."""
     bn.train(tiny.views(3), out=tmp_path / "map", config=tiny.config(2), bake=False)
     refused, read = list[str](), bn.load_map

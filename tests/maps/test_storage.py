@@ -67,8 +67,11 @@ def field(seed: int) -> HashGridField:
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for value in made.state_dict().values():
-            value.copy_(torch.rand(value.shape, generator=generator) > 0.5 if value.dtype == torch.bool
-                        else torch.randn(value.shape, generator=generator))  # fmt: skip
+            value.copy_(
+                torch.rand(value.shape, generator=generator) > 0.5
+                if value.dtype == torch.bool
+                else torch.randn(value.shape, generator=generator)
+            )
     return made
 
 
@@ -105,9 +108,7 @@ def described(folder: Path, **changes: Any) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
-def test_backends_are_imported_where_tensors_have_values(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_backends_are_imported_where_tensors_have_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Shapes are checked on a device without values, on which the constants of a module would have none."""
     devices = list[str]()
 
@@ -145,13 +146,23 @@ def test_what_is_saved_is_what_is_loaded(complete: bool, tmp_path: Path) -> None
 rows = poses().map(lambda T: tuple(map(tuple, T.matrix().tolist())))
 descriptions = record(
     MapInfo,
-    cameras=st.lists(record(StoredCamera, T_world_camera=rows, given_T_world_camera=st.none() | rows), max_size=2).map(tuple),
+    cameras=st.lists(record(StoredCamera, T_world_camera=rows, given_T_world_camera=st.none() | rows), max_size=2).map(
+        tuple
+    ),
     pose_refinement=st.none() | record(PoseRefinement, noise_before=shares, noise_after=shares),
-    anchor=st.none() | record(Anchor, latitude=st.floats(-89, 89), longitude=st.floats(-180, 180),
-        metres_per_unit=st.floats(1e-3, 1e3), T_enu_world=rows, position_sigma=shares, orientation_sigma=shares),
+    anchor=st.none()
+    | record(
+        Anchor,
+        latitude=st.floats(-89, 89),
+        longitude=st.floats(-180, 180),
+        metres_per_unit=st.floats(1e-3, 1e3),
+        T_enu_world=rows,
+        position_sigma=shares,
+        orientation_sigma=shares,
+    ),
     field_frame=st.none() | record(FieldFrame, scale=st.floats(1e-3, 1e3)),
     **{name: st.just(getattr(info(), name)) for name in ("landmark_source", "colour_noise", "format", "version")},
-)  # fmt: skip
+)
 
 
 @settings(max_examples=20)
@@ -192,8 +203,11 @@ def test_nothing_on_disk_can_run(tmp_path: Path) -> None:
 
 def test_old_files_are_removed_and_others_are_left_alone(tmp_path: Path) -> None:
     mine = ["weights-best.safetensors", "training-00000001-aaaaaaaa.txt", ".map.json.swp", "notes"]
-    stray = [".weights-00000004-0a1b2c3d.safetensors.0a1b2c3d", ".map.json.0a1b2c3d",
-             "training-00000004-0a1b2c3d.safetensors"]  # fmt: skip
+    stray = [
+        ".weights-00000004-0a1b2c3d.safetensors.0a1b2c3d",
+        ".map.json.0a1b2c3d",
+        "training-00000004-0a1b2c3d.safetensors",
+    ]
     for name in (*mine, *stray):
         (tmp_path / name).touch()
     write_parts(tmp_path, info(step=5), state(5))
@@ -271,9 +285,7 @@ def test_a_map_that_a_training_replaces_while_it_is_read(
         assert_holds(loaded, state(5))
 
 
-def test_a_damaged_description_makes_no_save_remove_anything(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_damaged_description_makes_no_save_remove_anything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_parts(tmp_path, info(step=5), state(5))
     (tmp_path / "map.json").write_text("{")
     before = names(tmp_path)
@@ -293,15 +305,11 @@ def test_what_json_cannot_hold_is_told_before_anything_is_written(tmp_path: Path
 # What a backend builds is judged as well.
 
 
-def test_a_backend_that_builds_something_else_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_backend_that_builds_something_else_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_parts(tmp_path, info(), state())
     chosen = load_backend("hashgrid")
     monkeypatch.setattr(type(chosen), "build", lambda *_: HomogeneousBall(1.0, 1.0))
-    with refused(
-        where=tmp_path / "map.json", found="'hashgrid' built a HomogeneousBall", expected="an nn.Module"
-    ):
+    with refused(where=tmp_path / "map.json", found="'hashgrid' built a HomogeneousBall", expected="an nn.Module"):
         load_map(tmp_path)
 
 
@@ -453,9 +461,7 @@ def test_a_damaged_part_is_named_and_can_be_made_anew(damage: str, name: str, tm
     ],
     ids=["other surface", "other landmarks", "negative noise", "not a number"],
 )
-def test_a_part_of_other_tensors_is_named(
-    name: str, tensors: dict[str, Tensor], found: str, tmp_path: Path
-) -> None:
+def test_a_part_of_other_tensors_is_named(name: str, tensors: dict[str, Tensor], found: str, tmp_path: Path) -> None:
     _, path = with_part(tmp_path, name)
     path.write_bytes(tensors_to_bytes(tensors))
     with refused(where=path, found=found, expected="which 'bidnerf bake' can recreate"):
@@ -466,9 +472,7 @@ def test_a_part_of_other_tensors_is_named(
 def test_a_name_that_leads_out_of_the_folder_is_refused(name: str, tmp_path: Path) -> None:
     for part in (*PARTS, "weights", "training"):
         described(tmp_path, **{part: name})
-        with refused(
-            where=tmp_path / "map.json", found=f"names {name!r}", expected="the name of a file next to it"
-        ):
+        with refused(where=tmp_path / "map.json", found=f"names {name!r}", expected="the name of a file next to it"):
             load_map(tmp_path)
 
 
@@ -509,9 +513,7 @@ def test_weights_that_no_training_gives_are_refused(tmp_path: Path, value: float
     saved = write_parts(tmp_path, info(step=5), state(5))
     tensors = state(5).field
     name = next(key for key, held in tensors.items() if held.is_floating_point())
-    write_file(
-        tmp_path / saved.weights, tensors_to_bytes(tensors | {name: torch.full_like(tensors[name], value)})
-    )
+    write_file(tmp_path / saved.weights, tensors_to_bytes(tensors | {name: torch.full_like(tensors[name], value)}))
     with refused(where=tmp_path / saved.weights, found=f"tensor {name!r}", expected="trained weights"):
         load_map(tmp_path)
 
@@ -527,10 +529,14 @@ EYE = torch.eye(4).tolist()
         ({"cameras": [PLAIN["cameras"][0] | {"T_world_camera": EYE[:3]}]}, "camera", "rigid"),
         ({"bounds": PLAIN["bounds"] | {"far": 1e308}}, "bounds", "1e+308"),
         ({"bounds": PLAIN["bounds"] | {"far": 1e16}}, "bounds", "1e+16"),
-        ({"pose_refinement": {"noise_before": 1e308, "noise_after": 0.3, "refined": False}}, "pose_refinement", "1e+308"),
+        (
+            {"pose_refinement": {"noise_before": 1e308, "noise_after": 0.3, "refined": False}},
+            "pose_refinement",
+            "1e+308",
+        ),
         ({"field_frame": {"scale": 0.0, "bounds": PLAIN["bounds"]}}, "field_frame", "0.0"),
     ],
-)  # fmt: skip
+)
 def test_descriptions_of_what_cannot_be_are_refused(
     changes: dict[str, Any], culprit: str, value: str, tmp_path: Path
 ) -> None:
@@ -556,9 +562,7 @@ def test_more_layers_than_there_are_weights_for_are_refused_at_once(tmp_path: Pa
 def test_a_map_of_hundreds_of_cameras_is_described_without_a_loop_of_tensors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    many = tuple(
-        replace(CAMERAS[0], name=f"{i}", given_T_world_camera=CAMERAS[1].T_world_camera) for i in range(500)
-    )
+    many = tuple(replace(CAMERAS[0], name=f"{i}", given_T_world_camera=CAMERAS[1].T_world_camera) for i in range(500))
     write_parts(tmp_path, replace(info(complete=True), cameras=many), state())
     counted = []
     usual = SE3.from_matrix

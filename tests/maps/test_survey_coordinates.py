@@ -151,9 +151,7 @@ def test_exports_are_in_the_users_world(tmp_path: Path) -> None:
     cameras = json.loads((tmp_path / "ply" / "cameras.json").read_text())
     assert [c["position"] for c in cameras] == poses.translation.tolist()
     rows = [line.split() for line in (tmp_path / "colmap" / "points3D.txt").read_text().splitlines()]
-    places = torch.tensor(
-        [[float(x) for x in row[1:4]] for row in rows if row[0] != "#"], dtype=torch.float64
-    )
+    places = torch.tensor([[float(x) for x in row[1:4]] for row in rows if row[0] != "#"], dtype=torch.float64)
     assert torch.allclose(places, expected, rtol=0, atol=1e-6)
     transforms = json.loads((tmp_path / "transforms.json" / "transforms.json").read_text())
     matrices = torch.tensor([f["transform_matrix"] for f in transforms["frames"]], dtype=torch.float64)
@@ -180,9 +178,13 @@ def test_a_dataset_is_trained_interrupted_resumed_and_baked(tmp_path: Path) -> N
     seen = list[Progress]()
     with pytest.raises(Cancelled):
         train(
-            folder, out=tmp_path / "map", config=tiny.config(20), bake=False, progress=seen.append,
+            folder,
+            out=tmp_path / "map",
+            config=tiny.config(20),
+            bake=False,
+            progress=seen.append,
             cancel=lambda: any(now.stage == "training" and now.done >= 10 for now in seen),
-        )  # fmt: skip
+        )
     whole = resume(tmp_path / "map", folder, bake=SMALL)
     assert whole.info.complete
     assert whole.origin == ORIGIN
@@ -215,7 +217,7 @@ class AnyImporter:
         assert isinstance(field, torch.nn.Module)
         return ImportedField(
             "hashgrid", tiny.config(), dict(field.state_dict()), near().bounds, steps=1, cameras=near().info.cameras
-        )  # fmt: skip
+        )
 
 
 def test_a_field_is_imported_into_survey_coordinates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -50,9 +50,7 @@ BY_NAME = {
 
 def test_only_the_registry_imports_by_name(trees: dict[str, ast.Module]) -> None:
     """The core reaches a backend through ``load_backend`` alone."""
-    found = {
-        name: _names(tree) & {"import_module", "__import__", "entry_points"} for name, tree in trees.items()
-    }
+    found = {name: _names(tree) & {"import_module", "__import__", "entry_points"} for name, tree in trees.items()}
     surplus = {name: calls - BY_NAME.get(name, set()) for name, calls in found.items()}
     assert {name: calls for name, calls in surplus.items() if calls} == {}
 

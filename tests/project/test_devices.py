@@ -180,9 +180,7 @@ def test_neither_a_capture_nor_a_call_may_wait(monkeypatch: pytest.MonkeyPatch) 
     assert waits == [False] * 5  # one of them before the capture, and one in it
 
 
-@pytest.mark.parametrize(
-    "part", ["surface.surfels.rgb", "landmarks.cones", "field.heads", "surface.index.level"]
-)
+@pytest.mark.parametrize("part", ["surface.surfels.rgb", "landmarks.cones", "field.heads", "surface.index.level"])
 def test_a_tensor_that_is_forgotten_is_named(part: str) -> None:
     with Elsewhere():
         there = whole_map("vanilla").to(DEVICE)

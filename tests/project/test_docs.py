@@ -136,8 +136,7 @@ def given(page: Path) -> dict[str, Any]:
     if page.stem != "embedding":
         return {}
     moments = [
-        (v.frame.rgb, (v.frame.depth * 1000).int().numpy().astype("uint16"), SE3.identity())
-        for v in tiny.views(2)
+        (v.frame.rgb, (v.frame.depth * 1000).int().numpy().astype("uint16"), SE3.identity()) for v in tiny.views(2)
     ]
     return {"sensor": moments, "camera": tiny.CAMERA}
 
@@ -204,9 +203,7 @@ def parsed_only(parse: Callable[..., Any]) -> Callable[..., None]:
 
 def test_other_commands_name_what_exists() -> None:
     targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    unknown = [
-        f"{page.name}: {shlex.join(c)}" for page in PAGES for c in commands(page) if not exists(c, targets)
-    ]
+    unknown = [f"{page.name}: {shlex.join(c)}" for page in PAGES for c in commands(page) if not exists(c, targets)]
     assert unknown == []
 
 
@@ -225,9 +222,7 @@ def exists(command: list[str], targets: set[str]) -> bool:
 
 
 def extras(arguments: list[str]) -> set[str]:
-    return {
-        name for word in arguments for names in re.findall(r"\[([\w,]+)\]", word) for name in names.split(",")
-    }
+    return {name for word in arguments for names in re.findall(r"\[([\w,]+)\]", word) for name in names.split(",")}
 
 
 @pytest.mark.slow
@@ -235,10 +230,7 @@ def extras(arguments: list[str]) -> set[str]:
 def test_the_backend_of_the_documentation_trains_and_localizes(inside: Path) -> None:
     namespace = executed(ROOT / "docs" / "extend.md", "backend = Fog()")
     field = next(block for block in blocks(ROOT / "README.md", "python") if "FogField" in block.text)
-    assert (
-        field.text.partition("def query")[2].split("\n", 1)[1].strip()
-        in (ROOT / "docs" / "extend.md").read_text()
-    )
+    assert field.text.partition("def query")[2].split("\n", 1)[1].strip() in (ROOT / "docs" / "extend.md").read_text()
     backend, scene, views = namespace["backend"], demo_object(), tiny.views(16)
     config = namespace["FogConfig"](cells=24, steps=120)
     field = backend.build(config, scene.bounds)
@@ -248,9 +240,7 @@ def test_the_backend_of_the_documentation_trains_and_localizes(inside: Path) -> 
     start = perturb(unseen.T_ref_camera, 0.3, 8.0, seed=0)
     settings = settings_of("bid", {"rays": 512, "max_steps": 80})
     found = Localizer(stored, "bid", settings)(unseen.frame, start)
-    before, after = (
-        float(pose_error(T, unseen.T_ref_camera).translation) for T in (start, found.T_world_camera)
-    )
+    before, after = (float(pose_error(T, unseen.T_ref_camera).translation) for T in (start, found.T_world_camera))
     assert after < 0.5 * before
 
 
@@ -314,9 +304,7 @@ def test_every_table_is_on_a_page(tables: Any) -> None:
 
 def test_every_record_is_among_all_measurements(tables: Any) -> None:
     page = tables.MEASUREMENTS.read_text()
-    assert {path.stem for path in tables.RECORDS.glob("*.json")} == {
-        *re.findall(r"^## (\w+)$", page, re.MULTILINE)
-    }
+    assert {path.stem for path in tables.RECORDS.glob("*.json")} == {*re.findall(r"^## (\w+)$", page, re.MULTILINE)}
     assert "| Lego, RGB, none | 40 |" in page.partition("## no_start_rgb\n")[2].partition("\n## ")[0]
 
 

@@ -38,9 +38,7 @@ def test_the_message_is_made_of_the_parts(error: InputError, message: str) -> No
 
 
 @given(where=PART, found=st.text("ab: ,;1"), expected=PART)
-def test_parts_outlive_copies_processes_and_another_class(
-    where: str | None, found: str, expected: str | None
-) -> None:
+def test_parts_outlive_copies_processes_and_another_class(where: str | None, found: str, expected: str | None) -> None:
     error = UsageError(found, where=where, expected=expected)
     assert (error.where, error.found, error.expected) == (where, found, expected)
     for same in (pickle.loads(pickle.dumps(error)), copy.copy(error), UsageError(error)):

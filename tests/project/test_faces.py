@@ -13,9 +13,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 STOREYS = ("bidnerf_core", "bidnerf")
-PACKAGES = sorted(
-    f"{name}.{face.parent.name}" for name in STOREYS for face in (ROOT / name).glob("*/__init__.py")
-)
+PACKAGES = sorted(f"{name}.{face.parent.name}" for name in STOREYS for face in (ROOT / name).glob("*/__init__.py"))
 OUTSIDE = ("backends", "plugins", "benchmarks", "examples", "docs", "tests")
 REASON = re.compile(r"^ *# Inside: .{10,}", re.MULTILINE)
 """How a test file says why it needs parts that its package does not offer."""
@@ -23,6 +21,7 @@ REASON = re.compile(r"^ *# Inside: .{10,}", re.MULTILINE)
 EXCEPTIONS = {
     "benchmarks/paper_tables.py": "shows the progress of the command line",
     "tests/conftest.py": "does in this process what a process of a comparison does",
+    "tests/formats/test_scan_readers.py": "pictures that are no files, which every reader may have",
     "tests/frames/test_masks.py": "hides pixels from everything that reads them, in whichever package",
     "tests/frames/test_pixel_store.py": "the memory that reading photos takes, which five packages share",
     "tests/maps/test_interrupted_saves.py": "interrupts every writer of files, in whichever package",
@@ -58,9 +57,7 @@ def deep_imports(file: Path) -> set[tuple[str, str]]:
     for node in statements(file.read_text(encoding="utf-8")):
         names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
         if isinstance(node, ast.ImportFrom) and (node.module or "").count(".") == 1:
-            names = [
-                f"{node.module}.{name.name}" for name in node.names if _is_module(node.module, name.name)
-            ]
+            names = [f"{node.module}.{name.name}" for name in node.names if _is_module(node.module, name.name)]
         if isinstance(node, ast.Import):
             names = [name.name for name in node.names]
         for name in names:

@@ -86,10 +86,7 @@ def imported(file: Path) -> set[str]:
     """Top-level names of what a file imports."""
     nodes = list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
     plain = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
-    return {
-        name.partition(".")[0]
-        for name in plain | {n.module or "" for n in nodes if isinstance(n, ast.ImportFrom)}
-    }
+    return {name.partition(".")[0] for name in plain | {n.module or "" for n in nodes if isinstance(n, ast.ImportFrom)}}
 
 
 def test_the_template_can_be_renamed_as_it_says(tmp_path: Path) -> None:

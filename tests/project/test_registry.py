@@ -197,9 +197,7 @@ def test_every_group_is_listed_loaded_and_refused_alike(site: Site, group: str) 
 
 
 @pytest.mark.parametrize("group", [group for group in GROUPS if group not in ("importers", "services")])
-def test_bundled_plugins_are_registered_as_a_strangers_are_and_their_names_are_taken(
-    site: Site, group: str
-) -> None:
+def test_bundled_plugins_are_registered_as_a_strangers_are_and_their_names_are_taken(site: Site, group: str) -> None:
     infos = [info for info in list_plugins(group) if info.is_bundled]
     assert infos
     for info in infos:
@@ -237,9 +235,7 @@ def test_an_unknown_name_gets_the_nearest_and_the_installed(site: Site) -> None:
         ("def broken(:\n", ["SyntaxError"]),
     ],
 )
-def test_a_module_that_does_not_import_is_told_with_its_cause(
-    site: Site, source: str, causes: list[str]
-) -> None:
+def test_a_module_that_does_not_import_is_told_with_its_cause(site: Site, source: str, causes: list[str]) -> None:
     site.backend(source, dist="stranger-broken", version="0.7")
     assert listed("fog")[0].fault is None  # its fault surfaces when it is asked for, and only then
     message = refusal("fog")
@@ -277,9 +273,7 @@ def test_ctrl_c_during_an_import_stays_an_interruption(site: Site) -> None:
         ("config_type = Config", "config_type = property(lambda self: 1 // 0)", "ZeroDivisionError"),
     ],
 )
-def test_an_object_that_is_no_backend_is_told_what_it_lacks(
-    site: Site, old: str, new: str, expected: str
-) -> None:
+def test_an_object_that_is_no_backend_is_told_what_it_lacks(site: Site, old: str, new: str, expected: str) -> None:
     assert old in FOG
     site.backend(FOG.replace(old, new))
     message = refusal("fog")
@@ -296,9 +290,7 @@ def test_an_object_that_is_no_backend_is_told_what_it_lacks(
         ("json:bakend", "no attribute 'bakend'"),
     ],
 )
-def test_a_value_that_leads_nowhere_is_a_fault_of_that_backend_alone(
-    site: Site, value: str, fault: str
-) -> None:
+def test_a_value_that_leads_nowhere_is_a_fault_of_that_backend_alone(site: Site, value: str, fault: str) -> None:
     site.plugin("nowhere", value)
     assert fault in refusal("nowhere")
     assert load_backend("hashgrid").summary

@@ -95,10 +95,15 @@ def test_literals_may_be_numbers_or_mixed() -> None:
 
 
 OUTERS = st.builds(
-    Outer, st.builds(Inner, st.floats(0, 1), st.floats(0, 10, exclude_min=True), st.floats(0, 1e308)),
-    st.integers(1, 10_000_000), st.none() | st.integers(-(2**63), 2**63 - 1), st.sampled_from(["a", "b"]),
-    st.just("first"), st.booleans(), st.none() | st.integers(0, 9),
-)  # fmt: skip
+    Outer,
+    st.builds(Inner, st.floats(0, 1), st.floats(0, 10, exclude_min=True), st.floats(0, 1e308)),
+    st.integers(1, 10_000_000),
+    st.none() | st.integers(-(2**63), 2**63 - 1),
+    st.sampled_from(["a", "b"]),
+    st.just("first"),
+    st.booleans(),
+    st.none() | st.integers(0, 9),
+)
 
 
 @given(OUTERS)

@@ -29,9 +29,7 @@ from bidnerf.results.errors import Within, rotation_angle
 from bidnerf_core.geometry import SE3, perturb, random_units
 from refusals import refused
 
-tangents = st.lists(st.floats(-3, 3), min_size=6, max_size=6).map(
-    lambda x: torch.tensor(x, dtype=torch.float64)
-)
+tangents = st.lists(st.floats(-3, 3), min_size=6, max_size=6).map(lambda x: torch.tensor(x, dtype=torch.float64))
 
 
 def trace(translation: list[float], rotation_deg: list[float] | None = None) -> PoseError:
@@ -47,9 +45,7 @@ def test_error_agrees_with_scipy(a: torch.Tensor, b: torch.Tensor) -> None:
         Rotation.from_matrix(one.rotation.numpy()).inv() * Rotation.from_matrix(two.rotation.numpy())
     ).magnitude()
     assert float(error.rotation_deg) == pytest.approx(math.degrees(expected), abs=1e-6)
-    assert float(error.translation) == pytest.approx(
-        np.linalg.norm(one.translation - two.translation), abs=1e-12
-    )
+    assert float(error.translation) == pytest.approx(np.linalg.norm(one.translation - two.translation), abs=1e-12)
 
 
 def test_normalized_errors_of_an_honest_covariance_are_chi_squared() -> None:
@@ -72,9 +68,7 @@ def test_normalized_error_without_an_inverse_is_no_finite_number() -> None:
 
 
 @given(tangents, tangents, tangents)
-def test_error_is_a_distance_that_no_common_motion_changes(
-    a: torch.Tensor, b: torch.Tensor, c: torch.Tensor
-) -> None:
+def test_error_is_a_distance_that_no_common_motion_changes(a: torch.Tensor, b: torch.Tensor, c: torch.Tensor) -> None:
     one, two, move = SE3.exp(a), SE3.exp(b), SE3.exp(c)
     error, back, moved = pose_error(one, two), pose_error(two, one), pose_error(move @ one, move @ two)
     for other in (back, moved):
@@ -91,9 +85,7 @@ def test_error_is_a_distance_that_no_common_motion_changes(
 def test_angle_keeps_its_digits_at_both_ends(angle: float, generator: torch.Generator) -> None:
     for axis in random_units(20, generator):
         rotation = torch.from_numpy(Rotation.from_rotvec(angle * axis.numpy()).as_matrix())
-        assert float(rotation_angle(rotation)) == pytest.approx(
-            angle, abs=1e-15, rel=1e-6 if angle < 1 else 1e-14
-        )
+        assert float(rotation_angle(rotation)) == pytest.approx(angle, abs=1e-15, rel=1e-6 if angle < 1 else 1e-14)
 
 
 def test_error_of_a_batch_and_of_what_is_not_finite() -> None:
@@ -151,9 +143,7 @@ def test_wilson_interval(trials: int) -> None:
         found = success_rate(successes, trials)
         share, z = successes / trials, 1.959963984540054
         middle = (share + z * z / (2 * trials)) / (1 + z * z / trials)
-        half = (
-            z / (1 + z * z / trials) * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
-        )
+        half = z / (1 + z * z / trials) * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
         assert (found.low, found.high) == pytest.approx((middle - half, middle + half), abs=1e-9)
         assert 0 <= found.low <= found.rate <= found.high <= 1
     assert str(success_rate(23, 24)) == "95.8% (23 of 24; 79.8% to 99.3%)"
@@ -162,9 +152,7 @@ def test_wilson_interval(trials: int) -> None:
 def test_trials_of_one_frame_are_not_independent() -> None:
     frames = [n // 4 for n in range(24)]
     alike = success_rate_by_frame([True] * 24, frames)
-    assert (alike.low, alike.high) == pytest.approx(
-        (success_rate(6, 6).low, 1.0)
-    )  # six frames tell what six tell
+    assert (alike.low, alike.high) == pytest.approx((success_rate(6, 6).low, 1.0))  # six frames tell what six tell
     assert str(alike) == "100.0% (24 of 24 on 6 frames; 61.0% to 100.0%)"
     split = success_rate_by_frame([frame < 3 for frame in frames], frames)
     whole = success_rate(3, 6)
@@ -210,13 +198,9 @@ def test_bid_has_the_lengths_of_its_tangent(widest: float, size: float) -> None:
     starts = SE3.stack([bid_start(true, size, seed, widest) for seed in range(200)])
     tangents = (true.inverse() @ starts).log()
     assert tangents[:, :3].norm(dim=-1).tolist() == pytest.approx([size] * 200)
-    assert tangents[:, 3:].norm(dim=-1).tolist() == pytest.approx(
-        [np.interp(size, (0.5, 3.4), (0.2, widest))] * 200
-    )
+    assert tangents[:, 3:].norm(dim=-1).tolist() == pytest.approx([np.interp(size, (0.5, 3.4), (0.2, widest))] * 200)
     directions = torch.nn.functional.normalize(tangents.reshape(-1, 2, 3), dim=-1)
-    assert (
-        directions.mean(0).abs().max() < 0.15
-    )  # three standard deviations of a mean of 200 uniform directions
+    assert directions.mean(0).abs().max() < 0.15  # three standard deviations of a mean of 200 uniform directions
     assert (directions[:, 0] * directions[:, 1]).sum(-1).mean().abs() < 0.15  # the two are independent
 
 

@@ -25,9 +25,7 @@ from refusals import refused
 @pytest.fixture(scope="module")
 def scene() -> Map:
     known = textured_map(surface=True)
-    cameras = tuple(
-        replace(camera, file=f"images/{camera.name}.JPG") for camera in stored_cameras(training_views())
-    )
+    cameras = tuple(replace(camera, file=f"images/{camera.name}.JPG") for camera in stored_cameras(training_views()))
     info = MapInfo("ground", {}, BOUNDS, 1, True, "ground", weights="w", cameras=cameras, unit="metres")
     return Map(info, known.field, known.surface, known.landmarks)
 
@@ -81,9 +79,7 @@ def test_colmap_reads_the_model(scene: Map, tmp_path: Path) -> None:
     assert landmarks.tracks is not None
     assert len(model.points3D) == len(landmarks)
     np.testing.assert_allclose(model.points3D[1].xyz, landmarks.positions[0], atol=1e-6)
-    assert {image.name for image in model.images.values()} == {
-        f"{camera.name}.JPG" for camera in scene.info.cameras
-    }
+    assert {image.name for image in model.images.values()} == {f"{camera.name}.JPG" for camera in scene.info.cameras}
     assert [model.points3D[n + 1].track.length() for n in range(len(landmarks))] == landmarks.views.tolist()
     assert model.compute_num_observations() == len(landmarks.tracks.landmark)
     first = model.points3D[1]
@@ -119,9 +115,7 @@ def test_photos_that_were_turned_upright_are_exported_as_their_files_store_them(
     pycolmap = pytest.importorskip("pycolmap")
     first, *others = scene.info.cameras
     turned = replace(first, orientation=Orientation.from_exif(code))
-    bn.export_map(
-        replace(scene, info=replace(scene.info, cameras=(turned, *others))), tmp_path / "out", "colmap"
-    )
+    bn.export_map(replace(scene, info=replace(scene.info, cameras=(turned, *others))), tmp_path / "out", "colmap")
     model = pycolmap.Reconstruction(str(tmp_path / "out"))
     image = model.images[1]
     size = (image.camera.width, image.camera.height)
@@ -166,9 +160,7 @@ def test_what_cannot_be_exported_is_said(scene: Map, tmp_path: Path) -> None:
         bn.export_map(scene, tmp_path / "full", "ply")
 
 
-def test_a_registered_exporter_gets_the_map(
-    scene: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_registered_exporter_gets_the_map(scene: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def write(map_: Map, out: Path) -> list[Path]:
         (out / "count.txt").write_text(str(len(map_.landmarks or ())))
         return [out / "count.txt"]
@@ -181,7 +173,5 @@ def test_a_registered_exporter_gets_the_map(
     assert file.read_text() == str(len(scene.landmarks))
 
     monkeypatch.setitem(registered, ("exporters", "count"), lambda: None)
-    with refused(
-        where="exporter 'count'", found="not an exporter: it does not take (scene, out)", error=PluginError
-    ):
+    with refused(where="exporter 'count'", found="not an exporter: it does not take (scene, out)", error=PluginError):
         bn.export_map(scene, tmp_path / "out", "count", overwrite=True)

@@ -118,7 +118,7 @@ POSE_READERS: dict[str, Callable[[Path, list[float]], list[SE3]]] = {
     "poses.json": lambda path, _: list(read_poses(path).values()),
     "transforms.json": lambda path, _: [frame.T_world_camera for frame in read_frames(read_record(path))],
     "images.txt": lambda path, _: [image.T_camera_model.inverse() for image in read_posed_images(path.parent)[0]],
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", POSE_READERS)
@@ -149,9 +149,7 @@ def timed_images(count: int) -> list[PosedImage]:
     roots = torch.randn((count, 6, 6), generator=generator, dtype=torch.float64)
     return [
         replace(image, time=104137.25 + number / 30, covariance=1e-4 * root @ root.mT)
-        for number, (image, root) in enumerate(
-            zip(images([f"f{n}" for n in range(count)]), roots, strict=True)
-        )
+        for number, (image, root) in enumerate(zip(images([f"f{n}" for n in range(count)]), roots, strict=True))
     ]
 
 

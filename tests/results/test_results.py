@@ -57,14 +57,10 @@ def scene() -> Any:
     return textured_map(surface=True)
 
 
-def test_a_sequence_is_tracked_in_a_thread_of_any_kind(
-    folder: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_sequence_is_tracked_in_a_thread_of_any_kind(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     reports, paths = list[Progress](), list[Answers]()
     with caplog.at_level(logging.INFO, "bidnerf"):
-        worker = threading.Thread(
-            target=lambda: paths.append(bn.track(scene(), folder, progress=reports.append))
-        )
+        worker = threading.Thread(target=lambda: paths.append(bn.track(scene(), folder, progress=reports.append)))
         worker.start()
         worker.join()
     (path,) = paths
@@ -154,19 +150,38 @@ def test_an_overlay_of_something_else_is_refused() -> None:
 T = SE3.exp(torch.tensor([0.1, -2.0, 3.0, 0.4, -0.5, 0.6], dtype=torch.float64))
 CAMERA = bn.Intrinsics(width=4, height=3, fx=4.0, fy=4.0, cx=2.0, cy=1.5)
 FOUND = Localization(
-    T, Outcome.AMBIGUOUS, "two places fit", 2, 0.25, 0.125, "auto", SE3.stack([T, T, T]),
-    torch.tensor([0.5, 0.125]).double(), torch.eye(6).double(), 0.9, 0.25, None, CAMERA,
-)  # fmt: skip
+    T,
+    Outcome.AMBIGUOUS,
+    "two places fit",
+    2,
+    0.25,
+    0.125,
+    "auto",
+    SE3.stack([T, T, T]),
+    torch.tensor([0.5, 0.125]).double(),
+    torch.eye(6).double(),
+    0.9,
+    0.25,
+    None,
+    CAMERA,
+)
 
 
 @settings(max_examples=30)
 @given(
     found=record(
-        Localization, T_world_camera=drawn.poses(), outcome=st.sampled_from(Outcome), poses=st.just(FOUND.poses),
-        losses=st.just(FOUND.losses), loss=st.floats(), focal_factor=st.floats(), diagnostics=st.none(), shown=st.none(),
+        Localization,
+        T_world_camera=drawn.poses(),
+        outcome=st.sampled_from(Outcome),
+        poses=st.just(FOUND.poses),
+        losses=st.just(FOUND.losses),
+        loss=st.floats(),
+        focal_factor=st.floats(),
+        diagnostics=st.none(),
+        shown=st.none(),
         covariance=st.none() | st.floats(0.01, 1).map(lambda x: x * torch.eye(6).double()),
     )
-)  # fmt: skip
+)
 def test_any_localization_is_loaded_as_it_was_saved(found: Localization, tmp_path: Path) -> None:
     found.save(tmp_path / "found.json")
     again, T = Localization.load(tmp_path / "found.json"), found.T_world_camera.matrix()
@@ -181,13 +196,18 @@ def test_any_localization_is_loaded_as_it_was_saved(found: Localization, tmp_pat
     [
         ({"T_world_camera": None}, "found.json", "T_world_camera is null", "a finite pose"),
         ({"T_world_camera": [[1.0]]}, "found.json", "T_world_camera has 1 rows", "4 rows of 4 numbers"),
-        ({"T_world_camera": (2 * torch.eye(4)).tolist()}, "found.json", "T_world_camera has the last row [0.0, 0.0, 0.0, 2.0]", "[0, 0, 0, 1]"),
+        (
+            {"T_world_camera": (2 * torch.eye(4)).tolist()},
+            "found.json",
+            "T_world_camera has the last row [0.0, 0.0, 0.0, 2.0]",
+            "[0, 0, 0, 1]",
+        ),
         ({"covariance": [[1.0]]}, "found.json", "covariance has 1 rows", "6 rows of 6 numbers"),
         ({"outcome": "fine"}, "found.json: outcome", "found 'fine'", "'converged', "),
         ({"steps": "two"}, "found.json: steps", "found 'two'", "int"),
         ({"more": 1}, "found.json", "no field 'more'", "any of T_world_camera"),
     ],
-)  # fmt: skip
+)
 def test_a_file_of_another_kind_is_no_localization(
     tmp_path: Path, change: dict[str, Any], where: str | None, found: str, expected: str
 ) -> None:
@@ -239,9 +259,7 @@ def test_a_query_that_fails_does_not_stop_the_others(tmp_path: Path, monkeypatch
         localize_each(Localizer(scene(), warm_up=False), Photos([files[1]], DatasetOptions(CAMERA)))
 
 
-def test_answers_in_a_format_of_poses_hold_the_accepted_ones(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_answers_in_a_format_of_poses_hold_the_accepted_ones(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     answers = Answers()
     frame = Frame("a", torch.zeros((3, 4, 3)), CAMERA)
     for found in (FOUND, replace(FOUND, outcome=Outcome.CONVERGED)):
@@ -269,9 +287,7 @@ def test_answers_become_a_table(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pandas", types.SimpleNamespace(DataFrame=lambda rows: rows))
     known, failed = answers.to_pandas()
     assert [known["x"], known["y"], known["z"]] == FOUND.T_world_camera.translation.tolist()
-    assert [known["qx"], known["qy"], known["qz"], known["qw"]] == FOUND.T_world_camera.quaternion(
-        "xyzw"
-    ).tolist()
+    assert [known["qx"], known["qy"], known["qz"], known["qw"]] == FOUND.T_world_camera.quaternion("xyzw").tolist()
     assert (known["frame"], known["outcome"], known["confidence"]) == ("a", "converged", 0.25)
     assert known["error_translation"] == pytest.approx(5.0)
     assert known["sigma_translation"] == pytest.approx(3**0.5)
@@ -290,9 +306,7 @@ def test_errors_by_another_world_are_told_from_errors_of_poses(line: bool) -> No
     tangents = torch.randn((6, 6), dtype=torch.float64, generator=generator)
     truths = [SE3.exp(tangent) for tangent in tangents]
     if line:
-        truths = [
-            SE3(truth.rotation, truth.translation * T.translation.new_tensor([1, 0, 0])) for truth in truths
-        ]
+        truths = [SE3(truth.rotation, truth.translation * T.translation.new_tensor([1, 0, 0])) for truth in truths]
     there = [SE3(T.rotation @ truth.rotation, T.apply(1.7 * truth.translation)) for truth in truths]
     noise = 0.01 * torch.randn((6, 6), dtype=torch.float64, generator=generator)
     noisy = [pose.retract(step) for pose, step in zip(there, noise, strict=True)]

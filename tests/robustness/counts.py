@@ -58,9 +58,7 @@ KINDS: dict[str, Kind] = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=list(KINDS), default=list(KINDS), metavar="KIND")
     parser.add_argument("--scale", type=float, default=1.0, help="of the random searches")
     parser.add_argument("--json", type=Path, help="write the counts and all defects here")

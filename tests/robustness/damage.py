@@ -25,11 +25,33 @@ TERMINAL = "\x1b[2J\x1b]0;owned\x07\x9b31m\x00\r\u202e\ud800\u2028"
 PLAIN_TERMINAL = TERMINAL.replace("\ud800", "").replace("\0", "")
 """The part of it that a file's name can hold."""
 TEXTS = (
-    "", " ", TERMINAL, "../../etc/passwd", "/dev/zero", "a" * 5000, "\0", "NaN", "1e400", "-1", "%s%n", "{0}",
-)  # fmt: skip
+    "",
+    " ",
+    TERMINAL,
+    "../../etc/passwd",
+    "/dev/zero",
+    "a" * 5000,
+    "\0",
+    "NaN",
+    "1e400",
+    "-1",
+    "%s%n",
+    "{0}",
+)
 NUMBERS = (
-    "NaN", "Infinity", "-Infinity", "1e400", "-1e308", "1e-320", "0", "-1", "1.5", "9" * 30, "1" + "0" * 400, str(2**63),
-)  # fmt: skip
+    "NaN",
+    "Infinity",
+    "-Infinity",
+    "1e400",
+    "-1e308",
+    "1e-320",
+    "0",
+    "-1",
+    "1.5",
+    "9" * 30,
+    "1" + "0" * 400,
+    str(2**63),
+)
 OTHER_VALUES: tuple[Any, ...] = (None, True, [], {}, "text", 0, -1, 1.5, [[]], [None], {"": {}}, [1, 2, 3])
 LARGE = 100_000
 """Columns and rows of images and arrays that are too large for any memory."""
@@ -142,12 +164,29 @@ def of_json(content: bytes) -> Damages:
 # Images.
 
 SIZES = (
-    (LARGE, LARGE), (2**31 - 1, 1), (1, 2**31 - 1), (0, 5), (2000, 1500), (25, 24),
-)  # fmt: skip
+    (LARGE, LARGE),
+    (2**31 - 1, 1),
+    (1, 2**31 - 1),
+    (0, 5),
+    (2000, 1500),
+    (25, 24),
+)
 MODES = (
-    ("L", "PNG"), ("LA", "PNG"), ("P", "PNG"), ("P", "GIF"), ("1", "PNG"), ("CMYK", "JPEG"), ("F", "TIFF"), ("I", "TIFF"),
-    ("I;16", "PNG"), ("YCbCr", "JPEG"), ("LAB", "TIFF"), ("RGB", "BMP"), ("RGB", "WEBP"), ("L", "PPM"),
-)  # fmt: skip
+    ("L", "PNG"),
+    ("LA", "PNG"),
+    ("P", "PNG"),
+    ("P", "GIF"),
+    ("1", "PNG"),
+    ("CMYK", "JPEG"),
+    ("F", "TIFF"),
+    ("I", "TIFF"),
+    ("I;16", "PNG"),
+    ("YCbCr", "JPEG"),
+    ("LAB", "TIFF"),
+    ("RGB", "BMP"),
+    ("RGB", "WEBP"),
+    ("L", "PPM"),
+)
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 24 24\n%%EndComments\n{} loop\n"
 
 
@@ -201,7 +240,8 @@ def of_image(content: bytes) -> Damages:
         ),
         "one pixel or line": st.builds(
             lambda size, kind: saved(Image.new("RGB", size), kind),
-            st.sampled_from(((1, 1), (1, 24), (24, 1))), st.sampled_from(("PNG", "JPEG")),
+            st.sampled_from(((1, 1), (1, 24), (24, 1))),
+            st.sampled_from(("PNG", "JPEG")),
         ),
         "compressed zeros": st.sampled_from((500, 2000)).map(zeros_png),
         "part of a JPEG": of_jpeg["cut"] | of_jpeg["flipped"],
@@ -210,7 +250,7 @@ def of_image(content: bytes) -> Damages:
         ),
         "long compressed text": st.builds(long_text),
         "PostScript": st.just(POSTSCRIPT),
-    }  # fmt: skip
+    }
 
 
 # Arrays of numpy, as depth and as points.
@@ -219,12 +259,30 @@ SHAPES = ((24, 24), (24, 25), (24, 24, 3), (0, 24), (), (24,), (576, 3), (0, 3),
 KINDS = ("f2", "f4", "f8", "i1", "u2", "i4", "u8", "c16", "U3", "S2", "?", "M8[s]", "f4,i4", ">f4")
 VALUES = (np.nan, np.inf, -np.inf, -1.0, 0.0, 1e10, 3.4e38, 1e308, 1e-320, 65.535)
 HEADER_SHAPES = (
-    "(100000, 100000)", "(1000000000000,)", "(-1, 24)", "(24, 24)" * 3, "(" * 500, f"({'9' * 50}, 3)", "(1, 2",
-)  # fmt: skip
+    "(100000, 100000)",
+    "(1000000000000,)",
+    "(-1, 24)",
+    "(24, 24)" * 3,
+    "(" * 500,
+    f"({'9' * 50}, 3)",
+    "(1, 2",
+)
 ROWS = (
-    b"1 2\n3 4\n", b"1,5 2,5\n", b"nan inf 1\n", b"a b c\n", b"1 2 3\n4 5\n", b"# \x1b[2J\n", b"1e400 0 1\n", b"0 0 0\n",
-    b"1 2 3 " * 20_000, b"1_0 2 3\n", b"\xff\xfe1 2 3\n", b"1;2;3\n", b"-1 -2 -3\n", b"\0\0\0",
-)  # fmt: skip
+    b"1 2\n3 4\n",
+    b"1,5 2,5\n",
+    b"nan inf 1\n",
+    b"a b c\n",
+    b"1 2 3\n4 5\n",
+    b"# \x1b[2J\n",
+    b"1e400 0 1\n",
+    b"0 0 0\n",
+    b"1 2 3 " * 20_000,
+    b"1_0 2 3\n",
+    b"\xff\xfe1 2 3\n",
+    b"1;2;3\n",
+    b"-1 -2 -3\n",
+    b"\0\0\0",
+)
 
 
 def array_bytes(array: Any) -> bytes:
@@ -263,9 +321,10 @@ def of_array(content: bytes) -> Damages:
         "pickled": st.just(array_bytes(np.array([{"a": 1}, None], dtype=object))),
         "header of an array": st.builds(
             array_file,
-            st.sampled_from(("<f8", "<f4", "O", "V1000000000", "x", "\\x1b[31m")), st.sampled_from(HEADER_SHAPES),
+            st.sampled_from(("<f8", "<f4", "O", "V1000000000", "x", "\\x1b[31m")),
+            st.sampled_from(HEADER_SHAPES),
         ),
-    }  # fmt: skip
+    }
     names = ("points.npy", "points", "other.npy", "T_camera_sensor.npy", PLAIN_TERMINAL)
     inside = st.one_of(NOISE, *damages.values())
     archive = st.builds(
@@ -327,12 +386,8 @@ def of_tensors(content: bytes) -> Damages:
         "another type": st.builds(with_entry, names, st.sampled_from([{"dtype": kind} for kind in TYPES])),
         "another shape": st.builds(another_shape, names, st.integers(0, 6)),
         "not finite": st.builds(not_finite, names),
-        "another name": st.builds(
-            another_name, names, st.sampled_from((TERMINAL.replace("\ud800", ""), "other", ""))
-        ),
-        "random numbers": st.builds(
-            random_numbers, st.integers(0, len(numbers) - 1), st.sampled_from((1, 4, 1000))
-        ),
+        "another name": st.builds(another_name, names, st.sampled_from((TERMINAL.replace("\ud800", ""), "other", ""))),
+        "random numbers": st.builds(random_numbers, st.integers(0, len(numbers) - 1), st.sampled_from((1, 4, 1000))),
     }
 
 
@@ -356,7 +411,7 @@ def false_counts(content: bytes) -> dict[str, bytes]:
         "one less": held - 1,
         "none": 0,
     }
-    return {f"count {name}": with_count(number, content) for name, number in numbers.items()}  # fmt: skip
+    return {f"count {name}": with_count(number, content) for name, number in numbers.items()}
 
 
 def of_colmap(content: bytes) -> Damages:

@@ -88,12 +88,25 @@ def data_door(folder: Path) -> object:
 
 OF_DATA: list[FolderDoor] = [TRAIN, RENDER, FRAME, [*EVALUATE, "{}/new.jsonl"], BAKE, TRACK, data_door]
 OF_MAP: list[FolderDoor] = [
-    ["info", "{}/map"], ["info", "{}/map", "--json"], RENDER, FRAME, [*EVALUATE, "{}/new.jsonl"], BAKE, map_door, localized,
+    ["info", "{}/map"],
+    ["info", "{}/map", "--json"],
+    RENDER,
+    FRAME,
+    [*EVALUATE, "{}/new.jsonl"],
+    BAKE,
+    map_door,
+    localized,
     ["train", "{}/data", "--out", "{}/map", "--resume"],
-]  # fmt: skip
+]
 OF_BAKED: list[FolderDoor] = [
-    ["info", "{}/map"], ["localize", "{}/map", "{}/data", *AUTO], BAKE, TRACK, map_door, localized, [*SEARCH, "{}/new.jsonl"],
-]  # fmt: skip
+    ["info", "{}/map"],
+    ["localize", "{}/map", "{}/data", *AUTO],
+    BAKE,
+    TRACK,
+    map_door,
+    localized,
+    [*SEARCH, "{}/new.jsonl"],
+]
 
 
 TARGETS: list[tuple[str, Callable[[bytes], Damages], list[FolderDoor]]] = [
@@ -107,8 +120,16 @@ TARGETS: list[tuple[str, Callable[[bytes], Damages], list[FolderDoor]]] = [
     ("map/surface-*", of_tensors, OF_BAKED),
     ("map/landmarks-*", of_tensors, OF_BAKED),
     ("photo.png", of_image, [KNOWN, [*PHOTO, "--camera", "{}/camera.json"], frame_door(hfov=40.0), frame_door()]),
-    ("photo.depth.png", of_image, [[*KNOWN, "--depth", "{}/photo.depth.png"], frame_door(hfov=40.0, depth="photo.depth.png")]),
-    ("photo.depth.npy", of_array, [[*KNOWN, "--depth", "{}/photo.depth.npy"], frame_door(hfov=40.0, depth="photo.depth.npy")]),
+    (
+        "photo.depth.png",
+        of_image,
+        [[*KNOWN, "--depth", "{}/photo.depth.png"], frame_door(hfov=40.0, depth="photo.depth.png")],
+    ),
+    (
+        "photo.depth.npy",
+        of_array,
+        [[*KNOWN, "--depth", "{}/photo.depth.npy"], frame_door(hfov=40.0, depth="photo.depth.npy")],
+    ),
     ("camera.json", of_json, [[*PHOTO, "--camera", "{}/camera.json"], frame_door(camera="camera.json")]),
     ("cameras.txt", of_points, [[*PHOTO, "--camera", "{}/cameras.txt"], frame_door(camera="cameras.txt")]),
     ("pose.json", of_json, [KNOWN, [*KNOWN, "--json"]]),
@@ -118,7 +139,7 @@ TARGETS: list[tuple[str, Callable[[bytes], Damages], list[FolderDoor]]] = [
     ("colmap/sparse/0/*.bin", of_colmap, [COLMAP, lambda folder: views_of(folder / "colmap")]),
     ("results.jsonl", of_json, [REPORT, [*SEARCH, "{}/results.jsonl"]]),
     ("results.meta.json", of_json, [REPORT, [*EVALUATE, "{}/results.jsonl"]]),
-]  # fmt: skip
+]
 
 
 # Other things in place of a file.
@@ -149,9 +170,19 @@ PLACES: dict[str, Callable[[Path], object]] = {
 # Options and arguments.
 
 COMMANDS: list[list[str]] = [
-    TRAIN, RENDER, FRAME, [*EVALUATE, "{}/new.jsonl"], BAKE, ["info", "{}/map"], COMPARE, KNOWN, REPORT, TRACK, ["backends"],
+    TRAIN,
+    RENDER,
+    FRAME,
+    [*EVALUATE, "{}/new.jsonl"],
+    BAKE,
+    ["info", "{}/map"],
+    COMPARE,
+    KNOWN,
+    REPORT,
+    TRACK,
+    ["backends"],
     ["demo", "--out", "{}/new", "--frames", "0"],
-]  # fmt: skip
+]
 OPTIONS = """
 --out --seed --split --frame --size --trials --workers --shards --shard --images --angle --fault --device --protocol --method
 --steps --levels --log2-table-size --width --learning-rate --cells --rays --max-steps --hypotheses --start --perturb --window
@@ -159,18 +190,39 @@ OPTIONS = """
 --dask --criterion --title --no-depth --split= --plot --video --help --help-all --nothing
 """.split()  # noqa: SIM905
 VALUES = (
-    *TEXTS, *NUMBERS, "test", "train", "none", "auto", "bid", "0.3", "1", "2", "1e9", "99999999", "{}", "{}/map", "{}/data",
-    "{}/photo.png", "{}/nowhere", "/dev/null", "/", "demo:blobs", "demo:nothing", "x\x1b[2Jy", "\udcff", "0.1:5", "white",
-)  # fmt: skip
+    *TEXTS,
+    *NUMBERS,
+    "test",
+    "train",
+    "none",
+    "auto",
+    "bid",
+    "0.3",
+    "1",
+    "2",
+    "1e9",
+    "99999999",
+    "{}",
+    "{}/map",
+    "{}/data",
+    "{}/photo.png",
+    "{}/nowhere",
+    "/dev/null",
+    "/",
+    "demo:blobs",
+    "demo:nothing",
+    "x\x1b[2Jy",
+    "\udcff",
+    "0.1:5",
+    "white",
+)
 
 
 @st.composite
 def odd_words(draw: st.DrawFn) -> list[str]:
     """Draw a command with options that are unknown, out of range, contradictory, or not even valid text."""
     words, value = list(draw(st.sampled_from(COMMANDS))), st.sampled_from(VALUES)
-    for how in draw(
-        st.lists(st.sampled_from(["add", "add", "add", "replace", "leave out"]), min_size=1, max_size=4)
-    ):
+    for how in draw(st.lists(st.sampled_from(["add", "add", "add", "replace", "leave out"]), min_size=1, max_size=4)):
         place = draw(st.integers(1, len(words)))
         if how == "add":
             words += [draw(st.sampled_from(OPTIONS)), *draw(st.lists(value, max_size=3))]
@@ -180,11 +232,33 @@ def odd_words(draw: st.DrawFn) -> list[str]:
 
 
 ODD_NUMBERS: tuple[Any, ...] = (
-    0, -1, 1.5, float("nan"), float("inf"), 1e308, 10**400, 2**63, "1", None, True, [], np.float32(24), 24,
-)  # fmt: skip
+    0,
+    -1,
+    1.5,
+    float("nan"),
+    float("inf"),
+    1e308,
+    10**400,
+    2**63,
+    "1",
+    None,
+    True,
+    [],
+    np.float32(24),
+    24,
+)
 ODD_SHAPES = (
-    (24, 24, 3), (24, 24), (0, 0, 3), (24, 24, 5), (3, 24, 24), (), (24,), (1, 1, 3), (24, 24, 4), (24, 24, 0),
-)  # fmt: skip
+    (24, 24, 3),
+    (24, 24),
+    (0, 0, 3),
+    (24, 24, 5),
+    (3, 24, 24),
+    (),
+    (24,),
+    (1, 1, 3),
+    (24, 24, 4),
+    (24, 24, 0),
+)
 ODD_LENSES: tuple[Any, ...] = ((), (1, 2), (float("nan"),) * 4, (1e9,) * 5, (-1e6,) * 14, None, "k1")
 
 
@@ -197,9 +271,7 @@ def odd_call(draw: st.DrawFn) -> tuple[str, Callable[[Path], object]]:
 
     n = [one_of(*ODD_NUMBERS) for _ in range(6)]
     kind = one_of("u1", "u2", "i4", "f2", "f4", "f8", "c8", "?", "O", "U1")
-    array = np.full(one_of(*ODD_SHAPES), one_of(0, 1, 0.5, 255, np.nan, -1), "f8").astype(
-        kind, casting="unsafe"
-    )
+    array = np.full(one_of(*ODD_SHAPES), one_of(0, 1, 0.5, 255, np.nan, -1), "f8").astype(kind, casting="unsafe")
     pixels: Any = one_of(array, array, array, None, "photo.png", [[1, 2], [3]], torch.zeros(24, 24, 3))
     numbers = torch.full((24, 24, 3), float("nan")), torch.zeros((24, 24, 3), dtype=torch.int64)
     tensor: Any = one_of(pixels, *numbers)
@@ -217,7 +289,7 @@ def odd_call(draw: st.DrawFn) -> tuple[str, Callable[[Path], object]]:
         "start": lambda folder: Localizer(load_map(folder / "map"), "bid", bid(), warm_up=False)(photo(folder), start),
         "seed": lambda folder: localized(folder, seed=n[0]),
         "Frame.open": lambda folder: Frame.open(folder / "photo.png", hfov=n[0], largest=n[1]),
-    }  # fmt: skip
+    }
     name = one_of(*calls)
     return name, calls[name]
 
@@ -271,9 +343,7 @@ def wrong_with(case: Case, folder: Path) -> list[str]:
         found = run(words, folder.with_suffix(".log"), nobody=case.nobody, before=partial(os.chdir, folder))
         return defects(found, folder, before)
     call = partial(case.door, folder)
-    return defects(
-        run(call, folder.with_suffix(".log"), nobody=case.nobody, before=partial(os.chdir, folder))
-    )
+    return defects(run(call, folder.with_suffix(".log"), nobody=case.nobody, before=partial(os.chdir, folder)))
 
 
 def remove(folder: Path) -> None:
@@ -292,9 +362,13 @@ def checks(work: Path, count: int, minutes: float = 10.0) -> Iterator[Check]:
     until = time.monotonic() + 60 * minutes
 
     @settings(
-        max_examples=count, phases=[Phase.generate], derandomize=True, database=None, deadline=None,
+        max_examples=count,
+        phases=[Phase.generate],
+        derandomize=True,
+        database=None,
+        deadline=None,
         suppress_health_check=list(HealthCheck),
-    )  # fmt: skip
+    )
     @given(case=cases(sound))
     def tried(case: Case) -> None:
         if time.monotonic() < until:

@@ -73,9 +73,7 @@ def sound_folder(folder: Path, test: int = 2) -> Path:
     """Write a dataset, a map of it with surface and landmarks, photos with depth, and every other kind of input."""
     torch.set_num_threads(1)
     scene = demo_object()
-    seen, unseen = (
-        seen_from(scene, CAMERA, orbit(3.5, count, seed=seed)) for seed, count in ((0, 6), (1, test))
-    )
+    seen, unseen = (seen_from(scene, CAMERA, orbit(3.5, count, seed=seed)) for seed, count in ((0, 6), (1, test)))
     write_transforms(folder / "data", {"train": seen, "test": unseen}, scene.bounds.background)
     command("train", folder / "data", "--out", folder / "map", *SMALL_FIELD, "--steps", "6", "--no-bake")
     command("bake", folder / "map", "--data", folder / "data", *BAKED)
@@ -167,9 +165,13 @@ TRACEBACK = 70
 
 
 def begin(
-    door: Door, log: Path, memory: int = MEMORY, before: Callable[[], object] = lambda: None, out: Path | int | None = None,
+    door: Door,
+    log: Path,
+    memory: int = MEMORY,
+    before: Callable[[], object] = lambda: None,
+    out: Path | int | None = None,
     nobody: bool = False,
-) -> int:  # fmt: skip
+) -> int:
     """Run a case in a child of its own group, whose process id is returned; what it prints goes to ``log``.out and .err,
     or to the file or descriptor ``out``.
     """

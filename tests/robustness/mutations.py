@@ -148,9 +148,7 @@ def candidates(root: Path, path: Path) -> Iterator[tuple[Fault, bytes]]:
             case ast.Subscript(slice=ast.Tuple(elts=[first, *_, ast.Constant() as axis])):
                 if text(axis) in AXES and (isinstance(first, ast.Slice) or text(first) == "..."):
                     yield "axes", (*span(axis), AXES[text(axis)])
-            case ast.Attribute(attr="T" | "mT" as name) if not source.startswith(
-                ".", end
-            ):  # a pose's has more
+            case ast.Attribute(attr="T" | "mT" as name) if not source.startswith(".", end):  # a pose's has more
                 yield "axes", (end - len(name) - 1, end, "")
 
     def walk(node: Any, name: str, inside: bool, around: list[ast.AST]) -> Iterator[tuple[Fault, bytes]]:
@@ -328,9 +326,7 @@ class Measurement:
 
     def verdict(self, number: int, fault: Fault) -> Row:
         place, done, by = [fault.file, fault.function], self.runs[number], self.caught(number)
-        entering = [
-            u for u, run in self.runs[None].items() if place in run["entered"] and run["outcome"] != "empty"
-        ]
+        entering = [u for u, run in self.runs[None].items() if place in run["entered"] and run["outcome"] != "empty"]
         left = 0 if by else len(set(entering) - set(done))
         survived = "not entered" if not entering else "out of time" if left else "survived"
         spent = sum(run["seconds"] for run in done.values())

@@ -90,10 +90,14 @@ def jobs(sound: Path) -> dict[str, Job]:
         "train": Job(training, step_of, lambda folder: parts(folder, ("weights",))),
         "bake": Job(baking, step_of, lambda folder: parts(folder, ("surface", "landmarks"))),
         "evaluate": Job(trials, lambda folder: len(rows(folder)), rows),
-        "report": Job(lambda folder: ["report", sound / "results.jsonl", "--out", folder / "report"], pages, files_of_report),
-        "localize": answers("localize", "--json", "--perturb", "0.1", "5", "--method", "bid", "--max-steps", "12", "--rays", "64"),
+        "report": Job(
+            lambda folder: ["report", sound / "results.jsonl", "--out", folder / "report"], pages, files_of_report
+        ),
+        "localize": answers(
+            "localize", "--json", "--perturb", "0.1", "5", "--method", "bid", "--max-steps", "12", "--rays", "64"
+        ),
         "track": answers("track"),
-    }  # fmt: skip
+    }
 
 
 class Broken(Exception):
@@ -169,9 +173,7 @@ def equal(job: Job, folder: Path, expected: object) -> list[str]:
 # Kills, and resuming after them.
 
 
-def killed(
-    job: Job, work: Path, expected: object, seconds: float, kills: int, chance: random.Random
-) -> Checks:
+def killed(job: Job, work: Path, expected: object, seconds: float, kills: int, chance: random.Random) -> Checks:
     """Kill a command at random moments and resume it; a run that comes to its end is compared and begun anew."""
     rounds, before, folder = 0, 0, work / "0"
     folder.mkdir(parents=True)
@@ -215,9 +217,7 @@ def signalled(job: Job, work: Path, seconds: float, count: int, chance: random.R
         folder.mkdir(parents=True)
         moment = chance.uniform(0, 1.1 * seconds)
         found = stopped(job, folder, kind, moment)
-        answered = (
-            len(found.out.split("\n")) - 1 if "--json" in job.words(folder) else int(moment > 0.7 * seconds)
-        )
+        answered = len(found.out.split("\n")) - 1 if "--json" in job.words(folder) else int(moment > 0.7 * seconds)
         printed = 0 if job.resumes else answered
         wrong = kept_whole(job, folder, printed if kind != signal.SIGKILL else 0)
         if kind != signal.SIGKILL:
@@ -277,7 +277,17 @@ def read_only(sound: Path, work: Path) -> Checks:
     known = ["localize", map_folder, shot, "--hfov", "40", "--start", sound / "pose.json", *QUICK]
     commands: dict[str, list[object]] = {
         "train into it": ["train", data, "--out", work / "new", *SMALL_FIELD, "--steps", "2", "--no-bake"],
-        "train over a map": ["train", data, "--out", work / "map", "--overwrite", *SMALL_FIELD, "--steps", "2", "--no-bake"],
+        "train over a map": [
+            "train",
+            data,
+            "--out",
+            work / "map",
+            "--overwrite",
+            *SMALL_FIELD,
+            "--steps",
+            "2",
+            "--no-bake",
+        ],
         "resume": ["train", data, "--out", work / "map", "--resume"],
         "bake": ["bake", work / "map", "--data", data, *BAKED],
         "localize --out": [*known, "--out", work / "p.json"],
@@ -285,13 +295,35 @@ def read_only(sound: Path, work: Path) -> Checks:
         "localize --draw": [*known, "--draw", work / "pictures"],
         "track --out": ["track", map_folder, data, "--out", work / "t.json"],
         "track --plot": ["track", map_folder, data, "--out", work.parent / "t.json", "--plot", work / "t.png"],
-        "evaluate": ["evaluate", map_folder, data, "--out", work / "e.jsonl", "--trials", "1", "--workers", "1", *QUICK],
-        "evaluate --resume": ["evaluate", map_folder, data, "--out", work / "r.jsonl", "--trials", "1", "--workers", "1", *QUICK],
+        "evaluate": [
+            "evaluate",
+            map_folder,
+            data,
+            "--out",
+            work / "e.jsonl",
+            "--trials",
+            "1",
+            "--workers",
+            "1",
+            *QUICK,
+        ],
+        "evaluate --resume": [
+            "evaluate",
+            map_folder,
+            data,
+            "--out",
+            work / "r.jsonl",
+            "--trials",
+            "1",
+            "--workers",
+            "1",
+            *QUICK,
+        ],
         "report": ["report", sound / "results.jsonl", "--out", work / "report"],
         "render": ["render", map_folder, data, "--out", work / "images"],
         "demo": ["demo", "--out", work / "demo"],
         "info": ["info", work / "map"],
-    }  # fmt: skip
+    }
     for name, words in commands.items():
         before = files_of(work)
         found = run(words, work.parent / "readonly.log", 60, nobody=True)
@@ -300,11 +332,7 @@ def read_only(sound: Path, work: Path) -> Checks:
         yield Check(f"read-only: {name}", tuple(wrong))
     for name, words in {"localize": known, "info": ["info", map_folder], "backends": ["backends"]}.items():
         found = run(words, work.parent / "full.log", 60, out=Path("/dev/full"))
-        wrong = (
-            []
-            if found.ending == "refused" and "No space left" in found.last
-            else [f"{found.ending}: {found.last}"]
-        )
+        wrong = [] if found.ending == "refused" and "No space left" in found.last else [f"{found.ending}: {found.last}"]
         yield Check(f"full stdout: {name}", tuple(wrong))
 
 
@@ -385,9 +413,7 @@ def threads(sound: Path, seconds: float) -> Checks:
     yield Check("memory", () if growth < 50 else (f"grew by {growth:.0f} MiB",))
 
 
-def checks(
-    work: Path, kinds: Sequence[str], kills: int, signals: int, seconds: float = 20, seed: int = 0
-) -> Checks:
+def checks(work: Path, kinds: Sequence[str], kills: int, signals: int, seconds: float = 20, seed: int = 0) -> Checks:
     """Yield all checks of some ``kinds``: kills, signals, disks, read-only, crowds."""
     work.chmod(0o755)
     sound = work / "sound"
@@ -396,16 +422,17 @@ def checks(
     for name, job in jobs(sound).items():
         folder, chance = work / name, random.Random(f"{seed}/{name}")
         wanted = {
-            "kills": job.resumes, "disks": job.resumes, "crowds": job.resumes, "signals": name not in ("train", "bake"),
-        }  # fmt: skip
+            "kills": job.resumes,
+            "disks": job.resumes,
+            "crowds": job.resumes,
+            "signals": name not in ("train", "bake"),
+        }
         if not any(wanted.get(kind) for kind in kinds):
             continue
         took = undisturbed(job, folder / "whole")
         expected = job.result(folder / "whole")
         parts_of_job = {
-            "kills": lambda j=job, f=folder, e=expected, t=took, c=chance: killed(
-                j, f / "kills", e, t, kills, c
-            ),
+            "kills": lambda j=job, f=folder, e=expected, t=took, c=chance: killed(j, f / "kills", e, t, kills, c),
             "signals": lambda j=job, f=folder, t=took, c=chance: signalled(j, f / "signals", t, signals, c),
             "disks": lambda j=job, f=folder, e=expected: full_disk(j, f / "full", e),
             "crowds": lambda j=job, f=folder: two_at_once(j, f / "two", 2),

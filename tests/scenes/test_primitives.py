@@ -43,9 +43,7 @@ def placed(shape: Shape, generator: torch.Generator) -> Primitive:
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_distance_is_the_first_crossing_of_the_implicit_surface(
-    shape: Shape, generator: torch.Generator
-) -> None:
+def test_distance_is_the_first_crossing_of_the_implicit_surface(shape: Shape, generator: torch.Generator) -> None:
     primitive = placed(shape, generator)
     origins, directions = random_rays(300, generator)
     distance = primitive.distance(origins.T, directions.T)
@@ -66,9 +64,7 @@ def test_distance_is_the_first_crossing_of_the_implicit_surface(
             continue
         i = int(crossings[0])
         ends = steps[i : i + 2].tolist()
-        root = brentq(
-            lambda t, r=ray: float(level(r, torch.tensor(t, dtype=torch.float64))), *ends, xtol=1e-13
-        )
+        root = brentq(lambda t, r=ray: float(level(r, torch.tensor(t, dtype=torch.float64))), *ends, xtol=1e-13)
         assert float(distance[ray]) == pytest.approx(root, abs=1e-9)
         compared += 1
     assert compared > 25
@@ -76,17 +72,13 @@ def test_distance_is_the_first_crossing_of_the_implicit_surface(
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_distance_is_never_negative_or_nan(
-    shape: Shape, dtype: torch.dtype, generator: torch.Generator
-) -> None:
+def test_distance_is_never_negative_or_nan(shape: Shape, dtype: torch.dtype, generator: torch.Generator) -> None:
     for primitive in (placed(shape, generator), Primitive(shape, SE3.identity(), PAINT)):
         origins, directions = (x.to(dtype).T for x in random_rays(5000, generator))
         for starts in (origins, 1e4 * origins, torch.zeros_like(origins)):
             distance = primitive.distance(starts, directions)
             assert (distance >= 0).all()  # false for NaN
-        assert (
-            distance.isfinite().all() == (primitive.T_world_shape.translation == 0).all()
-        )  # left from within
+        assert distance.isfinite().all() == (primitive.T_world_shape.translation == 0).all()  # left from within
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)

@@ -42,9 +42,7 @@ def test_what_rays_meet_has_a_colour(scene: ClosedFormScene, generator: torch.Ge
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda s: s.name)
-def test_one_origin_for_all_is_the_same_as_one_for_each(
-    scene: ClosedFormScene, generator: torch.Generator
-) -> None:
+def test_one_origin_for_all_is_the_same_as_one_for_each(scene: ClosedFormScene, generator: torch.Generator) -> None:
     _, directions = random_rays(600, generator)
     origin = torch.tensor([0.3, -1.4, 1.2], dtype=torch.float64)
     shared = scene.intersect(origin, directions.reshape(20, 30, 3))
@@ -56,9 +54,7 @@ def test_one_origin_for_all_is_the_same_as_one_for_each(
 @pytest.mark.parametrize("scene", SCENES, ids=lambda s: s.name)
 def test_all_matter_lies_within_the_bounds(scene: ClosedFormScene) -> None:
     for T in views_of(scene, 6):
-        rays = T.rotate(
-            torch.nn.functional.normalize(CAMERA.unproject(CAMERA.pixel_centres(torch.float64)), dim=-1)
-        )
+        rays = T.rotate(torch.nn.functional.normalize(CAMERA.unproject(CAMERA.pixel_centres(torch.float64)), dim=-1))
         distance = scene.intersect(T.translation, rays)[0]
         limits = scene.bounds.rays(T.translation.expand_as(rays), rays)
         met = distance.isfinite()
@@ -67,9 +63,7 @@ def test_all_matter_lies_within_the_bounds(scene: ClosedFormScene) -> None:
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda s: s.name)
 @pytest.mark.parametrize("distortion", [(), (-0.1, 0.02, 1e-3, -1e-3)], ids=["pinhole", "distorted"])
-def test_depth_is_planar_and_exact_at_the_pixel_centre(
-    scene: ClosedFormScene, distortion: tuple[float, ...]
-) -> None:
+def test_depth_is_planar_and_exact_at_the_pixel_centre(scene: ClosedFormScene, distortion: tuple[float, ...]) -> None:
     camera, T = replace(CAMERA, distortion=distortion), views_of(scene)[1]
     frame = scene.render(camera, T)
     assert frame.depth is not None
@@ -78,9 +72,7 @@ def test_depth_is_planar_and_exact_at_the_pixel_centre(
     seen = frame.depth > 0
     distance, _ = scene.intersect(T.translation, torch.nn.functional.normalize(away[seen], dim=-1))
     assert seen.any()
-    assert (
-        torch.quantile((distance - away[seen].norm(dim=-1)).abs(), 0.99) < 1e-6
-    )  # silhouettes are ill-conditioned
+    assert torch.quantile((distance - away[seen].norm(dim=-1)).abs(), 0.99) < 1e-6  # silhouettes are ill-conditioned
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda s: s.name)
@@ -143,9 +135,7 @@ def test_no_symmetry_maps_a_scene_onto_itself(scene: ClosedFormScene) -> None:
     middle = (torch.tensor(scene.bounds.lower) + torch.tensor(scene.bounds.upper)).double() / 2
     camera = CAMERA.scaled(0.5)
     for T in views_of(scene, 3):
-        rays = T.rotate(
-            torch.nn.functional.normalize(camera.unproject(camera.pixel_centres(torch.float64)), dim=-1)
-        )
+        rays = T.rotate(torch.nn.functional.normalize(camera.unproject(camera.pixel_centres(torch.float64)), dim=-1))
         seen = scene.intersect(T.translation, rays)
         for symmetry in SYMMETRIES:
             other = scene.intersect(symmetry @ (T.translation - middle) + middle, rays @ symmetry.T)

@@ -49,9 +49,7 @@ from bombs import png_of
 from commands import Run, assert_refused
 
 QUICK = {"max_steps": 3, "rays": 64}
-LIMITS = ServiceLimits(
-    workers=1, queue=3, timeout=120.0, upload_timeout=0.5, max_megabytes=1.0, max_megapixels=1.0
-)
+LIMITS = ServiceLimits(workers=1, queue=3, timeout=120.0, upload_timeout=0.5, max_megabytes=1.0, max_megapixels=1.0)
 FORM = "multipart/form-data; boundary=xyz"
 ECHO = '''"""A protocol that answers the JSON of a photo with its name."""
 import base64
@@ -116,17 +114,31 @@ class Service:
         return self.run(self.ask(method, path, []))
 
     async def ask(
-        self, method: str, path: str, chunks: list[bytes], headers: dict[str, str] | None = None,
-        leaving: asyncio.Event | None = None, stalls: bool = False,
-    ) -> Reply:  # fmt: skip
+        self,
+        method: str,
+        path: str,
+        chunks: list[bytes],
+        headers: dict[str, str] | None = None,
+        leaving: asyncio.Event | None = None,
+        stalls: bool = False,
+    ) -> Reply:
         path, _, query = path.partition("?")
         given = {"host": "localhost", **(headers or {})}
         scope = {
-            "type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": method, "path": path,
-            "raw_path": path.encode(), "query_string": query.encode(), "root_path": "", "scheme": "http",
-            "headers": [(k.encode(), v.encode("latin-1")) for k, v in given.items()], "client": ("127.0.0.1", 1),
-            "server": ("localhost", 80), "state": {},
-        }  # fmt: skip
+            "type": "http",
+            "asgi": {"version": "3.0"},
+            "http_version": "1.1",
+            "method": method,
+            "path": path,
+            "raw_path": path.encode(),
+            "query_string": query.encode(),
+            "root_path": "",
+            "scheme": "http",
+            "headers": [(k.encode(), v.encode("latin-1")) for k, v in given.items()],
+            "client": ("127.0.0.1", 1),
+            "server": ("localhost", 80),
+            "state": {},
+        }
         reply, parts = Reply(), list(chunks)
 
         async def receive() -> dict[str, Any]:
@@ -343,8 +355,7 @@ def test_malformed_requests_are_refused_with_a_reason(service: Service, place: P
             body[at : at + drawn.randrange(9)] = drawn.randbytes(drawn.randrange(9))
         values = ["", "nan", "-1", "1e999", "\0", "map", "32", "[[]]", "{", "9" * 400]
         query = "&".join(
-            f"{drawn.choice([*PhotoForm.model_fields, 'x'])}={drawn.choice(values)}"
-            for _ in range(drawn.randrange(4))
+            f"{drawn.choice([*PhotoForm.model_fields, 'x'])}={drawn.choice(values)}" for _ in range(drawn.randrange(4))
         )
         path = drawn.choice(paths)
         reply = service.post(f"{path}{'&' if '?' in path else '?'}{query}", bytes(body), drawn.choice(kinds))
@@ -423,9 +434,7 @@ def stopped(service: Service) -> Iterator[int]:
 
 def request(service: Service, place: Place, leaving: asyncio.Event | None = None) -> Any:
     path = f"/localize?map=map&focal=32&start={place.start}"
-    return asyncio.run_coroutine_threadsafe(
-        service.ask("POST", path, [place.photo], leaving=leaving), service.loop
-    )
+    return asyncio.run_coroutine_threadsafe(service.ask("POST", path, [place.photo], leaving=leaving), service.loop)
 
 
 def test_nothing_is_lost_when_a_worker_is_killed(service: Service, place: Place) -> None:
@@ -646,9 +655,7 @@ def test_bytes_that_are_not_http_are_refused(place: Place, address: tuple[str, i
     assert spoken(address, b"GET /maps HTTP/1.1\r\nHost: example.org\r\n\r\n").startswith(b"HTTP/1.1 403")
 
 
-def test_a_body_without_end_and_a_client_without_haste_are_cut_off(
-    place: Place, address: tuple[str, int]
-) -> None:
+def test_a_body_without_end_and_a_client_without_haste_are_cut_off(place: Place, address: tuple[str, int]) -> None:
     head = b"POST /localize HTTP/1.1\r\nHost: localhost\r\n"
     for length in (b"Content-Length: 2000000000", b"Transfer-Encoding: chunked"):
         sent, block = 0, bytes(2**16)
@@ -691,9 +698,7 @@ def test_strangers_who_read_the_description_find_it_true(
     assert found["requests"] > 100
 
 
-def test_a_token_that_is_given_is_not_shown(
-    tmp_path: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_token_that_is_given_is_not_shown(tmp_path: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def announced(maps: Any, *, token: str | None, ready: Any, **more: Any) -> None:
         ready("http://localhost:1", token or "made-up-0123456789")
 
@@ -749,9 +754,7 @@ def test_startup_of_another_server_starts_the_pool(monkeypatch: pytest.MonkeyPat
     assert told == ["started", "lifespan.startup.complete", "ended", "lifespan.shutdown.complete"]
 
 
-def test_a_folder_without_a_map_is_refused(
-    place: Place, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_without_a_map_is_refused(place: Place, bidnerf: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """The process that would hold the maps refuses it, which is a thread here, and the command prints its line."""
 
     class Threaded:

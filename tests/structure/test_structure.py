@@ -165,9 +165,7 @@ def test_poses_that_were_found_are_not_sought_again(search: Search, tmp_path: Pa
         bn.find_poses(fewer, search.out)
 
 
-def test_train_takes_photos_without_poses(
-    search: Search, bidnerf: Run, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_train_takes_photos_without_poses(search: Search, bidnerf: Run, caplog: pytest.LogCaptureFixture) -> None:
     """Poses that were found before are in the folder beside the map."""
     out, beside = search.out.with_name("room"), search.out.with_name("room-poses")
     search.out.rename(beside)
@@ -341,10 +339,7 @@ def test_upright_axes_are_those_of_the_turned_image(tmp_path: Path) -> None:
         orientation = bn_photo(tmp_path, code).exif.orientation
         for axis, pixel in zip(_upright_axes(bn_photo(tmp_path, code)), ((0, -1), (0, 0)), strict=True):
             image = stored.clone()
-            v, u = (
-                int(size - 1 if part > 0 else 0)
-                for size, part in zip((4, 6), (axis[1], axis[0]), strict=True)
-            )
+            v, u = (int(size - 1 if part > 0 else 0) for size, part in zip((4, 6), (axis[1], axis[0]), strict=True))
             if axis[0]:
                 image[:, u] = 1
             else:
@@ -440,10 +435,7 @@ def test_pairs_with_many_matches_tell_a_folded_model() -> None:
     pycolmap = pytest.importorskip("pycolmap")
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=640, height=480, params=[500.0, 320.0, 240.0, 0.02])
     points = np.random.default_rng(0).uniform([-2, -1.5, 4], [2, 1.5, 8], (400, 3))
-    true = {
-        n: pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, 0.05 * n, 0])), [0.4 * n, 0, 0])
-        for n in (1, 2, 3)
-    }
+    true = {n: pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, 0.05 * n, 0])), [0.4 * n, 0, 0]) for n in (1, 2, 3)}
     seen = {n: camera.img_from_cam(T * points) for n, T in true.items()}
     every = np.column_stack([np.arange(400)] * 2)
     pairs = {(1, 2): every, (2, 3): every[:100], (1, 3): every[:99]}

@@ -78,17 +78,13 @@ def points(*views: View, count: int = 1000, seed: int = 0, surface: SurfaceMap |
     return found
 
 
-def of_points(
-    positions: Tensor, rgb: Tensor, normal: tuple[float, float, float], cells: int = 20
-) -> SurfaceMap:
+def of_points(positions: Tensor, rgb: Tensor, normal: tuple[float, float, float], cells: int = 20) -> SurfaceMap:
     """Return the surfels of one plane, at most one a cell, in the cube from -1 to 1."""
     grid = VoxelGrid.cube(BOUNDS, cells)
     numbers = grid.numbers(positions)
     assert (numbers.diff() > 0).all(), "one a cell, in the order of the cells"
     count = len(positions)
-    surfels = Surfels(
-        positions, positions.new_tensor(normal).expand(count, 3), rgb, positions.new_zeros((count, 3, 3))
-    )
+    surfels = Surfels(positions, positions.new_tensor(normal).expand(count, 3), rgb, positions.new_zeros((count, 3, 3)))
     keyframes = torch.eye(4, dtype=torch.float64)[None]
     return SurfaceMap(surfels, SurfelIndex.of(positions, grid), keyframes)
 

@@ -142,9 +142,7 @@ def ground_landmarks(features: str = "sift", scatter: float = 0.01) -> LandmarkM
     assert landmarks is not None
     deviations = torch.full((4,), scatter, dtype=torch.float64)
     cameras = (CAMERA,)
-    return replace(
-        landmarks, features=features, calibration_scatter=deviations, correlation=1.0, cameras=cameras
-    )
+    return replace(landmarks, features=features, calibration_scatter=deviations, correlation=1.0, cameras=cameras)
 
 
 @functools.cache

@@ -73,9 +73,7 @@ def write_map(folder: Path, views: list[View]) -> None:
     bounds, config, backend = demo_object().bounds, tiny.config(), load_backend("hashgrid")
     field = backend.build(config, bounds)
     backend.train(field, views, config, Silent())
-    info = MapInfo(
-        "hashgrid", to_plain(config), bounds, config.steps, complete=True, cameras=stored_cameras(views)
-    )
+    info = MapInfo("hashgrid", to_plain(config), bounds, config.steps, complete=True, cameras=stored_cameras(views))
     state = TrainingState(config.steps, dict(field.state_dict()), {})
     seen = views_of(demo_object(), tiny.CAMERA, orbit(3.5, 12))
     surface = bake(field, bounds, [], seen, BakeConfig(rays=6_000, cells=6_000))

@@ -47,14 +47,22 @@ def cameras(coefficients: tuple[int, ...] = (0, 4, 5, 8)) -> SearchStrategy[Intr
 def bounds() -> SearchStrategy[SceneBounds]:
     corner, size = st.floats(-100, 100), st.floats(1e-3, 100)
 
-    def made(lower: tuple[float, ...], sizes: tuple[float, ...], near: float, more: float, **others: Any) -> SceneBounds:  # fmt: skip
+    def made(
+        lower: tuple[float, ...], sizes: tuple[float, ...], near: float, more: float, **others: Any
+    ) -> SceneBounds:
         upper = tuple(a + b for a, b in zip(lower, sizes, strict=True))
         return SceneBounds(lower, upper, near, near + more, **others)  # type: ignore[arg-type]
 
     return st.builds(
-        made, st.tuples(*[corner] * 3), st.tuples(*[size] * 3), shares, size,
-        background=st.tuples(*[shares] * 3), contracted=st.booleans(), footprint=shares,
-    )  # fmt: skip
+        made,
+        st.tuples(*[corner] * 3),
+        st.tuples(*[size] * 3),
+        shares,
+        size,
+        background=st.tuples(*[shares] * 3),
+        contracted=st.booleans(),
+        footprint=shares,
+    )
 
 
 def traces() -> SearchStrategy[Trace]:
@@ -63,9 +71,14 @@ def traces() -> SearchStrategy[Trace]:
 
 
 SPECIAL: dict[type, Callable[[], SearchStrategy[Any]]] = {
-    Intrinsics: cameras, SceneBounds: bounds, Trace: traces, bool: st.booleans, float: lambda: numbers, str: lambda: words,
+    Intrinsics: cameras,
+    SceneBounds: bounds,
+    Trace: traces,
+    bool: st.booleans,
+    float: lambda: numbers,
+    str: lambda: words,
     int: lambda: st.integers(0, 2**40),
-}  # fmt: skip
+}
 
 
 def record(kind: Any, **given: SearchStrategy[Any]) -> SearchStrategy[Any]:

@@ -47,9 +47,7 @@ def covered(frame: Frame) -> Frame:
 @functools.cache
 def localizer(landmarks: bool = True) -> Localizer:
     """Return a localizer of a map with a surface; shared by all tests, as trackers share it."""
-    return Localizer(
-        textured_map(surface=True), config=AutoConfig(landmarks=landmarks, hypotheses=64, fused_rays=128)
-    )
+    return Localizer(textured_map(surface=True), config=AutoConfig(landmarks=landmarks, hypotheses=64, fused_rays=128))
 
 
 def tracked(

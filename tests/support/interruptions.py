@@ -39,9 +39,7 @@ def outcomes(
             return
 
 
-def striking(
-    call: Callable[..., Any], calls: list[object], number: int, error: BaseException
-) -> Callable[..., Any]:
+def striking(call: Callable[..., Any], calls: list[object], number: int, error: BaseException) -> Callable[..., Any]:
     """Return ``call`` with ``error`` in place of its call number ``number``; opening a file to read it is not counted."""
 
     def wrapper(*arguments: Any, **options: Any) -> Any:

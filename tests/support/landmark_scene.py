@@ -87,9 +87,7 @@ class Points:
 def looking_in(angle: float, height: float = 0.3, distance: float = 4.0) -> SE3:
     """A camera on a ring about the origin (radians), looking at it."""
     a = torch.tensor(angle, dtype=torch.float64)
-    centre = torch.stack(
-        [distance * a.sin(), torch.tensor(-height, dtype=torch.float64), -distance * a.cos()]
-    )
+    centre = torch.stack([distance * a.sin(), torch.tensor(-height, dtype=torch.float64), -distance * a.cos()])
     z = -centre / centre.norm()
     down = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
     x = torch.linalg.cross(down, z)

@@ -17,9 +17,14 @@ def answer(T: SE3 | None = None, outcome: Outcome = Outcome.CONVERGED, **changes
     """Return an answer, accepted by default."""
     pose = SE3.identity() if T is None else T
     fields = {
-        "reason": "as the search has it", "steps": 0, "seconds": 1.0, "loss": 0.0, "method": "auto", "poses": pose[None],
+        "reason": "as the search has it",
+        "steps": 0,
+        "seconds": 1.0,
+        "loss": 0.0,
+        "method": "auto",
+        "poses": pose[None],
         "losses": torch.zeros(0, dtype=torch.float64),
-    }  # fmt: skip
+    }
     return Localization(pose, outcome, **(fields | changes))
 
 

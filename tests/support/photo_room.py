@@ -58,16 +58,12 @@ def photograph(T_world_camera: SE3, seed: int = 0, walls: int = 6, camera: Intri
         here = (axis == of) & ((np.take_along_axis(rays, axis[..., None], -1)[..., 0] > 0) == (sign == 0))
         if here.any():
             u, v = ((places[..., i] / HALF + 1) / 2 * (PIXELS - 1) for i in range(3) if i != of)
-            seen = cv2.remap(
-                _pattern(wall, seed), u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR
-            )
+            seen = cv2.remap(_pattern(wall, seed), u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
             image[here] = seen[here]
     return image.round().astype(np.uint8)
 
 
-def write_photos(
-    folder: Path, poses: Sequence[SE3], seed: int = 0, walls: int = 6, first: int = 0
-) -> list[Path]:
+def write_photos(folder: Path, poses: Sequence[SE3], seed: int = 0, walls: int = 6, first: int = 0) -> list[Path]:
     """Write photos NUMBER.png of the room from each pose, numbered from ``first`` on."""
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / f"{first + number:03d}.png" for number in range(len(poses))]

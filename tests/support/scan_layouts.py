@@ -94,13 +94,17 @@ def record3d_files(views: Sequence[View]) -> dict[str, bytes]:
     """The members of a ``.r3d`` archive by name."""
     camera, (cx, cy) = views[0].frame.intrinsics, centre(views[0])
     metadata: dict[str, Any] = {
-        "w": camera.width, "h": camera.height, "dw": camera.width, "dh": camera.height, "fps": 4,
+        "w": camera.width,
+        "h": camera.height,
+        "dw": camera.width,
+        "dh": camera.height,
+        "fps": 4,
         "K": [camera.fx, 0, 0, 0, camera.fy, 0, cx, cy, 1],  # column by column
         "perFrameIntrinsicCoeffs": [[camera.fx, camera.fy, cx, cy] for _ in views],
         "poses": [[*quaternion(opengl(view)), *matrix(view)[:3, 3].tolist()] for view in views],
         "initPose": [0, 0, 0, 1, 0, 0, 0],
         "frameTimestamps": [START + PERIOD * number for number in range(len(views))],
-    }  # fmt: skip
+    }
     files = {"metadata": json.dumps(metadata).encode(), "icon": b"\xff\xd8"}
     for number, view in enumerate(views):
         files[f"rgbd/{number}.jpg"] = iio.imwrite("<bytes>", pixels(view), extension=".jpg", quality=97)
@@ -154,9 +158,7 @@ def write_stray_scanner(folder: Path, views: Sequence[View]) -> Path:
     write_video(folder / "rgb.mp4", [pixels(view) for view in views])
     (folder / "odometry.csv").write_text("\n".join(rows) + "\n")
     camera, (cx, cy) = views[0].frame.intrinsics, centre(views[0])
-    (folder / "camera_matrix.csv").write_text(
-        f"{camera.fx}, 0.0, {cx}\n0.0, {camera.fy}, {cy}\n0.0, 0.0, 1.0\n"
-    )
+    (folder / "camera_matrix.csv").write_text(f"{camera.fx}, 0.0, {cx}\n0.0, {camera.fy}, {cy}\n0.0, 0.0, 1.0\n")
     return folder
 
 
@@ -377,10 +379,15 @@ def write_opensfm(folder: Path, views: Sequence[View]) -> Path:
     camera = views[0].frame.intrinsics
     side = max(camera.width, camera.height)
     about = {
-        "projection_type": "brown", "width": camera.width, "height": camera.height, "focal_x": camera.fx / side,
-        "focal_y": camera.fy / side, "c_x": (camera.cx - camera.width / 2) / side, "c_y": (camera.cy - camera.height / 2) / side,
+        "projection_type": "brown",
+        "width": camera.width,
+        "height": camera.height,
+        "focal_x": camera.fx / side,
+        "focal_y": camera.fy / side,
+        "c_x": (camera.cx - camera.width / 2) / side,
+        "c_y": (camera.cy - camera.height / 2) / side,
         **dict(zip(("k1", "k2", "p1", "p2", "k3"), (*camera.distortion, *[0.0] * 5), strict=False)),
-    }  # fmt: skip
+    }
     shots = {}
     for number, view in enumerate(views):
         write_image(folder / "images" / f"{number}.png", pixels(view))
@@ -401,18 +408,23 @@ def write_metashape(folder: Path, views: Sequence[View]) -> Path:
     camera = views[0].frame.intrinsics
     k1, k2, p1, p2, k3 = (*camera.distortion, *[0.0] * 5)[:5]
     values = {
-        "f": camera.fy, "b1": camera.fx - camera.fy, "cx": camera.cx - camera.width / 2, "cy": camera.cy - camera.height / 2,
-        "k1": k1, "k2": k2, "k3": k3, "p1": p2, "p2": p1,
-    }  # fmt: skip
+        "f": camera.fy,
+        "b1": camera.fx - camera.fy,
+        "cx": camera.cx - camera.width / 2,
+        "cy": camera.cy - camera.height / 2,
+        "k1": k1,
+        "k2": k2,
+        "k3": k3,
+        "p1": p2,
+        "p2": p1,
+    }
     size = f'<resolution width="{camera.width}" height="{camera.height}"/>'
     lens = "".join(f"<{key}>{value}</{key}>" for key, value in values.items())
     cameras = ""
     for number, view in enumerate(views):
         write_image(folder / "images" / f"IMG_{number}.png", pixels(view))
         rows = " ".join(map(repr, matrix(view).ravel().tolist()))
-        cameras += (
-            f'<camera id="{number}" sensor_id="0" label="IMG_{number}"><transform>{rows}</transform></camera>'
-        )
+        cameras += f'<camera id="{number}" sensor_id="0" label="IMG_{number}"><transform>{rows}</transform></camera>'
     sensor = f'<sensor id="0" type="frame">{size}<calibration type="frame" class="adjusted">{size}{lens}</calibration></sensor>'
     chunk = f"<chunk><sensors>{sensor}</sensors><cameras>{cameras}</cameras></chunk>"
     (folder / "cameras.xml").write_text(
@@ -451,7 +463,7 @@ LAYOUTS = {
     "transforms": Layout("transforms", write_nerfstudio, unit=None),
     "colmap": Layout("colmap", write_colmap, depth=False, unit=None),
     "colmap, binary": Layout("colmap", partial(write_colmap, binary=True), depth=False, unit=None),
-}  # fmt: skip
+}
 
 
 # What is said of them

@@ -39,9 +39,7 @@ class Known:
         return len(self.points) - self.wrong
 
 
-def known(
-    views: Sequence[View], names: Sequence[str], each: int = 12, wrong: int = 3, agree: float = 0.01
-) -> Known:
+def known(views: Sequence[View], names: Sequence[str], each: int = 12, wrong: int = 3, agree: float = 0.01) -> Known:
     """About ``each`` points of each view's depth; others see them whose depth there is the same but for ``agree``."""
     generator = torch.Generator().manual_seed(0)
     found = []

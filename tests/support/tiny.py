@@ -32,17 +32,23 @@ STEPS = 12
 def config(steps: int = STEPS, **changes: Any) -> HashGridConfig:
     """A field that trains in milliseconds a step; pruning begins within the few steps that tests take."""
     settings: dict[str, Any] = {
-        "encoding": ENCODING, "width": 16, "geometry_features": 3, "grid_resolution": 16, "coarse_levels": 1,
-        "steps": steps, "samples_per_step": 2048, "rays_at_most": 256, "prune_from": 4, "prune_every": 4,
-    }  # fmt: skip
+        "encoding": ENCODING,
+        "width": 16,
+        "geometry_features": 3,
+        "grid_resolution": 16,
+        "coarse_levels": 1,
+        "steps": steps,
+        "samples_per_step": 2048,
+        "rays_at_most": 256,
+        "prune_from": 4,
+        "prune_every": 4,
+    }
     return HashGridConfig(**(settings | changes))
 
 
 def options(steps: int = STEPS) -> list[str]:
     """Return the options of the command line that make such a field."""
-    plain = {
-        f: getattr(ENCODING, f) for f in ("levels", "log2_table_size", "base_resolution", "finest_resolution")
-    }
+    plain = {f: getattr(ENCODING, f) for f in ("levels", "log2_table_size", "base_resolution", "finest_resolution")}
     chosen = config(steps)
     names = ("width", "geometry_features", "grid_resolution", "coarse_levels", "steps", "samples_per_step")
     plain |= {name: getattr(chosen, name) for name in (*names, "rays_at_most", "prune_from", "prune_every")}
@@ -59,9 +65,7 @@ def black_batch(rays: Rays, distance: torch.Tensor) -> TrainingBatch:
     coloured = torch.ones(len(distance), dtype=torch.bool)
     black = torch.zeros_like(rays.origins)
     observed = Observations(rays.origins, rays.directions, black, distance, coloured)
-    return TrainingBatch(
-        rays, observed, black, torch.zeros(len(black), dtype=torch.long), torch.zeros_like(distance)
-    )
+    return TrainingBatch(rays, observed, black, torch.zeros(len(black), dtype=torch.long), torch.zeros_like(distance))
 
 
 def write_anchor(folder: Path, anchor: Anchor) -> None:
@@ -71,9 +75,7 @@ def write_anchor(folder: Path, anchor: Anchor) -> None:
 
 def write_dataset(folder: Path, train: int = 6, test: int = 3, depth: bool = True) -> Path:
     """Views of the closed-form scene as nerfstudio's dialect has them; test frames are called t_0000 ..."""
-    seen = [("train", "r", view) for view in views(train)] + [
-        ("test", "t", view) for view in views(test, seed=1)
-    ]
+    seen = [("train", "r", view) for view in views(train)] + [("test", "t", view) for view in views(test, seed=1)]
     frames, listed = [], {"train_filenames": [], "test_filenames": []}
     for split, letter, view in seen:
         name = f"images/{letter}_{view.frame.name}.png"

@@ -9,16 +9,30 @@ from typing import Any
 from bidnerf.evaluation import ScalarPoseError, Trace, Trial, TrialResult
 
 
-def trial_result(
-    trial: Trial, distances: Sequence[float], angles: Sequence[float] = (), **changes: Any
-) -> TrialResult:
+def trial_result(trial: Trial, distances: Sequence[float], angles: Sequence[float] = (), **changes: Any) -> TrialResult:
     """Return the result of a trial whose errors went like that, from the start on (metres, degrees); ``changes`` are
     other fields.
     """
     angles = tuple(angles) or (0.0,) * len(distances)
     start, end = (ScalarPoseError(distances[step], angles[step]) for step in (0, -1))
     made = TrialResult(
-        None, True, len(distances) - 1, 2.0, None, 0.1, "fog", trial.method, end, trial.frame, trial.seed, start,
-        Trace(tuple(distances), angles), "done", 2**30, {}, "weights-1", trial,
-    )  # fmt: skip
+        None,
+        True,
+        len(distances) - 1,
+        2.0,
+        None,
+        0.1,
+        "fog",
+        trial.method,
+        end,
+        trial.frame,
+        trial.seed,
+        start,
+        Trace(tuple(distances), angles),
+        "done",
+        2**30,
+        {},
+        "weights-1",
+        trial,
+    )
     return replace(made, **changes)

@@ -11,10 +11,7 @@ from bidnerf_core.fields import VoxelGrid
 
 def cell_centres(grid: VoxelGrid) -> Float[Tensor, "x y z 3"]:
     """Return the centre of each cell (metres, world)."""
-    axes = [
-        low + (torch.arange(count) + 0.5) * grid.cell
-        for low, count in zip(grid.lower, grid.shape, strict=True)
-    ]
+    axes = [low + (torch.arange(count) + 0.5) * grid.cell for low, count in zip(grid.lower, grid.shape, strict=True)]
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
 
 

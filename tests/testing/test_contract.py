@@ -149,9 +149,7 @@ def asked(change: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]) -> Any:
 
 def answered(change: Callable[[FieldValues, Tensor], FieldValues]) -> Any:
     """Its field's values are changed, knowing the positions."""
-    return with_field(
-        query=lambda self, positions, directions: change(good(self, positions, directions), positions)
-    )
+    return with_field(query=lambda self, positions, directions: change(good(self, positions, directions), positions))
 
 
 def by_sampler(sampler: Callable[[Rays, Generator | None], RaySamples]) -> Any:
@@ -252,9 +250,7 @@ def chosen_by_a_mask(values: FieldValues, positions: Tensor) -> FieldValues:
     return replace(values, rgb=torch.zeros_like(values.rgb).index_put((dense,), values.rgb[dense]))
 
 
-def steeper(
-    self: Any, positions: Tensor, directions: Tensor, wanted: Tensor | None = None
-) -> FieldDerivatives:
+def steeper(self: Any, positions: Tensor, directions: Tensor, wanted: Tensor | None = None) -> FieldDerivatives:
     found = backward_derivatives(self.query, positions, directions)
     return replace(found, by_position=1.01 * found.by_position)
 
@@ -324,9 +320,7 @@ class PlainState(WaveField):
         return replace(values, density=self.scale * values.density)
 
 
-def trained_by(
-    before: Changed = lambda *given: None, after: Changed = lambda *given: None, **members: Any
-) -> Any:
+def trained_by(before: Changed = lambda *given: None, after: Changed = lambda *given: None, **members: Any) -> Any:
     """Its recipe does something with what it is given before the good recipe or after it."""
 
     class Broken(WaveBackend):
@@ -410,8 +404,10 @@ def drawn_width(field: Any, *given: Any) -> None:
 
 
 SAYS, CONFIG, JSON = (
-    "test_backend_says_what_it_is", "test_config_is_a_frozen_dataclass_with_defaults_and_steps", "test_config_survives_json",
-)  # fmt: skip
+    "test_backend_says_what_it_is",
+    "test_config_is_a_frozen_dataclass_with_defaults_and_steps",
+    "test_config_survives_json",
+)
 BUILD, SHAPES, RANGES = (
     "test_build_gives_a_field",
     "test_query_takes_any_shape",
@@ -422,12 +418,16 @@ JACOBIAN = "test_jacobian_is_the_derivative_of_query"
 DTYPE, INTERVALS = "test_query_follows_the_dtype", "test_samples_are_sorted_disjoint_and_on_the_ray"
 REPEATABLE, ALONE = "test_samples_are_repeatable", "test_rays_do_not_depend_on_each_other"
 LEVELS, POSE, SAVED = (
-    "test_levels_are_fields_coarsest_first", "test_rendering_carries_gradients_to_the_pose", "test_saved_field_renders_the_same",
-)  # fmt: skip
+    "test_levels_are_fields_coarsest_first",
+    "test_rendering_carries_gradients_to_the_pose",
+    "test_saved_field_renders_the_same",
+)
 RGB, EXPOSURE = "test_training_learns_from_rgb", "test_training_learns_the_exposure_of_images"
 STEPS, REPORTS, RESUMES = (
-    "test_steps_stay_on_the_device", "test_training_reports_and_saves", "test_training_stops_and_resumes",
-)  # fmt: skip
+    "test_steps_stay_on_the_device",
+    "test_training_reports_and_saves",
+    "test_training_stops_and_resumes",
+)
 DIFFERENCES = "agrees with finite differences at"
 RISES = "the derivative of density by position " + DIFFERENCES
 ABSORBED = "of the images' exposures went into the colours of the field, expected 6% or less"
@@ -447,8 +447,11 @@ BREAKS: list[tuple[str, Any, str]] = [
     (JSON, with_members(config_type=Forgetful), "comes back from JSON"),
     (BUILD, with_members(build=lambda self, config, bounds: object()), "expected an nn.Module"),
     (BUILD, with_members(build=lambda self, config, bounds: nn.Linear(3, 4)), "without query or sampler"),
-    ("test_build_is_reproducible", with_members(build=lambda self, config, bounds: WaveField(config, bounds)),
-     "differs between two builds of one config"),
+    (
+        "test_build_is_reproducible",
+        with_members(build=lambda self, config, bounds: WaveField(config, bounds)),
+        "differs between two builds of one config",
+    ),
     # What the field says.
     (SHAPES, asked(lambda p, d: (p.reshape(-1, 3), d.reshape(-1, 3))), "density has shape (1,), expected ()"),
     (SHAPES, asked(lambda p, d: (p + 0 * float(p.max()), d)), "query of points arranged as (0,) raised"),
@@ -456,9 +459,21 @@ BREAKS: list[tuple[str, Any, str]] = [
     (RANGES, answered(lambda v, p: replace(v, density=v.density - 5)), "expected 0 or more"),
     (RANGES, answered(lambda v, p: replace(v, rgb=4 * v.rgb)), "expected 0 to 1"),
     (RANGES, answered(lambda v, p: replace(v, rgb=v.rgb - 0.5)), "expected 0 to 1"),
-    (RANGES, answered(lambda v, p: replace(v, density=torch.where(far(p), torch.nan, v.density))), "far outside the box: density is NaN"),
-    (RANGES, answered(lambda v, p: replace(v, rgb=v.rgb.where(~far(p)[..., None], v.rgb / 0))), "far outside the box: rgb is NaN"),
-    (RANGES, asked(lambda p, d: (p + 0 * torch.zeros(9)[((p[..., 0] + 1) * 4).long()][..., None], d)), "far outside the box raised IndexError"),
+    (
+        RANGES,
+        answered(lambda v, p: replace(v, density=torch.where(far(p), torch.nan, v.density))),
+        "far outside the box: density is NaN",
+    ),
+    (
+        RANGES,
+        answered(lambda v, p: replace(v, rgb=v.rgb.where(~far(p)[..., None], v.rgb / 0))),
+        "far outside the box: rgb is NaN",
+    ),
+    (
+        RANGES,
+        asked(lambda p, d: (p + 0 * torch.zeros(9)[((p[..., 0] + 1) * 4).long()][..., None], d)),
+        "far outside the box raised IndexError",
+    ),
     (RANGES, with_levels(lambda field: (Negative(field), field)), "Negative.query"),
     (POSITION, asked(lambda p, d: (p.detach(), d)), RISES),
     (POSITION, with_field(query=with_no_grad), RISES),
@@ -468,39 +483,86 @@ BREAKS: list[tuple[str, Any, str]] = [
     (DIRECTION, with_field(query=with_no_grad), f"by direction {DIFFERENCES}"),
     (DIRECTION, asked(lambda p, d: (p, Doubling.apply(d))), f"by direction {DIFFERENCES}"),
     (JACOBIAN, with_field(jacobian=steeper), "the derivative by position differs from that of query"),
-    (DTYPE, answered(lambda v, p: FieldValues(v.density.float(), v.rgb.float())), "density is torch.float32, expected float64"),
-    (DTYPE, answered(lambda v, p: FieldValues(v.density.double(), v.rgb.double())), "density is torch.float64 for points in float32"),
+    (
+        DTYPE,
+        answered(lambda v, p: FieldValues(v.density.float(), v.rgb.float())),
+        "density is torch.float32, expected float64",
+    ),
+    (
+        DTYPE,
+        answered(lambda v, p: FieldValues(v.density.double(), v.rgb.double())),
+        "density is torch.float64 for points in float32",
+    ),
     (DTYPE, asked(lambda p, d: (p + (p.dtype == torch.float64), d)), "is another than in float32"),
     ("test_query_serves_several_threads", with_field(query=careless), "threads"),
     # Where the field is asked.
-    (INTERVALS, taken(lambda s: RaySamples(s.starts.flip(-1), s.ends.flip(-1), s.valid)), "not sorted, expected nearest first"),
+    (
+        INTERVALS,
+        taken(lambda s: RaySamples(s.starts.flip(-1), s.ends.flip(-1), s.valid)),
+        "not sorted, expected nearest first",
+    ),
     (INTERVALS, taken(lambda s: replace(s, ends=s.ends + 0.1)), "overlap"),
     (INTERVALS, taken(lambda s: replace(s, starts=s.starts + 0.1, ends=s.ends + 0.1)), "lies outside [near, far]"),
-    (INTERVALS, taken(lambda s: replace(s, valid=torch.ones_like(s.valid))), "a ray with far <= near has valid samples"),
-    (INTERVALS, taken(lambda s: replace(s, starts=s.starts.where(s.valid, torch.inf), ends=s.ends.where(s.valid, torch.inf))), "NaN or infinite"),
+    (
+        INTERVALS,
+        taken(lambda s: replace(s, valid=torch.ones_like(s.valid))),
+        "a ray with far <= near has valid samples",
+    ),
+    (
+        INTERVALS,
+        taken(lambda s: replace(s, starts=s.starts.where(s.valid, torch.inf), ends=s.ends.where(s.valid, torch.inf))),
+        "NaN or infinite",
+    ),
     (INTERVALS, along(one_axis), "expected the same for all three: () and one more axis"),
     (INTERVALS, taken(not_bool), "expected torch.bool"),
-    (INTERVALS, along(lambda rays: replace(rays, far=rays.far + 0 * float(rays.far.max()))), "rays arranged as (0,) raised"),
+    (
+        INTERVALS,
+        along(lambda rays: replace(rays, far=rays.far + 0 * float(rays.far.max()))),
+        "rays arranged as (0,) raised",
+    ),
     (REPEATABLE, by_sampler(chance), "two calls without jitter differ"),
-    (REPEATABLE, by_sampler(lambda rays, jitter=None: sampled(rays) if jitter is None else chance(rays)),  # type: ignore[misc]
-     "two calls with jitter of the same seed differ"),
+    (
+        REPEATABLE,
+        by_sampler(lambda rays, jitter=None: sampled(rays) if jitter is None else chance(rays)),  # type: ignore[misc]
+        "two calls with jitter of the same seed differ",
+    ),
     (ALONE, along(as_long_as_the_shortest), "expected each ray to be sampled for itself"),
     (ALONE, along(by_place), "in another order"),
-    ("test_rays_that_miss_see_the_background", along(lambda rays: replace(rays, far=rays.far + 1)), "does not see the background alone"),
+    (
+        "test_rays_that_miss_see_the_background",
+        along(lambda rays: replace(rays, far=rays.far + 1)),
+        "does not see the background alone",
+    ),
     ("test_hits_agree_with_the_density", with_field(hits=opaque), "of the light of rays"),
-    (LEVELS, with_levels(lambda field: (field, HalfSamples(field))), "the last one renders otherwise than the field itself"),
+    (
+        LEVELS,
+        with_levels(lambda field: (field, HalfSamples(field))),
+        "the last one renders otherwise than the field itself",
+    ),
     (LEVELS, with_levels(lambda field: ("coarse", field)), "levels[0] is a str, expected a field"),
     (POSE, untrained(asked(lambda p, d: (p.detach(), d.detach()))), "no gradient"),
     (POSE, untrained(with_field(query=with_no_grad)), "no gradient"),
     (STEPS, untrained(answered(read_by_the_host)), "reads a number"),
     (STEPS, untrained(answered(chosen_by_a_mask)), "depends on values"),
     # What is saved.
-    (SAVED, trained_by(after=lambda field, *given: setattr(field, "scale", 2.0), field_type=PlainState), "is some state not in state_dict"),
-    (SAVED, trained_by(lambda field, *given: field.register_buffer("late", torch.zeros(3))), "load_state_dict of a saved state_dict raised"),
+    (
+        SAVED,
+        trained_by(after=lambda field, *given: setattr(field, "scale", 2.0), field_type=PlainState),
+        "is some state not in state_dict",
+    ),
+    (
+        SAVED,
+        trained_by(lambda field, *given: field.register_buffer("late", torch.zeros(3))),
+        "load_state_dict of a saved state_dict raised",
+    ),
     # How it is trained.
     ("test_training_learns_from_rgbd", Lazy(), "does the recipe change the field"),
     (RGB, Lazy(), "does the recipe change the field"),
-    (RGB, trained_by(lambda field, views, *given: views[0].frame.depth.mean()), "train on RGB views raised AttributeError"),
+    (
+        RGB,
+        trained_by(lambda field, views, *given: views[0].frame.depth.mean()),
+        "train on RGB views raised AttributeError",
+    ),
     (EXPOSURE, PlainWaves(), ABSORBED),
     (EXPOSURE, with_members(train=by_a_ray_bank), "train with bidnerf_core.training.Supervision"),
     (REPORTS, reporting(step=every_other), "report.step was called with [(1, 6), (3, 6)"),
@@ -512,7 +574,7 @@ BREAKS: list[tuple[str, Any, str]] = [
     (RESUMES, Deaf(), "TrainingStopped says step 4"),
     (RESUMES, reporting(resume=lambda report: lambda: None), "resumed after step 3, it reported steps [1, 2, ... 6]"),
     (RESUMES, trained_by(drawn_width), "a resumed training arrives elsewhere"),
-]  # fmt: skip
+]
 ON_CUDA = ("test_field_moves_to_a_device", asked(lambda p, d: (p + cpu_offset, d)), "on CUDA raised")
 
 
@@ -534,7 +596,7 @@ FINE = {
     "a direction that is ignored": (asked(lambda p, d: (p, torch.zeros_like(d))), [DIRECTION]),
     "float32 alone": (asked(single), [POSITION, DIRECTION]),
     "levels": (with_levels(lambda field: (HalfSamples(field), field)), [c for c in CHECKS if "training" not in c]),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", FINE)
@@ -552,6 +614,4 @@ def test_a_backend_may_be_given_by_the_name_of_its_entry_point() -> None:
 
 def test_the_contract_does_not_need_pytest() -> None:
     files = Path(bidnerf_core.__file__).parent.rglob("*.py")
-    assert not [
-        file for file in files if re.search(r"^\s*(import|from) pytest", file.read_text(), re.MULTILINE)
-    ]
+    assert not [file for file in files if re.search(r"^\s*(import|from) pytest", file.read_text(), re.MULTILINE)]

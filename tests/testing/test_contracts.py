@@ -169,9 +169,7 @@ def test_a_mistake_of_a_detector_is_named(monkeypatch: pytest.MonkeyPatch, detec
 def credulous(problem: Problem, config: AutoConfig, seed: int) -> Localization:
     """Accept one pose for every image."""
     pose = SE3.identity()
-    return Localization(
-        pose, Outcome.CONVERGED, "seen", 0, 0.0, 0.0, "mistaken", SE3.stack([pose]), torch.zeros(1)
-    )
+    return Localization(pose, Outcome.CONVERGED, "seen", 0, 0.0, 0.0, "mistaken", SE3.stack([pose]), torch.zeros(1))
 
 
 def fickle(problem: Problem, config: AutoConfig, seed: int) -> Localization:
@@ -187,9 +185,7 @@ def fickle(problem: Problem, config: AutoConfig, seed: int) -> Localization:
         (fickle, "test_same_seed_gives_the_same_pose", "different poses"),
     ],
 )
-def test_a_mistake_of_a_method_is_named(
-    monkeypatch: pytest.MonkeyPatch, solve: Any, test: str, said: str
-) -> None:
+def test_a_mistake_of_a_method_is_named(monkeypatch: pytest.MonkeyPatch, solve: Any, test: str, said: str) -> None:
     monkeypatch.setitem(registered, ("methods", "mistaken"), replace(find_method("auto"), solve=solve))
     assert said in fault_of(MethodContract, test, name="mistaken", config=QUICK)
 

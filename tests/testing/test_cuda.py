@@ -136,9 +136,7 @@ def test_queries_have_the_answers_of_the_cpu_and_replay_graphs(monkeypatch: pyte
         for other in (found, expected):
             same = other[number % 2]
             assert answer.outcome is same.outcome
-            torch.testing.assert_close(
-                answer.T_world_camera.matrix(), same.T_world_camera.matrix(), rtol=0, atol=1e-3
-            )
+            torch.testing.assert_close(answer.T_world_camera.matrix(), same.T_world_camera.matrix(), rtol=0, atol=1e-3)
     assert all(replayed)
 
 
@@ -174,9 +172,7 @@ class Interrupted(Silent):
         self.stopping = progress.step == self.stop
 
     def save(self, state: TrainingState) -> None:
-        parts = (
-            {name: value.clone() for name, value in part.items()} for part in (state.field, state.optimizer)
-        )
+        parts = ({name: value.clone() for name, value in part.items()} for part in (state.field, state.optimizer))
         self.saved = TrainingState(state.step, *parts)
 
 

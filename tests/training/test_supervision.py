@@ -26,13 +26,33 @@ from bidnerf_vanilla import backend as vanilla
 
 BOUNDS = demo_object().bounds
 VANILLA = VanillaConfig(
-    layers=2, width=32, skip=1, position_frequencies=4, direction_frequencies=1, coarse_samples=16, fine_samples=8,
-    room_resolution=16, samples_per_step=2048, rays_at_most=256, learning_rate=0.01,
-)  # fmt: skip
+    layers=2,
+    width=32,
+    skip=1,
+    position_frequencies=4,
+    direction_frequencies=1,
+    coarse_samples=16,
+    fine_samples=8,
+    room_resolution=16,
+    samples_per_step=2048,
+    rays_at_most=256,
+    learning_rate=0.01,
+)
 ADANERF = AdaNerfConfig(
-    width=32, layers=2, position_frequencies=4, oracle_width=32, oracle_layers=2, ray_points=4, ray_frequencies=2,
-    bins=16, max_samples=5, samples_per_step=4096, rays_at_most=256, learning_rate=0.02, room_resolution=16,
-)  # fmt: skip
+    width=32,
+    layers=2,
+    position_frequencies=4,
+    oracle_width=32,
+    oracle_layers=2,
+    ray_points=4,
+    ray_frequencies=2,
+    bins=16,
+    max_samples=5,
+    samples_per_step=4096,
+    rays_at_most=256,
+    learning_rate=0.02,
+    room_resolution=16,
+)
 BACKENDS = {
     "hashgrid": (hashgrid, tiny.config()),
     "vanilla": (vanilla, VANILLA),
@@ -79,9 +99,7 @@ def test_the_loss_is_the_mean_over_measured_rays() -> None:
     assert none == 0
     renderings, batches = zip(*parts, strict=True)
     samples = RaySamples(*map(torch.cat, zip(*(r.samples.parts for r in renderings), strict=True)))
-    weights, distance = (
-        torch.cat([getattr(r, name) for r in renderings]) for name in ("weights", "distance")
-    )
+    weights, distance = (torch.cat([getattr(r, name) for r in renderings]) for name in ("weights", "distance"))
     together = Rendering(torch.zeros(3, 3), distance, weights.sum(-1), weights, samples)
     measured = torch.cat([batch.observed.distance for batch in batches])
     zero = measured.new_zeros(3, 3)
@@ -180,9 +198,7 @@ def test_a_share_of_the_rays_ends_at_landmarks_where_they_are() -> None:
     points = batch.observed[known].points
     surface = exact.draw(20_000, torch.Generator().manual_seed(2)).observed
     off = torch.cdist(points, surface[surface.measured].points).amin(1)
-    assert (
-        float((off < 1e-3).float().mean()) > 0.95
-    )  # each is a pixel's point, and nearly all pixels were drawn
+    assert float((off < 1e-3).float().mean()) > 0.95  # each is a pixel's point, and nearly all pixels were drawn
 
 
 @pytest.mark.parametrize("name", BACKENDS)

@@ -59,9 +59,7 @@ class Kept(Silent):
         return self.told[-1].step == self.told[-1].total
 
     def save(self, state: TrainingState) -> None:
-        copies = (
-            {name: value.clone() for name, value in part.items()} for part in (state.field, state.optimizer)
-        )
+        copies = ({name: value.clone() for name, value in part.items()} for part in (state.field, state.optimizer))
         self.saved.append(TrainingState(state.step, *copies))
 
 
@@ -242,9 +240,7 @@ def random_views(count: int, alpha: bool, depth: bool, seed: int = 0) -> list[Vi
         metres = torch.rand(size, generator=generator) * 3 if depth else None
         if metres is not None:
             metres[0] = 0
-        views.append(
-            View(Frame(str(number), torch.rand((*size, 3), generator=generator), camera, metres, cover), T)
-        )
+        views.append(View(Frame(str(number), torch.rand((*size, 3), generator=generator), camera, metres, cover), T))
     return views
 
 
@@ -254,10 +250,7 @@ def drawn(views: list[View], count: int = 400) -> tuple[TrainingBatch, list[Tens
     batch = bank.draw(count, torch.Generator().manual_seed(1))
     index = torch.randint(bank.count, (count,), generator=torch.Generator().manual_seed(1))
     seen = [observe(view, all_pixels(view.frame)) for view in views]
-    every = [
-        torch.cat([getattr(part, name) for part in seen])
-        for name in ("origins", "directions", "rgb", "distance")
-    ]
+    every = [torch.cat([getattr(part, name) for part in seen]) for name in ("origins", "directions", "rgb", "distance")]
     assert len(every[0]) == bank.count
     covers = [torch.ones(v.frame.rgb.shape[:2]) if v.frame.alpha is None else v.frame.alpha for v in views]
     return batch, [part[index] for part in every], torch.cat([c.reshape(-1) for c in covers])[index]
@@ -311,9 +304,7 @@ def test_views_with_and_without_alpha_and_depth_mix() -> None:
 def test_every_visible_pixel_is_as_likely_as_any_other(share: float, generator: torch.Generator) -> None:
     views = random_views(3, False, False)
     hidden = [torch.rand(view.frame.rgb.shape[:2], generator=generator) < share for view in views]
-    views = [
-        replace(view, frame=view.frame.with_hidden(part)) for view, part in zip(views, hidden, strict=True)
-    ]
+    views = [replace(view, frame=view.frame.with_hidden(part)) for view, part in zip(views, hidden, strict=True)]
     batch = RayBank(views, BOUNDS).draw(20000, torch.Generator().manual_seed(0))
     colours, counts = batch.observed.rgb.unique(dim=0, return_counts=True)
     visible = torch.cat([view.frame.rgb[~part] for view, part in zip(views, hidden, strict=True)])

@@ -28,9 +28,7 @@ from test_training import Kept
 VIEWS = tiny.views(6)
 BOUNDS = estimate_bounds(VIEWS, tiny.BACKGROUND)
 # On a device, the sampler that concentrates samples draws random numbers for all rays.
-CHANGES: dict[str, dict[str, Any]] = {
-    "hashgrid": {"samples_per_ray": 0, "rays_at_most": 32, "prune_from": 24}
-}
+CHANGES: dict[str, dict[str, Any]] = {"hashgrid": {"samples_per_ray": 0, "rays_at_most": 32, "prune_from": 24}}
 
 
 @contextmanager
@@ -39,9 +37,7 @@ def elsewhere(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     replays: list[int] = []
     with Elsewhere() as mode:
 
-        def captured(
-            step: Callable[[], None], device: torch.device, generator: Any, memory: Any
-        ) -> Callable[[], None]:
+        def captured(step: Callable[[], None], device: torch.device, generator: Any, memory: Any) -> Callable[[], None]:
             assert device == generator.device == DEVICE
 
             def replay() -> None:
@@ -160,8 +156,5 @@ def test_packed_samples_have_the_values_of_the_others(room: int, generator: torc
         torch.testing.assert_close(found[kept.valid], part[kept.valid])
         assert not bool(found[~kept.valid].any())
     weights = torch.rand(12, 8, generator=generator) * kept.valid
-    slopes = [
-        torch.autograd.grad((v.density * weights).sum(), field.encoding.tables[0])[0]
-        for v in (values, expected)
-    ]
+    slopes = [torch.autograd.grad((v.density * weights).sum(), field.encoding.tables[0])[0] for v in (values, expected)]
     torch.testing.assert_close(*slopes)

@@ -126,9 +126,7 @@ def test_an_accepted_pose_passes_its_figures(found: dict[str, Any]) -> None:
 def test_a_refused_pose_fails_a_figure_and_shows_its_search(refused: dict[str, Any]) -> None:
     assert not refused["accepted"]
     assert any(figure.passed is False for figure in refused["figures"])
-    assert (
-        max(len(step["scores"]) for step in refused["steps"]) > 50
-    )  # the hypotheses of the search on the surface
+    assert max(len(step["scores"]) for step in refused["steps"]) > 50  # the hypotheses of the search on the surface
     assert refused["runner_up"] is not None
 
 
@@ -169,9 +167,7 @@ def test_another_place_is_a_contest_a_step_and_the_runner_up(
     found = record.answers[-1]
     posterior, T = found.posterior, found.posterior.states.T
     aside = replace(T, translation=T.translation + torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64))
-    states = States.cat(
-        [posterior.states, replace(posterior.states, T=aside, mode=posterior.states.mode + 1)]
-    )
+    states = States.cat([posterior.states, replace(posterior.states, T=aside, mode=posterior.states.mode + 1)])
     probability = torch.cat([0.75 * posterior.probability, 0.25 * posterior.probability])
     update = torch.cat([posterior.update, posterior.update])
     both = replace(posterior, states=states, probability=probability, update=update)
@@ -187,9 +183,7 @@ def test_another_place_is_a_contest_a_step_and_the_runner_up(
     assert shown["steps"][-2]["scores"] == pytest.approx((-math.log(0.75), -math.log(0.25)))
 
 
-def test_a_bar_is_beyond_its_middle_on_the_side_that_passes(
-    found: dict[str, Any], refused: dict[str, Any]
-) -> None:
+def test_a_bar_is_beyond_its_middle_on_the_side_that_passes(found: dict[str, Any], refused: dict[str, Any]) -> None:
     figures = [figure for answer in (found, refused) for figure in answer["figures"] if figure.bar]
     assert {figure.passed for figure in figures} == {True, False}
     for figure in figures:
@@ -205,9 +199,7 @@ def test_a_bar_is_beyond_its_middle_on_the_side_that_passes(
     assert bar(math.nan, 3.0, True) is None
 
 
-def test_a_refusal_says_what_to_try_and_a_method_what_it_is(
-    found: dict[str, Any], refused: dict[str, Any]
-) -> None:
+def test_a_refusal_says_what_to_try_and_a_method_what_it_is(found: dict[str, Any], refused: dict[str, Any]) -> None:
     assert found["advice"] == ""
     assert refused["advice"] == ADVICE[Outcome(refused["outcome"])].first
     assert found["method_summary"] == METHODS["auto"].summary
@@ -234,7 +226,7 @@ def test_the_loss_of_a_descent_is_the_first_figure(answer: Localization) -> None
     said = Support({"plain": 5.0, "displaced": -3.0, "other": 9.0, "confidence": 0.05, "mean_loss": 0.036})
     lost = replace(answer, confidence=0.05, diagnostics=said)
     first = acceptance_figures(lost, None)[0]
-    assert (first.name, first.value, first.threshold, first.passed) == ("mean loss", "0.036", "at most 0.02", False)  # fmt: skip
+    assert (first.name, first.value, first.threshold, first.passed) == ("mean loss", "0.036", "at most 0.02", False)
     assert "not even a local optimum" in contests(lost, None)[0]["remark"]
 
 
@@ -243,9 +235,7 @@ def test_a_descent_is_shown_step_by_step_with_its_loss(room: Map, answer: Locali
     steps = shown_answer(room, "descent", replace(answer, poses=T, losses=losses))["steps"]
     assert len(steps) <= MOST_STEPS + 1
     assert [steps[0]["caption"], steps[-1]["caption"]] == ["step 0 of 500", HERE]
-    assert [step["loss"] for step in steps] == sorted(
-        (step["loss"] for step in steps if step["loss"]), reverse=True
-    )
+    assert [step["loss"] for step in steps] == sorted((step["loss"] for step in steps if step["loss"]), reverse=True)
     assert steps[0]["loss"] == 0.5
 
 
@@ -253,11 +243,7 @@ def test_an_earlier_pose_by_landmarks_is_told_from_the_pose_found(
     room: Map, query: Query, answer: Localization, record: SearchRecord
 ) -> None:
     here = shown_answer(room, "here", answer, query.frame, record)
-    assert (
-        {figure.pose for figure in here["figures"]}
-        == {here["matches"]["pose"] if here["matches"] else None}
-        == {""}
-    )
+    assert {figure.pose for figure in here["figures"]} == {here["matches"]["pose"] if here["matches"] else None} == {""}
     away = replace(answer.T_world_camera, translation=answer.T_world_camera.translation + 1.0)
     given_up = replace(answer, T_world_camera=away, diagnostics=None, confidence=None)
     there = shown_answer(room, "there", given_up, query.frame, record)
@@ -294,9 +280,7 @@ def test_the_ellipsoid_is_that_of_two_standard_deviations_in_the_world(generator
 
 def test_depth_difference_is_the_offset_of_a_shifted_measurement(room: Map, query: Query) -> None:
     image, frame = room.render(query.views[0]), query.frame
-    shifted = depth_difference(
-        image, replace(frame, depth=torch.where(image.depth > 0.3, image.depth - 0.25, 0))
-    )
+    shifted = depth_difference(image, replace(frame, depth=torch.where(image.depth > 0.3, image.depth - 0.25, 0)))
     assert shifted is not None
     assert math.isclose(shifted["median"], 0.25, rel_tol=1e-4)
     assert depth_difference(image, replace(frame, depth=None)) is None
@@ -411,13 +395,9 @@ def test_the_field_is_seen_from_beyond_the_reach_of_the_images_rays(contracted: 
 def test_the_field_is_seen_from_nearer_than_the_images_saw_it(room: Map) -> None:
     """Rays begin before the nearest matter, which the surface tells, however far the images were from it."""
     pose, camera = viewed.walk(3)[1], Intrinsics.from_hfov(60, 16, 9)
-    from_afar = replace(
-        room, info=replace(room.info, bounds=replace(room.bounds, near=0.99 * room.bounds.far))
-    )
+    from_afar = replace(room, info=replace(room.info, bounds=replace(room.bounds, near=0.99 * room.bounds.far)))
     assert render_image(from_afar.field, camera, pose, from_afar.bounds).opacity.max() < 0.1
-    torch.testing.assert_close(
-        field_image(from_afar, camera, pose), field_image(room, camera, pose), atol=0.1, rtol=0
-    )
+    torch.testing.assert_close(field_image(from_afar, camera, pose), field_image(room, camera, pose), atol=0.1, rtol=0)
 
 
 def test_a_rendering_is_the_fields_and_stops_when_it_is_not_wanted(room: Map) -> None:

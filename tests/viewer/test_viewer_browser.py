@@ -34,9 +34,17 @@ from viewer_client import serving
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
 ARGUMENTS = [
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-]  # fmt: skip
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
 DROP = """([content, name]) => {
   const bytes = Uint8Array.from(atob(content), (letter) => letter.charCodeAt(0)), dataTransfer = new DataTransfer();
   dataTransfer.items.add(new File([bytes], name, { type: "image/png" }));
@@ -55,7 +63,9 @@ FARTHEST = """() => {
 }"""
 """Where the cameras and the poses are in the window, whose edge is at 1."""
 LAPTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
-LOOKED_AT = """() => page.space.controls.target.distanceTo(new THREE.Vector3(page.pose[3], page.pose[7], page.pose[11]))"""
+LOOKED_AT = (
+    """() => page.space.controls.target.distanceTo(new THREE.Vector3(page.pose[3], page.pose[7], page.pose[11]))"""
+)
 """How far the middle of the view is from the pose that the page tells of."""
 IDLE = "document.getElementById('progress').hidden"
 WAIT = 120_000  # ms
@@ -80,11 +90,14 @@ def saved(room: Map, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ]
     entries = [
         {
-            "frame": f"t{i}", "time": i / 10, "T_world_camera": T.matrix().tolist(), "outcome": "converged" if i % 3 else "ambiguous",
+            "frame": f"t{i}",
+            "time": i / 10,
+            "T_world_camera": T.matrix().tolist(),
+            "outcome": "converged" if i % 3 else "ambiguous",
             "covariance": [[(1 + i) * 1e-4 * (a == b) for b in range(6)] for a in range(6)],
         }
         for i, T in enumerate(viewed.walk(12))
-    ]  # fmt: skip
+    ]
     (folder / "track.json").write_text(json.dumps(entries))
     pose = tuple(viewed.walk(12)[4].matrix().flatten().tolist())
     rows = [
@@ -189,9 +202,7 @@ def test_a_saved_page_works_from_disk_without_a_network(browser: Any, saved: Pat
             page.locator("#wipe").fill(share)
             shown = [page.evaluate(VISIBLE, side) for side in ("left", "right")]
             assert shown == [seen == "only photo", seen == "only rendered"]
-        ends = page.evaluate(
-            "[...document.querySelector('.under').childNodes].map((node) => node.textContent)"
-        )
+        ends = page.evaluate("[...document.querySelector('.under').childNodes].map((node) => node.textContent)")
         assert ends == ["only rendered", "", "only photo"]  # from the least to the largest share of the photo
         for number, mode in enumerate(("Wipe", "Blink", "Difference", "Edges", "Depth", "Matches"), start=1):
             page.keyboard.press("Escape")
@@ -256,9 +267,7 @@ def test_a_descent_can_be_replayed(browser: Any, room: Map, tmp_path: Path) -> N
         assert page.text_content("#caption") == "step 10 of 30: loss 0.362"
         assert "this step" in page.locator("#labels span").all_text_contents()
         assert page.is_visible("#losses")
-        heights = [
-            float(point.split(",")[1]) for point in page.get_attribute("#losses polyline", "points").split()
-        ]
+        heights = [float(point.split(",")[1]) for point in page.get_attribute("#losses polyline", "points").split()]
         assert heights == sorted(heights)  # the loss falls
         page.locator("#step").fill("30")
         assert page.text_content("#caption") == "the pose found"
@@ -309,7 +318,10 @@ def test_the_first_view_of_a_tall_window_holds_the_map_and_the_poses(browser: An
 def test_a_phone_shows_everything_in_its_width(browser: Any, saved: Path) -> None:
     with opened(browser, saved.as_uri(), PHONE, offline=True, has_touch=True) as page:
         assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
-        verdict, stage = (page.evaluate(f"document.querySelector('{name}').getBoundingClientRect().top") for name in ("#verdict", "#stage"))  # fmt: skip
+        verdict, stage = (
+            page.evaluate(f"document.querySelector('{name}').getBoundingClientRect().top")
+            for name in ("#verdict", "#stage")
+        )
         assert verdict < 100 < stage
         for scheme in ("light", "dark"):
             page.emulate_media(color_scheme=scheme, reduced_motion="reduce")

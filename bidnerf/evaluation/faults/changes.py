@@ -136,9 +136,7 @@ def _on_plane(points: Float[Tensor, "*p 3"], plane: Float[Tensor, "4"]) -> Bool[
 def _around_a_pixel(frame: Frame, size: int, generator: Generator) -> list[Bool[Tensor, "n"]]:
     """Return masks of ``size`` adjacent rows and of columns, centred on a random measured pixel as far as borders allow."""
     found = []
-    for middle, length in zip(
-        random_pixel(depth_of(frame) > 0, generator), depth_of(frame).shape, strict=True
-    ):
+    for middle, length in zip(random_pixel(depth_of(frame) > 0, generator), depth_of(frame).shape, strict=True):
         first = max(0, min(middle - size // 2, length - size))
         places = torch.arange(length)
         found.append((places >= first) & (places < first + size))
@@ -168,9 +166,7 @@ def cropped(frame: Frame, share: float, generator: Generator) -> Frame:
     """
     camera = frame.intrinsics
     parts = []
-    for size, at_end in zip(
-        (camera.width, camera.height), torch.rand(2, generator=generator) < 0.5, strict=True
-    ):
+    for size, at_end in zip((camera.width, camera.height), torch.rand(2, generator=generator) < 0.5, strict=True):
         cut = min(round(share * size), size - 1)
         parts.append(slice(0, size - cut) if at_end else slice(cut, size))
     columns, rows = parts
@@ -266,9 +262,7 @@ def blur(frame: Frame, pixels: float, generator: Generator) -> Frame:
 def jpeg(frame: Frame, quality: float, generator: Generator) -> Frame:
     """Compress the colours as JPEG with a ``quality`` of 1 to 100, and decode them."""
     file = io.BytesIO()
-    Image.fromarray((frame.rgb * 255).round().to(torch.uint8).numpy()).save(
-        file, "JPEG", quality=int(quality)
-    )
+    Image.fromarray((frame.rgb * 255).round().to(torch.uint8).numpy()).save(file, "JPEG", quality=int(quality))
     return recoloured(frame, torch.from_numpy(np.array(Image.open(file))).to(frame.rgb) / 255)
 
 
@@ -392,9 +386,7 @@ def vanished_thing(frame: Frame, share: float, generator: Generator) -> Frame:
     # The surrounding colours are continued (Telea 2004).
     colours = (frame.rgb * 255).round().to(torch.uint8).contiguous().numpy()
     filled = cv2.inpaint(colours, mask.to(torch.uint8).numpy(), RIM, cv2.INPAINT_TELEA)
-    return _pasted(
-        frame, mask, torch.from_numpy(filled).to(frame.rgb) / 255, depth[rim].max().expand_as(depth)
-    )
+    return _pasted(frame, mask, torch.from_numpy(filled).to(frame.rgb) / 255, depth[rim].max().expand_as(depth))
 
 
 def _surface_piece(frame: Frame, share: float, generator: Generator) -> Bool[Tensor, "h w"]:
@@ -443,8 +435,7 @@ def blob(height: int, width: int, share: float, generator: Generator) -> Bool[Te
     # there, so that the blob is one piece.
     angle = torch.atan2(down, across)
     waves = [
-        uniform_number(generator, -0.35, 0.35)
-        * torch.cos(n * angle + uniform_number(generator, 0, 2 * math.pi))
+        uniform_number(generator, -0.35, 0.35) * torch.cos(n * angle + uniform_number(generator, 0, 2 * math.pi))
         for n in range(2, 6)  # number of periods around the outline
     ]
     distance = torch.hypot(down, across) / torch.stack(waves).sum(0).exp()
@@ -468,9 +459,7 @@ def texture(height: int, width: int, generator: Generator) -> Float[Tensor, "h w
     return ((noise - low) / (high - low).clamp_min(1e-6)).clamp(0, 1)
 
 
-def smooth_noise(
-    height: int, width: int, rows: int, columns: int, generator: Generator
-) -> Float[Tensor, "h w"]:
+def smooth_noise(height: int, width: int, rows: int, columns: int, generator: Generator) -> Float[Tensor, "h w"]:
     """Return normally distributed values on a grid of ``rows`` by ``columns``, interpolated with cubic splines."""
     values = torch.randn((1, 1, rows, columns), generator=generator)
     return torch.nn.functional.interpolate(values, (height, width), mode="bicubic", align_corners=False)[0, 0]

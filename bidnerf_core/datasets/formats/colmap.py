@@ -36,13 +36,33 @@ from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import natural_order
 
 MODELS = (
-    "sparse", "colmap/sparse", ".", "colmap", "dense/sparse", "dense/0/sparse", "undistorted/sparse", "model",
-)  # fmt: skip
+    "sparse",
+    "colmap/sparse",
+    ".",
+    "colmap",
+    "dense/sparse",
+    "dense/0/sparse",
+    "undistorted/sparse",
+    "model",
+)
 """Where to look for a model, or numbered folders of models, in order of preference."""
 IMAGES = (
-    "images", "images_2", "images_4", "images_8", "colmap/images", "dense/images", "dense/0/images", "undistorted/images", "input", "image", "photos", "rgb", ".",
-    "../images", "../../images",
-)  # fmt: skip
+    "images",
+    "images_2",
+    "images_4",
+    "images_8",
+    "colmap/images",
+    "dense/images",
+    "dense/0/images",
+    "undistorted/images",
+    "input",
+    "image",
+    "photos",
+    "rgb",
+    ".",
+    "../images",
+    "../../images",
+)
 """Where to look for the images, relative to the folder; those next to the model come first."""
 
 
@@ -142,9 +162,13 @@ def shot_of(model: Path, image: ModelImage, file: Path | None, cameras: dict[int
     name, depth = posix_name(image.name), depth_map_of(model, image.name)
     read = None if depth is None else DepthFile(depth, partial(read_colmap_depth, depth))
     return Shot(
-        image=file, camera=cameras[image.camera], T_world_camera=image.T_camera_model.inverse(), depth=read,
-        stem=name.stem, folders=name.parts[:-1],
-    )  # fmt: skip
+        image=file,
+        camera=cameras[image.camera],
+        T_world_camera=image.T_camera_model.inverse(),
+        depth=read,
+        stem=name.stem,
+        folders=name.parts[:-1],
+    )
 
 
 reader = Format("images with a sparse model in sparse/0 (COLMAP)", colmap_models, _read)

@@ -39,9 +39,14 @@ class PhotoShot(Shot):
         """Read the photo as ``Frame.read`` does."""
         source = self.camera if isinstance(self.camera, CameraSource) else CameraSource(self.camera)
         found = Frame.read(
-            self.image, source, depth=self.depth_image, depth_unit=self.depth_unit, sensor=self.sensor,
-            background=None if self.awaits_background else background, largest=side,
-        )  # fmt: skip
+            self.image,
+            source,
+            depth=self.depth_image,
+            depth_unit=self.depth_unit,
+            sensor=self.sensor,
+            background=None if self.awaits_background else background,
+            largest=side,
+        )
         return found.replace(name=self.name)
 
 
@@ -77,9 +82,15 @@ def _read_video(path: Path, found: bool, options: DatasetOptions) -> Capture:
     source, video = options.camera_source, Video(path)
     source.require(path, "a video does not record its focal length")
     shots = [
-        Shot(image=VideoPicture(video, number, is_upright=True), camera=source, time=time, stem=f"{number:06d}", tells_camera=True)
+        Shot(
+            image=VideoPicture(video, number, is_upright=True),
+            camera=source,
+            time=time,
+            stem=f"{number:06d}",
+            tells_camera=True,
+        )
         for number, time in enumerate(video.times)
-    ]  # fmt: skip
+    ]
     return Capture(path, shots)
 
 

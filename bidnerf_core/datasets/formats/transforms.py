@@ -77,10 +77,12 @@ def _read(path: Path, found: list[Path], options: DatasetOptions) -> Capture:
             first.setdefault(splits[:1], image)
     white = options.background is None and any(has_alpha for _, has_alpha in map(_header, first.values()))
     return Capture(
-        path, shots, background_colour("white") if white else options.colour,
+        path,
+        shots,
+        background_colour("white") if white else options.colour,
         unit=next((unit for unit in get_args(LengthUnit) if units == {unit}), None),
         depth_unit=options.depth_unit or (steps.pop() if len(steps) == 1 else None),
-    )  # fmt: skip
+    )
 
 
 def _find(path: Path) -> list[Path]:

@@ -86,7 +86,9 @@ def read_frames(file: Record) -> list[FrameRecord]:
     unposed = {number: entry for number, entry in enumerate(entries) if _lacks_pose(entry)}
     if 0 < len(unposed) < len(entries):
         count, first = len(unposed), next(iter(unposed.values())).get("file_path")
-        found = f"{count} of {amount(len(entries), 'frame')} have no pose (transform_matrix is missing, zero or not finite)"
+        found = (
+            f"{count} of {amount(len(entries), 'frame')} have no pose (transform_matrix is missing, zero or not finite)"
+        )
         remark(file.where, f"{found} and are left out, first: {first}")
     all_are = len(unposed) == len(entries)  # an error, raised when the first frame is read
     frames = [_frame(file, n, entry) for n, entry in enumerate(entries) if all_are or n not in unposed]

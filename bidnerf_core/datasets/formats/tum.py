@@ -69,17 +69,13 @@ def _read(path: Path, colour_list: Path, options: DatasetOptions) -> Capture:
     sensor, unit = options.sensor(path), options.depth_unit or 1 / 5000
     depth_list, read_depth = path / "depth.txt", DepthReader(documented=("65535",))
     images = [_file(row, names) for row in colours]
-    measured = (
-        [(row.time, _file(row, names)) for row in read_timed_files(depth_list)] if is_file(depth_list) else []
-    )
+    measured = [(row.time, _file(row, names)) for row in read_timed_files(depth_list)] if is_file(depth_list) else []
     depths = [(time, file) for time, file in measured if is_file(file)]
     if lost := len(measured) - len(depths):
         remark(depth_list, f"{lost} of {amount(len(measured), 'depth image')} are missing and left out")
     # Only existing files are associated: an image whose nearest depth image is missing may belong to the next one.
     there = [index for index, image in enumerate(images) if is_file(image)]
-    partners = associate(
-        [times[index] for index in there], [time for time, _ in depths], 0.02
-    )  # as in the benchmark
+    partners = associate([times[index] for index in there], [time for time, _ in depths], 0.02)  # as in the benchmark
     depth_of = {there[place]: depths[other][1] for place, other in partners.items()}
     shots = list[Shot]()
     for index, (time, image) in enumerate(zip(times, images, strict=True)):
@@ -95,10 +91,15 @@ def _read(path: Path, colour_list: Path, options: DatasetOptions) -> Capture:
         )
     samples = f"samples before and after the times of images, at most {LARGEST_GAP:g} s apart"
     return Capture(
-        path, shots, options.colour, unit="metres", depth_unit=unit, pose_file=truth,
+        path,
+        shots,
+        options.colour,
+        unit="metres",
+        depth_unit=unit,
+        pose_file=truth,
         poses_expected="the poses of the frames of a dataset" if trajectory is None else samples,
         unposed=f"before its first pose, after its last, or in gaps of more than {LARGEST_GAP:g} s",
-    )  # fmt: skip
+    )
 
 
 def _find(path: Path) -> Path | None:

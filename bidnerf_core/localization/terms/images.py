@@ -156,9 +156,13 @@ class Images:
             return inlier_weight(off.square().sum(-1, keepdim=True), scales.colour)
 
         gain, offset = fit_exposure(
-            seen, measured, lambda off: inlier(off).square().expand_as(off), sure,
-            ((scales.colour / scales.gain) ** 2, (scales.colour / 0.1) ** 2), scales.rounds,
-        )  # fmt: skip
+            seen,
+            measured,
+            lambda off: inlier(off).square().expand_as(off),
+            sure,
+            ((scales.colour / scales.gain) ** 2, (scales.colour / 0.1) ** 2),
+            scales.rounds,
+        )
         corrected = gain * seen + offset
         error = corrected.clamp(0, 1) - measured
         near = inlier(error)
@@ -193,8 +197,7 @@ def render_view(renderer: Renderer, small: Thumbnail, T: SE3) -> tuple[Tensor, T
     origins = (rotation @ origin + translation)[:, None].expand_as(directions)
     rgb, known, along = renderer(origins.reshape(-1, 3), directions.reshape(-1, 3))
     rgb, known = (
-        smooth(part.reshape(count, camera.height, camera.width, -1).permute(0, 3, 1, 2))
-        for part in (rgb, known)
+        smooth(part.reshape(count, camera.height, camera.width, -1).permute(0, 3, 1, 2)) for part in (rgb, known)
     )
     rgb, along = rgb / known.clamp(min=1e-3), along.view(count, -1)
     points = origin + along[..., None] * local

@@ -87,9 +87,17 @@ class RenderedRays:
             zero, z = torch.zeros_like(some.origins), some.directions
             least = torch.nn.functional.one_hot(z.abs().argmin(-1), 3).to(z)
             x = normalize(torch.linalg.cross(least, z), dim=-1)
-            parts.append((
-                zero[:, :2], zero[:, 0], torch.stack([x, torch.linalg.cross(z, x), z], -1), some.origins, zero, zero[:, 0], some.distance,
-            ))  # fmt: skip
+            parts.append(
+                (
+                    zero[:, :2],
+                    zero[:, 0],
+                    torch.stack([x, torch.linalg.cross(z, x), z], -1),
+                    some.origins,
+                    zero,
+                    zero[:, 0],
+                    some.distance,
+                )
+            )
         image, times, R, t, rgb, coloured, depth = (torch.cat(part) for part in zip(*parts, strict=True))
         seen = Sights(image, times, R, t, single=len(views) == 1 and depth_rays is None)
         measured = moved((seen, rgb, coloured, depth), device or device_of(field))
@@ -172,9 +180,7 @@ class RenderedRays:
         # The residual of a ray that hits nothing is that of an outlier, but less than the whole distance.
         return self.distance.float().repeat(count), 3.0 * self.depth_loss.scale
 
-    def _differences(
-        self, seen: Float[Tensor, "h n c"]
-    ) -> tuple[Float[Tensor, "h n c"], Float[Tensor, "h 1 3"]]:
+    def _differences(self, seen: Float[Tensor, "h n c"]) -> tuple[Float[Tensor, "h n c"], Float[Tensor, "h 1 3"]]:
         """Return the rendered minus the measured values, and the gain of the exposure."""
         gain, offset = self._exposure(seen[..., :3])
         value = (gain * seen[..., :3] + offset - self.rgb) * self.coloured[:, None]
@@ -210,9 +216,7 @@ class RenderedRays:
         value, gain = self._differences(seen)
         R, sights = states.T.rotation, self.sights
         # In the rig's axes. Products of many rows by one matrix are faster than many of few rows.
-        by_origin, by_direction = (
-            (part.flatten(1, 2) @ R).view(part.shape) for part in (by_origin, by_direction)
-        )
+        by_origin, by_direction = ((part.flatten(1, 2) @ R).view(part.shape) for part in (by_origin, by_direction))
 
         def by_frame(origin: Tensor, direction: Tensor, at: Tensor, along: Tensor) -> Tensor:
             turning = torch.linalg.cross(along[..., None, :].expand_as(direction), direction)

@@ -44,9 +44,12 @@ def channels(rendering: Rendering, measured: Float[Tensor, "r"] | None, miss: fl
 
 
 def differentiate(
-    field: RadianceField, rays: Rays, background: tuple[float, float, float],
-    measured: Float[Tensor, "r"] | None = None, miss: float = 0.0,
-) -> Derivatives:  # fmt: skip
+    field: RadianceField,
+    rays: Rays,
+    background: tuple[float, float, float],
+    measured: Float[Tensor, "r"] | None = None,
+    miss: float = 0.0,
+) -> Derivatives:
     """Render rays (r), and differentiate their ``channels`` with respect to the ray origins and directions."""
     if isinstance(field, HitField):
         return _differentiate_hits(field, rays, background, measured, miss)
@@ -64,8 +67,7 @@ def differentiate(
     middles = chosen(samples.middles)
     if index is None:
         origins, directions = (
-            part[:, None].expand(*samples.valid.shape, 3).flatten(0, 1)
-            for part in (rays.origins, rays.directions)
+            part[:, None].expand(*samples.valid.shape, 3).flatten(0, 1) for part in (rays.origins, rays.directions)
         )
     else:
         ray = index // max(samples.valid.shape[-1], 1)
@@ -102,8 +104,12 @@ def differentiate(
 
 
 def _differentiate_hits(
-    field: HitField, rays: Rays, background: tuple[float, float, float], measured: Float[Tensor, "r"] | None, miss: float
-) -> Derivatives:  # fmt: skip
+    field: HitField,
+    rays: Rays,
+    background: tuple[float, float, float],
+    measured: Float[Tensor, "r"] | None,
+    miss: float,
+) -> Derivatives:
     """Differentiate with one backward pass per channel: the gradient of the channel's sum over rays holds the gradients of all rays."""
     leaves = [part.detach().requires_grad_() for part in (rays.origins, rays.directions)]
     with torch.enable_grad():

@@ -32,9 +32,7 @@ COLOUR = 0.15
 """Norm of the colour difference (three channels, each in [0, 1]) at which a point's inlier weight is one half."""
 
 
-def sights_of(
-    view: View, row: Tensor, column: Tensor, may_move: bool
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def sights_of(view: View, row: Tensor, column: Tensor, may_move: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the fields of ``Sights`` for some pixels of a view; rotation and translation are T_rig_camera.
 
     ``may_move`` is true if the camera may have moved during the readout, and false for a rig, whose views may be from
@@ -65,9 +63,13 @@ class Surface:
 
     @staticmethod
     def of(
-        views: Sequence[View], rays: Observations | None, surface: SurfaceMap, seed: int, count: int = 500,
+        views: Sequence[View],
+        rays: Observations | None,
+        surface: SurfaceMap,
+        seed: int,
+        count: int = 500,
         device: torch.device | str | None = None,
-    ) -> Surface | None:  # fmt: skip
+    ) -> Surface | None:
         """Draw measured points of ``views``, whose poses are relative to the last view, in random order; None if there are too few.
 
         The points are put on ``device``, by default the surface's.
@@ -99,9 +101,7 @@ class Surface:
         if total < LEAST_POINTS:
             return None
         order = torch.randperm(total, generator=generator)
-        image, times, R, t, z, fixed, rgb, coloured = (
-            torch.cat(part)[order] for part in zip(*parts, strict=True)
-        )
+        image, times, R, t, z, fixed, rgb, coloured = (torch.cat(part)[order] for part in zip(*parts, strict=True))
         measured = moved((Sights(image, times, R, t), z, fixed, rgb, coloured), device or surface.device)
         return Surface(surface, *measured, noise=2 * surface.cell)
 
@@ -195,9 +195,7 @@ class Surface:
     def _alike(self, difference: Float[Tensor, "h n 3"]) -> Float[Tensor, "h n"]:
         return inlier_weight(difference.double().square().sum(-1), COLOUR)
 
-    def _colours(
-        self, index: Tensor, along: Tensor
-    ) -> tuple[Float[Tensor, "h n 3"], Float[Tensor, "h n 3 3"]]:
+    def _colours(self, index: Tensor, along: Tensor) -> tuple[Float[Tensor, "h n 3"], Float[Tensor, "h n 3 3"]]:
         """Return the surface's colour at each point minus the measured one, and the derivative with respect to the point (world)."""
         surfels = self.surface.surfels
         slope = surfels.rgb_gradient[index]

@@ -110,9 +110,7 @@ class Measurer:
     sensor: DepthSensorModel
 
     @torch.no_grad()
-    def __call__(
-        self, frame: Frame, image: Grey | None, state: TrackerState, predicted: Motion
-    ) -> Measurement | None:
+    def __call__(self, frame: Frame, image: Grey | None, state: TrackerState, predicted: Motion) -> Measurement | None:
         """Correct a prediction by all measurements of a frame; None if the frame shows nothing of the map.
 
         Landmarks tracked to this frame are used as long as there are enough; otherwise, landmarks are recognised anew around the pose
@@ -139,9 +137,7 @@ class Measurer:
         tracked = tracked or self._by_landmarks(landmarks, frame, state, fit, predicted)
         return found if found is not None and not tracked.verdict.accepted else tracked
 
-    def _recognised(
-        self, known: LandmarkMap, frame: Frame, predicted: Motion, tracked: Fit | None
-    ) -> Fit | None:
+    def _recognised(self, known: LandmarkMap, frame: Frame, predicted: Motion, tracked: Fit | None) -> Fit | None:
         """Fit a pose to landmarks recognised around the pose of the tracked landmarks, or else around the prediction."""
         assert self.features is not None
         camera, T = frame.intrinsics, predicted.T_world_camera
@@ -162,9 +158,12 @@ class Measurer:
         def points_of(matches: Matches) -> Points:
             index = matches.landmark
             return Points(
-                query.keypoints.pixels[matches.keypoint], landmarks.positions[index].double(),
-                landmarks.deviations[index].double(), landmarks.directions[index].double(), number[index],
-            )  # fmt: skip
+                query.keypoints.pixels[matches.keypoint],
+                landmarks.positions[index].double(),
+                landmarks.deviations[index].double(),
+                landmarks.directions[index].double(),
+                number[index],
+            )
 
         def near(within: float) -> tuple[Points, Projected]:
             seen = Projected(query, landmarks, States.known(T, still), within)
@@ -254,9 +253,7 @@ class Measurer:
         found = self._judged(landmarks, state, replace(fit, states=here), motion, distance)
         return replace(found, verdict=replace(found.verdict, reason=found.verdict.reason + words))
 
-    def _depth(
-        self, frame: Frame, state: TrackerState, points: Points, states: States
-    ) -> tuple[Surface | None, float]:
+    def _depth(self, frame: Frame, state: TrackerState, points: Points, states: States) -> tuple[Surface | None, float]:
         """Return the term of the measured points, or None, and the ratio of their depth to that of the landmarks.
 
         There is no term without a surface or enough depth, or if the ratio is implausible; the ratio is 1 unless it is implausible.
@@ -288,12 +285,19 @@ class Measurer:
             nfa = log10_nfa(fit.keypoints, count, min(0.5, max(0.5, fit.by_chance) / fit.keypoints))
             chance, recall = fit.by_chance, count / fit.keypoints
         evidence = Evidence(
-            log10_nfa=nfa, inliers=count, by_chance=chance, recall=recall,
+            log10_nfa=nfa,
+            inliers=count,
+            by_chance=chance,
+            recall=recall,
             spread=len(cells(inliers.pixels, fit.camera).unique()) / CELLS**2,
-            noise_ratio=noise / landmarks.noise, precision=_position_deviation(covariance) / distance,
+            noise_ratio=noise / landmarks.noise,
+            precision=_position_deviation(covariance) / distance,
             mass=mass_within(one, torch.zeros((1, 6)).double(), covariance[None], distance),
-            other_place=0.0, credible=1.0, replaced=0.0, searched=True,
-        )  # fmt: skip
+            other_place=0.0,
+            credible=1.0,
+            replaced=0.0,
+            searched=True,
+        )
         # Prior log odds of 4 if no image was rejected before: one pose in fifty is wrong, far more than tracked sequences show.
         verdict = judge(evidence, 0.0 if state.searchable else 4.0)
         if fit.is_recognised:
@@ -342,9 +346,7 @@ class Measurer:
             for wider in (3.0, 1.0):
                 fitted = replace(points, noise=max(points.noise, off)).fitted_noise(states)
                 # This widens the basin of convergence and keeps the information.
-                fitted = replace(
-                    fitted, noise=wider * fitted.noise, independent=points.independent * wider**2
-                )
+                fitted = replace(fitted, noise=wider * fitted.noise, independent=points.independent * wider**2)
                 term = Determined(fitted) if image is None else fitted
                 states, normal = descend(states, [prediction, term], 2)
             # A point counts half at a distance of four cells from the surface.
@@ -370,15 +372,24 @@ class Measurer:
         verdict = measured.verdict(words)
         doubts = [
             # The pose is within five standard deviations of the prediction (a squared Mahalanobis distance).
-            (float(moved @ torch.linalg.solve(covariance, moved)) <= 25,
-             Outcome.AMBIGUOUS, "the measurements fit a place that is inconsistent with the motion"),
-            (image is not None or state.clock.stamped,
-             Outcome.IMPRECISE, f"{words}, but without a time stamp the motion is unknown"),
+            (
+                float(moved @ torch.linalg.solve(covariance, moved)) <= 25,
+                Outcome.AMBIGUOUS,
+                "the measurements fit a place that is inconsistent with the motion",
+            ),
+            (
+                image is not None or state.clock.stamped,
+                Outcome.IMPRECISE,
+                f"{words}, but without a time stamp the motion is unknown",
+            ),
             (deviation <= TOLERANCE * reach, Outcome.IMPRECISE, uncertain),
             # Without colours, the position is bounded in terms of the median error of the map's own images.
-            (image is not None or not typical or deviation <= 4.5 * typical,
-             Outcome.IMPRECISE, f"{uncertain}, images by {typical:.3g}"),
-        ]  # fmt: skip
+            (
+                image is not None or not typical or deviation <= 4.5 * typical,
+                Outcome.IMPRECISE,
+                f"{uncertain}, images by {typical:.3g}",
+            ),
+        ]
         if verdict.accepted:
             verdict = next((Verdict(outcome, why) for known, outcome, why in doubts if not known), verdict)
         return Measurement(motion, verdict, 1 - share, state)

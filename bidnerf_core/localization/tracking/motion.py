@@ -198,9 +198,7 @@ class Motion:
         noise[:6, :6] = back @ self.noise[:6, :6] @ back.T + relative
         noise[6:, 6:] = 2 * relative / seconds**2 + self._acceleration() * seconds**2
         bias = back @ self.bias @ back.T
-        return replace(
-            self, T_world_camera=T_world_camera, velocity=step / seconds, noise=_symmetric(noise), bias=bias
-        )
+        return replace(self, T_world_camera=T_world_camera, velocity=step / seconds, noise=_symmetric(noise), bias=bias)
 
 
 def pixel_radius(covariance: Float[Tensor, "6 6"], focal: float, distance: float) -> float:

@@ -144,15 +144,25 @@ class Fit:
         states = States.known(T, torch.zeros(6, dtype=torch.float64))
         zero, one = torch.zeros((1, count, 3), dtype=torch.float64), torch.ones(count, dtype=torch.float64)
         sights = Sights(
-            image[None], exposure_times(points.pixels, camera)[None],
-            torch.eye(3, dtype=torch.float64).expand(1, count, 3, 3), zero, single=True,
-        )  # fmt: skip
+            image[None],
+            exposure_times(points.pixels, camera)[None],
+            torch.eye(3, dtype=torch.float64).expand(1, count, 3, 3),
+            zero,
+            single=True,
+        )
         variance = point_variance(points, torch.arange(count), states, focal * one)
         correlated = torch.tensor([correlation], dtype=torch.float64)
         term = Landmarks(
-            points.positions[None], sights, one[None], variance[None], focal * one[None], correlated,
-            1 / correlated, float(camera.width * camera.height), threshold,
-        )  # fmt: skip
+            points.positions[None],
+            sights,
+            one[None],
+            variance[None],
+            focal * one[None],
+            correlated,
+            1 / correlated,
+            float(camera.width * camera.height),
+            threshold,
+        )
         return Fit(points, camera, term.with_noise(states), term)
 
     @cached_property
@@ -214,9 +224,7 @@ def flow(
     return torch.from_numpy(there + FIRST_CENTRE).to(pixels), torch.from_numpy(found)
 
 
-def alike(
-    before: Grey, now: Grey, pixels: Float[Tensor, "m 2"], there: Float[Tensor, "m 2"]
-) -> Bool[Tensor, "m"]:
+def alike(before: Grey, now: Grey, pixels: Float[Tensor, "m 2"], there: Float[Tensor, "m 2"]) -> Bool[Tensor, "m"]:
     """Return a mask of the patches around ``pixels`` of one image that resemble those around ``there`` in the next.
 
     In pure noise, the flow stays where its search started, and the patches do not correlate.

@@ -40,18 +40,17 @@ class Tracker:
     localizer, even across threads, but a tracker itself belongs to one thread.
     """
 
-    def __init__(
-        self, localizer: Localizer, config: TrackerConfig | None = None, start: Start | None = None
-    ) -> None:
+    def __init__(self, localizer: Localizer, config: TrackerConfig | None = None, start: Start | None = None) -> None:
         """Track in the map of ``localizer``; ``start`` is a guess at the first T_world_camera.
 
         Raises ``InputError`` if ``localizer`` is not a ``Localizer``, or if its map has no distances.
         """
         if not isinstance(localizer, Localizer):
             raise InputError(
-                f"got a {type(localizer).__name__}", where="Tracker",
+                f"got a {type(localizer).__name__}",
+                where="Tracker",
                 expected="a Localizer; Localizer(map) makes one" if isinstance(localizer, SceneMap) else "a Localizer",
-            )  # fmt: skip
+            )
         self.localizer, config = localizer, TrackerConfig() if config is None else config
         self._scene = localizer.scene
         if not self._scene.has_distances:
@@ -98,10 +97,13 @@ class Tracker:
         self._state = state
         stated, taken = frame.intrinsics, state.corrected(frame).intrinsics
         return replace(
-            answer, method="track", seconds=clocks.perf_counter() - began, unit=unit_of(self._scene),
+            answer,
+            method="track",
+            seconds=clocks.perf_counter() - began,
+            unit=unit_of(self._scene),
             focal_factor=math.sqrt(taken.fx * taken.fy / (stated.fx * stated.fy)),
             intrinsics=None if taken == stated else taken,
-        ).translated(self._origin)  # fmt: skip
+        ).translated(self._origin)
 
     def save(self, path: str | Path) -> None:
         """Write the tracker's state to a file, from which ``restore`` resumes tracking exactly."""
@@ -145,9 +147,7 @@ class Tracker:
         state = replace(state, lost=state.lost + 1, searchable=state.searchable + searchable)
         if state.motion is None or predicted is None:
             if found is None:
-                why = Verdict(
-                    Outcome.TOO_FEW_MATCHES, "the beginning of the sequence has not been recognised yet"
-                )
+                why = Verdict(Outcome.TOO_FEW_MATCHES, "the beginning of the sequence has not been recognised yet")
                 T = SE3.identity() if self._start is None else self._start
                 deviation = torch.tensor([self._extent] * 3 + [math.pi] * 3, dtype=torch.float64)
                 path, losses = SE3.stack([T, T]), torch.ones(1, dtype=torch.float64)
@@ -157,9 +157,10 @@ class Tracker:
             return found, state
         # With each lost frame, 0.6 of the velocity is kept.
         state = replace(
-            state, motion=replace(predicted, velocity=0.6 * predicted.velocity),
+            state,
+            motion=replace(predicted, velocity=0.6 * predicted.velocity),
             points=self._corners(frame, image, state.points, predicted.T_world_camera),
-        )  # fmt: skip
+        )
         verdict = Verdict(Outcome.TOO_FEW_MATCHES, "no landmarks were recognised around the prediction")
         verdict = verdict if measured is None else measured.verdict
         reason = f"lost for {amount(state.lost, 'frame')}, bridged by {how}: {verdict.reason}"
@@ -214,9 +215,7 @@ class Tracker:
         if measured is not None and measured.verdict.accepted:
             reason, state = f"{reason}; {measured.verdict.reason}", measured.state
         measured = Measurement(motion, Verdict(found.outcome, reason), found.loss, state)
-        return replace(found, reason=reason, covariance=motion.covariance), self._after(
-            frame, image, measured
-        )
+        return replace(found, reason=reason, covariance=motion.covariance), self._after(frame, image, measured)
 
     def _corners(self, frame: Frame, image: Grey | None, points: Points, T_world_camera: SE3) -> Points:
         """Return the corners among ``points``, or new corners at the pose of this frame if few are left."""

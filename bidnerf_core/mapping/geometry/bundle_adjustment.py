@@ -107,9 +107,7 @@ class AdjustmentSystem:
         reduced = block_diag(_damped(self.image_blocks, damping).numpy(), format="csc")
         reduced = csc_array(reduced - (product @ mixed.T).tocsc())
         right = product @ self.point_gradient.numpy().ravel() - self.image_gradient.numpy().ravel()
-        factors = splu(
-            reduced, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
+        factors = splu(reduced, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         of_images = factors.solve(right)
         rest = self.point_gradient + torch.from_numpy(mixed.T @ of_images).reshape(-1, 3)
         of_points = -(inverse @ rest[..., None])[..., 0]
@@ -155,13 +153,13 @@ def linearized(
         summed((point_weighted @ column)[..., 0], point, count),
         summed(view_weighted @ by_view, view, views) + torch.diag_embed(precision),
         summed(point_weighted @ by_point, point, count),
-        view_weighted @ by_point, view, point,
-    )  # fmt: skip
+        view_weighted @ by_point,
+        view,
+        point,
+    )
 
 
-def _prior_term(
-    state: Adjustment, prior: PosePrior
-) -> tuple[float, Float[Tensor, "v k"], Float[Tensor, "v k"]]:
+def _prior_term(state: Adjustment, prior: PosePrior) -> tuple[float, Float[Tensor, "v k"], Float[Tensor, "v k"]]:
     """Return the cost, the gradient and the diagonal of the precision of the prior.
 
     Deviations from the given poses have a Cauchy loss, and motions a quadratic one.

@@ -154,9 +154,7 @@ class TrackedViews:
         """Return a detector for queries with ``view``, which is image ``number``; the detector reuses the image's keypoints."""
         return FoundOnce(self.detector, [(view.frame.rgb, self.observations.images[number].keypoints)])
 
-    def landmarks(
-        self, config: LandmarkConfig, report: Callable[[str], None] = lambda sentence: None
-    ) -> LandmarkMap:
+    def landmarks(self, config: LandmarkConfig, report: Callable[[str], None] = lambda sentence: None) -> LandmarkMap:
         """Return the landmarks built from the tracks. Raises ``InputError`` if there are none."""
         found = _located(self.observations, config, self.points)
         if not len(found):
@@ -202,16 +200,14 @@ class TrackedViews:
         """Return the tracks with the images' poses (v) replaced, and also their motions (metres, then radians) if ``motion`` is given."""
         motion = self.motion if motion is None else motion
         images = [
-            replace(p, T_ref_camera=T_world_camera[i], motion=motion[i])
-            for i, p in enumerate(self.observations.images)
+            replace(p, T_ref_camera=T_world_camera[i], motion=motion[i]) for i, p in enumerate(self.observations.images)
         ]
         return replace(self, observations=replace(self.observations, images=images))
 
     def at_distance(self, distance: float) -> TrackedViews:
         """Return the tracks with ``distance`` (metres from the camera) as the measured distance of every keypoint."""
         images = [
-            replace(p, depth=distance / torch.linalg.vector_norm(p.rays, dim=-1))
-            for p in self.observations.images
+            replace(p, depth=distance / torch.linalg.vector_norm(p.rays, dim=-1)) for p in self.observations.images
         ]
         return replace(self, observations=replace(self.observations, images=images))
 
@@ -219,9 +215,7 @@ class TrackedViews:
         """Match the same keypoints again, with the current poses, and return the new tracks."""
         images = self.observations.images
         pairs = likely_pairs([image.T_ref_camera for image in images], config.neighbours)
-        return replace(
-            self, observations=_joined(images, pairs, _counter("poses", "image pairs", len(pairs)))
-        )
+        return replace(self, observations=_joined(images, pairs, _counter("poses", "image pairs", len(pairs))))
 
     def without(self, images: Sequence[int]) -> TrackedViews:
         """Return the tracks without the keypoints of ``images``, and without known points, whose positions may come from these images."""
@@ -282,9 +276,7 @@ def posed_keypoints(views: Sequence[View], features: Features) -> list[ImageKeyp
     return _mapped(lambda view: image_keypoints(view, features), views)
 
 
-def _located(
-    observations: TrackedKeypoints, config: LandmarkConfig, known: Float[Tensor, "p 3"] | None
-) -> LandmarkMap:
+def _located(observations: TrackedKeypoints, config: LandmarkConfig, known: Float[Tensor, "p 3"] | None) -> LandmarkMap:
     """Return the triangulated or ``known`` landmarks, followed by landmarks from the measured depth of the remaining keypoints."""
     kept, positions, covariance = _triangulated(observations, radians(config.parallax), known)
     sightings = kept.sightings

@@ -85,9 +85,7 @@ class Sift(Settings):
     def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
         # Precise upscaling maps index x to 2 x; without it, all keypoints of the first octave are a quarter of a pixel
         # off. A detector object is not thread-safe, and is cheap to create.
-        sift = cv2.SIFT.create(
-            nfeatures=self.count, contrastThreshold=self.contrast, enable_precise_upscale=True
-        )
+        sift = cv2.SIFT.create(nfeatures=self.count, contrastThreshold=self.contrast, enable_precise_upscale=True)
         grey = grey_image(rgb)
         height, width = grey.shape
         size, scale = reduced_size(width, height, self.largest), np.ones(2, dtype=np.float32)
@@ -271,10 +269,14 @@ def image_keypoints(view: View, features: Features) -> ImageKeypoints:
         reached = away[rows.clamp(0, hidden.shape[0] - 1), columns.clamp(0, hidden.shape[1] - 1)]
         keypoints = keypoints[reached > keypoints.sizes.to(reached) / 2]
     return ImageKeypoints(
-        keypoints, frame.intrinsics.unproject(keypoints.pixels.double()), measured_depth(frame, keypoints.pixels),
-        frame.intrinsics, view.T_ref_camera.to("cpu", torch.float64),
-        AT_REST if view.motion is None else view.motion, hidden,
-    )  # fmt: skip
+        keypoints,
+        frame.intrinsics.unproject(keypoints.pixels.double()),
+        measured_depth(frame, keypoints.pixels),
+        frame.intrinsics,
+        view.T_ref_camera.to("cpu", torch.float64),
+        AT_REST if view.motion is None else view.motion,
+        hidden,
+    )
 
 
 def measured_depth(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:

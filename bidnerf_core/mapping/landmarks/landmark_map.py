@@ -47,9 +47,7 @@ class Tracks:
     image: Int[Tensor, "m"]  # number of the image among the cameras of the map, int32
     pixel: Float[Tensor, "m 2"]  # in the image
 
-    def renumbered(
-        self, landmarks: Int[Tensor, "n"] | None = None, images: Int[Tensor, "v"] | None = None
-    ) -> Tracks:
+    def renumbered(self, landmarks: Int[Tensor, "n"] | None = None, images: Int[Tensor, "v"] | None = None) -> Tracks:
         """Renumber the landmarks and images, given the new number for each old one; keypoints whose new number is -1 are dropped."""
         landmark = self.landmark if landmarks is None else landmarks.int()[self.landmark.long()]
         image = self.image if images is None else images.int()[self.image.long()]
@@ -92,9 +90,15 @@ class LandmarkCells:
             torch.from_numpy(np.maximum.reduceat(of, first)) for of in (apart, angle, sizes.numpy()[order])
         )
         return LandmarkCells(
-            torch.from_numpy(order), torch.from_numpy(first), torch.from_numpy(counts), torch.from_numpy(centres),
-            radii, mean, widest.clamp(max=torch.pi), largest,
-        )  # fmt: skip
+            torch.from_numpy(order),
+            torch.from_numpy(first),
+            torch.from_numpy(counts),
+            torch.from_numpy(centres),
+            radii,
+            mean,
+            widest.clamp(max=torch.pi),
+            largest,
+        )
 
     def seen_from(
         self, T_world_camera: SE3, slopes: Float[Tensor, "2"], oblique: float, size: float = 0.0
@@ -137,9 +141,7 @@ class LandmarkMap:
     positions: Float[Tensor, "n 3"]
     deviations: Float[Tensor, "n 2"]  # metres: standard deviation across and along ``directions``
     descriptors: UInt8[Tensor, "n d"]  # mean over the views; see ``mapping.landmarks.features``
-    directions: Float[
-        Tensor, "n 3"
-    ]  # unit, from the landmark: the mean direction to the cameras that observed it
+    directions: Float[Tensor, "n 3"]  # unit, from the landmark: the mean direction to the cameras that observed it
     cones: Float[Tensor, "n"]  # radians: largest angle between ``directions`` and such a camera
     sizes: Float[Tensor, "n"]  # metres: diameter of the keypoint, measured at its distance
     views: Int[Tensor, "n"]  # number of images that observed it, int32
@@ -153,13 +155,9 @@ class LandmarkMap:
     usual_matches: float = 0.0  # median over the images of the map; 0 if unknown
     # Standard deviations of the spurious corrections to right intrinsics that are estimated from images of the map:
     # logarithm of the focal length, principal point (u, v) as a fraction of it, radial distortion. Float64.
-    calibration_scatter: Float[Tensor, "4"] = field(
-        default_factory=lambda: torch.full((4,), 0.02, dtype=torch.float64)
-    )
+    calibration_scatter: Float[Tensor, "4"] = field(default_factory=lambda: torch.full((4,), 0.02, dtype=torch.float64))
     trial: HeldOutTrial = HeldOutTrial()
-    moving: float = (
-        0.0  # fraction of the map's images whose cameras moved during readout, see ``rolling_shutter``
-    )
+    moving: float = 0.0  # fraction of the map's images whose cameras moved during readout, see ``rolling_shutter``
     cameras: tuple[Intrinsics, ...] = ()  # of the images, where known
     features: str = USUAL_FEATURES  # name of the detector of the keypoints; "" if it has none
     tracks: Tracks | None = None  # None in maps that earlier versions stored
@@ -215,11 +213,7 @@ class LandmarkMap:
     @cached_property
     def cells(self) -> LandmarkCells | None:
         """The cells of the landmarks, on the CPU (computing them takes a second for a million landmarks); None for few landmarks."""
-        return (
-            LandmarkCells.of(self.positions, self.directions, self.cones, self.sizes)
-            if len(self) > FEW
-            else None
-        )
+        return LandmarkCells.of(self.positions, self.directions, self.cones, self.sizes) if len(self) > FEW else None
 
     def in_view(
         self, T_world_camera: SE3, slopes: Float[Tensor, "2"], oblique: float, size: float = 0.0
@@ -229,11 +223,7 @@ class LandmarkMap:
         The conditions and the arguments are those of ``LandmarkCells.seen_from``.
         """
         cells = self.cells
-        index = (
-            torch.arange(len(self))
-            if cells is None
-            else cells.seen_from(T_world_camera, slopes, oblique, size)
-        )
+        index = torch.arange(len(self)) if cells is None else cells.seen_from(T_world_camera, slopes, oblique, size)
         local = T_world_camera.inverse().to(torch.float32).apply(self.positions[index])
         inside = (local[:, :2].abs() <= slopes * local[:, 2:]).all(-1) & (local[:, 2] > 0)
         inside &= self.sizes[index] >= size * local[:, 2]
@@ -263,8 +253,6 @@ def concatenated(maps: list[LandmarkMap]) -> LandmarkMap:
             tracks.append(m.tracks.renumbered(torch.arange(len(m)) + first))
         first += len(m)
     if tracks:
-        parts = (
-            torch.cat([getattr(part, name) for part in tracks]) for name in ("landmark", "image", "pixel")
-        )
+        parts = (torch.cat([getattr(part, name) for part in tracks]) for name in ("landmark", "image", "pixel"))
         joined["tracks"] = Tracks(*parts)
     return replace(maps[0], **joined)

@@ -104,9 +104,7 @@ def matches_of_points(
         local = image.T_ref_camera.inverse().apply(positions[points])
         pixels = image.intrinsics.project(local).nan_to_num(torch.inf)
         # Exact differences: products would round by about a pixel, and give NaN for points behind the camera.
-        distance = torch.cdist(
-            pixels.float(), image.keypoints.pixels, compute_mode="donot_use_mm_for_euclid_dist"
-        )
+        distance = torch.cdist(pixels.float(), image.keypoints.pixels, compute_mode="donot_use_mm_for_euclid_dist")
         best, partner = distance.min(dim=1)
         mutual = distance.argmin(dim=0)[partner] == torch.arange(len(points))
         kept = (mutual & (best <= EPIPOLAR_BAND)).nonzero()[:, 0]
@@ -139,9 +137,7 @@ def _on_line(a: ImageKeypoints, b: ImageKeypoints) -> Bool[Tensor, "n m"]:
     rays, base = T_b_a.rotate(a.rays), T_b_a.translation
     front = rays[:, 2:].sign()
     start = rays[:, :2] / rays[:, 2:].abs().clamp(min=1e-9) * front
-    step = (
-        base[:2] - base[2] * start
-    ) * front  # direction in which the projection moves as the point comes nearer
+    step = (base[:2] - base[2] * start) * front  # direction in which the projection moves as the point comes nearer
     size = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
     forward = step / size.clamp(min=1e-300)
     sideways = torch.stack([-forward[:, 1], forward[:, 0]], dim=-1)
@@ -150,8 +146,7 @@ def _on_line(a: ImageKeypoints, b: ImageKeypoints) -> Bool[Tensor, "n m"]:
     if float(torch.linalg.vector_norm(base)) < LEAST_BASELINE:
         return torch.cdist(start.float(), seen[:2].mT) <= band
     across, along = (
-        torch.cat([axis, -(axis * start).sum(-1, keepdim=True)], dim=-1).float() @ seen
-        for axis in (sideways, forward)
+        torch.cat([axis, -(axis * start).sum(-1, keepdim=True)], dim=-1).float() @ seen for axis in (sideways, forward)
     )
     # If a ray points behind the other camera, its point at infinity has no projection, so the whole line is allowed.
     least = torch.where(front > 0, -band, -torch.inf).float()
@@ -169,9 +164,7 @@ def joined_tracks(matches: Sequence[tuple[int, int, Matches]], sizes: Sequence[i
     is dropped, because a single wrong match would otherwise merge two correct tracks.
     """
     first = np.concatenate([[0], np.cumsum(sizes)])
-    ends = np.concatenate(
-        [np.zeros((0, 2), np.int64)] + [m.pairs.numpy() + first[[i, j]] for i, j, m in matches]
-    )
+    ends = np.concatenate([np.zeros((0, 2), np.int64)] + [m.pairs.numpy() + first[[i, j]] for i, j, m in matches])
     ambiguity = np.concatenate([np.zeros(0)] + [m.ambiguity.numpy() for _, _, m in matches])
     # Most keypoints have no match, so only those with one are considered.
     matched, ends = np.unique(ends, return_inverse=True)
@@ -278,9 +271,7 @@ def fused_landmarks(
     cosine = (towards * directions[sightings.point]).sum(-1).clamp(-1, 1)
     least = torch.ones(count, dtype=cosine.dtype).scatter_reduce(0, sightings.point, cosine, "amin")
     along = (directions[:, None] @ covariance @ directions[..., None])[:, 0, 0]
-    across = (
-        covariance.diagonal(dim1=-2, dim2=-1).sum(-1) - along
-    ) / 2  # the variances of both axes averaged
+    across = (covariance.diagonal(dim1=-2, dim2=-1).sum(-1) - along) / 2  # the variances of both axes averaged
     metres = observations.sizes * sightings.in_camera(positions)[:, 2].clamp(min=0) / sightings.focal
     return LandmarkMap(
         positions.float(),
@@ -309,9 +300,7 @@ def seen_landmarks(
     return [SeenLandmarks(*(part[image == i] for part in parts)) for i in range(len(observations.images))]
 
 
-def _mean_descriptors(
-    descriptors: UInt8[Tensor, "m d"], point: Int[Tensor, "m"], count: int
-) -> UInt8[Tensor, "n d"]:
+def _mean_descriptors(descriptors: UInt8[Tensor, "m d"], point: Int[Tensor, "m"], count: int) -> UInt8[Tensor, "n d"]:
     """Return the mean descriptor of each point, rescaled to the mean norm, since a shorter descriptor is closer to all others."""
     total, lengths = torch.zeros((count, descriptors.shape[1])), torch.zeros((count, 1))
     zero = byte_of_zero(descriptors)

@@ -25,9 +25,7 @@ BLOCK = 2**20
 """Number of distances to cell centres computed at a time, which bounds the memory."""
 
 
-def k_means(
-    descriptors: UInt8[Tensor, "n d"], count: int, generator: torch.Generator
-) -> Float[Tensor, "c d"]:
+def k_means(descriptors: UInt8[Tensor, "n d"], count: int, generator: torch.Generator) -> Float[Tensor, "c d"]:
     """Return the centres of k-means clusters (Lloyd 1982) of a sample of twenty descriptors per cluster.
 
     A cluster that becomes empty keeps its centre.

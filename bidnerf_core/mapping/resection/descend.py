@@ -37,9 +37,10 @@ class Normal:
 
     def where(self, mask: Bool[Tensor, "h"], other: Normal) -> Normal:
         return Normal(
-            torch.where(mask, self.cost, other.cost), torch.where(mask[:, None], self.gradient, other.gradient),
+            torch.where(mask, self.cost, other.cost),
+            torch.where(mask[:, None], self.gradient, other.gradient),
             torch.where(mask[:, None, None], self.hessian, other.hessian),
-        )  # fmt: skip
+        )
 
 
 CostTerm = Callable[[States], Normal]
@@ -103,9 +104,7 @@ class Quadratic:
     def of(found: Normal, here: States) -> Quadratic:
         """Build the models from normal equations, without priors, at the states ``here`` (g), where no nuisance is fixed."""
         unit = here.unit
-        return Quadratic(
-            here, found.cost, found.gradient * unit, unit[:, :, None] * found.hessian * unit[:, None]
-        )
+        return Quadratic(here, found.cost, found.gradient * unit, unit[:, :, None] * found.hessian * unit[:, None])
 
     def __call__(self, states: States) -> Normal:
         g = states.mode

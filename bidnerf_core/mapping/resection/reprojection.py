@@ -48,9 +48,7 @@ class Landmarks:
         cost, rows, pull = self._weighted(states)
         return Normal(cost, (rows @ pull[..., None])[..., 0], rows @ rows.mT)
 
-    def sandwich(
-        self, states: States
-    ) -> tuple[Float[Tensor, "h P P"], Float[Tensor, "h P P"], Float[Tensor, "h P P"]]:
+    def sandwich(self, states: States) -> tuple[Float[Tensor, "h P P"], Float[Tensor, "h P P"], Float[Tensor, "h P P"]]:
         """Return the reweighted Hessian, the curvature, and the scatter of the matches' gradients.
 
         The covariance of an M-estimator is curvature^-1 scatter curvature^-1 (Huber 1981, 6.3). Matches with more influence often have
@@ -75,9 +73,7 @@ class Landmarks:
         alike = (excess * count / (count - 6).clamp(min=1))[:, None, None] * curvature
         return hessian, curvature, known * scatter + (1 - known) * alike
 
-    def _weighted(
-        self, states: States
-    ) -> tuple[Float[Tensor, "h"], Float[Tensor, "h P r"], Float[Tensor, "h r"]]:
+    def _weighted(self, states: States) -> tuple[Float[Tensor, "h"], Float[Tensor, "h P r"], Float[Tensor, "h r"]]:
         """Return the term's cost, and the weighted rows (transposed) and residuals of its least-squares problem."""
         own = self._of(states)
         seen = project(states, own.points, own.sights)
@@ -236,9 +232,15 @@ def resections(
         h = b * len(motions)
         zero, mode = torch.zeros((h, N), dtype=torch.float64), torch.arange(b).repeat(len(motions))
         states = States(
-            SE3(torch.eye(3, dtype=torch.float64).expand(h, 3, 3), zero[:, :3]), zero, zero,
-            deviation.repeat_interleave(b, 0), zero[:, 0], zero[:, 0], mode, torch.arange(h) // b,
-        )  # fmt: skip
+            SE3(torch.eye(3, dtype=torch.float64).expand(h, 3, 3), zero[:, :3]),
+            zero,
+            zero,
+            deviation.repeat_interleave(b, 0),
+            zero[:, 0],
+            zero[:, 0],
+            mode,
+            torch.arange(h) // b,
+        )
         for _ in range(3):  # each time, the noise is estimated anew
             states, _ = descend(term.with_noise(states), [term], 10)
         states = term.with_noise(states)

@@ -185,19 +185,23 @@ def jacobian(states: States, seen: Projections, sights: Sights) -> Float[Tensor,
         by_pose = _by_update((back @ by_point.transpose(1, 2)).transpose(1, 2), rig)
     bent, zero = flat * seen.bend, torch.zeros_like(flat)
     scaled = bent * seen.linear.diagonal(dim1=-2, dim2=-1)[:, None]
-    by_camera = torch.stack([
-        scaled, *(constant(e, flat).expand_as(flat) for e in ((1.0, 0.0), (0.0, 1.0))), (flat * seen.square) @ A,
-        scaled * constant((0.5, -0.5), flat), pad(bent[..., 1:], (0, 1)),
-    ], 1)  # fmt: skip
+    by_camera = torch.stack(
+        [
+            scaled,
+            *(constant(e, flat).expand_as(flat) for e in ((1.0, 0.0), (0.0, 1.0))),
+            (flat * seen.square) @ A,
+            scaled * constant((0.5, -0.5), flat),
+            pad(bent[..., 1:], (0, 1)),
+        ],
+        1,
+    )
     by_motion = by_row * sights.times[..., None, :, None]
     found = torch.cat([by_pose, by_camera, by_motion, zero[:, None]], 1)
     found[:, 6:] *= states.deviation[:, :, None, None]
     return found
 
 
-def _by_update(
-    by_point: Float[Tensor, "h 3 m k"], points: Float[Tensor, "h m 3"]
-) -> Float[Tensor, "h 6 m k"]:
+def _by_update(by_point: Float[Tensor, "h 3 m k"], points: Float[Tensor, "h m 3"]) -> Float[Tensor, "h 6 m k"]:
     """Return the same as ``by_update``, with the axes in the order of the annotated result (h 6 m k)."""
     return torch.cat([-by_point, torch.linalg.cross(by_point, points.mT[..., None], dim=1)], 1)
 
@@ -240,9 +244,13 @@ def true_intrinsics(stated: Intrinsics, camera: Float[Tensor, "6"]) -> Intrinsic
     log_focal, cx, cy, k1, log_aspect, _ = camera.tolist()
     bent, *others = stated.distortion or (0.0, 0.0, 0.0, 0.0)
     return replace(
-        stated, fx=stated.fx * math.exp(log_focal + log_aspect / 2), fy=stated.fy * math.exp(log_focal - log_aspect / 2),
-        cx=stated.cx + cx * stated.fx, cy=stated.cy + cy * stated.fy, distortion=(bent + k1, *others),
-    )  # fmt: skip
+        stated,
+        fx=stated.fx * math.exp(log_focal + log_aspect / 2),
+        fy=stated.fy * math.exp(log_focal - log_aspect / 2),
+        cx=stated.cx + cx * stated.fx,
+        cy=stated.cy + cy * stated.fy,
+        distortion=(bent + k1, *others),
+    )
 
 
 def rays_through(states: States, image: Float[Tensor, "m 2"]) -> Float[Tensor, "h m 3"]:
@@ -262,8 +270,12 @@ def rays_by_camera(rays: Float[Tensor, "h m 3"], states: States) -> Float[Tensor
     one, zero = torch.ones_like(flat[..., :1]), torch.zeros_like(flat[..., :1])
     square = flat.square().sum(-1, keepdim=True)
     columns = [
-        flat, torch.cat([one, zero], -1), torch.cat([zero, one], -1), flat * square, flat * constant((0.5, -0.5), flat),
+        flat,
+        torch.cat([one, zero], -1),
+        torch.cat([zero, one], -1),
+        flat * square,
+        flat * constant((0.5, -0.5), flat),
         torch.cat([flat[..., 1:], zero], -1),
-    ]  # fmt: skip
+    ]
     found = -torch.stack(columns, -1) * states.deviation[:, None, None, CAMERA]
     return torch.cat([found, torch.zeros_like(found[..., :1, :])], -2)

@@ -115,9 +115,12 @@ def bake(
 
 
 def surface_of_points(
-    points: Float[Tensor, "p 3"], rgb: Float[Tensor, "p 3"], bounds: SceneBounds, cameras: Sequence[Camera],
+    points: Float[Tensor, "p 3"],
+    rgb: Float[Tensor, "p 3"],
+    bounds: SceneBounds,
+    cameras: Sequence[Camera],
     config: BakeConfig = BakeConfig(),
-) -> SurfaceMap:  # fmt: skip
+) -> SurfaceMap:
     """Bake the surface from points on it (metres, world), such as a scan's; ``cameras`` become its keyframes.
 
     The cells follow the density of the points. Raises ``InputError`` for fewer than two points within the bounds.
@@ -134,9 +137,13 @@ def surface_of_points(
 
 
 def _fused(
-    points: Float[Tensor, "p 3"], rgb: Float[Tensor, "p 3"], bounds: SceneBounds,
-    cells: tuple[float, float], keyframes: Sequence[SE3], config: BakeConfig,
-) -> SurfaceMap:  # fmt: skip
+    points: Float[Tensor, "p 3"],
+    rgb: Float[Tensor, "p 3"],
+    bounds: SceneBounds,
+    cells: tuple[float, float],
+    keyframes: Sequence[SE3],
+    config: BakeConfig,
+) -> SurfaceMap:
     """Fuse points into a surface; ``cells`` are the finest and the coarsest permitted cell size (metres)."""
     grid = chosen_grid(points, bounds, *cells, config.megabytes)
     _, (positions, colours) = merged(grid.numbers(points), points, rgb)

@@ -242,9 +242,7 @@ def surface_bytes(points: Float[Tensor, "p 3"], grid: VoxelGrid) -> float:
     return surfel_bytes(surfels) + index_bytes(block_levels(points, grid))
 
 
-def _depths(
-    images: Sequence[PosedDepthImage], opacity: float
-) -> list[tuple[PosedDepthImage, Float[Tensor, "p"]]]:
+def _depths(images: Sequence[PosedDepthImage], opacity: float) -> list[tuple[PosedDepthImage, Float[Tensor, "p"]]]:
     """Return the images that show a surface, with the depths (metres) of the pixels that show it."""
     found = [(posed, posed.image.depth[posed.solid(opacity)]) for posed in images]
     return [(posed, depths) for posed, depths in found if len(depths)]

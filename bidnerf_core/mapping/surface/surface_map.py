@@ -39,8 +39,7 @@ def merged(cells: Int[Tensor, "p"], *values: Float[Tensor, "p _"]) -> tuple[Int[
     """Return the occupied cells, in ascending order, and the means of the points' ``values`` in each."""
     found, place, counts = cells.unique(return_inverse=True, return_counts=True)
     means = [
-        torch.zeros((len(found), v.shape[-1]), dtype=v.dtype).index_add_(0, place, v) / counts[:, None]
-        for v in values
+        torch.zeros((len(found), v.shape[-1]), dtype=v.dtype).index_add_(0, place, v) / counts[:, None] for v in values
     ]
     return found, means
 

@@ -14,9 +14,7 @@ from bidnerf.cli import main
 @pytest.fixture(scope="module")
 def trained(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("trained") / "map"
-    small = (
-        "--steps 8 --rays-at-most 256 --levels 3 --log2-table-size 9 --finest-resolution 16 --coarse-levels 1"
-    )
+    small = "--steps 8 --rays-at-most 256 --levels 3 --log2-table-size 9 --finest-resolution 16 --coarse-levels 1"
     words = [*small.split(" "), "--landmark-features", "orb", "--refine-poses", "never"]
     assert main(["train", str(capture), "--out", str(folder), *words]) == 0
     return folder
@@ -30,9 +28,7 @@ def test_the_map_is_of_the_readers_images_and_the_detectors_landmarks(trained: P
     assert [camera.name for camera in scene.info.cameras][:2] == ["image00", "image01"]
 
 
-def test_an_image_is_localized_by_the_method(
-    trained: Path, capture: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_image_is_localized_by_the_method(trained: Path, capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--frame", "image03", "--method", "landmarks-alone", "--json"]
     assert main(["localize", str(trained), str(capture), "--split", "train", *words]) == 0
     found = json.loads(capsys.readouterr().out)

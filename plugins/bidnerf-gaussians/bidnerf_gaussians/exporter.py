@@ -55,9 +55,7 @@ def gaussians_of_map(scene: Map) -> Gaussians:
     if isinstance(field, GaussiansField):
         return field.gaussians().similar(scale, torch.eye(3), torch.zeros(3))
     if scene.surface is None:
-        raise InputError(
-            "has no surface, from which a splat could be made; 'bidnerf bake' adds one", where=scene.name
-        )
+        raise InputError("has no surface, from which a splat could be made; 'bidnerf bake' adds one", where=scene.name)
     return gaussians_of_surface(scene.surface)
 
 

@@ -90,13 +90,10 @@ class GaussiansField(PieceField):
         rgb = colours(self.harmonics.detach()[:, :1], means)
         return Splats(means, rgb, self.logits.detach().sigmoid(), self.log_scales.detach().mean(-1).exp())
 
-    def meet(
-        self, index: Int[Tensor, "p"], origins: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
-    ) -> Peaks:
+    def meet(self, index: Int[Tensor, "p"], origins: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]) -> Peaks:
         """Return where lines come nearest to the Gaussians with indices ``index``."""
         means, widths, turns, logits = (
-            part.index_select(0, index)
-            for part in (self.means, self.log_scales, self.quaternions, self.logits)
+            part.index_select(0, index) for part in (self.means, self.log_scales, self.quaternions, self.logits)
         )
         turns = turns * turns.square().sum(-1, keepdim=True).clamp(min=1e-24).rsqrt()
         # Relative to the point nearest to the mean, so that rounding is that of lengths around the Gaussian.

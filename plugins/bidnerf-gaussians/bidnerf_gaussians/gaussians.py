@@ -47,9 +47,7 @@ class Gaussians:
         """Opacities, in [0, 1]."""
         return self.logits.sigmoid()
 
-    def similar(
-        self, scale: float, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]
-    ) -> Gaussians:
+    def similar(self, scale: float, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]) -> Gaussians:
         """Return the Gaussians transformed by ``x -> rotation @ (scale * x) + translation``; colours rotate with them."""
         R = rotation.double()
         means = (scale * self.means.double()) @ R.mT + translation.double()

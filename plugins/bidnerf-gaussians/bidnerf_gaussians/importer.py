@@ -44,7 +44,9 @@ class ImportSettings(Settings):
 class GaussiansImporter:
     """Reads files of Gaussians in all formats."""
 
-    summary: str = "Gaussian splats: .ply, compressed .ply, .splat, .spz, .sog, .glb, checkpoints of gsplat and splatfacto"
+    summary: str = (
+        "Gaussian splats: .ply, compressed .ply, .splat, .spz, .sog, .glb, checkpoints of gsplat and splatfacto"
+    )
     config_type: type = ImportSettings
 
     def recognises(self, path: Path) -> bool:
@@ -59,24 +61,23 @@ class GaussiansImporter:
         found = format_of(path)
         if found is None:
             raise InputError("not a readable file of Gaussians", where=path, expected=self.summary)
-        return imported(
-            found.read(path), str(path), config, placement, found, cameras_beside(path, placement)
-        )
+        return imported(found.read(path), str(path), config, placement, found, cameras_beside(path, placement))
 
 
 def imported(
-    gaussians: Gaussians, where: str, config: ImportSettings = ImportSettings(),
-    placement: Similarity = UNMOVED, of: Format | None = None,
+    gaussians: Gaussians,
+    where: str,
+    config: ImportSettings = ImportSettings(),
+    placement: Similarity = UNMOVED,
+    of: Format | None = None,
     cameras: tuple[StoredCamera, ...] = (),
-) -> ImportedField:  # fmt: skip
+) -> ImportedField:
     """Build a field from Gaussians of any source. Raises ``InputError`` if none of them can be rendered."""
     kept, dropped = cleaned(gaussians, where)
     if config.least_opacity:
         before, kept = len(kept), kept[kept.opacities >= config.least_opacity]
         if not len(kept):
-            raise InputError(
-                f"no Gaussian reaches opacity {config.least_opacity:g} (least_opacity)", where=where
-            )
+            raise InputError(f"no Gaussian reaches opacity {config.least_opacity:g} (least_opacity)", where=where)
     count = len(gaussians)
     kept = replace(kept, harmonics=kept.harmonics[:, : (config.degree + 1) ** 2])
     T = placement.T_target_source
@@ -98,14 +99,19 @@ def imported(
         facts.append(f"axes: {of.convention}")
     up = T.rotation.double() @ torch.tensor(UP if of is None else of.up, dtype=torch.float64)
     return ImportedField(
-        "gaussians", settings, dict(field.state_dict()), bounds, found=tuple(facts), steps=settings.steps, points=points,
-        cameras=cameras, up=(float(up[0]), float(up[1]), float(up[2])),
-    )  # fmt: skip
+        "gaussians",
+        settings,
+        dict(field.state_dict()),
+        bounds,
+        found=tuple(facts),
+        steps=settings.steps,
+        points=points,
+        cameras=cameras,
+        up=(float(up[0]), float(up[1]), float(up[2])),
+    )
 
 
-def with_dilation(
-    gaussians: Gaussians, pixel_angle: float, cameras: tuple[StoredCamera, ...] = ()
-) -> Gaussians:
+def with_dilation(gaussians: Gaussians, pixel_angle: float, cameras: tuple[StoredCamera, ...] = ()) -> Gaussians:
     """Return the Gaussians as wide as an image renderer shows them: at least about half a pixel.
 
     The original 3DGS code adds ``DILATION`` square pixels to the covariance in the image, and Gaussians are

@@ -62,9 +62,7 @@ class PieceField(nn.Module, ABC):
     None if the box must contain the point."""
 
     @abstractmethod
-    def meet(
-        self, index: Int[Tensor, "p"], origins: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
-    ) -> Meeting:
+    def meet(self, index: Int[Tensor, "p"], origins: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]) -> Meeting:
         """Return where lines meet the pieces with indices ``index``; an opacity below ``LEAST_ALPHA`` counts as none."""
 
     @abstractmethod
@@ -95,9 +93,7 @@ class PieceField(nn.Module, ABC):
         """The boxes of each node's children, starting with the lowest level (whose children are pieces)."""
         return [part for name, part in self.named_buffers(recurse=False) if name.startswith("boxes_")]
 
-    def rebuild(
-        self, centres: Float[Tensor, "n 3"], halves: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]
-    ) -> None:
+    def rebuild(self, centres: Float[Tensor, "n 3"], halves: Float[Tensor, "n 3"], seen: Bool[Tensor, "n"]) -> None:
         """Fill the tree from boxes with these centres and half sizes; pieces that are not ``seen`` get an empty box."""
         self.order.copy_(torch.argsort(_morton(centres, seen), stable=True))
         centres, halves, seen = centres[self.order], halves[self.order], seen[self.order, None]
@@ -147,9 +143,7 @@ class PieceField(nn.Module, ABC):
         """
         waiting = may_wait(rays.near.device)
 
-        def met_by_few(
-            origins: Tensor, directions: Tensor, near: Tensor, far: Tensor
-        ) -> tuple[Tensor, Tensor]:
+        def met_by_few(origins: Tensor, directions: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
             last = torch.where(far > near, far, near - 1)  # rays that miss the scene meet nothing
             line, index, hit = self._nearby(origins, directions, near, last)
             found = self.meet(index, origins.index_select(0, line), directions.index_select(0, line))
@@ -187,8 +181,7 @@ class PieceField(nn.Module, ABC):
         parts = _in_parts(met_by_few, tuple(vars(rays).values()), some)
         width = max(piece.shape[1] for piece, _ in parts)
         piece, valid = (
-            torch.cat([pad(part, (0, width - part.shape[1])) for part in column])
-            for column in zip(*parts, strict=True)
+            torch.cat([pad(part, (0, width - part.shape[1])) for part in column]) for column in zip(*parts, strict=True)
         )
         return piece, valid
 
@@ -214,8 +207,12 @@ class PieceField(nn.Module, ABC):
         return FieldValues(density.reshape(positions.shape[:-1]), rgb.reshape(positions.shape))
 
     def _nearby(
-        self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"], near: Float[Tensor, "r"], far: Float[Tensor, "r"]
-    ) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"], Bool[Tensor, "p"]]:  # fmt: skip
+        self,
+        origins: Float[Tensor, "r 3"],
+        directions: Float[Tensor, "r 3"],
+        near: Float[Tensor, "r"],
+        far: Float[Tensor, "r"],
+    ) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"], Bool[Tensor, "p"]]:
         """Return pairs of a line and a piece whose box it crosses between ``near`` and ``far``, sorted by line, and which are valid.
 
         If the host must not wait, each line gets the same number of pairs, for the boxes that it enters first. Otherwise all pairs

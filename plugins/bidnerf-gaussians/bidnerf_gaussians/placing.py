@@ -25,9 +25,7 @@ NEIGHBOURS = 3
 """Number of neighbours whose mean distance is the initial width of a Gaussian."""
 
 
-def first_gaussians(
-    field: GaussiansField, views: Sequence[View], unit: float, generator: Generator
-) -> Gaussians:
+def first_gaussians(field: GaussiansField, views: Sequence[View], unit: float, generator: Generator) -> Gaussians:
     """Return as many Gaussians as the field has, placed on what the views measured, and the rest where matter can be."""
     count, bounds = len(field.means), field.bounds
     points, colours = _measured(views, count, generator)
@@ -40,9 +38,7 @@ def first_gaussians(
     harmonics[:, 0] = (rgb - 0.5) / C0
     quaternions = torch.zeros(count, 4)
     quaternions[:, 0] = 1
-    return Gaussians(
-        means, _widths(means, unit).log()[:, None].expand(-1, 3), quaternions, opacity.logit(), harmonics
-    )
+    return Gaussians(means, _widths(means, unit).log()[:, None].expand(-1, 3), quaternions, opacity.logit(), harmonics)
 
 
 def _widths(means: Float[Tensor, "n 3"], unit: float) -> Float[Tensor, "n"]:
@@ -76,9 +72,7 @@ def _measured(
     return found[chosen], rgb[chosen]
 
 
-def _with_distance(
-    view: View, most: int, generator: Generator
-) -> tuple[Float[Tensor, "p 2"], Float[Tensor, "p"]]:
+def _with_distance(view: View, most: int, generator: Generator) -> tuple[Float[Tensor, "p 2"], Float[Tensor, "p"]]:
     """Return pixels of a view with their distance along the ray (metres)."""
     frame = view.frame
     if frame.depth is not None and bool((frame.depth > 0).any()):
@@ -93,9 +87,7 @@ def _with_distance(
     return torch.zeros(0, 2), torch.zeros(0)
 
 
-def _anywhere(
-    views: Sequence[View], bounds: SceneBounds, count: int, generator: Generator
-) -> Float[Tensor, "n 3"]:
+def _anywhere(views: Sequence[View], bounds: SceneBounds, count: int, generator: Generator) -> Float[Tensor, "n 3"]:
     """Return random points (metres, world) that the views do not show to be empty."""
     lower, size = torch.tensor(bounds.lower), torch.tensor(bounds.size)
     if count <= 0:

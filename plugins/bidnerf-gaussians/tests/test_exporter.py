@@ -36,8 +36,7 @@ def test_a_surface_is_as_opaque_and_as_far_away_as_splat(scene: Map, tmp_path: P
     found = import_map(files[1], config={"background": BOUNDS.background}, bake=False)
     view = training_views()[1]
     first, second = (
-        render_image(each.field, view.frame.intrinsics, view.T_ref_camera, each.bounds)
-        for each in (scene, found)
+        render_image(each.field, view.frame.intrinsics, view.T_ref_camera, each.bounds) for each in (scene, found)
     )
     seen = (first.opacity > 0.99) & (second.opacity > 0.5)
     assert float(seen.float().mean()) > 0.9 * float((first.opacity > 0.99).float().mean())
@@ -66,9 +65,7 @@ def test_cameras_are_found_again(scene: Map, tmp_path: Path) -> None:
     found = import_map(files[1], bake=False).info.cameras
     assert [camera.name for camera in found] == [camera.name for camera in scene.info.cameras]
     for own, other in zip(scene.info.cameras, found, strict=True):
-        assert other.intrinsics == replace(
-            own.intrinsics, cx=own.intrinsics.width / 2, cy=own.intrinsics.height / 2
-        )
+        assert other.intrinsics == replace(own.intrinsics, cx=own.intrinsics.width / 2, cy=own.intrinsics.height / 2)
         assert torch.allclose(own.pose.matrix(), other.pose.matrix(), atol=1e-9)
 
 

@@ -66,9 +66,12 @@ def test_rays_see_all_gaussians_in_order_of_depth(some: Callable[..., Gaussians]
 def test_one_gaussian_alone() -> None:
     """Through its middle, alpha is the opacity; a standard deviation beside it, exp(-1/2) of that."""
     alone = Gaussians(
-        torch.zeros(1, 3), torch.tensor([[0.1, 0.2, 0.4]]).log(), torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([0.0]),
+        torch.zeros(1, 3),
+        torch.tensor([[0.1, 0.2, 0.4]]).log(),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.tensor([0.0]),
         torch.ones(1, 1, 3),
-    )  # fmt: skip
+    )
     origins = torch.tensor([[0.0, 0, -3], [0.1, 0, -3], [0, 0.2, -3], [-3, 0, 0.4]])
     directions = torch.tensor([[0.0, 0, 1]] * 3 + [[1.0, 0, 0]])
     hits = field_of(alone).hits(Rays(origins, directions, torch.zeros(4), torch.full((4,), 10.0)))
@@ -82,17 +85,17 @@ def test_moved_with_the_rays_nothing_changes(some: Callable[..., Gaussians]) -> 
     T = SE3.exp(torch.tensor([0.3, -0.8, 0.5, 0.7, -1.9, 0.4], dtype=torch.float64))
     moved = gaussians.similar(2.5, T.rotation, T.translation)
     there = Rays(
-        T.apply(2.5 * along.origins.double()).float(), T.rotate(along.directions.double()).float(), along.near,
+        T.apply(2.5 * along.origins.double()).float(),
+        T.rotate(along.directions.double()).float(),
+        along.near,
         2.5 * along.far,
-    )  # fmt: skip
+    )
     before, after = render(field_of(gaussians), along), render(field_of(moved), there)
     assert torch.allclose(before.rgb, after.rgb, atol=2e-3)
     assert torch.allclose(2.5 * before.distance, after.distance, atol=1e-2)
 
 
-def test_in_known_shapes_the_same_is_seen(
-    some: Callable[..., Gaussians], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_in_known_shapes_the_same_is_seen(some: Callable[..., Gaussians], monkeypatch: pytest.MonkeyPatch) -> None:
     field, along = field_of(some(300)), rays()
     expected = render(field, along)
     points = rays(50, 5).at(torch.full((50, 1), 3.0))[:, 0]
@@ -105,9 +108,7 @@ def test_in_known_shapes_the_same_is_seen(
     assert torch.allclose(again.density, density.density, atol=1e-3 * float(density.density.max()))
 
 
-def test_many_boxes_are_tested_in_parts(
-    some: Callable[..., Gaussians], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_many_boxes_are_tested_in_parts(some: Callable[..., Gaussians], monkeypatch: pytest.MonkeyPatch) -> None:
     field, along = field_of(some(300)), rays()
     expected = field.hits(along)
     monkeypatch.setattr("bidnerf_gaussians.pieces.MOST_PAIRS", 400)
@@ -154,9 +155,7 @@ def test_splats_are_the_gaussians_as_points(some: Callable[..., Gaussians]) -> N
     torch.testing.assert_close(found.radius**3, gaussians.log_scales.exp().prod(-1))
     directions = torch.nn.functional.normalize(torch.randn((4000, 3)), dim=-1)
     linear = 0.5 + torch.einsum("pk,nkc->npc", basis(directions, 4), gaussians.harmonics)
-    inside = (
-        ((linear > 0) & (linear < 1)).all(1).all(-1)
-    )  # where nothing is clipped, the first harmonic is the mean
+    inside = ((linear > 0) & (linear < 1)).all(1).all(-1)  # where nothing is clipped, the first harmonic is the mean
     torch.testing.assert_close(found.rgb[inside], linear.mean(1)[inside], atol=0.02, rtol=0)
     torch.testing.assert_close(grown.splats().positions, 2 * found.positions)
     torch.testing.assert_close(grown.splats().radius, 2 * found.radius)

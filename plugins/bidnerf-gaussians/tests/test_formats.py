@@ -70,11 +70,14 @@ def test_discs_of_2d_gaussian_splatting_are_thin_gaussians(tmp_path: Path, some:
     gaussians, path = some(40), tmp_path / "discs.ply"
     columns = torch.cat(
         [
-            gaussians.means, gaussians.harmonics[:, 0], gaussians.logits[:, None], gaussians.log_scales[:, :2],
+            gaussians.means,
+            gaussians.harmonics[:, 0],
+            gaussians.logits[:, None],
+            gaussians.log_scales[:, :2],
             gaussians.quaternions,
         ],
         dim=-1,
-    )  # fmt: skip
+    )
     body = columns.numpy().astype("<f4").tobytes()
     path.write_bytes(inria(40, body=body).replace(b"property float scale_2\n", b""))
     thin = gaussians.log_scales.clone()
@@ -121,9 +124,7 @@ def test_all_versions_of_spz(tmp_path: Path) -> None:
             path.write_bytes(gzip.compress(header + b"".join(sections)))
         else:
             packed = [zstandard.ZstdCompressor().compress(part) for part in sections]
-            sizes = b"".join(
-                struct.pack("<QQ", len(a), len(b)) for a, b in zip(packed, sections, strict=True)
-            )
+            sizes = b"".join(struct.pack("<QQ", len(a), len(b)) for a, b in zip(packed, sections, strict=True))
             header = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, 2, 1, 12, 0, 6, 32)
             path.write_bytes(header + sizes + b"".join(packed))
         found = read_gaussians(path)
@@ -150,10 +151,7 @@ def compressed_ply(counts: tuple[int, int] = (1, 2)) -> bytes:
     """Return a compressed file of one chunk from -1 to 1, with one Gaussian in a corner and one in the middle."""
     ranges = ("x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b")
     order = [
-        f"{end}_{name}"
-        for part in (ranges[:3], ranges[3:6], ranges[6:])
-        for end in ("min", "max")
-        for name in part
+        f"{end}_{name}" for part in (ranges[:3], ranges[3:6], ranges[6:]) for end in ("min", "max") for name in part
     ]
     header = ["ply", "format binary_little_endian 1.0", f"element chunk {counts[0]}"]
     header += [f"property float {name}" for name in order] + [f"element vertex {counts[1]}"]
@@ -190,19 +188,25 @@ def sog_parts(count: int = 3) -> dict[str, bytes]:
 
     book = np.linspace(-4, 4, 256).tolist()
     files = {
-        "means": ["means_l.webp", "means_u.webp"], "quats": ["quats.webp"], "scales": ["scales.webp"],
-        "sh0": ["sh0.webp"], "shN": ["centroids.webp", "labels.webp"],
-    }  # fmt: skip
+        "means": ["means_l.webp", "means_u.webp"],
+        "quats": ["quats.webp"],
+        "scales": ["scales.webp"],
+        "sh0": ["sh0.webp"],
+        "shN": ["centroids.webp", "labels.webp"],
+    }
     meta = {name: {"files": names, "codebook": book} for name, names in files.items()}
     meta["means"] |= {"mins": [-1, -1, -1], "maxs": [1, 1, 1]}
     meta["shN"] |= {"bands": 1, "count": 64}
     return {
         "meta.json": json.dumps({"version": 2, "count": count} | meta).encode(),
-        "means_l.webp": image(255, 0, 255, 255), "means_u.webp": image(255, 0, 127, 255),
-        "quats.webp": image(128, 128, 128, 252), "scales.webp": image(0, 255, 0, 255),
-        "sh0.webp": image(255, 0, 255, 128), "centroids.webp": image(255, 0, 0, 255, size=(64 * 3, 1)),
+        "means_l.webp": image(255, 0, 255, 255),
+        "means_u.webp": image(255, 0, 127, 255),
+        "quats.webp": image(128, 128, 128, 252),
+        "scales.webp": image(0, 255, 0, 255),
+        "sh0.webp": image(255, 0, 255, 128),
+        "centroids.webp": image(255, 0, 0, 255, size=(64 * 3, 1)),
         "labels.webp": image(5, 0, 0, 255),
-    }  # fmt: skip
+    }
 
 
 def write_sog(path: Path, parts: dict[str, bytes]) -> Path:
@@ -231,11 +235,7 @@ def test_known_bytes_of_a_sog_archive_and_folder(tmp_path: Path) -> None:
 def glb(g: Gaussians, **node: object) -> bytes:
     """Return a file of one mesh of Gaussians in a node."""
     names = ["POSITION", *(f"KHR_gaussian_splatting:{n}" for n in ("SCALE", "ROTATION", "OPACITY"))]
-    names += [
-        f"KHR_gaussian_splatting:SH_DEGREE_{d}_COEF_{n}"
-        for d in range(g.degree + 1)
-        for n in range(2 * d + 1)
-    ]
+    names += [f"KHR_gaussian_splatting:SH_DEGREE_{d}_COEF_{n}" for d in range(g.degree + 1) for n in range(2 * d + 1)]
     columns = [g.means, g.log_scales, g.quaternions.roll(-1, 1), g.opacities[:, None], *g.harmonics.unbind(1)]
     body, views, accessors = b"", [], []
     for number, column in enumerate(columns):
@@ -244,18 +244,22 @@ def glb(g: Gaussians, **node: object) -> bytes:
         accessors.append({"bufferView": number, "componentType": 5126, "count": len(column), "type": kind})
         body += column.numpy().astype("<f4").tobytes()
     primitive = {
-        "attributes": {name: number for number, name in enumerate(names)}, "mode": 0,
+        "attributes": {name: number for number, name in enumerate(names)},
+        "mode": 0,
         "extensions": {"KHR_gaussian_splatting": {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
-    }  # fmt: skip
+    }
     gltf = {
-        "asset": {"version": "2.0"}, "extensionsUsed": ["KHR_gaussian_splatting"], "buffers": [{"byteLength": len(body)}],
-        "bufferViews": views, "accessors": accessors, "meshes": [{"primitives": [primitive]}], "nodes": [{"mesh": 0} | node],
-    }  # fmt: skip
+        "asset": {"version": "2.0"},
+        "extensionsUsed": ["KHR_gaussian_splatting"],
+        "buffers": [{"byteLength": len(body)}],
+        "bufferViews": views,
+        "accessors": accessors,
+        "meshes": [{"primitives": [primitive]}],
+        "nodes": [{"mesh": 0} | node],
+    }
     text = json.dumps(gltf).encode()
     text += b" " * (-len(text) % 4)
-    chunks = (
-        struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(body), 0x004E4942) + body
-    )
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(body), 0x004E4942) + body
     return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
 
 
@@ -271,9 +275,7 @@ def with_nodes(content: bytes, nodes: list[dict[str, object]]) -> bytes:
 def test_nodes_of_a_gltf_take_time_and_memory_in_proportion_to_the_file(tmp_path: Path, some: Some) -> None:
     path, content = tmp_path / "a.glb", glb(some(3))
     count = 20_000
-    chain: list[dict[str, object]] = [
-        {"children": [number + 1], "translation": [1, 0, 0]} for number in range(count)
-    ]
+    chain: list[dict[str, object]] = [{"children": [number + 1], "translation": [1, 0, 0]} for number in range(count)]
     path.write_bytes(with_nodes(content, [*chain, {"mesh": 0}]))
     shift = torch.tensor([float(count), 0, 0])
     torch.testing.assert_close(read_gaussians(path).means, some(3).means + shift)
@@ -323,8 +325,10 @@ def test_checkpoints_of_gsplat_and_splatfacto(tmp_path: Path, some: Some) -> Non
     names = {"means": g.means, "scales": g.log_scales, "quats": g.quaternions}
     gsplat = names | {"opacities": g.logits, "sh0": g.harmonics[:, :1], "shN": g.harmonics[:, 1:]}
     splatfacto = names | {
-        "opacities": g.logits[:, None], "features_dc": g.harmonics[:, 0], "features_rest": g.harmonics[:, 1:]
-    }  # fmt: skip
+        "opacities": g.logits[:, None],
+        "features_dc": g.harmonics[:, 0],
+        "features_rest": g.harmonics[:, 1:],
+    }
     pipeline = {f"_model.gauss_params.{name}": value for name, value in splatfacto.items()}
     torch.save({"step": 1, "splats": gsplat}, tmp_path / "a.pt")
     torch.save({"pipeline": pipeline | {"_model.lpips.weight": torch.zeros(2)}}, tmp_path / "b.ckpt")
@@ -370,9 +374,7 @@ def test_gaussians_that_cannot_be_rendered_are_dropped_and_counted(some: Some) -
     kept, dropped = cleaned(g, "x")
     assert len(kept) == 3
     assert bool(kept.logits.isfinite().all())
-    counts = (
-        "3 with numbers that are not finite or too large, 1 with a zero quaternion, 1 that are transparent"
-    )
+    counts = "3 with numbers that are not finite or too large, 1 with a zero quaternion, 1 that are transparent"
     assert dropped == counts
     with pytest.raises(InputError, match="none of its 1 Gaussians"):
         cleaned(g[:1], "x")
@@ -397,7 +399,10 @@ def test_bad_files_are_told_before_memory_is_taken(tmp_path: Path, some: Some) -
     cases: dict[str, tuple[bytes, str]] = {
         "huge.ply": (inria(10**12), "too few"),
         "lists.ply": (inria(1).replace(b"property float x", b"property list uchar int l\nproperty float x"), "too few"),
-        "bare.ply": (inria(1).replace(b"element vertex", b"element bare 1000000000000\nelement vertex"), "not a readable file of Gaussians"),
+        "bare.ply": (
+            inria(1).replace(b"element vertex", b"element bare 1000000000000\nelement vertex"),
+            "not a readable file of Gaussians",
+        ),
         "cut.ply": (inria(3, body=bytes(100)), "too few"),
         "degree.ply": (inria(1, 10, bytes(24 * 4)), "properties f_rest_N"),
         "chunks.ply": (compressed_ply((0, 2)), "too few chunks"),
@@ -412,8 +417,11 @@ def test_bad_files_are_told_before_memory_is_taken(tmp_path: Path, some: Some) -
         "dense4.spz": (struct.pack("<4sIIBBBBI12x", b"NGSP", 4, 10**9, 0, 12, 0, 5, 32) + bytes(80), "can hold"),
         "none.sog": (b"no archive", "not a zip archive"),
         "text.pt": (b"no checkpoint", "not a readable file of Gaussians"),
-        "mesh.ply": (b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n", "not a readable file of Gaussians"),
-    }  # fmt: skip
+        "mesh.ply": (
+            b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n",
+            "not a readable file of Gaussians",
+        ),
+    }
     archive = bytearray(write_sog(tmp_path / "a.sog", parts).read_bytes())
     archive[6] |= 1  # "encrypted", in both headers of the first member
     archive[archive.index(b"PK\x01\x02") + 8] |= 1
@@ -450,9 +458,7 @@ def test_a_zip_bomb_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         read_gaussians(tmp_path / "bomb.spz")
     stream = gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 2, 0, 12, 0, 0) + bytes(10**7))
     (tmp_path / "bomb.spz").write_bytes(stream)
-    assert (
-        len(read_gaussians(tmp_path / "bomb.spz")) == 2
-    )  # what is behind the declared Gaussians is left packed
+    assert len(read_gaussians(tmp_path / "bomb.spz")) == 2  # what is behind the declared Gaussians is left packed
 
 
 def test_other_endings_are_not_written(tmp_path: Path, some: Some) -> None:

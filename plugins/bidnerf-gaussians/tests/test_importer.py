@@ -61,9 +61,15 @@ def test_a_map_in_another_world(file: Path) -> None:
 
 def test_the_cameras_beside_a_file_are_its_viewpoints(file: Path) -> None:
     entry = {
-        "id": 0, "img_name": "a", "width": 64, "height": 48, "position": [1.0, 2, 3], "fx": 50.0, "fy": 51.0,
+        "id": 0,
+        "img_name": "a",
+        "width": 64,
+        "height": 48,
+        "position": [1.0, 2, 3],
+        "fx": 50.0,
+        "fy": 51.0,
         "rotation": torch.eye(3).tolist(),
-    }  # fmt: skip
+    }
     (file.parent / "cameras.json").write_text(json.dumps([entry]))
     (camera,) = import_map(file, bake=False, options=ImportOptions(scale=2.0)).info.cameras
     assert camera.intrinsics == Intrinsics(50.0, 51.0, 32.0, 24.0, 64, 48)

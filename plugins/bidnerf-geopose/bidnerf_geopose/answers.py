@@ -59,9 +59,12 @@ def answer(
         reason = f"not localized: {localization.outcome}: {localization.reason}"
         raise Refused(422, reason, localization=plain)
     return {
-        "id": request.id[:LONGEST_NAME], "timestamp": round(time.time() * 1000), "accuracy": accuracy(localization, anchor),
-        **_pose(localization.T_world_camera, anchor), "localization": plain,
-    }  # fmt: skip
+        "id": request.id[:LONGEST_NAME],
+        "timestamp": round(time.time() * 1000),
+        "accuracy": accuracy(localization, anchor),
+        **_pose(localization.T_world_camera, anchor),
+        "localization": plain,
+    }
 
 
 def _pose(T_world_camera: SE3, anchor: Anchor | None) -> dict[str, Any]:
@@ -88,9 +91,7 @@ def accuracy(found: Localization, anchor: Anchor | None) -> dict[str, float] | N
     """
     if found.covariance is None or not bool(found.covariance.isfinite().all()):
         return None
-    position, orientation = (
-        float(part.mean().clamp(min=0).sqrt()) for part in found.covariance.diagonal().split(3)
-    )
+    position, orientation = (float(part.mean().clamp(min=0).sqrt()) for part in found.covariance.diagonal().split(3))
     orientation = math.degrees(orientation)
     if anchor is None:
         return {"position": position, "orientation": orientation}
@@ -132,9 +133,7 @@ def _image(reading: Reading) -> bytes:
     width, height = reading.size or (0, 0)
     channels = RAW_CHANNELS[kind]
     if not content or len(content) != width * height * channels:
-        raise InputError(
-            f"{len(content)} bytes of {kind}", expected=f"size and width x height x {channels} bytes"
-        )
+        raise InputError(f"{len(content)} bytes of {kind}", expected=f"size and width x height x {channels} bytes")
     pixels = np.frombuffer(content, np.uint8).reshape(height, width, channels)
     return png_bytes(pixels[..., :3] if channels > 1 else pixels[..., 0])
 

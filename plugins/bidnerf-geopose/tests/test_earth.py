@@ -15,9 +15,7 @@ from bidnerf_geopose.wgs84 import Geodetic, geodetic
 places = st.builds(Geodetic, st.floats(-90, 90), st.floats(-179.99, 179.99), st.floats(-5000, 20000))
 TURNED = SE3.exp(torch.tensor([3.0, -2.0, 1.0, 0.4, -0.5, 0.6], dtype=torch.float64))
 ROWS = tuple(tuple(row) for row in TURNED.matrix().tolist())
-BUDAPEST = Anchor(
-    47.4734, 19.0598, 150.2, ROWS, metres_per_unit=2.0, position_sigma=0.3, orientation_sigma=0.4
-)
+BUDAPEST = Anchor(47.4734, 19.0598, 150.2, ROWS, metres_per_unit=2.0, position_sigma=0.3, orientation_sigma=0.4)
 
 
 def test_known_places() -> None:

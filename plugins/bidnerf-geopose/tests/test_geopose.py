@@ -26,9 +26,7 @@ from bidnerf_geopose.wgs84 import Geodetic
 
 TURNED = SE3.exp(torch.tensor([3.0, -2.0, 1.0, 0.4, -0.5, 0.6], dtype=torch.float64))
 ROWS = tuple(tuple(row) for row in TURNED.matrix().tolist())
-BUDAPEST = Anchor(
-    47.4734, 19.0598, 150.2, ROWS, metres_per_unit=2.0, position_sigma=0.3, orientation_sigma=0.4
-)
+BUDAPEST = Anchor(47.4734, 19.0598, 150.2, ROWS, metres_per_unit=2.0, position_sigma=0.3, orientation_sigma=0.4)
 COVARIANCE = torch.diag(torch.tensor([1e-4, 4e-4, 1e-4, 1e-6, 1e-6, 1e-6], dtype=torch.float64))
 POSE = SE3.exp(torch.tensor([1.0, 2.0, 3.0, 0.7, -0.2, 0.3], dtype=torch.float64))
 
@@ -43,9 +41,11 @@ def asked(anchor: Anchor | None, found: Localization, **more: Any) -> tuple[dict
     picture = io.BytesIO()
     Image.fromarray(np.zeros((24, 32, 3), np.uint8)).save(picture, "PNG")
     reading = {
-        "imageBytes": base64.b64encode(picture.getvalue()).decode(), "imageFormat": "PNG", "size": [32, 24],
+        "imageBytes": base64.b64encode(picture.getvalue()).decode(),
+        "imageFormat": "PNG",
+        "size": [32, 24],
         "params": {"model": "PINHOLE", "modelParams": [30, 30, 16, 12]},
-    }  # fmt: skip
+    }
     body = {"id": "7", "sensorReadings": {"cameraReadings": [reading | more.pop("reading", {})]}} | more
     uploads = []
 
@@ -79,9 +79,7 @@ def test_a_geopose_is_the_pose_and_its_accuracy_the_covariance() -> None:
 
 def test_a_camera_that_looks_east_is_not_rotated() -> None:
     """OGC 21-056r11: without a rotation, x points east, y north and z up."""
-    east = torch.tensor(
-        [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64
-    )  # R_enu_camera
+    east = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)  # R_enu_camera
     looking = replace(localization(), T_world_camera=SE3(east, torch.zeros(3, dtype=torch.float64)))
     body = asked(Anchor(47.0, 19.0, 100.0), looking)[0]
     assert [body["geopose"]["quaternion"][key] for key in "xyzw"] == pytest.approx([0, 0, 0, 1], abs=1e-9)
@@ -145,16 +143,19 @@ def test_requests_that_contradict_the_protocol_are_refused_with_the_part_that_is
             "quaternion": {"x": 0, "y": 0, "z": 0, "w": 1},
         }
     }
-    stretched = {
-        "geopose": {"position": {"lat": 1, "lon": 2, "h": 3}, "quaternion": {"x": 0, "y": 0, "z": 0, "w": 2}}
-    }
+    stretched = {"geopose": {"position": {"lat": 1, "lon": 2, "h": 3}, "quaternion": {"x": 0, "y": 0, "z": 0, "w": 2}}}
     endless = {"geopose": stretched["geopose"] | {"quaternion": dict.fromkeys("xyzw", 1.7e308)}}
     for wrong, part in (
-        ({"timestamp": "now"}, "timestamp"), ({"type": 1}, "type"), ({"sensors": [1]}, "sensors.0"),
-        ({"sensors": [{"id": 1}]}, "sensors.0.id"), ({"priorPoses": {}}, "priorPoses"), ({"priorPoses": [prior]}, "position.lon"),
-        ({"priorPoses": [stretched]}, "expected length 1, not 2"), ({"priorPoses": [endless]}, "expected length 1, not inf"),
+        ({"timestamp": "now"}, "timestamp"),
+        ({"type": 1}, "type"),
+        ({"sensors": [1]}, "sensors.0"),
+        ({"sensors": [{"id": 1}]}, "sensors.0.id"),
+        ({"priorPoses": {}}, "priorPoses"),
+        ({"priorPoses": [prior]}, "position.lon"),
+        ({"priorPoses": [stretched]}, "expected length 1, not 2"),
+        ({"priorPoses": [endless]}, "expected length 1, not inf"),
         ({"sensorReadings": {"cameraReadings": []}}, "cameraReadings"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(InputError, match=part):
             asked(None, localization(), **wrong)
     assert asked(None, localization(), timestamp=None, priorPoses=None)[0]["type"] == "localpose"

@@ -44,9 +44,7 @@ def read_checkpoint(path: Path, octaves: bool = True) -> Checkpoint:
     """
     found = read_saved(path, EXPECTED)
     if not isinstance(found, dict) or not isinstance(found.get(NETWORKS["coarse"]), dict):
-        raise InputError(
-            f"contains no {NETWORKS['coarse']!r}", where=path, expected="a nerf-pytorch checkpoint"
-        )
+        raise InputError(f"contains no {NETWORKS['coarse']!r}", where=path, expected="a nerf-pytorch checkpoint")
     if not isinstance(found.get(NETWORKS["fine"]), dict):
         raise InputError("has no fine network", where=path, expected="a coarse and a fine one")
     kinds: dict[str, NetworkConfig] = {}
@@ -55,9 +53,7 @@ def read_checkpoint(path: Path, octaves: bool = True) -> Checkpoint:
         kinds[level] = _architecture(found[key], octaves, f"{path}: {level} network")
         tensors |= {f"{level}.network.{name}": value.float() for name, value in found[key].items()}
     if kinds["coarse"] != kinds["fine"]:
-        raise InputError(
-            f"the networks differ ({kinds['coarse']}; {kinds['fine']})", where=path, expected="equal ones"
-        )
+        raise InputError(f"the networks differ ({kinds['coarse']}; {kinds['fine']})", where=path, expected="equal ones")
     steps = found.get("iter")
     return Checkpoint(kinds["fine"], tensors, steps + 1 if type(steps) is int and steps >= 0 else 0)
 
@@ -71,9 +67,7 @@ def _architecture(tensors: dict[str, Any], octaves: bool, where: str) -> Network
     skips = tuple(i for i, shape in enumerate(inputs, 1) if shape[-1:] == (width + seen,))
     frequencies = *_frequencies(seen, where), *_frequencies(turned, where)
     try:
-        network = NetworkConfig(
-            1 + len(inputs), width, skips, *frequencies, octaves, "fc_out.weight" not in shapes
-        )
+        network = NetworkConfig(1 + len(inputs), width, skips, *frequencies, octaves, "fc_out.weight" not in shapes)
     except InputError as error:
         raise InputError(f"unknown architecture, {error}", where=where) from error
     _check(tensors, shapes, Network(network), where)
@@ -86,18 +80,14 @@ def _is_hidden(name: str) -> bool:
 
 def _sizes(shape: tuple[int, ...] | None, where: str) -> tuple[int, int]:
     if shape is None or len(shape) != 2:
-        raise InputError(
-            "unknown architecture without 'layer1.weight'", where=where, expected="FlexibleNeRFModel"
-        )
+        raise InputError("unknown architecture without 'layer1.weight'", where=where, expected="FlexibleNeRFModel")
     return shape[0], shape[1]
 
 
 def _frequencies(width: int, where: str) -> tuple[int, bool]:
     """Return the number of frequencies of an encoding of length ``width``, and whether it includes the input itself."""
     if width < 3 or width % 3:
-        raise InputError(
-            f"unknown architecture, {width} inputs where a multiple of 3 was expected", where=where
-        )
+        raise InputError(f"unknown architecture, {width} inputs where a multiple of 3 was expected", where=where)
     return width // 6, width // 3 % 2 == 1
 
 

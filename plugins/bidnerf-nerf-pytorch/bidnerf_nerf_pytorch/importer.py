@@ -31,9 +31,7 @@ class ImportSettings(Settings):
     box: Box = (-1.5, -1.5, -1.5, 1.5, 1.5, 1.5)
     coarse_samples: Count = 64  # places on a ray at which the coarse network is evaluated
     fine_samples: Count = 64  # further places at which the fine network is evaluated
-    octaves: bool = (
-        True  # whether frequencies double (nerf-pytorch's log_sampling), which the weights do not reveal
-    )
+    octaves: bool = True  # whether frequencies double (nerf-pytorch's log_sampling), which the weights do not reveal
 
 
 @dataclass(frozen=True)
@@ -65,16 +63,16 @@ class NerfPytorchImporter:
         )
         found = read_checkpoint(path, config.octaves)
         settings = NerfPytorchConfig(
-            **asdict(found.network), coarse_samples=config.coarse_samples, fine_samples=config.fine_samples,
+            **asdict(found.network),
+            coarse_samples=config.coarse_samples,
+            fine_samples=config.fine_samples,
             steps=max(1, found.steps),
-        )  # fmt: skip
+        )
         field = NerfPytorchField(settings, bounds)
         field.load_state_dict(found.tensors)
         size = f"{settings.layers} layers of {settings.width}"
         facts = (f"coarse and fine network of {size}, {found.steps} steps",)
-        return ImportedField(
-            "nerf-pytorch", settings, dict(field.state_dict()), bounds, found=facts, steps=found.steps
-        )
+        return ImportedField("nerf-pytorch", settings, dict(field.state_dict()), bounds, found=facts, steps=found.steps)
 
 
 importer = NerfPytorchImporter()

@@ -73,9 +73,7 @@ class Network(nn.Module):
         return self.fc_alpha(hidden)[:, 0], self.fc_rgb(looked)
 
 
-def encoded(
-    points: Float[Tensor, "p 3"], frequencies: int, include_input: bool, octaves: bool
-) -> Float[Tensor, "p f"]:
+def encoded(points: Float[Tensor, "p 3"], frequencies: int, include_input: bool, octaves: bool) -> Float[Tensor, "p f"]:
     """Return ``(p, sin f1 p, cos f1 p, sin f2 p, ...)`` in nerf-pytorch's order: unlike in NeRF's eq. 4 there
     is no pi.
     """

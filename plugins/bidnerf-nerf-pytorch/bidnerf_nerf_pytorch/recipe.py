@@ -58,7 +58,5 @@ def _start_from(path: Path, field: NerfPytorchField) -> None:
     for each in fields(NetworkConfig):
         found, expected = getattr(checkpoint.network, each.name), getattr(field.config, each.name)
         if found != expected:
-            raise InputError(
-                f"its networks have {each.name} {found}, but the config says {expected}", where=path
-            )
+            raise InputError(f"its networks have {each.name} {found}, but the config says {expected}", where=path)
     field.load_state_dict(checkpoint.tensors)

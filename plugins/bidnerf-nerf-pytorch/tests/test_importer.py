@@ -27,9 +27,7 @@ def test_a_checkpoint_is_recognised_and_imported(write: Writer) -> None:
 
 def test_the_map_holds_the_networks_and_the_options(write: Writer) -> None:
     box = (-1.0, -2.0, -3.0, 1.0, 2.0, 3.5)
-    scene = import_map(
-        write(), config={"far": 9.0, "coarse_samples": 8, "fine_samples": 7, "box": box}, bake=False
-    )
+    scene = import_map(write(), config={"far": 9.0, "coarse_samples": 8, "fine_samples": 7, "box": box}, bake=False)
     assert (scene.info.step, scene.info.complete) == (100, True)
     assert scene.bounds == SceneBounds(box[:3], box[3:], 2.0, 9.0, (1.0, 1.0, 1.0))
     assert (scene.info.config["fine_samples"], scene.info.config["width"]) == (7, SMALL.width)

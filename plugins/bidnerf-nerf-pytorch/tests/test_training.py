@@ -20,9 +20,14 @@ def test_the_backend_is_found_by_name() -> None:
 def test_training_goes_on_from_a_checkpoint(write: Writer) -> None:
     path = write()
     config = NerfPytorchConfig(
-        **vars(SMALL), coarse_samples=8, fine_samples=4, steps=1, rays_per_step=16, learning_rate=0.0,
+        **vars(SMALL),
+        coarse_samples=8,
+        fine_samples=4,
+        steps=1,
+        rays_per_step=16,
+        learning_rate=0.0,
         checkpoint=str(path),
-    )  # fmt: skip
+    )
     field = backend.build(config, SCENE_BOUNDS)
     backend.train(field, rgb_views(), config, Silent())
     for name, value in read_checkpoint(path).tensors.items():

@@ -40,9 +40,7 @@ class ImportSettings(Settings):
 class NerfstudioImporter:
     """Reads runs of nerfacto, instant-ngp, vanilla-nerf and splatfacto."""
 
-    summary: str = (
-        "runs of nerfstudio (the folder with config.yml): nerfacto, instant-ngp, vanilla-nerf, splatfacto"
-    )
+    summary: str = "runs of nerfstudio (the folder with config.yml): nerfacto, instant-ngp, vanilla-nerf, splatfacto"
     config_type: type = ImportSettings
 
     def recognises(self, path: Path) -> bool:
@@ -63,19 +61,12 @@ class NerfstudioImporter:
         else:
             found = _networks(run, placed, config)
         photos = (
-            (data.parent if data.suffix == ".json" else data)
-            if data is not None and placement.is_identity
-            else None
+            (data.parent if data.suffix == ".json" else data) if data is not None and placement.is_identity else None
         )
         if data is not None and photos is None:
-            told = (
-                "its photos are ignored, since their poses are not in the world of the map (--scale,"
-                " --T-world-file)"
-            )
+            told = "its photos are ignored, since their poses are not in the world of the map (--scale, --T-world-file)"
         facts = (*found.found, frame, *([told] if told else []))
-        up = torch.tensor(placed.rotation, dtype=torch.float64).reshape(3, 3).mT @ torch.tensor(
-            UP, dtype=torch.float64
-        )
+        up = torch.tensor(placed.rotation, dtype=torch.float64).reshape(3, 3).mT @ torch.tensor(UP, dtype=torch.float64)
         return replace(found, found=facts, photos=photos, up=(float(up[0]), float(up[1]), float(up[2])))
 
 
@@ -84,9 +75,7 @@ def _data(run: Run, config: ImportSettings) -> tuple[Path | None, str]:
     if config.data:
         given = Path(config.data)
         if not given.exists():
-            raise InputError(
-                "no such file or folder", where=given, expected="the dataset of the run (--data)"
-            )
+            raise InputError("no such file or folder", where=given, expected="the dataset of the run (--data)")
         return given, ""
     named = run.data
     if named is None or not named.exists():
@@ -101,9 +90,7 @@ class Model:
 
     backend: str
     read: Callable[[Weights, Record, Record], models.Read]
-    reach: Callable[
-        [Record], tuple[float, float]
-    ]  # nearest and farthest distance of matter, in training units
+    reach: Callable[[Record], tuple[float, float]]  # nearest and farthest distance of matter, in training units
 
 
 def _planes(model: Record) -> tuple[float, float]:
@@ -156,18 +143,14 @@ def _bounds(
     """Return the bounds in the world: the box around that of the training, and its distance limits."""
     lower, upper = (torch.tensor(corner, dtype=torch.float64) for corner in (read.box[:3], read.box[3:]))
     if not bool((lower < upper).all()):
-        raise InputError(
-            f"the scene's box {read.box} is empty", where=run.checkpoint, expected="one with an extent"
-        )
+        raise InputError(f"the scene's box {read.box} is empty", where=run.checkpoint, expected="one with an extent")
     corners = torch.cartesian_prod(*torch.stack([lower, upper], dim=-1))
     world = inverse(placement.similarity).apply(corners)
     low, high = world.amin(0).tolist(), world.amax(0).tolist()
     named = run.model.text("background_color") if config.background == "run" else config.background
     colour = background_colour("white" if named == "white" else "black")
     near, far = (distance / placement.scale for distance in reach)
-    return SceneBounds(
-        (low[0], low[1], low[2]), (high[0], high[1], high[2]), near, far, colour, read.contracted
-    )
+    return SceneBounds((low[0], low[1], low[2]), (high[0], high[1], high[2]), near, far, colour, read.contracted)
 
 
 def _splats(run: Run, placement: Similarity) -> ImportedField:

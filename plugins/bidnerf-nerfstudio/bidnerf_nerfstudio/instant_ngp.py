@@ -120,9 +120,7 @@ class OccupiedSteps:
             borders = borders + 1
         distances = self._distance(torch.minimum((begin + borders).clamp(min=0), end))
         distances = torch.minimum(torch.maximum(distances, near[..., None]), far[..., None])
-        samples = RaySamples(
-            distances[..., :-1], distances[..., 1:], distances[..., 1:] > distances[..., :-1]
-        )
+        samples = RaySamples(distances[..., :-1], distances[..., 1:], distances[..., 1:] > distances[..., :-1])
         kept = samples.valid & self.grid.holds(rays.at(samples.middles))
         samples = RaySamples(samples.starts, samples.ends, kept & (rays.far > rays.near)[..., None])
         if not may_wait(near.device):
@@ -157,9 +155,7 @@ class NgpField(PlacedRadiance):
     @property
     def sampler(self) -> RaySampler:
         """The sampler of rays in the world."""
-        return PlacedSampler(
-            OccupiedSteps(self.grid, self.config.step, self.config.cone_angle), self.placement
-        )
+        return PlacedSampler(OccupiedSteps(self.grid, self.config.step, self.config.cone_angle), self.placement)
 
 
 def train(field: NgpField, views: Sequence[View], config: NgpConfig, report: Report) -> None:
@@ -180,7 +176,5 @@ backend = RecipeBackend(
     NgpConfig,
     NgpField,
     train,
-    NgpConfig(
-        encoding=HashConfig(8, 2, 15, 16, 256), grid_resolution=32, step=2 * math.sqrt(3) / 128, steps=800
-    ),
+    NgpConfig(encoding=HashConfig(8, 2, 15, 16, 256), grid_resolution=32, step=2 * math.sqrt(3) / 128, steps=800),
 )

@@ -37,20 +37,23 @@ def nerfacto(weights: Weights, model: Record, parser: Record) -> Read:
     for number in range(count):
         own = options[min(number, len(options) - 1)]
         base = Record(f"{model.where}: proposal_net_args_list", own if isinstance(own, dict) else {})
-        proposal, tensors = _proposal(
-            weights, 0 if same else number, int(base.number("base_res") or 16), number
-        )
+        proposal, tensors = _proposal(weights, 0 if same else number, int(base.number("base_res") or 16), number)
         proposals.append(proposal)
         state |= tensors
     samples = model.value("num_proposal_samples_per_ray")
     counts = tuple(int(each) for each in samples)[:count] if isinstance(samples, list | tuple) else (256, 96)
     uniform = model.text("proposal_initial_sampler") == "uniform"
     settings = NerfactoConfig(
-        **radiance, proposals=tuple(proposals), proposal_samples=counts,
-        samples=int(model.number("num_nerf_samples_per_ray") or 48), spacing="uniform" if uniform else "piecewise",
-    )  # fmt: skip
+        **radiance,
+        proposals=tuple(proposals),
+        proposal_samples=counts,
+        samples=int(model.number("num_nerf_samples_per_ray") or 48),
+        spacing="uniform" if uniform else "piecewise",
+    )
     contracted = not model.value("disable_scene_contraction")
-    told = f"{settings.encoding.levels} levels of 2^{settings.encoding.log2_table_size} entries, {count} proposal networks"
+    told = (
+        f"{settings.encoding.levels} levels of 2^{settings.encoding.log2_table_size} entries, {count} proposal networks"
+    )
     return Read(settings, state, box, contracted, told)
 
 
@@ -73,10 +76,14 @@ def _radiance(
         raise weights.error(f"'field.aabb' is {tuple(box.shape)}", expected="(2, 3)")
     corners = tuple(box.reshape(-1).tolist())
     settings = {
-        "encoding": encoding, "geometry_features": geometry, "colour_layers": len(head),
-        "colour_width": weights.shape(f"{head[0]}weight", 2)[0], "appearance": len(code), "box": corners,
+        "encoding": encoding,
+        "geometry_features": geometry,
+        "colour_layers": len(head),
+        "colour_width": weights.shape(f"{head[0]}weight", 2)[0],
+        "appearance": len(code),
+        "box": corners,
         "initial_density": model.number("average_init_density") or 1.0,
-    }  # fmt: skip
+    }
     return settings, weights.renamed(names) | {"radiance.appearance": code}, corners
 
 
@@ -110,9 +117,12 @@ def instant_ngp(weights: Weights, model: Record, parser: Record) -> Read:
     side = [high - low for low, high in zip(box[:3], box[3:], strict=True)]
     step = model.number("render_step_size") or sum(s * s for s in side) ** 0.5 / 1000
     settings = NgpConfig(
-        **radiance, grid_levels=cells.shape[0], grid_resolution=cells.shape[1], step=step,
+        **radiance,
+        grid_levels=cells.shape[0],
+        grid_resolution=cells.shape[1],
+        step=step,
         cone_angle=model.number("cone_angle") or 0.0,
-    )  # fmt: skip
+    )
     state |= {"grid.cells": cells.bool(), "grid.peak": torch.zeros_like(cells)}
     share = float(cells.bool().float().mean())
     told = f"{share:.1%} of {cells.shape[0]} x {cells.shape[1]}^3 cells are occupied"
@@ -128,21 +138,18 @@ def vanilla(weights: Weights, model: Record, parser: Record) -> Read:
         begin = f"{ours}.network."
         names |= layer_names(f"{begin}base.", weights.layers(f"{theirs}.mlp_base."))
         names |= layer_names(f"{begin}head.", weights.layers(f"{theirs}.mlp_head."))
-        names |= {
-            f"{begin}density.{part}": f"{theirs}.field_output_density.net.{part}"
-            for part in ("weight", "bias")
-        }
-        names |= {
-            f"{begin}colour.{part}": f"{theirs}.field_heads.0.net.{part}" for part in ("weight", "bias")
-        }
+        names |= {f"{begin}density.{part}": f"{theirs}.field_output_density.net.{part}" for part in ("weight", "bias")}
+        names |= {f"{begin}colour.{part}": f"{theirs}.field_heads.0.net.{part}" for part in ("weight", "bias")}
     state = weights.renamed(names)
     base, head = weights.layers("field_fine.mlp_base."), weights.layers("field_fine.mlp_head.")
     settings = VanillaConfig(
-        width=weights.shape(f"{base[0]}weight", 2)[0], layers=len(base),
-        colour_width=weights.shape(f"{head[0]}weight", 2)[0], colour_layers=len(head),
+        width=weights.shape(f"{base[0]}weight", 2)[0],
+        layers=len(base),
+        colour_width=weights.shape(f"{head[0]}weight", 2)[0],
+        colour_layers=len(head),
         coarse_samples=int(model.number("num_coarse_samples") or 64),
         fine_samples=int(model.number("num_importance_samples") or 128) + 1,
-    )  # fmt: skip
+    )
     for ours in ("coarse", "fine"):
         for layer, count in (
             ("base.layers.0", POSITION),

@@ -123,7 +123,10 @@ backend = RecipeBackend(
     NerfactoField,
     train,
     NerfactoConfig(
-        encoding=HashConfig(8, 2, 15, 16, 256), proposals=tuple(HashConfig(4, 2, 13, 16, n, 16) for n in (64, 128)),
-        proposal_samples=(64, 32), samples=24, steps=800,
+        encoding=HashConfig(8, 2, 15, 16, 256),
+        proposals=tuple(HashConfig(4, 2, 13, 16, n, 16) for n in (64, 128)),
+        proposal_samples=(64, 32),
+        samples=24,
+        steps=800,
     ),
-)  # fmt: skip
+)

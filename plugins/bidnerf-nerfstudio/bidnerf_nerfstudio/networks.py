@@ -68,9 +68,7 @@ class HashEncoding(nn.Module):
         lower = scaled.detach().floor()
         x, y, z = (scaled - lower).unbind(-1)
         corner = lower.long()
-        a, b, c = (
-            torch.stack([corner[:, axis], corner[:, axis] + 1]) * prime for axis, prime in enumerate(PRIMES)
-        )
+        a, b, c = (torch.stack([corner[:, axis], corner[:, axis] + 1]) * prime for axis, prime in enumerate(PRIMES))
         places = (a[:, None, None] ^ b[None, :, None] ^ c[None, None]) & (self.size - 1)
         entries = self.table.index_select(0, places.reshape(-1) + number * self.size)
         found = entries.reshape(2, 2, 2, len(points), entries.shape[-1])
@@ -87,8 +85,7 @@ class Perceptron(nn.Module):
         self.skip = skip  # index of the layer that receives the input again
         widths = [inputs, *[width] * (layers - 1), outputs]
         self.layers = nn.ModuleList(
-            nn.Linear(a + (inputs if number == skip else 0), b)
-            for number, (a, b) in enumerate(pairwise(widths))
+            nn.Linear(a + (inputs if number == skip else 0), b) for number, (a, b) in enumerate(pairwise(widths))
         )
 
     def forward(self, given: Float[Tensor, "n i"]) -> Float[Tensor, "n o"]:
@@ -117,9 +114,7 @@ class HashNetwork(nn.Module):
         return found
 
 
-def unit_cube(
-    positions: Float[Tensor, "p 3"], box: SceneBounds
-) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p"]]:
+def unit_cube(positions: Float[Tensor, "p 3"], box: SceneBounds) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p"]]:
     """Return positions (training coordinates) in [0, 1], 0 if outside, and a mask that is 1 inside and 0 outside.
 
     In a contracted scene, all space within a cube around the origin fills the inner half of each axis,

@@ -34,18 +34,14 @@ class Placement:
             x, y, z = bounds.centre
             return Placement(scale, (1, 0, 0, 0, 1, 0, 0, 0, 1), (-scale * x, -scale * y, -scale * z))
         if len(numbers) != 13:
-            raise InputError(
-                f"placement has {len(numbers)} numbers", expected="a scale, 9 of a rotation, 3 of a shift"
-            )
+            raise InputError(f"placement has {len(numbers)} numbers", expected="a scale, 9 of a rotation, 3 of a shift")
         return Placement(numbers[0], numbers[1:10], numbers[10:])
 
     @staticmethod
     def from_similarity(world_to_trained: Similarity) -> Placement:
         """Return the placement of a similarity transform from the world to training coordinates."""
         T = world_to_trained.T_target_source.to(dtype=torch.float64)
-        return Placement(
-            world_to_trained.scale, tuple(T.rotation.reshape(-1).tolist()), tuple(T.translation.tolist())
-        )
+        return Placement(world_to_trained.scale, tuple(T.rotation.reshape(-1).tolist()), tuple(T.translation.tolist()))
 
     @property
     def numbers(self) -> tuple[float, ...]:
@@ -69,9 +65,11 @@ class Placement:
     def rays(self, rays: Rays) -> Rays:
         """Return rays of the world in training coordinates."""
         return Rays(
-            self.points(rays.origins), self.directions(rays.directions), self.scale * rays.near,
+            self.points(rays.origins),
+            self.directions(rays.directions),
+            self.scale * rays.near,
             self.scale * rays.far,
-        )  # fmt: skip
+        )
 
     def samples(self, samples: RaySamples) -> RaySamples:
         """Convert samples of rays from training coordinates to the world."""

@@ -81,9 +81,7 @@ class Run:
         parts = self.config.value("relative_model_dir")
         named = isinstance(parts, list) and bool(parts) and all(isinstance(part, str) for part in parts)
         folder = self.folder.joinpath(*parts) if named else self.folder / "nerfstudio_models"
-        found = [
-            (int(match[1]), path) for path in folder.glob("*.ckpt") if (match := STEP.fullmatch(path.name))
-        ]
+        found = [(int(match[1]), path) for path in folder.glob("*.ckpt") if (match := STEP.fullmatch(path.name))]
         if not found:
             raise InputError("no step-*.ckpt", where=folder, expected="the checkpoint of a training run")
         return max(found)[1]
@@ -93,9 +91,7 @@ class Run:
         found = read_saved(self.checkpoint, EXPECTED)
         tensors = found.get("pipeline") if isinstance(found, dict) else None
         if not isinstance(tensors, dict):
-            raise InputError(
-                "contains no 'pipeline'", where=self.checkpoint, expected="a nerfstudio checkpoint"
-            )
+            raise InputError("contains no 'pipeline'", where=self.checkpoint, expected="a nerfstudio checkpoint")
         named = {
             name.removeprefix("module.").removeprefix(PREFIX): value
             for name, value in tensors.items()

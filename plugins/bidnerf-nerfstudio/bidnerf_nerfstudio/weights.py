@@ -74,9 +74,7 @@ class Weights:
         rows, features = self.shape(table, 2)
         levels, log2 = self.number(f"{field}num_levels"), self.number(f"{field}log2_hashmap_size")
         if not (1 <= levels <= 64 and 1 <= log2 <= 30 and rows == levels * 2**log2):
-            raise self.error(
-                f"{table!r} has {rows:,} rows", expected=f"{levels} tables of 2 to the power of {log2}"
-            )
+            raise self.error(f"{table!r} has {rows:,} rows", expected=f"{levels} tables of 2 to the power of {log2}")
         width = self.shape(f"{layers[0]}weight", 2)[0] if len(layers) > 1 else 1
         return HashConfig(levels, features, log2, base, self.number(f"{field}max_res"), width, len(layers))
 

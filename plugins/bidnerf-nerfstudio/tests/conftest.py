@@ -26,14 +26,10 @@ def run_of(tmp_path: Path) -> RunOf:
         shutil.copytree(RUNS / method, folder)
         if not (folder / "nerfstudio_models").exists():
             known = json.loads((folder / "tensors.json").read_text())
-            tensors = drawn(known["drawn"]) | {
-                name: torch.tensor(value) for name, value in known["others"].items()
-            }
+            tensors = drawn(known["drawn"]) | {name: torch.tensor(value) for name, value in known["others"].items()}
             (folder / "nerfstudio_models").mkdir()
             pipeline = {PREFIX + name: value for name, value in tensors.items()}
-            torch.save(
-                {"step": 9, "pipeline": pipeline}, folder / "nerfstudio_models" / "step-000000009.ckpt"
-            )
+            torch.save({"step": 9, "pipeline": pipeline}, folder / "nerfstudio_models" / "step-000000009.ckpt")
         return folder
 
     return copied

@@ -108,9 +108,7 @@ def at_points(field: Any) -> dict[str, Tensor]:
     directions = torch.nn.functional.normalize(torch.randn((POINTS, 3), generator=generator), dim=-1)
     none = torch.zeros(POINTS, 1)
     frustums = Frustums(points, directions, none, none, none + 1)
-    values = {
-        kind.value: value for kind, value in field(RaySamples(frustums, camera_indices=none.long())).items()
-    }
+    values = {kind.value: value for kind, value in field(RaySamples(frustums, camera_indices=none.long())).items()}
     return {
         "points": points,
         "directions": directions,
@@ -127,30 +125,23 @@ def with_drawn_weights(method: str, folder: Path, box: float, **changes: Any) ->
     (folder / method).mkdir(parents=True, exist_ok=True)
     (folder / method / "config.yml").write_text(yaml.dump(config))
     aabb = torch.tensor([[-box] * 3, [box] * 3])
-    model = config.pipeline.model.setup(
-        scene_box=SceneBox(aabb), num_train_data=3, metadata={}, device="cpu"
-    ).eval()
+    model = config.pipeline.model.setup(scene_box=SceneBox(aabb), num_train_data=3, metadata={}, device="cpu").eval()
     state = model.state_dict()
     kept = ("layers", "hash_table", "embedding", "net", "binaries")
     shapes = {
         name: tuple(value.shape)
         for name, value in state.items()
-        if any(part in name for part in kept)
-        and not name.startswith("sampler.")  # which has the grid a second time
+        if any(part in name for part in kept) and not name.startswith("sampler.")  # which has the grid a second time
     }
     weights = drawn(shapes)
     model.load_state_dict({name: weights.get(name, value) for name, value in state.items()})
-    others = {
-        n: v.tolist() for n, v in state.items() if n not in shapes and v.numel() < 7 and "lpips" not in n
-    }
+    others = {n: v.tolist() for n, v in state.items() if n not in shapes and v.numel() < 7 and "lpips" not in n}
     (folder / method / "tensors.json").write_text(json.dumps({"drawn": shapes, "others": others}, indent=1))
     return model, weights
 
 
 def vanilla(folder: Path) -> None:
-    model, _ = with_drawn_weights(
-        "vanilla-nerf", folder, 1.0, num_coarse_samples=16, num_importance_samples=24
-    )
+    model, _ = with_drawn_weights("vanilla-nerf", folder, 1.0, num_coarse_samples=16, num_importance_samples=24)
     found = at_points(model.field_fine)
     generator = torch.Generator().manual_seed(1)
     directions = torch.nn.functional.normalize(torch.randn((64, 3), generator=generator), dim=-1)

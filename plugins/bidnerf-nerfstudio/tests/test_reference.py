@@ -61,9 +61,7 @@ def test_densities_and_colours_at_points(run_of: RunOf, method: str) -> None:
 def test_proposal_networks(run_of: RunOf) -> None:
     expected, field = reference("nerfacto"), imported(run_of("nerfacto")).field
     for number, network in enumerate(field.proposals):  # type: ignore[attr-defined]
-        assert torch.allclose(
-            network(expected["points"]), expected[f"proposal{number}"], rtol=1e-4, atol=1e-6
-        )
+        assert torch.allclose(network(expected["points"]), expected[f"proposal{number}"], rtol=1e-4, atol=1e-6)
 
 
 def test_an_image_from_a_pose_of_the_dataset(run_of: RunOf) -> None:

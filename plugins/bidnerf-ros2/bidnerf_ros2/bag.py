@@ -88,9 +88,7 @@ class Bag:
     def _is_complete(self, time: float, depths: deque[tuple[float, Any]]) -> bool:
         return self._topics.depth is None or any(other >= time for other, _ in depths)
 
-    def _with_depth(
-        self, time: float, image: Any, depths: deque[tuple[float, Any]]
-    ) -> tuple[Any, Any | None]:
+    def _with_depth(self, time: float, image: Any, depths: deque[tuple[float, Any]]) -> tuple[Any, Any | None]:
         nearest = min(depths, key=lambda depth: abs(depth[0] - time), default=None)
         # The times of an image and its depth may always differ by 20 ms.
         close = nearest is not None and abs(nearest[0] - time) <= max(0.02, self._topics.interval / 2)
@@ -114,9 +112,7 @@ class BagShot(Shot):
     bag: Bag
     number: int
 
-    def frame(
-        self, background: tuple[float, float, float] = (0.0, 0.0, 0.0), side: int | None = None
-    ) -> Frame:
+    def frame(self, background: tuple[float, float, float] = (0.0, 0.0, 0.0), side: int | None = None) -> Frame:
         """Decode the image and its depth."""
         image, depth = self.bag.read(self.number)
         found = frame_of(image, self.camera, depth, self.name)
@@ -192,9 +188,7 @@ def _topics(path: Path) -> Topics:
                 elif connection.msgtype == INFO and connection.msgcount:
                     infos.add(connection.topic)
     except (AnyReaderError, OSError, ValueError, KeyError) as error:
-        raise InputError(
-            f"not a readable bag ({error})", where=path, expected=BagReader().expected
-        ) from error
+        raise InputError(f"not a readable bag ({error})", where=path, expected=BagReader().expected) from error
     first = {topic: _first(path, topic) for topic in (*counts, *infos)}
     colour = [t for t in counts if not is_depth(first[t]) and _info_beside(t, infos) in infos]
     if not colour:
@@ -209,9 +203,7 @@ def _topics(path: Path) -> Topics:
     camera = intrinsics(first[info], rectified="rect" in image.rpartition("/")[2])
     depths = [t for t in counts if is_depth(first[t]) and _fits(first[t], camera)]
     depth = max(depths, key=lambda topic: counts[topic], default=None)
-    return Topics(
-        image, info, depth, camera, counts[image], span / max(counts[image], counts[depth]) if depth else 0.0
-    )
+    return Topics(image, info, depth, camera, counts[image], span / max(counts[image], counts[depth]) if depth else 0.0)
 
 
 def _info_beside(image: str, infos: set[str]) -> str:

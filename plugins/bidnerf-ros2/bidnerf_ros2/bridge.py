@@ -39,9 +39,7 @@ class _Recorded:
 
     def __call__(self, frame: Frame, start: SE3 | None = None) -> Localization:
         stamp = self.stamps.pop(frame.name)
-        found = (
-            self._localizer(frame, start) if self._tracker is None else self._tracker(frame, seconds(stamp))
-        )
+        found = self._localizer(frame, start) if self._tracker is None else self._tracker(frame, seconds(stamp))
         self.answers.put(Estimate(stamp, found))
         return found
 

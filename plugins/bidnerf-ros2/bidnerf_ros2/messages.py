@@ -53,9 +53,14 @@ def intrinsics(info: Any, rectified: bool = False) -> Intrinsics:
     bin_x, bin_y, roi = info.binning_x or 1, info.binning_y or 1, info.roi
     width, height = roi.width or info.width, roi.height or info.height
     return Intrinsics(
-        fx / bin_x, fy / bin_y, (cx + 0.5 - roi.x_offset) / bin_x, (cy + 0.5 - roi.y_offset) / bin_y,
-        int(width) // bin_x, int(height) // bin_y, lens,
-    )  # fmt: skip
+        fx / bin_x,
+        fy / bin_y,
+        (cx + 0.5 - roi.x_offset) / bin_x,
+        (cy + 0.5 - roi.y_offset) / bin_y,
+        int(width) // bin_x,
+        int(height) // bin_y,
+        lens,
+    )
 
 
 def _values(info: Any, name: str) -> list[float]:

@@ -58,9 +58,7 @@ def make_node() -> Any:
 
         def __init__(self) -> None:
             super().__init__("bidnerf")
-            self.options = {
-                name: self.declare_parameter(name, value).value for name, value in PARAMETERS.items()
-            }
+            self.options = {name: self.declare_parameter(name, value).value for name, value in PARAMETERS.items()}
             if not self.options["map"]:
                 raise InputError("parameter map is empty", expected="the folder of a map")
             self.bridge = Bridge(Localizer(load_map(self.options["map"])), bool(self.options["odom_frame"]))
@@ -91,9 +89,7 @@ def make_node() -> Any:
             self.optical_frame = image.header.frame_id
             T_odom_camera = None
             if self.bridge.has_odometry:
-                T_odom_camera = self.transform(
-                    self.options["odom_frame"], self.optical_frame, image.header.stamp
-                )
+                T_odom_camera = self.transform(self.options["odom_frame"], self.optical_frame, image.header.stamp)
                 if T_odom_camera is None:
                     return
             try:
@@ -107,9 +103,7 @@ def make_node() -> Any:
                 wait = rclpy.duration.Duration(seconds=0.0)
                 return transform_of(self.buffer.lookup_transform(target, source, stamp, wait).transform)
             except tf2_ros.TransformException as error:
-                self.get_logger().warning(
-                    f"no transform from {source} to {target}: {error}", throttle_duration_sec=5.0
-                )
+                self.get_logger().warning(f"no transform from {source} to {target}: {error}", throttle_duration_sec=5.0)
                 return None
 
         def on_timer(self) -> None:

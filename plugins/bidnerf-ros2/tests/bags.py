@@ -41,14 +41,10 @@ def compressed(store: Any, time: float, pixels: np.ndarray) -> Any:
     content = io.BytesIO()
     Image.fromarray(pixels).save(content, "PNG")
     data = np.frombuffer(content.getvalue(), np.uint8)
-    return store.types["sensor_msgs/msg/CompressedImage"](
-        header(store, time), "rgb8; png compressed rgb8", data
-    )
+    return store.types["sensor_msgs/msg/CompressedImage"](header(store, time), "rgb8; png compressed rgb8", data)
 
 
-def camera_info(
-    store: Any, time: float, fx: float, fy: float, cx: float, cy: float, width: int, height: int
-) -> Any:
+def camera_info(store: Any, time: float, fx: float, fy: float, cx: float, cy: float, width: int, height: int) -> Any:
     """Return a camera info; the principal point is that of ROS, from the centre of the first pixel."""
     k = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1], float)
     p = np.array([fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0], float)
@@ -78,13 +74,9 @@ def write(
         for time, colour, depth in moments:
             height, width = colour.shape[:2]
             parts = [("/camera/camera_info", camera_info(store, time, *camera, width, height), time)]
-            parts.append(
-                ("/camera/image_raw", image(store, time, colour[..., ::-1], "bgr8", padding=2), time)
-            )
+            parts.append(("/camera/image_raw", image(store, time, colour[..., ::-1], "bgr8", padding=2), time))
             if depth is not None:
-                parts.append(
-                    ("/camera/depth/image_raw", image(store, time + late, depth, "16UC1"), time + late)
-                )
+                parts.append(("/camera/depth/image_raw", image(store, time + late, depth, "16UC1"), time + late))
             for topic, message, at in parts:
                 bag.write(topics[topic], round(at * 1e9), serialize(message, message.__msgtype__))
     return path

@@ -50,9 +50,7 @@ def test_a_single_file_of_a_bag_is_one(tmp_path: Path) -> None:
 
 
 def test_depth_that_was_not_recorded_is_missing(tmp_path: Path) -> None:
-    some = [
-        (time, colour, depth if number % 2 else None) for number, (time, colour, depth) in enumerate(MOMENTS)
-    ]
+    some = [(time, colour, depth if number % 2 else None) for number, (time, colour, depth) in enumerate(MOMENTS)]
     found = list(open_sequence(bags.write(tmp_path / "b", some, CAMERA, late=0.001)))
     assert [timed.frame.depth is not None for timed in found] == [depth is not None for *_, depth in some]
     none = [(time, colour, None) for time, colour, _ in MOMENTS]
@@ -79,12 +77,13 @@ def test_images_of_all_encodings() -> None:
     assert depth is not None
     alpha = np.dstack([colour, np.full((24, 32, 1), 9, np.uint8)])
     for encoding, pixels in (
-        ("rgb8", colour), ("bgr8", colour[..., ::-1]), ("rgba8", alpha), ("bgra8", alpha[..., [2, 1, 0, 3]])
-    ):  # fmt: skip
+        ("rgb8", colour),
+        ("bgr8", colour[..., ::-1]),
+        ("rgba8", alpha),
+        ("bgra8", alpha[..., [2, 1, 0, 3]]),
+    ):
         for padding in (0, 7):
-            assert np.array_equal(
-                colour_image(bags.image(bags.ROS2, 0, pixels, encoding, padding)), colour
-            ), encoding
+            assert np.array_equal(colour_image(bags.image(bags.ROS2, 0, pixels, encoding, padding)), colour), encoding
     assert np.array_equal(colour_image(bags.image(bags.ROS2, 0, colour[..., 0], "mono8")), colour[..., 0])
     assert np.array_equal(colour_image(bags.compressed(bags.ROS2, 0, colour)), colour)
     metres = (depth / 1000).astype(np.float32)

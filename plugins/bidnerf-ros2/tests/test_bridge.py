@@ -21,9 +21,7 @@ POSE = SE3.exp(torch.tensor([0.1, 0.2, 0.3, 0.4, -0.5, 0.6], dtype=torch.float64
 COVARIANCE = torch.diag(torch.tensor([1e-4] * 3 + [1e-6] * 3, dtype=torch.float64))
 
 
-def answer(
-    outcome: Outcome = Outcome.CONVERGED, covariance: torch.Tensor | None = COVARIANCE
-) -> Localization:
+def answer(outcome: Outcome = Outcome.CONVERGED, covariance: torch.Tensor | None = COVARIANCE) -> Localization:
     losses = torch.zeros(1, dtype=torch.float64)
     return Localization(POSE, outcome, "because", 1, 0.1, 0.0, "auto", SE3.stack([POSE]), losses, covariance)
 
@@ -44,9 +42,10 @@ class Standing:
 def messages(stamp: float = 1.0) -> tuple[Any, Any, Any]:
     colour, depth = np.zeros((24, 32, 3), np.uint8), np.full((24, 32), 1500, np.uint16)
     return (
-        bags.image(bags.ROS2, stamp, colour, "rgb8"), bags.camera_info(bags.ROS2, stamp, 30, 30, 15.5, 11.5, 32, 24),
+        bags.image(bags.ROS2, stamp, colour, "rgb8"),
+        bags.camera_info(bags.ROS2, stamp, 30, 30, 15.5, 11.5, 32, 24),
         bags.image(bags.ROS2, stamp, depth, "16UC1"),
-    )  # fmt: skip
+    )
 
 
 def waited(bridge: Bridge) -> list[Estimate]:
@@ -76,9 +75,7 @@ def test_poses_have_the_covariance_of_their_frame() -> None:
     message = SimpleNamespace(pose=pose, covariance=None)
     fill_pose(message, answer())
     assert torch.allclose(transform_of(pose).matrix(), POSE.matrix())
-    assert np.reshape(message.covariance, (6, 6)) == pytest.approx(
-        COVARIANCE.numpy()
-    )  # the same along all axes
+    assert np.reshape(message.covariance, (6, 6)) == pytest.approx(COVARIANCE.numpy())  # the same along all axes
     T_camera_base = SE3.exp(torch.tensor([0.0, 0.0, -2.0, 0, 0, 0], dtype=torch.float64))
     fill_pose(message, answer(), T_camera_base)
     assert np.trace(np.reshape(message.covariance, (6, 6))[:3, :3]) == pytest.approx(3e-4 + 2 * 2.0**2 * 1e-6)
@@ -146,19 +143,24 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         )
     )
     parts: dict[str, dict[str, Any]] = {
-        "rclpy": {}, "rclpy.duration": {"Duration": Anything}, "rclpy.node": {"Node": FakeNode},
+        "rclpy": {},
+        "rclpy.duration": {"Duration": Anything},
+        "rclpy.node": {"Node": FakeNode},
         "rclpy.qos": {"qos_profile_sensor_data": None},
         "message_filters": {"Subscriber": Anything, "ApproximateTimeSynchronizer": Anything},
         "tf2_ros": {
-            "Buffer": lambda: SimpleNamespace(lookup_transform=lambda *_: T_odom_camera), "TransformListener": Anything,
+            "Buffer": lambda: SimpleNamespace(lookup_transform=lambda *_: T_odom_camera),
+            "TransformListener": Anything,
             "TransformBroadcaster": lambda _: SimpleNamespace(sendTransform=sent.append),
             "TransformException": TransformException,
         },
-        "diagnostic_msgs": {}, "geometry_msgs": {}, "sensor_msgs": {},
+        "diagnostic_msgs": {},
+        "geometry_msgs": {},
+        "sensor_msgs": {},
         "diagnostic_msgs.msg": dict.fromkeys(("DiagnosticArray", "DiagnosticStatus", "KeyValue"), Anything),
         "geometry_msgs.msg": dict.fromkeys(("PoseWithCovarianceStamped", "TransformStamped"), Anything),
         "sensor_msgs.msg": dict.fromkeys(("CameraInfo", "Image"), Anything),
-    }  # fmt: skip
+    }
     for name, values in parts.items():
         module = ModuleType(name)
         vars(module).update(values)

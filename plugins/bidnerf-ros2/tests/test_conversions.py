@@ -27,9 +27,7 @@ def rotations(count: int = 200) -> np.ndarray:
     axes = drawn.normal(size=(50, 3))
     turns = np.pi * axes / np.linalg.norm(axes, axis=1, keepdims=True)
     turns = np.concatenate([turns, np.pi * np.eye(3), np.zeros((1, 3)), 1e-9 * axes])
-    return np.concatenate(
-        [Rotation.random(count, rng=drawn).as_matrix(), Rotation.from_rotvec(turns).as_matrix()]
-    )
+    return np.concatenate([Rotation.random(count, rng=drawn).as_matrix(), Rotation.from_rotvec(turns).as_matrix()])
 
 
 def poses(seed: int = 0) -> SE3:
@@ -41,9 +39,7 @@ def test_quaternions_are_those_of_scipy_in_the_order_of_ros() -> None:
         message = SimpleNamespace(translation=SimpleNamespace(), rotation=SimpleNamespace())
         fill(message, SE3(torch.from_numpy(matrix), torch.zeros(3, dtype=torch.float64)))
         found = message.rotation
-        assert Rotation.from_quat([found.x, found.y, found.z, found.w]).as_matrix() == pytest.approx(
-            matrix, abs=1e-9
-        )
+        assert Rotation.from_quat([found.x, found.y, found.z, found.w]).as_matrix() == pytest.approx(matrix, abs=1e-9)
         assert transform_of(message).rotation.numpy() == pytest.approx(matrix, abs=1e-9)
 
 

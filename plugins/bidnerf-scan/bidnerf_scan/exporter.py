@@ -44,9 +44,7 @@ def export_obj(scene: Map, out: Path) -> list[Path]:
 
 def _mesh(scene: Map) -> Mesh:
     if scene.surface is None:
-        raise InputError(
-            "has no surface, from which a mesh could be made; 'bidnerf bake' adds one", where=scene.name
-        )
+        raise InputError("has no surface, from which a mesh could be made; 'bidnerf bake' adds one", where=scene.name)
     return mesh_of_surface(scene.surface)
 
 

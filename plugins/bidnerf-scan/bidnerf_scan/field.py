@@ -111,8 +111,7 @@ class ScanField(PieceField):
     ) -> Crossings:
         """Return where lines cross the planes of the pieces with indices ``index`` (Moeller and Trumbore 1997)."""
         corner, first, second, logits, is_round = (
-            part.index_select(0, index)
-            for part in (self.corner, self.first, self.second, self.logits, self.is_round)
+            part.index_select(0, index) for part in (self.corner, self.first, self.second, self.logits, self.is_round)
         )
         normal = torch.linalg.cross(first, second)
         area = torch.linalg.vector_norm(normal, dim=-1).clamp(min=1e-30)

@@ -72,15 +72,17 @@ class ScanImporter:
         found = format_of(path)
         if found is None:
             raise InputError("not a readable mesh or point cloud", where=path, expected=self.summary)
-        return imported(
-            found.read(path), str(path), config, placement, found, cameras_beside(path, placement)
-        )
+        return imported(found.read(path), str(path), config, placement, found, cameras_beside(path, placement))
 
 
 def imported(
-    scan: Scan, where: str, config: ScanSettings = ScanSettings(), placement: Similarity = UNMOVED,
-    of: Format | None = None, cameras: tuple[StoredCamera, ...] = (),
-) -> ImportedField:  # fmt: skip
+    scan: Scan,
+    where: str,
+    config: ScanSettings = ScanSettings(),
+    placement: Similarity = UNMOVED,
+    of: Format | None = None,
+    cameras: tuple[StoredCamera, ...] = (),
+) -> ImportedField:
     """Build a field from a scan of any source. Raises ``InputError`` if nothing in it can be rendered."""
     kept, dropped = cleaned(scan, where)
     points = placement.apply(torch.from_numpy(kept.points - np.array(config.origin)).double())
@@ -122,11 +124,19 @@ def imported(
     )
     up = placement.T_target_source.rotation.double() @ torch.tensor(UPS[axis], dtype=torch.float64)
     return ImportedField(
-        "scan", settings, dict(field.state_dict()), bounds, found=tuple(facts), steps=settings.steps, points=matter,
+        "scan",
+        settings,
+        dict(field.state_dict()),
+        bounds,
+        found=tuple(facts),
+        steps=settings.steps,
+        points=matter,
         up=(float(up[0]), float(up[1]), float(up[2])),
         surface=(matter, torch.full_like(matter, GREY) if colours is None else colours),
-        is_coloured=scan.has_colours, is_solid=solid, cameras=cameras,
-    )  # fmt: skip
+        is_coloured=scan.has_colours,
+        is_solid=solid,
+        cameras=cameras,
+    )
 
 
 @torch.no_grad()
@@ -170,9 +180,7 @@ def _counts(scan: Scan) -> str:
 def _check_precision(points: Float[Tensor, "n 3"], where: str, config: ScanSettings) -> None:
     """Raise ``InputError`` for coordinates so large that single precision does not resolve the scene."""
     middle = points.median(0).values
-    side = (
-        float((points.quantile(0.9, dim=0) - points.quantile(0.1, dim=0)).max()) if len(points) < 2**24 else 0
-    )
+    side = float((points.quantile(0.9, dim=0) - points.quantile(0.1, dim=0)).max()) if len(points) < 2**24 else 0
     side = side or float((points.amax(0) - points.amin(0)).max())
     # A coordinate in single precision is rounded relatively by less than this, with some margin. Where that is
     # too coarse for the scene's longest side, the scan must be moved to the origin.
@@ -180,8 +188,7 @@ def _check_precision(points: Float[Tensor, "n 3"], where: str, config: ScanSetti
     if rounding > 2e-4 * side:
         x, y, z = (round(o + float(m)) for o, m in zip(config.origin, middle, strict=True))
         raise InputError(
-            f"its coordinates are around ({x}, {y}, {z}), which single precision resolves only to"
-            f" {rounding:.2g};",
+            f"its coordinates are around ({x}, {y}, {z}), which single precision resolves only to {rounding:.2g};",
             where=where,
             expected=f"a scan near the origin (--origin {x} {y} {z} makes that place the origin)",
         )
@@ -206,9 +213,7 @@ def surface_places(
     return piece, torch.where(u + v > 1, 1 - u, u), torch.where(u + v > 1, 1 - v, v)
 
 
-def _bounds(
-    points: Float[Tensor, "n 3"], background: tuple[float, float, float], footprint: float
-) -> SceneBounds:
+def _bounds(points: Float[Tensor, "n 3"], background: tuple[float, float, float], footprint: float) -> SceneBounds:
     """Return bounds that contain all points, unless a few of them are far away."""
     found = bounds_about(points, background, footprint)
     lower, upper = points.amin(0).double(), points.amax(0).double()

@@ -80,9 +80,7 @@ class SignedDistance:
         """Prepare the distance from a surface on the CPU."""
         surfels = surface.surfels
         if len(surfels) <= NEIGHBOURS:
-            raise InputError(
-                f"a surface of {len(surfels)} surfels", expected="more from which to make a mesh"
-            )
+            raise InputError(f"a surface of {len(surfels)} surfels", expected="more from which to make a mesh")
         tree = cKDTree(surfels.positions.double().numpy())
         away, near = tree.query(tree.data, k=NEIGHBOURS, workers=-1)
         spacing = float(np.median(away[:, 1 : SPACED + 1]))

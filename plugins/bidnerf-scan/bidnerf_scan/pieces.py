@@ -66,9 +66,14 @@ def mesh_pieces(scan: Scan, points: Float[Tensor, "v 3"]) -> Pieces:
         rgb = torch.ones_like(rgb)
     a, b, c = rgb[faces].unbind(1)
     return Pieces(
-        corner, second - corner, third - corner, torch.stack([a, b - a, c - a], dim=1),
-        torch.full((len(faces),), OPAQUE), torch.zeros(len(faces), dtype=torch.bool), _textures(scan),
-    )  # fmt: skip
+        corner,
+        second - corner,
+        third - corner,
+        torch.stack([a, b - a, c - a], dim=1),
+        torch.full((len(faces),), OPAQUE),
+        torch.zeros(len(faces), dtype=torch.bool),
+        _textures(scan),
+    )
 
 
 def _textures(scan: Scan) -> Textures | None:
@@ -80,9 +85,7 @@ def _textures(scan: Scan) -> Textures | None:
         first += image.shape[0] * image.shape[1]
     a, b, c = torch.from_numpy(scan.uv).float().unbind(1)
     texels = torch.from_numpy(np.concatenate([image.reshape(-1, 3) for image in scan.images]))
-    return Textures(
-        texels, torch.tensor(shapes), torch.from_numpy(scan.image), torch.stack([a, b - a, c - a], 1)
-    )
+    return Textures(texels, torch.tensor(shapes), torch.from_numpy(scan.image), torch.stack([a, b - a, c - a], 1))
 
 
 def cloud_pieces(points: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"] | None) -> Pieces:
@@ -95,8 +98,7 @@ def cloud_pieces(points: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"] | None)
     tree = cKDTree(places)
     known = torch.full((len(points), 3), GREY) if rgb is None else rgb
     parts = [
-        _discs(points, known, tree, range(at, min(at + AT_ONCE, len(points))))
-        for at in range(0, len(points), AT_ONCE)
+        _discs(points, known, tree, range(at, min(at + AT_ONCE, len(points)))) for at in range(0, len(points), AT_ONCE)
     ]
     first, second, colours = (torch.cat([part[i] for part in parts]) for i in range(3))
     radius = torch.linalg.vector_norm(first, dim=-1)
@@ -105,9 +107,13 @@ def cloud_pieces(points: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"] | None)
     first, second = first * shrunk[:, None], second * shrunk[:, None]
     colours = torch.cat([colours[:, :1], colours[:, 1:] * shrunk[:, None, None]], dim=1)
     return Pieces(
-        points.float(), first.float(), second.float(), colours.float(),
-        torch.full((len(points),), DISC_OPACITY), torch.ones(len(points), dtype=torch.bool),
-    )  # fmt: skip
+        points.float(),
+        first.float(),
+        second.float(),
+        colours.float(),
+        torch.full((len(points),), DISC_OPACITY),
+        torch.ones(len(points), dtype=torch.bool),
+    )
 
 
 def _discs(
@@ -130,9 +136,9 @@ def _discs(
     flat = flat / radius[:, None, None].square()
     ones = torch.ones_like(flat[..., :1])
     design = torch.cat([ones, flat], dim=-1)
-    weight = 1 - 0.8 * flat.square().sum(-1, keepdim=True) / flat.square().sum(-1).amax(1)[
-        :, None, None
-    ].clamp(min=1e-12)
+    weight = 1 - 0.8 * flat.square().sum(-1, keepdim=True) / flat.square().sum(-1).amax(1)[:, None, None].clamp(
+        min=1e-12
+    )
     system = (weight * design).mT @ design
     system = system + 0.1 * torch.diag(torch.tensor([0.0, 1.0, 1.0], dtype=system.dtype))
     seen = (weight * design).mT @ rgb.double()[index]
@@ -143,9 +149,7 @@ def spacing(pieces: Pieces) -> float:
     """Return the mean distance (metres) of a cloud's points, from the radii of their discs, or 0 for a mesh."""
     if not len(pieces) or not bool(pieces.is_round.all()):
         return 0.0
-    return (
-        float(torch.linalg.vector_norm(pieces.first, dim=-1).median()) / WIDER * math.sqrt(math.pi / SPACED)
-    )
+    return float(torch.linalg.vector_norm(pieces.first, dim=-1).median()) / WIDER * math.sqrt(math.pi / SPACED)
 
 
 def thinned(

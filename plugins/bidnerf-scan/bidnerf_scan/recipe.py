@@ -37,9 +37,7 @@ def config_of(pieces: Pieces) -> ScanConfig:
     """Return a config whose size matches these pieces."""
     if pieces.textures is None:
         return ScanConfig(pieces=len(pieces))
-    return ScanConfig(
-        pieces=len(pieces), images=len(pieces.textures.shapes), texels=len(pieces.textures.texels)
-    )  # fmt: skip
+    return ScanConfig(pieces=len(pieces), images=len(pieces.textures.shapes), texels=len(pieces.textures.texels))
 
 
 def train(field: ScanField, views: Sequence[View], config: ScanConfig, report: Report) -> None:
@@ -81,9 +79,13 @@ def first_pieces(field: ScanField, views: Sequence[View], generator: Generator) 
     every = torch.cat([torch.arange(len(found)), again])
     logits = torch.cat([found.logits, torch.full((missing,), -20.0)])
     return Pieces(
-        found.corner[every], found.first[every], found.second[every], found.rgb[every], logits,
+        found.corner[every],
+        found.first[every],
+        found.second[every],
+        found.rgb[every],
+        logits,
         found.is_round[every],
-    )  # fmt: skip
+    )
 
 
 def _measured(
@@ -108,6 +110,10 @@ def _anywhere(field: ScanField, points: Float[Tensor, "n 3"], generator: Generat
     rgb[:, 0] = 0.5
     logit = math.log(OPACITY / (1 - OPACITY))
     return Pieces(
-        points, edges[..., 0], edges[..., 1], rgb, torch.full((count,), logit),
+        points,
+        edges[..., 0],
+        edges[..., 1],
+        rgb,
+        torch.full((count,), logit),
         torch.ones(count, dtype=torch.bool),
-    )  # fmt: skip
+    )

@@ -63,10 +63,13 @@ def cleaned(scan: Scan, where: str) -> tuple[Scan, str]:
     if not kept.any():
         raise InputError(f"none of its {len(kept):,} faces has three finite corners and an area", where=where)
     part = replace(
-        scan, points=np.where(good[:, None], scan.points, 0.0), rgb=rgb, faces=scan.faces[kept],
+        scan,
+        points=np.where(good[:, None], scan.points, 0.0),
+        rgb=rgb,
+        faces=scan.faces[kept],
         uv=None if scan.uv is None else np.nan_to_num(scan.uv[kept]),
         image=None if scan.image is None else scan.image[kept],
-    )  # fmt: skip
+    )
     return part, _listed(left)
 
 

@@ -87,9 +87,7 @@ def scene() -> Map:
 
 
 @pytest.mark.parametrize("ending", ["ply", "glb", "obj"])
-def test_the_importer_reads_the_mesh_in_the_frame_and_unit_of_the_map(
-    scene: Map, tmp_path: Path, ending: str
-) -> None:
+def test_the_importer_reads_the_mesh_in_the_frame_and_unit_of_the_map(scene: Map, tmp_path: Path, ending: str) -> None:
     files = {file.name: file for file in export_map(scene, tmp_path / "out", f"mesh.{ending}")}
     scan = read_scan(files[f"mesh.{ending}"])
     pose = files.get("T_world_file.json")
@@ -122,9 +120,7 @@ def test_a_new_mesh_replaces_those_whose_cameras_are_turned_otherwise(scene: Map
 
 
 def test_what_gives_no_mesh(scene: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(
-        InputError, match=re.escape("has no surface, from which a mesh could be made; 'bidnerf bake'")
-    ):
+    with pytest.raises(InputError, match=re.escape("has no surface, from which a mesh could be made; 'bidnerf bake'")):
         export_map(replace(scene, surface=None), tmp_path / "out", "mesh.ply")
     with pytest.raises(InputError, match="without keyframes"):
         mesh_of_surface(surface(units(500, 0), torch.zeros(0, 3)))

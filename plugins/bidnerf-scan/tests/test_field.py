@@ -66,9 +66,10 @@ def test_rays_meet_what_every_triangle_by_itself_gives() -> None:
     generator = torch.Generator().manual_seed(2)
     corners = torch.randn((60, 3, 3), generator=generator).clamp(-1.9, 1.9)
     scan = Scan(
-        corners.reshape(-1, 3).double().numpy(), torch.rand((180, 3), generator=generator).numpy(),
+        corners.reshape(-1, 3).double().numpy(),
+        torch.rand((180, 3), generator=generator).numpy(),
         np.arange(180).reshape(60, 3),
-    )  # fmt: skip
+    )
     pieces = mesh_pieces(scan, corners.reshape(-1, 3).double())
     rays = rays_to(torch.randn((300, 3), generator=generator))
     hits = field_of(pieces).hits(rays)
@@ -94,9 +95,7 @@ def test_a_cloud_of_a_plane_is_opaque_and_keeps_its_colours() -> None:
     assert spacing(pieces) == pytest.approx(math.sqrt(9 * math.sqrt(1.09) / 4000), rel=0.15)
     aim = 2 * torch.rand((500, 2), generator=generator) - 1
     seen = render(field_of(pieces), rays_to(torch.cat([aim, 0.3 * aim[:, :1]], dim=-1)))
-    away = torch.linalg.vector_norm(
-        torch.cat([aim, 0.3 * aim[:, :1]], -1) - torch.tensor([0.3, -0.2, 5.0]), dim=-1
-    )
+    away = torch.linalg.vector_norm(torch.cat([aim, 0.3 * aim[:, :1]], -1) - torch.tensor([0.3, -0.2, 5.0]), dim=-1)
     assert float(seen.opacity.quantile(0.02)) > 0.9
     assert float((seen.distance / seen.opacity - away).abs().max()) < 1e-3
     colours = seen.rgb / seen.opacity[:, None]
@@ -107,8 +106,11 @@ def test_textures(tmp_path: Path) -> None:
     """A texel is seen where its texture coordinates are, and light and dark ones are where the image has them."""
     image = np.zeros((8, 8, 3), np.uint8)
     image[:4, :4], image[:4, 4:], image[4:, :4], image[4:, 4:] = (
-        (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
-    )  # fmt: skip
+        (255, 0, 0),
+        (0, 255, 0),
+        (0, 0, 255),
+        (255, 255, 255),
+    )
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]])
     mesh = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(image))

@@ -46,9 +46,7 @@ def test_a_mesh_that_countless_nodes_place_is_refused(tmp_path: Path) -> None:
 
 def test_a_chain_of_countless_nodes_is_refused(tmp_path: Path) -> None:
     (tmp_path / "chain.gltf").write_text(
-        json.dumps(
-            {"asset": {"version": "2.0"}, "nodes": [{"children": [n + 1]} for n in range(5000)] + [{}]}
-        )
+        json.dumps({"asset": {"version": "2.0"}, "nodes": [{"children": [n + 1]} for n in range(5000)] + [{}]})
     )
     with pytest.raises(InputError, match="nodes below each other"):
         read_scan(tmp_path / "chain.gltf")
@@ -69,9 +67,7 @@ def test_no_file_outside_of_the_folder_is_opened(tmp_path: Path) -> None:
 def test_a_gltf_is_placed_by_its_nodes(tmp_path: Path) -> None:
     scene = trimesh.Scene()
     for number in range(2):
-        scene.add_geometry(
-            tetrahedron(), transform=trimesh.transformations.translation_matrix([number, 0, 0])
-        )
+        scene.add_geometry(tetrahedron(), transform=trimesh.transformations.translation_matrix([number, 0, 0]))
     scene.export(tmp_path / "two.glb")
     scan = read_scan(tmp_path / "two.glb")
     assert scan.faces is not None
@@ -146,8 +142,7 @@ def test_clouds(tmp_path: Path) -> None:
     files = {f"{t}.ply": ply_of(points, rgb, t) for t in (True, False)}
     files |= {f"{data}.pcd": pcd_of(points, rgb, data) for data in ("ascii", "binary", "binary_compressed")}
     files["v.obj"] = "\n".join(
-        "v " + " ".join(map(str, [*p, *(c / 255)]))
-        for p, c in zip(points.tolist(), rgb.astype(float), strict=True)
+        "v " + " ".join(map(str, [*p, *(c / 255)])) for p, c in zip(points.tolist(), rgb.astype(float), strict=True)
     ).encode()
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
@@ -177,9 +172,7 @@ def test_dark_colours_of_16_bits_stay_dark(tmp_path: Path) -> None:
 
 
 def test_surveyors_formats(tmp_path: Path) -> None:
-    points = np.array(
-        [[500000.25, 4200000.5, 100.125], [500001.0, 4200002.0, 101.0], [500003.0, 4200001.0, 99.0]]
-    )
+    points = np.array([[500000.25, 4200000.5, 100.125], [500001.0, 4200002.0, 101.0], [500003.0, 4200001.0, 99.0]])
     rgb = np.array([[65535, 0, 0], [0, 65535, 0], [0, 0, 65535]], np.uint16)
     laspy = pytest.importorskip("laspy")
     header = laspy.LasHeader(point_format=2, version="1.2")
@@ -191,9 +184,7 @@ def test_surveyors_formats(tmp_path: Path) -> None:
     pye57 = pytest.importorskip("pye57")
     file = pye57.E57(str(tmp_path / "a.e57"), mode="w")
     columns = {f"cartesian{axis}": points[:, i] for i, axis in enumerate("XYZ")}
-    columns |= {
-        f"color{c}": (rgb[:, i] >> 8).astype(np.uint8) for i, c in enumerate(("Red", "Green", "Blue"))
-    }
+    columns |= {f"color{c}": (rgb[:, i] >> 8).astype(np.uint8) for i, c in enumerate(("Red", "Green", "Blue"))}
     file.write_scan_raw(columns)
     file.close()
     for name in ("a.las", "a.e57"):
@@ -213,11 +204,23 @@ def broken() -> dict[str, bytes]:
     mesh, glb = tetrahedron().export(file_type="ply"), tetrahedron().export(file_type="glb")
     many = b"1000000000000"
     return {
-        "empty.ply": b"", "empty.obj": b"", "empty.glb": b"", "empty.pcd": b"", "empty.las": b"", "empty.e57": b"",
-        "noise.ply": b"ply\n" + bytes(range(256)), "noise.glb": b"glTF" + bytes(range(256)),
-        "noise.obj": bytes(range(256)), "noise.pcd": bytes(range(256)), "noise.las": bytes(range(256)),
-        "cut.ply": cloud[:-100], "cut-mesh.ply": mesh[:-20], "cut.glb": glb[:-40], "cut.pcd": pcd[:-100],
-        "cut-packed.pcd": packed[:-30], "cut-text.pcd": text[:-300],
+        "empty.ply": b"",
+        "empty.obj": b"",
+        "empty.glb": b"",
+        "empty.pcd": b"",
+        "empty.las": b"",
+        "empty.e57": b"",
+        "noise.ply": b"ply\n" + bytes(range(256)),
+        "noise.glb": b"glTF" + bytes(range(256)),
+        "noise.obj": bytes(range(256)),
+        "noise.pcd": bytes(range(256)),
+        "noise.las": bytes(range(256)),
+        "cut.ply": cloud[:-100],
+        "cut-mesh.ply": mesh[:-20],
+        "cut.glb": glb[:-40],
+        "cut.pcd": pcd[:-100],
+        "cut-packed.pcd": packed[:-30],
+        "cut-text.pcd": text[:-300],
         "many.ply": cloud.replace(b"vertex 50", b"vertex " + many),
         "many-vertices.ply": mesh.replace(b"vertex 4", b"vertex " + many),
         "many-faces.ply": mesh.replace(b"face 4", b"face " + many),
@@ -226,9 +229,11 @@ def broken() -> dict[str, bytes]:
         "many-packed.pcd": packed.replace(b"POINTS 50", b"POINTS " + many),
         "many-text.pcd": text.replace(b"POINTS 50", b"POINTS " + many),
         "wide.pcd": pcd.replace(b"COUNT 1 1 1 1", b"COUNT 1 1 1 " + many),
-        "many.glb": with_count(glb, 10**12), "many-zeros.glb": with_count(glb, 10**12, zeros=True),
-        "comment.obj": b"# nothing\n", "flat.obj": b"v 0 0 0\nv 1 1 1\nv 2 2 2\nf 1 2 3\n",
-    }  # fmt: skip
+        "many.glb": with_count(glb, 10**12),
+        "many-zeros.glb": with_count(glb, 10**12, zeros=True),
+        "comment.obj": b"# nothing\n",
+        "flat.obj": b"v 0 0 0\nv 1 1 1\nv 2 2 2\nf 1 2 3\n",
+    }
 
 
 def with_count(glb: bytes, count: int, zeros: bool = False) -> bytes:

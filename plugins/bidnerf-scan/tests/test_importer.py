@@ -78,8 +78,10 @@ def test_up_is_that_of_the_format_or_as_said(tmp_path: Path) -> None:
     box().export(tmp_path / "box.glb")
     box().export(tmp_path / "box.ply")
     for name, config, up in (
-        ("box.glb", {}, (0, 1, 0)), ("box.ply", {}, (0, 0, 1)), ("box.ply", {"up": "-y"}, (0, -1, 0))
-    ):  # fmt: skip
+        ("box.glb", {}, (0, 1, 0)),
+        ("box.ply", {}, (0, 0, 1)),
+        ("box.ply", {"up": "-y"}, (0, -1, 0)),
+    ):
         scene = import_map(tmp_path / name, config=config, bake=False)
         # The vertical of each picture, of which most are not taken straight from above or below.
         downs = torch.stack([camera.pose.rotation[:, 1] for camera in scene.info.cameras])

@@ -23,18 +23,14 @@ def test_frames_with_depth_are_found_by_the_shape_of_a_cloud(tmp_path: Path) -> 
         pytest.skip("needs BIDNERF_DATA")
     dataset = open_dataset(Path(folder) / "room_living")
     names = dataset.frame_names("train")[::2]
-    pixels = draw(
-        dataset.views("train", names), 120_000, uniform, torch.Generator().manual_seed(0)
-    ).flattened()
+    pixels = draw(dataset.views("train", names), 120_000, uniform, torch.Generator().manual_seed(0)).flattened()
     points = (pixels.origins + pixels.distance[:, None] * pixels.directions)[pixels.distance > 0]
     few, _ = thinned(points, None, 20_000)
     rows = few.numpy().astype("<f4")
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n" + "".join(
         f"property float {axis}\n" for axis in "xyz"
     )
-    (tmp_path / "cloud.ply").write_bytes(
-        head.encode() + b"end_header\n" + np.ascontiguousarray(rows).tobytes()
-    )
+    (tmp_path / "cloud.ply").write_bytes(head.encode() + b"end_header\n" + np.ascontiguousarray(rows).tobytes())
     scene = import_map(tmp_path / "cloud.ply")
     assert scene.landmarks is None
     localizer = Localizer(scene, "auto", {"rounds": 1})

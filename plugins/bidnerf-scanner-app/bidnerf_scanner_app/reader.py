@@ -48,9 +48,7 @@ class DepthShot(Shot):
     record: Record
     depth: DepthFile
 
-    def frame(
-        self, background: tuple[float, float, float] = (0.0, 0.0, 0.0), side: int | None = None
-    ) -> Frame:
+    def frame(self, background: tuple[float, float, float] = (0.0, 0.0, 0.0), side: int | None = None) -> Frame:
         """Read the depth, at its own resolution."""
         metres = self.depth.read().metres
         height, width = metres.shape
@@ -102,9 +100,7 @@ class ScannerAppReader(Reader):
         shots = [self._shot(file, photo, read) for file, photo in {**between, **described}.items()]
         shots.sort(key=lambda shot: int(shot.stem.split("_")[1]))
         up = (0.0, 1.0, 0.0)  # ARKit aligns its world with gravity
-        return Capture(
-            path, hold_out(shots, lambda shot: shot.image is not None), options.colour, unit="metres", up=up
-        )
+        return Capture(path, hold_out(shots, lambda shot: shot.image is not None), options.colour, unit="metres", up=up)
 
     def _shot(self, description: Path, photo: Path | None, read: LidarDepth | None) -> Shot:
         record = read_record(description)

@@ -278,9 +278,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
         r"conf_5\.png: is 64x48, expected 48x48",
     ),
     "depth shape between photos": (
-        lambda f: [
-            iio.imwrite(f / f"{kind}_5.png", np.ones((48, 48), np.uint8)) for kind in ("depth", "conf")
-        ],
+        lambda f: [iio.imwrite(f / f"{kind}_5.png", np.ones((48, 48), np.uint8)) for kind in ("depth", "conf")],
         r"depth_5\.png: depth is 48x48, but its camera's photos are 960x720",
     ),
     "no projection between photos": (

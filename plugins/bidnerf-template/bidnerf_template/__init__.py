@@ -35,18 +35,14 @@ class TemplateField(nn.Module):
         self.bounds = bounds
         self.side = max(bounds.size)
         self.sampler = Stratified(config.samples, bounds)
-        self.grid = nn.Parameter(
-            torch.zeros(4, *[config.resolution] * 3)
-        )  # density and rgb, before activation
+        self.grid = nn.Parameter(torch.zeros(4, *[config.resolution] * 3))  # density and rgb, before activation
 
     def query(self, positions: Tensor, directions: Tensor) -> FieldValues:
         """Return density (* per metre) and rgb (* 3) at positions (* 3, metres, world) along unit directions (* 3)."""
         places = self.bounds.normalized(positions).reshape(1, -1, 1, 1, 3)  # in [-1, 1]
         raw = functional.grid_sample(self.grid[None], places, padding_mode="border", align_corners=True)
         raw = raw.reshape(4, *positions.shape[:-1])
-        density = (
-            functional.softplus(raw[0] - 4) * 100 / self.side
-        )  # thin at first, regardless of the length unit
+        density = functional.softplus(raw[0] - 4) * 100 / self.side  # thin at first, regardless of the length unit
         return FieldValues(density, raw[1:].sigmoid().movedim(0, -1))
 
 
@@ -59,9 +55,7 @@ class TemplateBackend:
     def build(self, config: TemplateConfig, bounds: SceneBounds) -> TemplateField:
         return TemplateField(config, bounds)
 
-    def train(
-        self, field: TemplateField, views: Sequence[View], config: TemplateConfig, report: Report
-    ) -> None:
+    def train(self, field: TemplateField, views: Sequence[View], config: TemplateConfig, report: Report) -> None:
         supervision = Supervision(views, field.bounds, config, device_of(field))
 
         def outcome(step: int, generator: Generator) -> StepOutcome:

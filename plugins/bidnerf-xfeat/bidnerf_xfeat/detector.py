@@ -122,18 +122,14 @@ def _probabilities(image: Float[Tensor, "1 1 h w"], step: int) -> Float[Tensor, 
     total, starts = torch.zeros_like(image), range(0, CELL, step)
     # The blocks are taken one by one, because all of them would not fit into the cache.
     for row, column in product(starts, starts):
-        cells = model._unfold2d(
-            around[:, :, row : row + height + CELL, column : column + width + CELL], ws=CELL
-        )
+        cells = model._unfold2d(around[:, :, row : row + height + CELL, column : column + width + CELL], ws=CELL)
         # The last channel stands for no keypoint in the cell.
         found = pixel_shuffle(model.keypoint_head(cells).softmax(1)[:, : CELL**2], CELL)
         total += found[:, :, CELL - row : CELL - row + height, CELL - column : CELL - column + width]
     return total / len(starts) ** 2
 
 
-def _peaks(
-    probability: Float[Tensor, "1 1 h w"], least: float
-) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2"]]:
+def _peaks(probability: Float[Tensor, "1 1 h w"], least: float) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2"]]:
     """Return pixels (u, v from 0) that are local maxima of the probability, and the offsets to their centroids."""
     greatest = max_pool2d(probability, APART, 1, APART // 2)
     rows, columns = ((probability == greatest) & (probability > least))[0, 0].nonzero().unbind(-1)

@@ -41,10 +41,7 @@ class WithSift:
         ranks = torch.cat([torch.arange(len(part)) for part in parts])
         order = ranks.argsort(stable=True)
         return Keypoints(
-            *(
-                torch.cat([getattr(part, name) for part in parts])[order]
-                for name in ("pixels", "sizes", "descriptors")
-            )
+            *(torch.cat([getattr(part, name) for part in parts])[order] for name in ("pixels", "sizes", "descriptors"))
         )
 
 

@@ -113,9 +113,7 @@ def test_an_image_is_found_in_a_map_of_others() -> None:
 
     def view(number: int) -> View:
         camera = Intrinsics(300.0, 300.0, 160.0, 128.0, 320, 256)
-        where = torch.tensor(
-            [2 + 1.2 * math.cos(number), 2 + 1.2 * math.sin(number), -2.5 - 0.1 * (number % 3)]
-        )
+        where = torch.tensor([2 + 1.2 * math.cos(number), 2 + 1.2 * math.sin(number), -2.5 - 0.1 * (number % 3)])
         pose = look_at(where.double(), torch.tensor([2.0, 2.0, 0.0], dtype=torch.float64))
         T = pose.inverse().matrix().numpy()
         plane = camera.matrix().numpy() @ T[:3][:, [0, 1, 3]] @ np.diag([0.01, 0.01, 1])

@@ -41,9 +41,7 @@ FORMATS = (
         "y up, as glTF prescribes; node transforms are applied",
         (0.0, 1.0, 0.0),
     ),
-    Format(
-        "checkpoint of gsplat or splatfacto", checkpoint.recognises, checkpoint.read, "those of the training"
-    ),
+    Format("checkpoint of gsplat or splatfacto", checkpoint.recognises, checkpoint.read, "those of the training"),
 )
 
 

@@ -15,9 +15,15 @@ from bidnerf_gaussians.gaussians import Gaussians
 EXPECTED = "a checkpoint of gsplat or splatfacto"
 ENDINGS = (".pt", ".ckpt", ".pth")
 NAMES = {
-    "means": "means", "scales": "log_scales", "quats": "quaternions", "opacities": "logits", "sh0": "sh0",
-    "shN": "shN", "features_dc": "sh0", "features_rest": "shN",
-}  # fmt: skip
+    "means": "means",
+    "scales": "log_scales",
+    "quats": "quaternions",
+    "opacities": "logits",
+    "sh0": "sh0",
+    "shN": "shN",
+    "features_dc": "sh0",
+    "features_rest": "shN",
+}
 """The names used here for the parameters of both."""
 PREFIX = "_model.gauss_params."
 """Prefix of the names of splatfacto's parameters."""
@@ -45,18 +51,19 @@ def read(path: Path) -> Gaussians:
         sh0 = parts["sh0"].reshape(count, 1, 3)
         harmonics = torch.cat([sh0, parts["shN"].reshape(count, -1, 3)], dim=1) if "shN" in parts else sh0
         return Gaussians(
-            parts["means"].reshape(count, 3), parts["log_scales"].reshape(count, 3),
-            parts["quaternions"].reshape(count, 4), parts["logits"].reshape(count), harmonics,
-        )  # fmt: skip
+            parts["means"].reshape(count, 3),
+            parts["log_scales"].reshape(count, 3),
+            parts["quaternions"].reshape(count, 4),
+            parts["logits"].reshape(count),
+            harmonics,
+        )
     except (RuntimeError, TypeError) as error:
         raise InputError(f"tensors with different counts ({error})", where=path, expected=EXPECTED) from error
 
 
 def _parameters(saved: Any) -> dict[str, Tensor]:
     tensors = _inside(saved)
-    return {
-        ours: tensors[theirs] for theirs, ours in NAMES.items() if isinstance(tensors.get(theirs), Tensor)
-    }
+    return {ours: tensors[theirs] for theirs, ours in NAMES.items() if isinstance(tensors.get(theirs), Tensor)}
 
 
 def _inside(found: Any) -> dict[str, Any]:

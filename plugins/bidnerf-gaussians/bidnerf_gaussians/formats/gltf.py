@@ -54,18 +54,14 @@ class _Scene:
         if uri is None and self.binary is not None and number == 0:
             return self.binary
         if not isinstance(uri, str) or Path(uri).name != uri:
-            raise InputError(
-                f"names a buffer {str(uri)[:40]!r}", where=self.path, expected="a file next to it"
-            )
+            raise InputError(f"names a buffer {str(uri)[:40]!r}", where=self.path, expected="a file next to it")
         return read_file(self.path.parent / uri, f"a buffer of {EXPECTED}", LARGEST_FILE)
 
     def accessor(self, number: int) -> np.ndarray:
         """Return the numbers (n w) of an accessor; normalized integers become fractions."""
         entry = self.gltf["accessors"][number]
         if "sparse" in entry or "bufferView" not in entry:
-            raise InputError(
-                f"accessor {number} is sparse or empty", where=self.path, expected="plain numbers"
-            )
+            raise InputError(f"accessor {number} is sparse or empty", where=self.path, expected="plain numbers")
         view = self.gltf["bufferViews"][entry["bufferView"]]
         kind, width, count = (
             np.dtype(COMPONENTS[entry["componentType"]]),
@@ -78,8 +74,7 @@ class _Scene:
         last = start + (count - 1) * stride + width * kind.itemsize
         if min(start, count, stride - width * kind.itemsize) < 0 or last > len(content):
             raise InputError(
-                f"accessor {number} declares {count:,} elements, but its buffer of {len(content):,} bytes is"
-                " too short",
+                f"accessor {number} declares {count:,} elements, but its buffer of {len(content):,} bytes is too short",
                 where=self.path,
             )
         rows = np.ndarray((count, width), kind, content, start, (stride, kind.itemsize)).astype(np.float32)
@@ -118,9 +113,7 @@ def read(path: Path) -> Gaussians:
     except (KeyError, TypeError, IndexError, ValueError, AttributeError, RuntimeError) as error:
         if isinstance(error, InputError) and error.where:
             raise
-        raise InputError(
-            f"is damaged ({type(error).__name__}: {error})", where=path, expected=EXPECTED
-        ) from error
+        raise InputError(f"is damaged ({type(error).__name__}: {error})", where=path, expected=EXPECTED) from error
     if not found:
         raise InputError("no node shows Gaussians", where=path, expected=EXPECTED)
     return joined(found)
@@ -176,9 +169,7 @@ def _gaussians(scene: _Scene, primitive: dict[str, Any]) -> Gaussians:
     names = primitive["attributes"]
     if "extensions" in primitive["extensions"][EXTENSION]:
         further = ", ".join(primitive["extensions"][EXTENSION]["extensions"])
-        raise InputError(
-            f"its Gaussians are compressed ({further}), which is not supported", where=scene.path
-        )
+        raise InputError(f"its Gaussians are compressed ({further}), which is not supported", where=scene.path)
     harmonics = []
     for degree in COEFFICIENTS:
         of_degree = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{n}" for n in range(2 * degree + 1)]
@@ -197,9 +188,7 @@ def _gaussians(scene: _Scene, primitive: dict[str, Any]) -> Gaussians:
     shapes = [part.shape for part in (position, scale, rotation, opacity, *harmonics)]
     count = len(position)
     if shapes != [(count, 3), (count, 3), (count, 4), (count, 1), *[(count, 3)] * len(harmonics)]:
-        raise InputError(
-            f"its attributes have the shapes {shapes}", where=scene.path, expected="one for each Gaussian"
-        )
+        raise InputError(f"its attributes have the shapes {shapes}", where=scene.path, expected="one for each Gaussian")
     return gaussians_of(
         position, scale, np.roll(rotation, 1, axis=-1), logit(opacity[:, 0]), np.stack(harmonics, axis=1)
     )
@@ -211,8 +200,6 @@ def _placed(gaussians: Gaussians, matrix: np.ndarray, path: Path) -> Gaussians:
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     # Scales along a node's axes count as equal up to a relative difference of a thousandth.
     if not scale > 0 or float(np.ptp(scales)) > 1e-3 * scale:
-        raise InputError(
-            "a node stretches or mirrors its Gaussians", where=path, expected="one scale for all axes"
-        )
+        raise InputError("a node stretches or mirrors its Gaussians", where=path, expected="one scale for all axes")
     rotation = torch.from_numpy(matrix[:3, :3] / scale)
     return gaussians.similar(scale, rotation, torch.from_numpy(matrix[:3, 3].copy()))

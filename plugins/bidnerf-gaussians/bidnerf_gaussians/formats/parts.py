@@ -30,10 +30,7 @@ def gaussians_of(
 def joined(parts: Sequence[Gaussians]) -> Gaussians:
     """Concatenate Gaussians, with harmonics up to the highest degree among them."""
     count = max(part.harmonics.shape[1] for part in parts)
-    full = [
-        replace(part, harmonics=pad(part.harmonics, (0, 0, 0, count - part.harmonics.shape[1])))
-        for part in parts
-    ]
+    full = [replace(part, harmonics=pad(part.harmonics, (0, 0, 0, count - part.harmonics.shape[1]))) for part in parts]
     return Gaussians(*(torch.cat([getattr(part, of.name) for part in full]) for of in fields(Gaussians)))
 
 

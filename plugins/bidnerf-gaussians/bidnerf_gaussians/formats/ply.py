@@ -76,9 +76,12 @@ def read(path: Path) -> Gaussians:
     if scales.shape[1] == 2:
         scales = np.concatenate([scales, scales.min(axis=1, keepdims=True) + np.float32(DISC)], axis=1)
     return gaussians_of(
-        _columns(vertices, MEANS), scales, _columns(vertices, TURNS),
-        vertices["opacity"], harmonics,
-    )  # fmt: skip
+        _columns(vertices, MEANS),
+        scales,
+        _columns(vertices, TURNS),
+        vertices["opacity"],
+        harmonics,
+    )
 
 
 def _vertices(elements: Mapping[str, np.ndarray], path: Path) -> np.ndarray:
@@ -106,16 +109,19 @@ def write(path: Path, gaussians: Gaussians) -> None:
     """Write a PLY file in the layout of the original 3DGS code."""
     count = gaussians.harmonics.shape[1] - 1
     rest = gaussians.harmonics[:, 1:].mT.reshape(len(gaussians), -1)
-    names = (
-        *MEANS, "nx", "ny", "nz", *COLOUR, *(f"f_rest_{i}" for i in range(3 * count)), "opacity", *SCALES, *TURNS
-    )  # fmt: skip
+    names = (*MEANS, "nx", "ny", "nz", *COLOUR, *(f"f_rest_{i}" for i in range(3 * count)), "opacity", *SCALES, *TURNS)
     columns = torch.cat(
         [
-            gaussians.means, torch.zeros_like(gaussians.means), gaussians.harmonics[:, 0], rest,
-            gaussians.logits[:, None], gaussians.log_scales, gaussians.quaternions,
+            gaussians.means,
+            torch.zeros_like(gaussians.means),
+            gaussians.harmonics[:, 0],
+            rest,
+            gaussians.logits[:, None],
+            gaussians.log_scales,
+            gaussians.quaternions,
         ],
         dim=-1,
-    )  # fmt: skip
+    )
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
     header += [f"property float {name}" for name in names] + ["end_header", ""]
     write_file(path, "\n".join(header).encode() + columns.cpu().numpy().astype("<f4").tobytes())

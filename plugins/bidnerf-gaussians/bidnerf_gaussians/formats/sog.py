@@ -132,6 +132,4 @@ def _image(content: bytes, where: str) -> np.ndarray:
                 )
             return np.asarray(image.convert("RGBA"))
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(
-            f"is not a readable image ({error})", where=where, expected="a lossless WebP"
-        ) from error
+        raise InputError(f"is not a readable image ({error})", where=where, expected="a lossless WebP") from error

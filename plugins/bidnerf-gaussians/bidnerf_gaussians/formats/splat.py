@@ -24,14 +24,10 @@ def read(path: Path) -> Gaussians:
     """Read the Gaussians of a file: plain scales, one-byte colours and opacities, quaternions (b - 128) / 128."""
     content = read_file(path, "a .splat file", LARGEST_FILE)
     if not content or len(content) % ROW.itemsize:
-        raise InputError(
-            f"has {len(content):,} bytes", where=path, expected="a multiple of 32, the size of a Gaussian"
-        )
+        raise InputError(f"has {len(content):,} bytes", where=path, expected="a multiple of 32, the size of a Gaussian")
     rows = np.frombuffer(content, ROW)
     rgba = rows["rgba"] / np.float32(255)
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales = np.log(rows["scales"])
     quaternions = (rows["turn"].astype(np.float32) - 128) / 128
-    return gaussians_of(
-        rows["means"], log_scales, quaternions, logit(rgba[:, 3]), ((rgba[:, :3] - 0.5) / C0)[:, None]
-    )
+    return gaussians_of(rows["means"], log_scales, quaternions, logit(rgba[:, 3]), ((rgba[:, :3] - 0.5) / C0)[:, None])

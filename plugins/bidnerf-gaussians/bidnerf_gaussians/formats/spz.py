@@ -85,9 +85,7 @@ def _unzipped(content: bytes, path: Path) -> tuple[list[bytes], int, int, int, i
         version, count, degree, bits = _checked(HEADER.unpack(start), range(1, 4), path)
         sizes = _sizes(version, count, degree)
         if sum(sizes) > MOST_INFLATED * len(content):
-            raise InputError(
-                f"declares {count:,} Gaussians, more than its {len(content):,} bytes can hold", where=path
-            )
+            raise InputError(f"declares {count:,} Gaussians, more than its {len(content):,} bytes can hold", where=path)
         # No more than declared is ever unpacked.
         rest = stream.decompress(stream.unconsumed_tail, sum(sizes) or 1)
     except zlib.error as error:
@@ -117,9 +115,7 @@ def _streams(content: bytes, path: Path) -> tuple[list[bytes], int, int, int, in
             expected=f"{len(wanted)} for {count:,} Gaussians of degree {degree}",
         )
     if sum(sizes) > MOST_INFLATED * len(content):
-        raise InputError(
-            f"declares {count:,} Gaussians, more than its {len(content):,} bytes can hold", where=path
-        )
+        raise InputError(f"declares {count:,} Gaussians, more than its {len(content):,} bytes can hold", where=path)
     found = []
     for index, size in enumerate(wanted):
         packed, unpacked = struct.unpack_from("<QQ", content, place + 16 * index)
@@ -141,9 +137,7 @@ def _zstandard(content: bytes, size: int, path: Path) -> bytes:
             "has version 4, which needs the package zstandard: pip install zstandard", where=path
         ) from error
     try:
-        told = zstandard.get_frame_parameters(
-            content
-        ).content_size  # which the library trusts, regardless of our limit
+        told = zstandard.get_frame_parameters(content).content_size  # which the library trusts, regardless of our limit
         if told not in (size, zstandard.CONTENTSIZE_UNKNOWN):
             raise InputError(f"a stream unpacks to {told:,} bytes", where=path, expected=f"{size:,}")
         found = bytes(zstandard.ZstdDecompressor().decompress(content, max_output_size=size))
@@ -204,9 +198,13 @@ def write(path: Path, gaussians: Gaussians) -> None:
     position = np.stack([fixed & 255, fixed >> 8 & 255, fixed >> 16], axis=-1)
     harmonics = found.harmonics.numpy()
     sections = (
-        position, found.opacities.numpy() * 255, harmonics[:, 0] * COLOUR_SCALE * 255 + 127.5,
-        (found.log_scales.numpy() + 10) * 16, _packed(found.quaternions.numpy()), harmonics[:, 1:] * 128 + 128,
-    )  # fmt: skip
+        position,
+        found.opacities.numpy() * 255,
+        harmonics[:, 0] * COLOUR_SCALE * 255 + 127.5,
+        (found.log_scales.numpy() + 10) * 16,
+        _packed(found.quaternions.numpy()),
+        harmonics[:, 1:] * 128 + 128,
+    )
     body = b"".join(np.clip(np.round(part), 0, 255).astype(np.uint8).tobytes() for part in sections)
     # Version 3 is the newest one that the standard library can compress.
     header = HEADER.pack(MAGIC, 3, len(found), found.degree, bits, 0, 0)
@@ -222,8 +220,6 @@ def _packed(quaternions: np.ndarray) -> np.ndarray:
     rows = np.arange(len(q))
     q *= np.where(q[rows, largest] < 0, -1, 1)[:, None]
     others = q[np.arange(4) != largest[:, None]].reshape(len(q), 3)
-    tens = np.round(np.abs(others) * np.sqrt(2) * 511).clip(0, 511).astype(np.uint32) | np.where(
-        others < 0, 512, 0
-    )
+    tens = np.round(np.abs(others) * np.sqrt(2) * 511).clip(0, 511).astype(np.uint32) | np.where(others < 0, 512, 0)
     packed = largest.astype(np.uint32) << 30 | tens[:, 0] << 20 | tens[:, 1] << 10 | tens[:, 2]
     return packed.astype("<u4").view(np.uint8).reshape(len(q), 4)

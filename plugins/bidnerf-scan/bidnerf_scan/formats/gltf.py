@@ -97,9 +97,7 @@ def _check_counts(path: Path, content: dict[str, Any]) -> None:
                     where=path,
                 )
         except (KeyError, IndexError, TypeError, ValueError) as error:
-            raise InputError(
-                f"accessor {number} is not readable ({error!r})", where=path, expected=EXPECTED
-            ) from error
+            raise InputError(f"accessor {number} is not readable ({error!r})", where=path, expected=EXPECTED) from error
 
 
 def _check_depth(path: Path, content: dict[str, Any]) -> None:

@@ -48,9 +48,7 @@ def _colours(rows: NDArray) -> NDArray[np.float32] | None:
     if packed is not None and rows.dtype[packed].itemsize == 4:
         # Three bytes in the bits of a number, which may be declared as a float.
         bits = np.ascontiguousarray(rows[packed]).view(np.uint32)
-        return np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=-1).astype(
-            np.float32
-        ) / np.float32(255)
+        return np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=-1).astype(np.float32) / np.float32(255)
     return colours_of(rows, ("r", "g", "b"), ("red", "green", "blue"))
 
 
@@ -74,12 +72,8 @@ def _header(path: Path, data: bytes) -> _Header:
             unique = f"_{number}" if name == "_" or name in names[:number] else name
             if not 0 < int(repeat) < 65536:
                 raise ValueError(f"COUNT {repeat}")
-            fields.append(
-                (unique, number_kind) if int(repeat) == 1 else (unique, number_kind, (int(repeat),))
-            )
-        count = (
-            int(found["POINTS"][0]) if "POINTS" in found else int(found["WIDTH"][0]) * int(found["HEIGHT"][0])
-        )
+            fields.append((unique, number_kind) if int(repeat) == 1 else (unique, number_kind, (int(repeat),)))
+        count = int(found["POINTS"][0]) if "POINTS" in found else int(found["WIDTH"][0]) * int(found["HEIGHT"][0])
         kind = np.dtype(fields)
         if count < 0:
             raise ValueError(f"{count} points")
@@ -180,7 +174,5 @@ def _decompressed(path: Path, data: bytes, size: int) -> bytes:
     except IndexError as error:
         raise InputError("its compressed data is damaged; is the file truncated?", where=path) from error
     if len(found) != size:
-        raise InputError(
-            f"{len(found):,} bytes when decompressed", where=path, expected=f"{size:,}; is it truncated?"
-        )
+        raise InputError(f"{len(found):,} bytes when decompressed", where=path, expected=f"{size:,}; is it truncated?")
     return bytes(found)

@@ -31,8 +31,7 @@ def read_las(path: Path) -> Scan:
             least = 1 if path.suffix.lower() == ".laz" else 8 * header.point_format.size
             if count * least > 8 * size:
                 raise InputError(
-                    f"declares {count:,} points, but its {size:,} bytes are too few for them; is the file"
-                    " truncated?",
+                    f"declares {count:,} points, but its {size:,} bytes are too few for them; is the file truncated?",
                     where=path,
                 )
             rows = file.read()

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from bidnerf.testing import ReaderContract, training_views
-
 # Inside: a limit of size that small images reach, and pictures that are no files
+from bidnerf.formats import lidar
+from bidnerf.testing import ReaderContract, training_views
 from bidnerf_core.datasets import (
     READERS,
     Capture,
@@ -19,7 +19,6 @@ from bidnerf_core.datasets import (
     DatasetOptions,
     Shot,
     find_reader,
-    lidar,
     open_dataset,
     open_sequence,
 )
@@ -136,9 +135,7 @@ def test_an_image_that_is_damaged_is_named_when_its_turn_comes(kind: str, tmp_pa
         ("transforms", "phone_doll"),
     ],
 )
-def test_a_recorded_scene_is_the_same_in_another_layout(
-    kind: str, scene: str, data_dir: Path, tmp_path: Path
-) -> None:
+def test_a_recorded_scene_is_the_same_in_another_layout(kind: str, scene: str, data_dir: Path, tmp_path: Path) -> None:
     recorded = open_dataset(data_dir / scene)
     expected = recorded.views("train", recorded.frame_names("train")[:3])
     found = open_sequence(LAYOUTS[kind].write(tmp_path, expected), **LAYOUTS[kind].options)
@@ -192,14 +189,10 @@ def test_pictures_need_no_hash(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "up"), [("polycam", (0.0, 1.0, 0.0)), ("stray-scanner", (0.0, 1.0, 0.0)), ("record3d", None)]
 )
-def test_scans_know_their_vertical_axis(
-    kind: str, up: tuple[float, float, float] | None, tmp_path: Path
-) -> None:
+def test_scans_know_their_vertical_axis(kind: str, up: tuple[float, float, float] | None, tmp_path: Path) -> None:
     """Whatever masks or splits are chosen. The world of Record3D is the camera of the first frame, however it was held."""
     scan = open_dataset(LAYOUTS[kind].write(tmp_path, small_views(3)))
-    assert all(
-        (part.unit, part.up) == ("metres", up) for part in (scan, scan.split("all"), scan.in_time_order()[:1])
-    )
+    assert all((part.unit, part.up) == ("metres", up) for part in (scan, scan.split("all"), scan.in_time_order()[:1]))
 
 
 @pytest.mark.parametrize("kind", OF_IMAGE_FILES)

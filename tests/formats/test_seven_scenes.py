@@ -50,9 +50,7 @@ def write_frame(folder: Path, number: int) -> None:
     depth[40:44, 50:54], depth[60:64, 90:94] = 65535, 0
     iio.imwrite(f"{stem}.depth.png", depth)
     rows = T_world_depth.matrix().tolist()
-    Path(f"{stem}.pose.txt").write_text(
-        "\n".join("\t ".join(f"{x:.10e}" for x in row) + "\t" for row in rows) + "\n"
-    )
+    Path(f"{stem}.pose.txt").write_text("\n".join("\t ".join(f"{x:.10e}" for x in row) + "\t" for row in rows) + "\n")
 
 
 @pytest.fixture
@@ -130,9 +128,7 @@ def test_a_sequence_may_lack_all_poses(scene: Path) -> None:
         file.unlink()
     frames = list(open_sequence(scene / "seq-01"))
     assert [(timed.truth, timed.time) for timed in frames] == [(None, None)] * 3
-    with refused(
-        where=scene / "seq-01", found="has no pose for any of 3 images", expected="frame-000000.pose.txt"
-    ):
+    with refused(where=scene / "seq-01", found="has no pose for any of 3 images", expected="frame-000000.pose.txt"):
         open_dataset(scene / "seq-01")
 
 
@@ -150,9 +146,7 @@ def test_a_camera_in_the_folder_is_that_of_the_images(scene: Path) -> None:
         ("the second", "", "line 1: 'the second'", "a sequence such as sequence1"),
     ],
 )
-def test_broken_split_files_name_the_line(
-    text: str, line: str, found: str, expected: str, scene: Path
-) -> None:
+def test_broken_split_files_name_the_line(text: str, line: str, found: str, expected: str, scene: Path) -> None:
     file = scene / "TestSplit.txt"
     file.write_text(text)
     with refused(where=f"{file}{line}", found=found, expected=expected):

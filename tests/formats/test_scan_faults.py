@@ -81,34 +81,78 @@ def missing_and_uncalibrated(root: Path) -> None:
 
 INCOMPLETE: dict[str, tuple[Callable[[Path], object], int, list[int], list[int], list[str]]] = {
     # What happens to six frames; how many a sequence has then, which of them have no pose and no depth; the remarks.
-    "record3d, unpacked": (lost_pose, 5, [2], [1], [
-        "1 of 6 images is missing and left out, first: rgbd/1.jpg", "1 of 5 depth images is missing",
-        "1 of 5 images have no pose and are left out",
-    ]),
+    "record3d, unpacked": (
+        lost_pose,
+        5,
+        [2],
+        [1],
+        [
+            "1 of 6 images is missing and left out, first: rgbd/1.jpg",
+            "1 of 5 depth images is missing",
+            "1 of 5 images have no pose and are left out",
+        ],
+    ),
     "polycam": (
-        unlinked("corrected_cameras/1000250000.json", "depth/1000500000.png", "corrected_images/1000750000.jpg"), 4, [], [1], [
-        "1 of 5 images is missing and left out", "1 of 5 photos have no camera in corrected_cameras",
-        "1 of 4 depth images is missing",
-    ]),
+        unlinked("corrected_cameras/1000250000.json", "depth/1000500000.png", "corrected_images/1000750000.jpg"),
+        4,
+        [],
+        [1],
+        [
+            "1 of 5 images is missing and left out",
+            "1 of 5 photos have no camera in corrected_cameras",
+            "1 of 4 depth images is missing",
+        ],
+    ),
     "polycam, not corrected": (unlinked(), 6, [], [], ["no corrected_cameras, so the poses are ARKit's, which drift"]),
-    "tum": (zero_pose, 6, [0], [], [
-        "2 poses of 12 not finite or zero, left out", "1 of 6 images have no pose",
-    ]),
-    "seven-scenes": (unlinked("frame-000001.pose.txt", "frame-000002.depth.png"), 6, [1], [2], [
-        "1 of 6 images have no pose and are left out",
-    ]),
+    "tum": (
+        zero_pose,
+        6,
+        [0],
+        [],
+        [
+            "2 poses of 12 not finite or zero, left out",
+            "1 of 6 images have no pose",
+        ],
+    ),
+    "seven-scenes": (
+        unlinked("frame-000001.pose.txt", "frame-000002.depth.png"),
+        6,
+        [1],
+        [2],
+        [
+            "1 of 6 images have no pose and are left out",
+        ],
+    ),
     "twelve-scenes": (lost_tracking, 6, [2], [], ["1 of 6 images have no pose and are left out"]),
-    "reality-capture": (unlinked("2.png"), 5, [], [*range(5)], [
-        "1 of 6 images is missing and left out, first: 2.png",
-    ]),
+    "reality-capture": (
+        unlinked("2.png"),
+        5,
+        [],
+        [*range(5)],
+        [
+            "1 of 6 images is missing and left out, first: 2.png",
+        ],
+    ),
     "kitti": (unlinked("image_2/000001.png"), 5, [], [*range(5)], ["1 of 6 images are missing, first: number 1"]),
     "euroc": (unlinked("cam0/data/*.png"), 5, [], [*range(5)], ["1 of 6 images is missing and left out"]),
-    "metashape": (missing_and_uncalibrated, 5, [], [*range(5)], ["1 of 6 images is missing and left out, first: IMG_2"]),
-    "colmap": (lambda root: (root / "images/r_2.png").rename(root / "images/r_9.png"), 5, [], [*range(5)], [
-        "1 of 6 images is missing and left out, first: images/r_2.png",
-        "1 of 6 photos are not registered in the model and are left out, first: r_9.png",
-    ]),
-}  # fmt: skip
+    "metashape": (
+        missing_and_uncalibrated,
+        5,
+        [],
+        [*range(5)],
+        ["1 of 6 images is missing and left out, first: IMG_2"],
+    ),
+    "colmap": (
+        lambda root: (root / "images/r_2.png").rename(root / "images/r_9.png"),
+        5,
+        [],
+        [*range(5)],
+        [
+            "1 of 6 images is missing and left out, first: images/r_2.png",
+            "1 of 6 photos are not registered in the model and are left out, first: r_9.png",
+        ],
+    ),
+}
 
 
 @pytest.mark.parametrize("kind", INCOMPLETE)
@@ -135,9 +179,7 @@ def metadata(files: dict[str, bytes], **changes: object) -> dict[str, bytes]:
     return {**files, "metadata": json.dumps({**json.loads(files["metadata"]), **changes}).encode()}
 
 
-def test_depth_of_low_confidence_far_away_and_not_finite_is_dropped(
-    views: list[View], tmp_path: Path
-) -> None:
+def test_depth_of_low_confidence_far_away_and_not_finite_is_dropped(views: list[View], tmp_path: Path) -> None:
     """Depth has a quarter of the photo's resolution, each number repeated; four of its pixels hold none."""
     size = metres(views[0]).shape
     depth = np.full((size[0] // 4, size[1] // 4), 2.0, np.float32)
@@ -163,9 +205,7 @@ def test_intrinsics_of_the_first_frame_hold_for_all_where_there_are_no_others(
         )
 
 
-def test_confidence_that_removes_all_depth_is_said_once_with_its_values(
-    views: list[View], tmp_path: Path
-) -> None:
+def test_confidence_that_removes_all_depth_is_said_once_with_its_values(views: list[View], tmp_path: Path) -> None:
     scan = write_polycam(tmp_path / "polycam", views)
     for file in (scan / "keyframes" / "confidence").iterdir():
         iio.imwrite(file, np.full(metres(views[0]).shape, 254, np.uint8))
@@ -249,10 +289,7 @@ def test_frames_of_a_video_in_any_order(tmp_path: Path) -> None:
 
 def test_five_frames_a_second_are_kept() -> None:
     for rate, kept in ((60, 12), (30, 6), (10, 2), (5, 1), (2, 1)):
-        frames = [
-            Shot(image=Path(f"{n}.png"), T_world_camera=SE3.identity(), time=10 + n / rate)
-            for n in range(120)
-        ]
+        frames = [Shot(image=Path(f"{n}.png"), T_world_camera=SE3.identity(), time=10 + n / rate) for n in range(120)]
         found = hold_out(frames, rate=5.0)
         assert [int(shot.stem) for shot in found if shot.splits] == list(range(0, 120, kept))
         assert len(found) == 120

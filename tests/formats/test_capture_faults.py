@@ -19,10 +19,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bidnerf_core.datasets import open_dataset, open_sequence
-
 # Inside: the limit of a member, which a small archive exceeds
-from bidnerf_core.datasets.formats import record3d
+from bidnerf.formats import record3d
+from bidnerf_core.datasets import open_dataset, open_sequence
 from bidnerf_core.errors import InputWarning
 from bidnerf_core.io import Archive
 from refusals import refused
@@ -128,7 +127,11 @@ FAULTS: dict[str, list[tuple[str, Edit, str | tuple[str, ...]]]] = {
         ("groundtruth.txt", first_row("999.997", *"123000", "0.5"), ("line 4", "quaternion", "0.5")),
         ("groundtruth.txt", first_row("999.997", "a"), ("line 4", "'a'")),
         ("groundtruth.txt", rows(lambda r: [*r, f"{r[0].split()[0]} 0 0 0 0 0 0 1"]), "another pose at the time"),
-        ("groundtruth.txt", rows(lambda r: ["1.0 0 0 0 0 0 0 1", "1.05 0 0 0 0 0 0 1"]), "has no pose for any of 6 images"),
+        (
+            "groundtruth.txt",
+            rows(lambda r: ["1.0 0 0 0 0 0 0 1", "1.05 0 0 0 0 0 0 1"]),
+            "has no pose for any of 6 images",
+        ),
         ("groundtruth.txt", Path.unlink, "the poses of the frames of a dataset"),
         ("rgb.txt", rows(lambda r: [r[0].split()[0], *r[1:]]), ("line 4", "1 of 2")),
         ("rgb.txt", content("# nothing\n"), ("no rows", "timestamp filename")),
@@ -150,14 +153,22 @@ FAULTS: dict[str, list[tuple[str, Edit, str | tuple[str, ...]]]] = {
     ],
     "reality-capture": [
         ("cameras.csv", replaced(",f,", ",focal,"), ("has the columns", "Internal/External")),
-        ("cameras.csv", lambda file: file.write_bytes(file.read_bytes() + b"6.png,0\r7"), ("line 8", "comma-separated")),
+        (
+            "cameras.csv",
+            lambda file: file.write_bytes(file.read_bytes() + b"6.png,0\r7"),
+            ("line 8", "comma-separated"),
+        ),
     ],
     "kitti": [("../../poses/07.txt", Path.unlink, "poses.txt")],
     "euroc": [("mav0/cam0/sensor.yaml", fisheye, ("equidistant", "radial-tangential"))],
     "colmap": [
         ("sparse/0/cameras.txt", replaced("OPENCV", "THIN_PRISM_FISHEYE"), ("line 2", "THIN_PRISM_FISHEYE")),
         ("sparse/0/cameras.txt", replaced("OPENCV", "PINHOLE"), ("line 2", "PINHOLE", "8 parameters", "4")),
-        ("sparse/0/cameras.txt", rows(lambda r: [*r, r[0].replace("20.0", "30.0")]), ("line 3", "camera 1 is repeated")),
+        (
+            "sparse/0/cameras.txt",
+            rows(lambda r: [*r, r[0].replace("20.0", "30.0")]),
+            ("line 3", "camera 1 is repeated"),
+        ),
         ("sparse/0/cameras.txt", replaced("1 OPENCV", "6 OPENCV"), ("r_0.png", "camera 1", "missing")),
         ("sparse/0/images.txt", replaced("r_1.png", "r_0.png"), ("r_0.png", "registered twice")),
         ("sparse/0/images.txt", content("# nothing\n"), "no registered image"),
@@ -194,22 +205,28 @@ FAULTS: dict[str, list[tuple[str, Edit, str | tuple[str, ...]]]] = {
         (JSON, frame(0, time="noon"), ("frame 0", "time", "finite number")),
         (JSON, frame(0, time=10**400), ("frame 0", "time", "finite number")),
         (JSON, keys(w=17), ("image is 16x12", "its camera is for 17x12")),
-        (JSON, lambda f: (keys(w=None, h=None)(f), image((13, 16, 3), np.uint8)(f.parent / "images/r_2.png")),
-         ("images/r_2.png", "16x13", "16x12")),
+        (
+            JSON,
+            lambda f: (keys(w=None, h=None)(f), image((13, 16, 3), np.uint8)(f.parent / "images/r_2.png")),
+            ("images/r_2.png", "16x13", "16x12"),
+        ),
         ("images/r_2.png", image((500, 400, 3), np.uint8, cut=True), ("400x500", "16x12")),  # is not decoded
         ("images/r_0.png", of_floats, ("float32", "RGB")),
         ("depth/r_0.png", image((12, 16, 3), np.uint8), ("12x16x3", "one channel")),
         ("depth/r_0.png", image((12, 8)), ("depth is 8x12", "16x12")),
         (JSON, depth_array, ("r_0.npy", "not readable as an array")),
     ],
-}  # fmt: skip
+}
 NEEDED_BY_DATASETS = (
     "has no pose for any of 6 images",
     "the poses of the frames of a dataset",
     "poses.txt",
 )  # sequences do without poses
-CASES = {f"{kind}: {file}: {said}": (kind, file, edit, said)
-         for kind, faults in FAULTS.items() for file, edit, said in faults}  # fmt: skip
+CASES = {
+    f"{kind}: {file}: {said}": (kind, file, edit, said)
+    for kind, faults in FAULTS.items()
+    for file, edit, said in faults
+}
 
 
 @pytest.fixture(scope="module")
@@ -234,9 +251,15 @@ def test_a_fault_is_named_in_one_line(case: str, sound: dict[str, tuple[Path, Pa
 
 @pytest.mark.parametrize(
     "pose",
-    [pose_with(None), pose_with(math.nan), pose_with(-math.inf), pose_with(math.nan, 0, 0), frame(transform_matrix=None),
-     frame(transform_matrix=[[0.0] * 4] * 4)],
-)  # fmt: skip
+    [
+        pose_with(None),
+        pose_with(math.nan),
+        pose_with(-math.inf),
+        pose_with(math.nan, 0, 0),
+        frame(transform_matrix=None),
+        frame(transform_matrix=[[0.0] * 4] * 4),
+    ],
+)
 def test_frames_without_a_pose_are_left_out_and_counted(pose: Edit, tmp_path: Path) -> None:
     folder = LAYOUTS["transforms"].write(tmp_path, small_views(COUNT))
     pose(folder / JSON)
@@ -244,9 +267,7 @@ def test_frames_without_a_pose_are_left_out_and_counted(pose: Edit, tmp_path: Pa
         assert sorted(read_all(folder)) == ["r_0", "r_2", "r_3", "r_4", "r_5"]
     for number in range(COUNT):
         frame(number, transform_matrix=None)(folder / JSON)
-    with refused(
-        where=f"{folder / JSON}: frame 0 (images/r_0.png)", found="no transform_matrix", expected="a 4x4"
-    ):
+    with refused(where=f"{folder / JSON}: frame 0 (images/r_0.png)", found="no transform_matrix", expected="a 4x4"):
         read_all(folder)
 
 
@@ -319,9 +340,7 @@ def test_an_archive_that_is_cut_or_none_or_empty(tmp_path: Path) -> None:
 
 def test_members_that_unpack_to_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The size that the archive states is checked first, and what comes out of it as well."""
-    file = packed(
-        tmp_path, {**record3d_files(small_views(2)), "metadata": bytes(10**6)}, zipfile.ZIP_DEFLATED
-    )
+    file = packed(tmp_path, {**record3d_files(small_views(2)), "metadata": bytes(10**6)}, zipfile.ZIP_DEFLATED)
     monkeypatch.setattr(record3d, "Archive", partial(Archive, largest_member=10**5))
     with refused(where=file / "metadata", found="unpacks to 1 MiB", expected="at most 0 MiB"):
         read_all(file)
