@@ -21,6 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import torch
 from _lab import (
     RESULTS,
@@ -38,7 +39,6 @@ from _lab import (
     times_slower,
     without_depth,
 )
-from query_conditions import resized
 
 from bidnerf import SE3, Frame, View
 from bidnerf.results import normalized_error_squared, pose_error
@@ -65,6 +65,14 @@ def at_night(frame: Frame) -> Frame:
     electrons = electrons + READ_NOISE * torch.randn(electrons.shape, generator=generator)
     rgb = (electrons / FULL_WELL).clamp(0, 1) ** (1 / GAMMA)
     return replace(frame, rgb=(255 * rgb).round() / 255)
+
+
+def resized(frame: Frame, factor: float) -> Frame:
+    """Return the image at another resolution, with the matching camera."""
+    camera = frame.intrinsics.scaled(factor)
+    kind = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+    rgb = cv2.resize(frame.rgb.numpy(), (camera.width, camera.height), interpolation=kind)
+    return replace(frame, rgb=torch.from_numpy(rgb).clamp(0, 1), intrinsics=camera, alpha=None, depth=None)
 
 
 CONDITIONS: dict[str, Callable[[Frame], Frame]] = {
