@@ -45,7 +45,7 @@ from bidnerf.results import normalized_error_squared, pose_error
 from bidnerf_core.captures import tried_landmarks
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.localization import LandmarkMatcher, Loop
-from bidnerf_core.mapping import Features, find_features, tracked_views
+from bidnerf_core.mapping import Features, find_features, track_views
 
 EVERY = (2, 4, 8, 16)
 ONE_GRID = "xfeat, one grid"
@@ -120,7 +120,7 @@ class Maps:
     def __getitem__(self, name: str) -> LandmarkMatcher:
         if name not in self._built:
             views = self._data.views("train", self._names)
-            self._built[name] = LandmarkMatcher(tried_landmarks(tracked_views(views, detector(name)), views))
+            self._built[name] = LandmarkMatcher(tried_landmarks(track_views(views, detector(name)), views))
         return self._built[name]
 
 

@@ -33,7 +33,7 @@ import torch
 from kornia.metrics import psnr, ssim
 from torch import Tensor
 
-from bidnerf_core.captures import RowMotion, at_stored_poses, moved_cameras, pose_updates
+from bidnerf_core.captures import RowMotion, apply_stored_poses, moved_cameras, refinement_updates
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.fields import RadianceField, SceneBounds, device_of, levels, render_image
 from bidnerf_core.frames import View
@@ -41,7 +41,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import LandmarkMatcher, Loop
 from bidnerf_core.maps import Map, load_map
-from bidnerf_core.training import fitted_colours
+from bidnerf_core.training import fit_colours
 
 LEAST_LANDMARKS = 30
 """Minimum number of landmarks from which the pose of a test frame is refined."""
@@ -76,7 +76,7 @@ def train_without_depth(data: Path, out: Path, options: list[str]) -> dict[str, 
 
 
 def judge(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[str, float | None]:
-    """Return the mean PSNR (as rendered, and after ``fitted_colours``) and SSIM, and statistics of the depth error.
+    """Return the mean PSNR (as rendered, and after ``fit_colours``) and SSIM, and statistics of the depth error.
 
     These are the median and 90th percentile of the absolute error (metres) over measured pixels, and the median of its ratio
     to the measured depth.
@@ -85,7 +85,7 @@ def judge(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[
     for view in views:
         image = render_image(field, view.frame.intrinsics, view.T_ref_camera, bounds, motion=view.motion)
         quality.append(float(psnr(image.rgb, view.frame.rgb, 1.0)))
-        fitted.append(float(psnr(fitted_colours(image.rgb, view.frame.rgb).clamp(0, 1), view.frame.rgb, 1.0)))
+        fitted.append(float(psnr(fit_colours(image.rgb, view.frame.rgb).clamp(0, 1), view.frame.rgb, 1.0)))
         pair = [i.permute(2, 0, 1)[None] for i in (image.rgb, view.frame.rgb)]
         likeness.append(float(ssim(*pair, window_size=11).mean()))
         if view.frame.depth is not None:
@@ -163,7 +163,9 @@ def moved_median(updates: Sequence[Tensor | RowMotion | None]) -> dict[str, floa
 def on_training_frames(stored: Map, data: Path) -> dict[str, float | None]:
     """Return the quality on a few training frames, at their poses in the map."""
     views = open_dataset(data, stored.bounds.background).views("train")
-    return judge(stored.field, stored.bounds, at_stored_poses(views, stored.info.cameras)[:: max(1, len(views) // 20)])
+    return judge(
+        stored.field, stored.bounds, apply_stored_poses(views, stored.info.cameras)[:: max(1, len(views) // 20)]
+    )
 
 
 def beside_dense(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[str, Any] | None:
@@ -217,7 +219,7 @@ def main() -> None:
         moved = moved_cameras(stored.info.cameras)
         results["pose_refinement"] = to_plain(stored.info.pose_refinement)
         results["pixels_moved_median"] = statistics.median(m.pixels for m in moved) if moved else 0.0
-        results["moved_median"] = moved_median(pose_updates(stored.info.cameras))
+        results["moved_median"] = moved_median(refinement_updates(stored.info.cameras))
         results["motion_median"] = moved_median([camera.motion for camera in stored.info.cameras])
     if not given.test_frames_only and (compared := beside_dense(stored.field, stored.bounds, views)):
         results["beside_dense"] = compared

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bidnerf_core.fields import encoded_width, frequency_encoding, octaves
+from bidnerf_core.fields import encoding_width, frequency_encoding, octaves
 
 
 def encode(points: Float[Tensor, "*p 3"], frequencies: int) -> Float[Tensor, "*p f"]:
@@ -30,9 +30,9 @@ class ShadingNetwork(nn.Module):
     def __init__(self, width: int, layers: int, position_frequencies: int, direction_frequencies: int) -> None:
         super().__init__()
         self.frequencies = position_frequencies, direction_frequencies
-        self.trunk = trunk(encoded_width(position_frequencies), width, layers)
+        self.trunk = trunk(encoding_width(position_frequencies), width, layers)
         self.density = nn.Linear(width, 1)
-        self.view = nn.Linear(width + encoded_width(direction_frequencies), max(1, width // 2))
+        self.view = nn.Linear(width + encoding_width(direction_frequencies), max(1, width // 2))
         self.colour = nn.Linear(max(1, width // 2), 3)
 
     def forward(
@@ -58,7 +58,7 @@ class Oracle(nn.Module):
         super().__init__()
         self.frequencies = frequencies
         self.register_buffer("places", torch.linspace(0, 1, points), persistent=False)
-        self.trunk = trunk(points * encoded_width(frequencies), width, layers)
+        self.trunk = trunk(points * encoding_width(frequencies), width, layers)
         self.scores = nn.Linear(width, bins)
         nn.init.constant_(self.scores.bias, FULL)
 

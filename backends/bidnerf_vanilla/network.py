@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bidnerf_core.fields import encoded_width, frequency_encoding, octaves
+from bidnerf_core.fields import encoding_width, frequency_encoding, octaves
 from bidnerf_core.settings import Count, Layers, Range, Settings
 
 
@@ -36,8 +36,8 @@ class NerfNetwork(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        seen = encoded_width(config.position_frequencies, config.include_input)
-        turned = encoded_width(config.direction_frequencies, config.include_input)
+        seen = encoding_width(config.position_frequencies, config.include_input)
+        turned = encoding_width(config.direction_frequencies, config.include_input)
         inputs = [config.width + seen * self._is_fed(number) for number in range(1, config.layers)]
         self.trunk = nn.ModuleList(nn.Linear(count, config.width) for count in (seen, *inputs))
         self.density = nn.Linear(config.width, 1)

@@ -21,7 +21,7 @@ from bidnerf.scenes import ClosedFormData, is_closed_form
 from bidnerf_core.datasets import Capture, DatasetOptions, in_other_split
 from bidnerf_core.errors import InputError, InputWarning, amount, refuse_text, unknown_name
 from bidnerf_core.frames import INVERTED, HiddenColour
-from bidnerf_core.geometry import SE3, perturb, random_units, turned_about
+from bidnerf_core.geometry import SE3, perturb, random_units, rotate_about
 from bidnerf_core.io import parse_record
 from bidnerf_core.localization import find_method, settings_of
 from bidnerf_core.settings import LARGEST_SEED, Range, Settings, WholeNumbers, to_flat
@@ -425,7 +425,7 @@ def arc(poses: Sequence[SE3], last: int, count: int, angle_deg: float) -> tuple[
     directions = torch.nn.functional.normalize(positions - middle, dim=-1)
     fitting = []
     for step in (angle_deg, -angle_deg):
-        turns = [turned_about(poses[last], middle, up, number * step) for number in range(count)]
+        turns = [rotate_about(poses[last], middle, up, number * step) for number in range(count)]
         ideal = torch.nn.functional.normalize(torch.stack([T.translation for T in turns]) - middle, dim=-1)
         cosines = directions @ ideal.mT  # (frames, steps)
         taken, missed = [last], [0.0]

@@ -24,7 +24,7 @@ from bidnerf.results.errors import (
 from bidnerf.results.plots import draw_path
 from bidnerf.results.pose_files import PosedImage, pose_format, write_poses
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.captures import UpDirection, as_given
+from bidnerf_core.captures import UpDirection, given_cameras
 from bidnerf_core.datasets import Query, QuerySource
 from bidnerf_core.depth import noise_remark
 from bidnerf_core.errors import InputError, UsageError, amount
@@ -355,7 +355,7 @@ class Answers:
             rows.append(("inside 95 % bound", f"{share:.1%} (by the poses' covariances)"))
         # Frames are training images of the map if their names and true poses are the same, up to rounding in files.
         info = getattr(self.scene, "info", None)
-        cameras = () if info is None else as_given(info.cameras)
+        cameras = () if info is None else given_cameras(info.cameras)
         given = {camera.name: camera.pose.translated(origin_of(self.scene)).matrix() for camera in cameras}
         seen = sum(
             answer.truth is not None

@@ -23,7 +23,7 @@ from bidnerf_core.datasets import Capture, Shot
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds, render_image
 from bidnerf_core.frames import BLACK, Frame
-from bidnerf_core.geometry import SE3, turned_about
+from bidnerf_core.geometry import SE3, rotate_about
 from bidnerf_core.maps import Map, MapInfo
 
 PREFIX = "demo:"
@@ -70,7 +70,7 @@ class ClosedFormData(Capture):
                 raise InputError(f"no frame {name!r}", where=self.path, expected=expected)
             pose = by_name[own].T_world_camera
             assert pose is not None
-            turned = turned_about(pose, middle, up, float(angle or 0))
+            turned = rotate_about(pose, middle, up, float(angle or 0))
             found.append(replace(by_name[own], T_world_camera=turned, name=name))
         return found
 

@@ -19,7 +19,7 @@ from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
     TrackedViews,
     depth_ratio,
-    tracked_views,
+    track_views,
 )
 
 ENOUGH_POINTS = 30
@@ -148,4 +148,4 @@ class ReaderContract(Named):
 
     def _tracked(self) -> TrackedViews:
         """Return the keypoints of the images, joined into tracks; computed once per test class."""
-        return once(self, lambda: tracked_views(self._views()))
+        return once(self, lambda: track_views(self._views()))

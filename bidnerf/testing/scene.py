@@ -13,7 +13,7 @@ from torch import Tensor
 from bidnerf.scenes import demo_object, orbit
 from bidnerf.scenes import views as seen_from
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.fields import Rays, widened
+from bidnerf_core.fields import Rays, widen
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 
@@ -89,7 +89,7 @@ def awkward_rays() -> dict[str, Rays]:
         "rays from outside": SCENE_BOUNDS.rays(outside, across),
         "rays from within the box": SCENE_BOUNDS.rays(inside, away),
         "rays along the axes": SCENE_BOUNDS.rays(middle - 2 * SIDE * axes + 0.1 * SIDE * axes.roll(1, -1), axes),
-        "rays that are sampled twice as far": widened(SCENE_BOUNDS.rays(outside, away), 2.0),
+        "rays that are sampled twice as far": widen(SCENE_BOUNDS.rays(outside, away), 2.0),
         "rays that miss the scene": SCENE_BOUNDS.rays(outside, -away),
     }
 

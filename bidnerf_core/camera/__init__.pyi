@@ -27,8 +27,8 @@ from .rolling_shutter import poses_of_rows as poses_of_rows
 from .source import WAYS as WAYS
 from .source import WAYS_OF_PHOTO as WAYS_OF_PHOTO
 from .source import CameraSource as CameraSource
-from .source import FoundCamera as FoundCamera
 from .source import Raster as Raster
+from .source import ResolvedCamera as ResolvedCamera
 from .source import camera_from_exif as camera_from_exif
-from .source import checked_side as checked_side
+from .source import check_side as check_side
 from .source import folder_camera as folder_camera

@@ -169,7 +169,7 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
         values = parse_yaml(content, str(path), EXPECTED)
         if not isinstance(values, Mapping):
             raise InputError(where=path, expected=EXPECTED)
-        return calibrated_camera(str(path), values, size)
+        return parse_calibration(str(path), values, size)
     return _chosen(path, _text_cameras(path, content), photo)
 
 
@@ -177,12 +177,12 @@ def _json_camera(record: Record, size: tuple[int, int]) -> Camera:
     values = record.values
     views = values.get("parameters")
     if isinstance(views, list) and views and isinstance(views[0], Mapping):  # Open3D's trajectory
-        found = {calibrated_camera(record.where, view, size) for view in views}
+        found = {parse_calibration(record.where, view, size) for view in views}
         if len(found) > 1:
             raise record.error(f"holds {len(found)} cameras", expected="one")
         return found.pop()
     if any(key in values for key in ("intrinsic_matrix", "intrinsic", "camera_matrix", "K")):
-        return calibrated_camera(record.where, values, size)
+        return parse_calibration(record.where, values, size)
     camera = camera_record(record)
     return camera.intrinsics(camera.width or size[0], camera.height or size[1])
 
@@ -242,7 +242,7 @@ def _text_cameras(path: Path, content: bytes, named: bool = True) -> dict[str, C
     return found
 
 
-def calibrated_camera(where: str, values: Mapping[str, Any], size: tuple[int, int]) -> Camera:
+def parse_calibration(where: str, values: Mapping[str, Any], size: tuple[int, int]) -> Camera:
     """Parse the camera in a mapping written by a calibration tool or a robot.
 
     Without an image size in it, ``size`` (width, height) is assumed. Raises ``InputError``, whose message begins with

@@ -23,7 +23,7 @@ WAYS_OF_PHOTO = "--camera FILE, --focal PX or --hfov DEG (in Python camera=, foc
 
 
 @dataclass(frozen=True)
-class FoundCamera:
+class ResolvedCamera:
     """The camera of an upright image (the lens, if the image is resampled), and a one-line description of its source."""
 
     camera: Camera
@@ -35,16 +35,16 @@ class FoundCamera:
         """The pinhole camera of the image after any resampling."""
         return self.camera.pinhole
 
-    def at_most(self, largest: int | None) -> FoundCamera:
+    def at_most(self, largest: int | None) -> ResolvedCamera:
         """Return the camera of the image reduced to at most ``largest`` pixels along its longer side, see ``checked_side``."""
-        side = checked_side(largest)
+        side = check_side(largest)
         if side is None or max(self.camera.width, self.camera.height) <= side:
             return self
         size = reduced_size(self.camera.width, self.camera.height, side)
         return replace(self, camera=self.camera.resized(*size))
 
 
-def checked_side(largest: int | None) -> int | None:
+def check_side(largest: int | None) -> int | None:
     """Return ``largest``, a limit on an image's longer side (pixels). Raises ``InputError`` unless it is a positive integer."""
     if largest is not None and (isinstance(largest, bool) or not isinstance(largest, int) or largest < 1):
         raise InputError(f"largest is {largest!r}", expected="a positive whole number of pixels")
@@ -118,7 +118,7 @@ class CameraSource:
         if not self.is_given and not self.assumed:
             raise InputError(why, where=path, expected=f"a camera: {WAYS}")
 
-    def find(self, where: Path | str, raster: Raster, exif: Exif | None = None) -> FoundCamera:
+    def find(self, where: Path | str, raster: Raster, exif: Exif | None = None) -> ResolvedCamera:
         """Return the camera of an upright image: the given one, else the one in EXIF, else one of the ``assumed`` ones.
 
         Raises ``InputError``, whose message begins with ``where``, if several cameras are given, if none is
@@ -178,12 +178,12 @@ def folder_camera(
     return CameraSource(found)
 
 
-def _described(camera: Intrinsics, origin: str) -> FoundCamera:
+def _described(camera: Intrinsics, origin: str) -> ResolvedCamera:
     centred = "(the principal point is assumed to be the image centre)"
-    return FoundCamera(camera, f"{origin}: {camera.sentence} {centred}")
+    return ResolvedCamera(camera, f"{origin}: {camera.sentence} {centred}")
 
 
-def _fitted(where: str, raster: Raster, given: Camera, origin: str) -> FoundCamera:
+def _fitted(where: str, raster: Raster, given: Camera, origin: str) -> ResolvedCamera:
     fitted = raster.upright(given)
     if fitted is None:
         size = "x".join(map(str, raster.upright_size))
@@ -192,10 +192,10 @@ def _fitted(where: str, raster: Raster, given: Camera, origin: str) -> FoundCame
             expected = "images that are not turned by a quarter against their cameras: export them as stored"
         found = f"image is {size}, but its camera is for {given.width}x{given.height}"
         raise InputError(found, where=where, expected=expected)
-    return FoundCamera(fitted, f"{origin}: {fitted.sentence}")
+    return ResolvedCamera(fitted, f"{origin}: {fitted.sentence}")
 
 
-def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: bool = False) -> FoundCamera:
+def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: bool = False) -> ResolvedCamera:
     """Return the camera that EXIF describes, accurate to a few percent and assumed to be free of distortion.
 
     If ``may_be_cropped``, an image cropped after it was taken is assumed to have kept its resolution unless its size
@@ -234,7 +234,7 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: boo
     return replace(found, description=found.description + part)
 
 
-def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> FoundCamera | None:
+def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> ResolvedCamera | None:
     """Return the camera with the median focal length among the cameras of the same size, or else of the same aspect
     ratio, or else among centre crops.
 
@@ -249,5 +249,5 @@ def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> FoundCamera | Non
     likely, *others = (sorted(group, key=lambda c: c.fx)[(len(group) - 1) // 2] for group in groups)
     origin = f"camera unknown, assumed to be that of {'' if whole else 'centre crops of '}the map's images"
     if not others:
-        return FoundCamera(likely, f"{origin}: {likely.sentence}")
+        return ResolvedCamera(likely, f"{origin}: {likely.sentence}")
     return _described(Intrinsics.from_focal(math.sqrt(likely.fx * likely.fy), *size), origin)

@@ -17,7 +17,7 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics, Orientation
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.frames import View
-from bidnerf_core.geometry import SE3, Similarity, multiplied
+from bidnerf_core.geometry import SE3, Similarity, scale_point
 from bidnerf_core.io import parse_record, read_file, write_file
 
 MatrixRows = tuple[tuple[float, float, float, float], ...]
@@ -53,7 +53,7 @@ class StoredCamera:
 
     def scaled(self, factor: float) -> StoredCamera:
         """Return the camera with all lengths (positions and motion) multiplied by ``factor``."""
-        motion = self.motion and (*multiplied(self.motion[:3], factor), *self.motion[3:])
+        motion = self.motion and (*scale_point(self.motion[:3], factor), *self.motion[3:])
         scaled = self._mapped(lambda rows: (*((a, b, c, t * factor) for a, b, c, t in rows[:3]), rows[3]))
         return replace(scaled, motion=motion)
 
@@ -118,12 +118,12 @@ def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
     )
 
 
-def as_given(cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
+def given_cameras(cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
     """Return the cameras at the poses given in the dataset, with names and intrinsics only."""
     return tuple(StoredCamera(c.name, c.intrinsics, c.given_T_world_camera or c.T_world_camera) for c in cameras)
 
 
-def moved_from(
+def record_refinement(
     given: Sequence[View], refined: Sequence[StoredCamera], pixels: Sequence[float]
 ) -> tuple[StoredCamera, ...]:
     """Return the refined cameras, with the given pose and the shift ``pixels`` recorded where the pose changed."""
@@ -135,7 +135,7 @@ def moved_from(
     )
 
 
-def with_wrong_pose(cameras: Sequence[StoredCamera]) -> list[str]:
+def cameras_with_invalid_pose(cameras: Sequence[StoredCamera]) -> list[str]:
     """Return the names of cameras whose given or refined pose is not a rigid transform."""
     poses = [(c.name, rows) for c in cameras for rows in (c.T_world_camera, c.given_T_world_camera) if rows]
     wrong = {name for name, rows in poses if len(rows) != 4}
@@ -145,7 +145,7 @@ def with_wrong_pose(cameras: Sequence[StoredCamera]) -> list[str]:
     return [camera.name for camera in cameras if camera.name in wrong]
 
 
-def pose_updates(cameras: Sequence[StoredCamera]) -> list[Float[Tensor, "6"] | None]:
+def refinement_updates(cameras: Sequence[StoredCamera]) -> list[Float[Tensor, "6"] | None]:
     """Return the right updates (metres, then radians) from given to refined poses; None for unrefined poses."""
     if not cameras:
         return []
@@ -160,7 +160,7 @@ def moved_cameras(cameras: Sequence[StoredCamera]) -> list[MovedCamera]:
     """Return how far refinement moved each camera whose pose it changed."""
     return [
         MovedCamera(c.name, float(u[:3].norm()), math.degrees(u[3:].norm()), c.moved_pixels or 0.0, c.motion)
-        for c, u in zip(cameras, pose_updates(cameras), strict=True)
+        for c, u in zip(cameras, refinement_updates(cameras), strict=True)
         if u is not None
     ]
 
@@ -193,7 +193,7 @@ def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> li
     return lines
 
 
-def at_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -> list[View]:
+def apply_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -> list[View]:
     """Return the views with the refined poses and motions from ``cameras``, matched by name and given pose.
 
     Views whose pose was not refined are returned unchanged.

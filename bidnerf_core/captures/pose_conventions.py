@@ -80,10 +80,10 @@ class PoseContradiction:
 def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | None:
     """Return how the poses of ``images`` contradict the images; None if they agree, or if the images are inconclusive."""
     proposed = _pairs(images)
-    pairs = [pair for i, j in proposed if (pair := matched_pair(images, i, j)) is not None]
+    pairs = [pair for i, j in proposed if (pair := match_pair(images, i, j)) is not None]
     if len(pairs) < MOST_PAIRS / 2:
         others = [pair for pair in _similar(images) if pair not in proposed][:MOST_PAIRS]
-        pairs += [pair for i, j in others if (pair := matched_pair(images, i, j)) is not None]
+        pairs += [pair for i, j in others if (pair := match_pair(images, i, j)) is not None]
     if len(pairs) < 8:  # too few to judge the poses
         return None
     poses = SE3.stack([image.T_ref_camera for image in images])
@@ -106,7 +106,7 @@ def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | 
     # Two images that do not agree with each other, but each with a neighbour, show places that look alike.
     disputes = [{pair.first, pair.second} for pair, agreed in zip(pairs, agrees, strict=True) if not agreed]
     near = likely_pairs([image.T_ref_camera for image in images], 2).tolist()
-    nearby = [matched_pair(images, i, j) for i, j in near if any({i, j} & both for both in disputes)]
+    nearby = [match_pair(images, i, j) for i, j in near if any({i, j} & both for both in disputes)]
     sound = {i for pair in nearby if pair and bool(pair.agreeing(poses[None])[0]) for i in (pair.first, pair.second)}
     alike = sum(both <= sound for both in disputes)
     return PoseContradiction(len(pairs), as_given) if as_given < 0.5 * (len(pairs) - alike) else None
@@ -192,7 +192,7 @@ def _mutual(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tuple[Int[Tenso
     return rows, partner[rows]
 
 
-def matched_pair(images: Sequence[ImageKeypoints], i: int, j: int) -> MatchedPair | None:
+def match_pair(images: Sequence[ImageKeypoints], i: int, j: int) -> MatchedPair | None:
     """Return the matches of two images that are inliers of an essential matrix; None if there are too few."""
     a, b = images[i], images[j]
     if min(len(a.keypoints), len(b.keypoints)) < ENOUGH_MATCHES:
@@ -221,7 +221,7 @@ def readings(count: int) -> tuple[Reading, ...]:
     return tuple(itertools.chain(*kinds))
 
 
-def changed(
+def reinterpret(
     T: SE3,
     axes: Float[Tensor, "3 3"] = AS_GIVEN,
     positions: Float[Tensor, "3 3"] = AS_GIVEN,
@@ -242,20 +242,20 @@ def _of_axes() -> Iterator[Reading]:
         "their cameras' y and z axes are reversed (OpenCV's and COLMAP's axes where OpenGL's and Blender's are expected, or the"
         " other way round)",
         SWAP,
-        partial(changed, axes=Y_AND_Z_REVERSED),
+        partial(reinterpret, axes=Y_AND_Z_REVERSED),
     )
     rotations = signed_permutations(1)  # as given first, then with y and z reversed
     for axes in rotations[2:]:
         yield Reading(
             f"their cameras have other axes: {_named(axes)}",
             "permute and reverse the first three columns of each accordingly",
-            partial(changed, axes=axes),
+            partial(reinterpret, axes=axes),
         )
     for number, axes in enumerate(rotations):
         yield Reading(
             f"they are inverses (world to camera){'' if number < 2 else f', of cameras whose {_named(axes)}'}",
             f"invert each, and if they are then rejected again, {SWAP}",
-            partial(changed, axes=axes, inverted=True),
+            partial(reinterpret, axes=axes, inverted=True),
         )
 
 
@@ -347,7 +347,7 @@ def _of_worlds() -> Iterator[Reading]:
         yield Reading(
             "their axes are left-handed, as in Unity",
             f"multiply each from the left by diag(1, 1, -1, 1); {_named(axes)} then",
-            partial(changed, axes=axes, positions=mirror, mirror=mirror),
+            partial(reinterpret, axes=axes, positions=mirror, mirror=mirror),
         )
 
 
@@ -358,7 +358,7 @@ def _of_positions() -> Iterator[Reading]:
         clause = f"x, y and z of their positions are the given ones' {order}"
         remedy = "correct the fourth column of each, not the rotations"
         for axes, also, swap in ((AS_GIVEN, "", ""), (Y_AND_Z_REVERSED, REVERSED_TOO, f", and {SWAP}")):
-            yield Reading(clause + also, remedy + swap, partial(changed, axes=axes, positions=D))
+            yield Reading(clause + also, remedy + swap, partial(reinterpret, axes=axes, positions=D))
 
 
 def _of_orders(count: int) -> Iterator[Reading]:
@@ -393,7 +393,7 @@ def _in_file_axes(clause: str, remedy: str, understand: Callable[[SE3], SE3]) ->
     """Yield the reading in our camera axes and in those of a file with y and z reversed, then with a reversal on one side only."""
 
     def whole(T: SE3, before: Tensor, after: Tensor) -> SE3:
-        return changed(understand(changed(T, before)), after)
+        return reinterpret(understand(reinterpret(T, before)), after)
 
     # The reader also reverses y and z of correct poses, so a reversal on both sides needs no remedy; one on a single side does.
     both = (AS_GIVEN, Y_AND_Z_REVERSED)

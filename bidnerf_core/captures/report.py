@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from bidnerf_core.errors import amount
-from bidnerf_core.geometry import multiplied
+from bidnerf_core.geometry import scale_point
 from bidnerf_core.mapping import HeldOutTrial
 
 PhotoProblem = Literal["mirrored", "turned", "badly posed", "apart", "isolated", "blurred", "badly exposed"]
@@ -123,12 +123,12 @@ class CaptureReport:
         photos = tuple(
             replace(
                 photo,
-                position=multiplied(photo.position, factor),
+                position=scale_point(photo.position, factor),
                 pose_translation=None if photo.pose_translation is None else photo.pose_translation * factor,
             )
             for photo in self.photos
         )
-        coverage = replace(self.coverage, centre=multiplied(self.coverage.centre, factor))
+        coverage = replace(self.coverage, centre=scale_point(self.coverage.centre, factor))
         return replace(self, photos=photos, coverage=coverage, trial=self.trial.scaled(factor))
 
     def with_problem(self, *problems: PhotoProblem) -> list[PhotoRecord]:

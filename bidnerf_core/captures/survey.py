@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from bidnerf_core.captures.coverage import UpDirection, coverage
-from bidnerf_core.captures.pose_conventions import matched_pair
+from bidnerf_core.captures.pose_conventions import match_pair
 from bidnerf_core.captures.report import CaptureReport, PhotoProblem, PhotoRecord
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
@@ -35,13 +35,13 @@ from bidnerf_core.mapping import (
     pose_updates,
     robust_covariance,
 )
-from bidnerf_core.training import blurred, excess, exposures, nearby, photo_measures, standing_out
+from bidnerf_core.training import are_blurred, are_outliers, excess, exposures, nearby_photos, photo_measures
 
 LEAST_GROUP = 3
 """Smallest number of linked photos that form a group."""
 
 
-def surveyed(
+def survey_capture(
     tracked: TrackedViews,
     views: Sequence[View],
     config: LandmarkConfig = DEFAULT_LANDMARKS,
@@ -55,21 +55,21 @@ def surveyed(
     held-out photos, and ``up`` is the upward direction of the scene, if known.
     """
     seen, positions = tracked.triangulated(config)
-    links = linked(seen)
+    links = link_photos(seen)
     sharp, overexposed, underexposed = photo_measures(views)
     group = groups(links)
-    near = nearby(views, group)
+    near = nearby_photos(views, group)
     count = torch.bincount(seen.image, minlength=len(views))
     doubtful = suspects(seen, links)
     posed: dict[int, Relocation | None] = dict(_by_own_landmarks(seen, positions, views))
-    posed |= dict.fromkeys(doubtful) | relocated(tracked, views, doubtful, config)
+    posed |= dict.fromkeys(doubtful) | relocate_photos(tracked, views, doubtful, config)
     exposure, sharpness = exposures(views, seen), excess(sharp, near)
     compared = exposure.isfinite()
     is_badly_exposed = torch.maximum(excess(overexposed, near), excess(underexposed, near)) > 0.25
     # Training corrects differences of less than a stop.
     if bool(compared.any()):
-        is_badly_exposed[compared] |= standing_out(exposure[compared].abs(), 1.0)
-    defects: dict[PhotoProblem, Tensor] = {"blurred": blurred(-sharpness), "badly exposed": is_badly_exposed}
+        is_badly_exposed[compared] |= are_outliers(exposure[compared].abs(), 1.0)
+    defects: dict[PhotoProblem, Tensor] = {"blurred": are_blurred(-sharpness), "badly exposed": is_badly_exposed}
     grouped = bool((group >= 0).any())  # if no photos are linked at all, no photo is reported as unlinked
     photos = []
     for i, (view, image) in enumerate(zip(views, seen.images, strict=True)):
@@ -132,7 +132,7 @@ def _by_own_landmarks(
     return found
 
 
-def linked(seen: TrackedKeypoints) -> csr_array:
+def link_photos(seen: TrackedKeypoints) -> csr_array:
     """Return the pairs of images that share enough landmarks, in both directions, as a sparse matrix (v, v).
 
     ``seen`` holds the keypoints consistent with their triangulated points. Five shared landmarks link two images: images of
@@ -214,7 +214,7 @@ def _has_support(images: Sequence[ImageKeypoints], links: csr_array, number: int
     """
     poses, needed = SE3.stack([image.T_ref_camera for image in images]), LEAST_GROUP - 1
     for other in links.indices[links.indptr[number] : links.indptr[number + 1]].tolist():
-        pair = matched_pair(images, number, other)
+        pair = match_pair(images, number, other)
         if pair is not None and bool(pair.agreeing(poses[None])[0]):
             needed -= 1
         if not needed:
@@ -222,7 +222,7 @@ def _has_support(images: Sequence[ImageKeypoints], links: csr_array, number: int
     return False
 
 
-def relocated(
+def relocate_photos(
     tracked: TrackedViews, views: Sequence[View], numbers: Sequence[int], config: LandmarkConfig
 ) -> dict[int, Relocation]:
     """Localize the photos ``numbers`` with landmarks built without them; photos that cannot be localized are left out.

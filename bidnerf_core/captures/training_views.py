@@ -16,13 +16,13 @@ from bidnerf_core.camera import STILL, MotionPrior
 from bidnerf_core.captures.cameras import (
     PoseRefinement,
     StoredCamera,
-    moved_from,
     pose_sentences,
+    record_refinement,
     stored_cameras,
 )
 from bidnerf_core.captures.coverage import shows_distances
 from bidnerf_core.captures.pose_conventions import pose_contradiction
-from bidnerf_core.captures.survey import linked, relocated, suspects
+from bidnerf_core.captures.survey import link_photos, relocate_photos, suspects
 from bidnerf_core.carving import has_outline
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
@@ -40,15 +40,15 @@ from bidnerf_core.mapping import (
     PosePrior,
     TrackedKeypoints,
     TrackedViews,
-    adjusted,
+    adjust_bundle,
     depth_ratio,
+    detect_keypoints,
     log_evidence,
     noise,
     pinhole,
     pose_updates,
-    posed_keypoints,
     resections,
-    tracked_views,
+    track_views,
 )
 from bidnerf_core.progress import counter
 
@@ -79,7 +79,7 @@ class TrainingViews:
     distances: bool = True  # whether the views determine distances
 
 
-def prepared(
+def prepare_views(
     views: Sequence[View],
     refinement: RefinementChoice = "auto",
     features: str = USUAL_FEATURES,
@@ -93,12 +93,12 @@ def prepared(
     pairs of images, unless ``trust_poses`` is set, and if measured depth is clearly in a different unit from the poses.
     """
     if refinement == "never":
-        tracked, seeing = located(views, features, trust_poses, depth_unit)
+        tracked, seeing = track_landmarks(views, features, trust_poses, depth_unit)
         if tracked is None and not trust_poses:
             # Up to twelve evenly spread runs of five consecutive views suffice to check the poses.
             every = 5 * max(1, math.ceil(len(views) / 60))
             some = [view for number, view in enumerate(views) if number % every < 5]
-            _check_poses(posed_keypoints(some, SIFT))
+            _check_poses(detect_keypoints(some, SIFT))
         return TrainingViews(seeing, tracked, stored_cameras(views), distances=shows_distances(views, tracked))
     tracked = _tracked(views, features, trust_poses, depth_unit)
     found = training_poses(tracked, views, 0.0 if refinement == "always" else INCONSISTENT)
@@ -108,7 +108,7 @@ def prepared(
         moved = [replace(view, T_ref_camera=poses[i]) for i, view in enumerate(views)]
         if bool(motion.any()):
             moved = [replace(view, motion=motion[i]) for i, view in enumerate(moved)]
-    cameras = moved_from(views, stored_cameras(moved), found.pixels.tolist())
+    cameras = record_refinement(views, stored_cameras(moved), found.pixels.tolist())
     summary = None
     if found.consistency is not None:
         names = tuple(views[number].frame.name for number in found.replaced)
@@ -125,7 +125,7 @@ def prepared(
     return TrainingViews(seeing, found.tracked, cameras, summary, distances)
 
 
-def located(
+def track_landmarks(
     views: Sequence[View],
     features: str = USUAL_FEATURES,
     trust_poses: bool = False,
@@ -152,7 +152,7 @@ def _tracked(views: Sequence[View], features: str, trust_poses: bool, depth_unit
 
     The unit is checked last, since triangulated distances are meaningless under wrong poses.
     """
-    tracked = tracked_views(views, features)
+    tracked = track_views(views, features)
     counter("checking poses", "stage")(0, 1)
     if not trust_poses:
         _check_poses(tracked.observations.images)
@@ -226,14 +226,14 @@ def training_poses(
     standard deviation of the keypoints; otherwise they are kept.
     """
     seen, _ = tracked.triangulated(config)
-    elsewhere = relocated(tracked, views, suspects(seen, linked(seen)), config)
+    elsewhere = relocate_photos(tracked, views, suspects(seen, link_photos(seen)), config)
     wrong = {i: photo for i, photo in elsewhere.items() if photo.problem in ("badly posed", "turned")}
     if wrong:
         updates = torch.zeros(len(views), 6, dtype=torch.float64)
         for number, photo in wrong.items():
             updates[number] = photo.update
         tracked = tracked.at(tracked.T_world_camera.retract(updates)).matched_anew(config)
-    fit = adjusted_poses(tracked, config, least)
+    fit = adjust_poses(tracked, config, least)
     pixels, refined = torch.zeros(len(views), dtype=torch.float64), False
     if fit is not None and fit[2].inconsistency >= least:
         (tracked, pixels, _), refined = fit, True
@@ -248,7 +248,7 @@ def training_poses(
     return TrainingPoses(tracked, pixels, list(wrong), refined, None if fit is None else fit[2])
 
 
-def adjusted_poses(
+def adjust_poses(
     tracked: TrackedViews, config: LandmarkConfig, least: float = 0.0
 ) -> tuple[TrackedViews, Float[Tensor, "v"], PoseRefinement] | None:
     """Bundle-adjust the poses and points of the ``tracked`` images; None if there are too few images or points.
@@ -276,7 +276,7 @@ def adjusted_poses(
     for number in range(ROUNDS):
         start = Adjustment(tracked.T_world_camera, points, tracked.motion)
         prior = PosePrior(given, *deviations, motion)
-        fit = adjusted(seen.sightings, start, prior, noise_of(seen, points), KEYPOINTS_PER_INDEPENDENT)
+        fit = adjust_bundle(seen.sightings, start, prior, noise_of(seen, points), KEYPOINTS_PER_INDEPENDENT)
         step = _image_motion(seen, fit.points, tracked.T_world_camera, fit.T_world_camera)
         moved = _deviations((given.inverse() @ fit.T_world_camera).log())
         deviations = max(deviations[0], moved[0]), max(deviations[1], moved[1])

@@ -24,7 +24,7 @@ from bidnerf_core.mapping import (
     LandmarkConfig,
     LandmarkMap,
     TrackedViews,
-    concatenated,
+    concatenate,
 )
 
 QUANTILE = 0.9
@@ -93,7 +93,7 @@ def _answers(
             others = torch.ones(len(landmarks), dtype=torch.bool)
             others[landmarks.tracks.landmark[seen].long()] = False
             anew = tracked.of_points_in(held_out).without(held_out).landmarks(config)
-            landmarks = concatenated([landmarks[others], anew])
+            landmarks = concatenate([landmarks[others], anew])
     except InputError:  # the remaining images do not overlap
         return answers, updates[0]
     plain = replace(landmarks, correlation=1.0, pose_covariance=torch.zeros_like(landmarks.pose_covariance))

@@ -12,14 +12,14 @@ from torch import Tensor
 
 from bidnerf_core.carving.free_space import occupied_cells
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields import SceneBounds, crossed_box
+from bidnerf_core.fields import SceneBounds, intersect_box
 from bidnerf_core.frames import SeenLandmarks, View
 
 AxisBox: TypeAlias = tuple[Float[Tensor, "3"], Float[Tensor, "3"]]
 """Lower and upper corner: metres, world, float64."""
 
 
-def grown(lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], at_least: float = 0.0, share: float = 0.03) -> AxisBox:
+def grow(lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], at_least: float = 0.0, share: float = 0.03) -> AxisBox:
     """Return the box with a margin of ``share`` of its size at each end, or of ``at_least`` metres if that is more.
 
     A flat box is given some thickness.
@@ -51,7 +51,7 @@ def has_outline(view: View) -> bool:
     )
 
 
-def carved_box(box: AxisBox, views: Sequence[View]) -> AxisBox:
+def carve_box(box: AxisBox, views: Sequence[View]) -> AxisBox:
     """Return the box of the cells that no two views see through and at which many views see something.
 
     The threshold on the number of views that see something at a cell, as a fraction of its maximum over all cells, is the largest for which
@@ -70,8 +70,8 @@ def carved_box(box: AxisBox, views: Sequence[View]) -> AxisBox:
         witnesses = torch.stack([_shows_something(view, points) for view in views]).sum(dim=0)
         for share in (0.5, 0.25, 0.1, 0.0):
             cells = kept[witnesses >= share * witnesses.amax()]
-            box = grown(lower + cells.amin(dim=0) * cell, lower + (cells.amax(dim=0) + 1) * cell)
-            near, far = crossed_box(origins, directions, *box)
+            box = grow(lower + cells.amin(dim=0) * cell, lower + (cells.amax(dim=0) + 1) * cell)
+            near, far = intersect_box(origins, directions, *box)
             if (far >= near.clamp(min=0)).double().mean() >= 0.999:
                 break
     return box
@@ -129,20 +129,20 @@ def estimate_bounds(views: Sequence[View], background: tuple[float, float, float
         share = max(500, 400_000 // len(measured))
         points, distances = map(torch.cat, zip(*(measured_points(v, share) for v in measured), strict=True))
         nearest = distances.sort().values[round(OUTLIERS * (len(points) - 1))].item()
-        box = grown(*_middle(points, OUTLIERS), nearest / 100, 0.03 if dense else 0.1)
+        box = grow(*_middle(points, OUTLIERS), nearest / 100, 0.03 if dense else 0.1)
         near = nearest / 2
         shown = [(view, float(d[d > 0].median())) for view in measured if (d := view.frame.depth) is not None]
     elif contracted and sum(len(seen.distance) for _, seen in seeing) >= 50:
         distances = torch.cat([seen.distance for _, seen in seeing]).sort().values
         points = torch.cat([_landmark_points(view, seen) for view, seen in seeing])
-        box = grown(*_middle(points, 0.05), distances[0].item() / 100)
+        box = grow(*_middle(points, 0.05), distances[0].item() / 100)
         last = len(points) - 1
         near = distances[round(0.01 * last)].item() / 2
         beyond = distances[round((1 - OUTLIERS) * last)].item()
         shown = [(view, float(seen.distance.median())) for view, seen in seeing]
     else:
         box = _guessed_box(views, places)
-        box = box if contracted else carved_box(box, outlined)
+        box = box if contracted else carve_box(box, outlined)
         outside = torch.maximum(box[0] - places, places - box[1]).clamp(min=0)
         nearest = torch.linalg.vector_norm(outside, dim=-1).amin().item()  # 0 if a camera is inside
         near = max(nearest / 2, 0.01 * _farthest(places, box))

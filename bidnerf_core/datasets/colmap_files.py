@@ -36,7 +36,7 @@ from bidnerf_core.depth import DepthImage, depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import is_file, read_file, read_lines
-from bidnerf_core.mapping import FIRST_CENTRE, Keypoints, quantized
+from bidnerf_core.mapping import FIRST_CENTRE, Keypoints, quantize
 
 MODEL_FILE = "a file of a COLMAP sparse model"
 LARGEST_MODEL = 2**30  # bytes of one file of a model
@@ -256,7 +256,7 @@ def stored_keypoints(path: Path) -> Iterator[tuple[str, Keypoints]]:
         sizes = torch.from_numpy(2 * np.asarray(scales, dtype=np.float32))
         numbers = torch.from_numpy(np.array(descriptors))
         if numbers.dtype != torch.uint8:
-            numbers = quantized(numbers.float())
+            numbers = quantize(numbers.float())
         yield name, Keypoints(torch.from_numpy(np.array(pixels, dtype=np.float32)), sizes, numbers)
 
 

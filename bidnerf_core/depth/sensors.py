@@ -110,7 +110,7 @@ LEAST_VALUES = 8
 """Minimum number of distinct rows and columns in a resampled depth image, and of distinct values in an image stored in steps."""
 
 
-def estimated_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -> DepthNoise | None:
+def estimate_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -> DepthNoise | None:
     """Return the noise of a depth image (planar z, metres, 0: not measured), as a function of the depth.
 
     The relative noise is ``linear + quadratic * z``, constant or growing; it is fitted to the larger of the
@@ -179,7 +179,7 @@ def noise_remark(depth: Float[Tensor, "h w"], intrinsics: Intrinsics, sensor: st
 
     Returns None if the noise cannot be estimated from the image.
     """
-    found = estimated_depth_noise(depth, intrinsics)
+    found = estimate_depth_noise(depth, intrinsics)
     if found is None:
         return None
     z = float(depth[depth > 0].median())

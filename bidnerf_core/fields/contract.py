@@ -16,7 +16,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry import multiplied
+from bidnerf_core.geometry import scale_point
 
 
 def contract_points(points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
@@ -328,8 +328,8 @@ class SceneBounds:
         """Return the bounds of the scene with lengths multiplied by ``factor``."""
         return replace(
             self,
-            lower=multiplied(self.lower, factor),
-            upper=multiplied(self.upper, factor),
+            lower=scale_point(self.lower, factor),
+            upper=scale_point(self.upper, factor),
             near=self.near * factor,
             far=self.far * factor,
             footprint=self.footprint * factor,
@@ -353,7 +353,7 @@ class SceneBounds:
             if self.contracted:
                 near = torch.full_like(origins[..., 0], self.near)
                 return Rays(origins, directions, near, torch.full_like(near, self.far))
-            enter, leave = crossed_box(
+            enter, leave = intersect_box(
                 origins, directions, constant(self.lower, origins), constant(self.upper, origins)
             )
             near = enter.clamp(self.near, self.far)
@@ -368,11 +368,11 @@ class SceneBounds:
             return RaySpacing(torch.zeros_like(rays.near), float("inf"))
         half = self.side / 2
         lower, upper = (tuple(c + sign * half for c in self.centre) for sign in (-1, 1))
-        enter, leave = crossed_box(origins, directions, constant(lower, origins), constant(upper, origins))
+        enter, leave = intersect_box(origins, directions, constant(lower, origins), constant(upper, origins))
         return RaySpacing(torch.where(leave > enter, leave, 0).clamp(min=0), half)
 
 
-def crossed_box(
+def intersect_box(
     origins: Float[Tensor, "*r 3"],
     directions: Float[Tensor, "*r 3"],
     lower: Float[Tensor, "3"],
@@ -385,7 +385,7 @@ def crossed_box(
     return torch.minimum(first, second).amax(-1), torch.maximum(first, second).amin(-1)
 
 
-def widened(rays: Rays, factor: float) -> Rays:
+def widen(rays: Rays, factor: float) -> Rays:
     """Return rays whose interval is ``factor`` times as long (the paper's "wide"), but does not begin behind the camera."""
     middle, half = (rays.near + rays.far) / 2, (rays.far - rays.near) / 2 * factor
     return replace(rays, near=(middle - half).clamp(min=0), far=middle + half)

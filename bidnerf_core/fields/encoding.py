@@ -18,7 +18,7 @@ Network: TypeAlias = Callable[
 """A function that returns raw density and RGB in [0, 1] at points of the cube [-1, 1], seen along unit directions."""
 
 
-def encoded_width(frequencies: int, include_input: bool = True) -> int:
+def encoding_width(frequencies: int, include_input: bool = True) -> int:
     """Return the number of values in the frequency encoding of a point."""
     return 3 * (2 * frequencies + include_input)
 

@@ -99,7 +99,7 @@ class Importance:
 
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
         with torch.no_grad():
-            rough = gathered(self.field.sampler(rays, jitter))
+            rough = gather_valid(self.field.sampler(rays, jitter))
             if rough.starts.shape[-1] == 0:
                 return rough
             weights = rendering_weights(query_samples(self.field, rays, rough).density, rough)
@@ -129,7 +129,7 @@ def inverse_transform(
     return torch.minimum(distances, end), index
 
 
-def gathered(samples: RaySamples) -> RaySamples:
+def gather_valid(samples: RaySamples) -> RaySamples:
     """Return the samples with valid intervals first, and without overlaps from rounding."""
     starts, ends, valid = samples.parts
     # Sorting costs more than everything else; most samplers return the valid intervals first.
@@ -192,7 +192,7 @@ class Concentrated:
 
     @torch.no_grad()
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
-        rough = gathered(self.guide.sampler(rays, jitter))
+        rough = gather_valid(self.guide.sampler(rays, jitter))
         if rough.starts.shape[-1] <= self.count:
             return rough
         many = rough.valid.sum(-1) > self.count
@@ -214,10 +214,10 @@ class Concentrated:
     def _concentrated(self, rays: Rays, rough: RaySamples, jitter: Generator | None) -> RaySamples:
         length = (rough.ends - rough.starts).clamp(min=torch.finfo(rough.ends.dtype).tiny)
         density = torch.minimum(query_samples(self.guide, rays, rough).density, LARGEST_THICKNESS / length)
-        return concentrated(rough, rendering_weights(density, rough), self.count, jitter)
+        return concentrate(rough, rendering_weights(density, rough), self.count, jitter)
 
 
-def concentrated(
+def concentrate(
     samples: RaySamples, weights: Float[Tensor, "*r s"], count: int, jitter: Generator | None
 ) -> RaySamples:
     """Resample rays to ``count`` intervals that are short where the ``weights`` of ``samples`` are large, see ``Concentrated``."""
@@ -281,7 +281,7 @@ class ScaledField(nn.Module):
     @property
     def levels(self) -> tuple[RadianceField, ...]:
         """The levels of detail of the field, coarsest first; the last one is this field."""
-        return (*(scaled_field(level, self.scale) for level in levels(self.trained)[:-1]), self)
+        return (*(scale_field(level, self.scale) for level in levels(self.trained)[:-1]), self)
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         """Return density and colour at ``positions`` in the scaled world."""
@@ -318,7 +318,7 @@ class ScaledSplatField(ScaledHitField):
         return replace(found, positions=found.positions * self.scale, radius=found.radius * self.scale)
 
 
-def scaled_field(field: RadianceField, scale: float) -> ScaledField:
+def scale_field(field: RadianceField, scale: float) -> ScaledField:
     """Return a field in a world that is ``scale`` times as large; it has the same optional interfaces as ``field``."""
     if isinstance(field, HitField) and isinstance(field, SplatField):
         return ScaledSplatField(field, scale)

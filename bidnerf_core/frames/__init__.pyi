@@ -20,8 +20,8 @@ from .photos import pinhole_of as pinhole_of
 from .pixels import DRAWERS as DRAWERS
 from .pixels import DrawerName as DrawerName
 from .pixels import all_pixels as all_pixels
-from .pixels import continued as continued
 from .pixels import draw as draw
+from .pixels import inpaint as inpaint
 from .pixels import measured_middle as measured_middle
 from .pixels import observe as observe
 from .pixels import uniform as uniform

@@ -140,7 +140,7 @@ def visible_at(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:
     return ~frame.hidden[rows.clamp(0, height - 1), columns.clamp(0, width - 1)].to(pixels.device)
 
 
-def continued(frame: Frame) -> Float[Tensor, "h w 3"]:
+def inpaint(frame: Frame) -> Float[Tensor, "h w 3"]:
     """Return the colours of a frame with hidden pixels filled in from the nearest visible ones."""
     if frame.hidden is None:
         return frame.rgb

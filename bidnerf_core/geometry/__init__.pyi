@@ -8,7 +8,7 @@ from .robust import chi_squared_quantile as chi_squared_quantile
 from .robust import independent as independent
 from .robust import inlier_weight as inlier_weight
 from .robust import mad_deviation as mad_deviation
-from .rotations import retracted as retracted
+from .rotations import retract as retract
 from .rotations import update_between as update_between
 from .se3 import SE3 as SE3
 from .se3 import perturb as perturb
@@ -22,8 +22,8 @@ from .similarity import Similarity as Similarity
 from .similarity import covariance_in as covariance_in
 from .similarity import fit_similarity as fit_similarity
 from .similarity import look_at as look_at
-from .similarity import multiplied as multiplied
 from .similarity import rigid_pose as rigid_pose
+from .similarity import rotate_about as rotate_about
+from .similarity import scale_point as scale_point
 from .similarity import spread as spread
 from .similarity import symbol as symbol
-from .similarity import turned_about as turned_about

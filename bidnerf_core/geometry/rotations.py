@@ -55,7 +55,7 @@ def left_jacobian(phi: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     return np.eye(3) + b * cross + c * cross @ cross
 
 
-def retracted(T: SE3, tangent: Float[Tensor, "6"]) -> SE3:
+def retract(T: SE3, tangent: Float[Tensor, "6"]) -> SE3:
     """Return ``T @ exp(tangent)`` (metres, radians), as ``SE3.retract`` does; float64, without derivatives."""
     step = tangent.numpy()
     rotation, translation = T.rotation.numpy(), T.translation.numpy()

@@ -38,7 +38,7 @@ def symbol(unit: LengthUnit) -> str:
     return "m" if unit == "metres" else "units"
 
 
-def multiplied(point: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
+def scale_point(point: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
     """Return a point with its coordinates multiplied by ``factor``."""
     x, y, z = point
     return x * factor, y * factor, z * factor
@@ -80,7 +80,7 @@ def look_at(
     return SE3(torch.stack([right, torch.linalg.cross(forward, right), forward], dim=-1), position)
 
 
-def turned_about(T_world_camera: SE3, middle: Float[Tensor, "3"], up: Float[Tensor, "3"], angle_deg: float) -> SE3:
+def rotate_about(T_world_camera: SE3, middle: Float[Tensor, "3"], up: Float[Tensor, "3"], angle_deg: float) -> SE3:
     """Return the camera's pose after a rotation by ``angle_deg`` about the axis ``up`` through ``middle``
     (metres, world).
     """

@@ -23,15 +23,15 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import (
     BLOCK,
     NORM,
+    CachedFeatures,
     Features,
-    FoundOnce,
     ImageKeypoints,
     Keypoints,
     LandmarkMap,
     Sights,
     States,
     byte_of_zero,
-    detected,
+    detect,
     find_features,
     image_keypoints,
     imaged,
@@ -164,7 +164,7 @@ class LandmarkMatcher:
         self.landmarks = landmarks.to("cpu")
         _ = self.landmarks.cells  # computed now and cached, as threads may share the matcher
         self._descriptors = landmarks.descriptors
-        self._cached_features: FoundOnce | None = None  # see ``for_query``
+        self._cached_features: CachedFeatures | None = None  # see ``for_query``
         # None: the search is exhaustive, as it is for up to 4,000 landmarks.
         self._index: _Products | _Cells | None = None
         if self.device.type != "cpu":
@@ -188,7 +188,7 @@ class LandmarkMatcher:
     def for_query(self) -> LandmarkMatcher:
         """Return a matcher for one query, whose ``features`` cache the keypoints of each image; everything else is shared."""
         found = copy.copy(self)
-        found._cached_features = FoundOnce(lambda rgb: detected(self.features, rgb))
+        found._cached_features = CachedFeatures(lambda rgb: detect(self.features, rgb))
         return found
 
     def nearest(self, descriptors: UInt8[Tensor, "q d"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:

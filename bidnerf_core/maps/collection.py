@@ -27,7 +27,7 @@ from bidnerf_core.localization import (
     origin_of,
     unit_of,
 )
-from bidnerf_core.mapping import LandmarkMap, Vocabulary, detected, find_features, pooled_views
+from bidnerf_core.mapping import LandmarkMap, Vocabulary, detect, find_features, pool_views
 from bidnerf_core.maps.description import DESCRIPTION, cameras_of, load_info
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.maps.store import read_part
@@ -138,7 +138,7 @@ class MapCollection:
         """Return the cosine similarity of an image to each map, most similar first; -1 where it cannot be computed."""
         vectors: dict[tuple[str, int], Float[Tensor, "p"]] = {}
         for key, vocabulary in self._vocabularies.items():
-            descriptors = detected(find_features(key[0]), frame.rgb).descriptors if frame.has_colour else None
+            descriptors = detect(find_features(key[0]), frame.rgb).descriptors if frame.has_colour else None
             if descriptors is not None and len(descriptors) and descriptors.shape[1] == key[1]:
                 vectors[key] = vocabulary.pooled(descriptors)
         found = dict.fromkeys(self._maps, -1.0)
@@ -199,7 +199,7 @@ class MapCollection:
             self._vocabularies[key] = Vocabulary.of(same)
         for name, found in landmarks.items():
             cameras = cameras_of(self._infos[name])
-            self._pooled[name] = pooled_views(self._vocabularies[keys[name]], found, cameras)
+            self._pooled[name] = pool_views(self._vocabularies[keys[name]], found, cameras)
         if bare := [name for name in self._maps if name not in landmarks]:
             log.info(f"{amount(len(bare), 'map')} without landmarks, tried last: {', '.join(bare)}")
         return keys

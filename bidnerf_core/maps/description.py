@@ -11,10 +11,10 @@ from typing import Annotated, Any, Literal
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.captures import PoseRefinement, StoredCamera, with_wrong_pose
+from bidnerf_core.captures import PoseRefinement, StoredCamera, cameras_with_invalid_pose
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields import RadianceField, SceneBounds, scaled_field
-from bidnerf_core.geometry import SE3, LengthUnit, multiplied, pose_from_matrix
+from bidnerf_core.fields import RadianceField, SceneBounds, scale_field
+from bidnerf_core.geometry import SE3, LengthUnit, pose_from_matrix, scale_point
 from bidnerf_core.io import from_plain, read_json
 from bidnerf_core.mapping import USUAL_FEATURES
 from bidnerf_core.settings import Above, NotNegative, Range, Settings
@@ -130,14 +130,14 @@ class MapInfo:
             bounds=frame.bounds if scale == 1 else self.bounds.scaled(factor),
             cameras=tuple(camera.scaled(factor) for camera in self.cameras),
             unit=unit,
-            origin=multiplied(self.origin, factor),
+            origin=scale_point(self.origin, factor),
             field_frame=None if scale == 1 else replace(frame, scale=scale),
             anchor=None if self.anchor is None else self.anchor.scaled(factor),
         )
 
     def in_map_unit(self, field: RadianceField) -> RadianceField:
         """Return a field built by the backend, converted to the length unit of the map."""
-        return field if self.field_frame is None else scaled_field(field, self.field_frame.scale)
+        return field if self.field_frame is None else scale_field(field, self.field_frame.scale)
 
 
 def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
@@ -178,6 +178,6 @@ def load_info(folder: Path) -> MapInfo:
     if (folder / ANCHOR).exists():
         anchor = from_plain(Anchor, read_json(folder / ANCHOR, "the anchor of a map"), str(folder / ANCHOR))
         info = replace(info, anchor=anchor)
-    for name in with_wrong_pose(info.cameras):
+    for name in cameras_with_invalid_pose(info.cameras):
         raise InputError(f"pose of camera {name!r} is not a rigid transform", where=path, expected="4x4 rows")
     return info

@@ -39,8 +39,8 @@ from bidnerf_core.mapping import (
     BakeConfig,
     LandmarkMap,
     bake,
-    concatenated,
-    tracked_views,
+    concatenate,
+    track_views,
 )
 from bidnerf_core.maps.description import load_info, longest_side
 from bidnerf_core.maps.map import USUAL_BAKE, Map, load_map
@@ -224,7 +224,7 @@ def _extended(
     """Return the map extended with ``new``; ``complete`` is whether ``old`` holds the map's photos rather than renderings."""
     where, everything = scene.name, [*old, *new]
     given = everything if complete else new
-    tracked = tracked_views(given, scene.info.landmark_features)
+    tracked = track_views(given, scene.info.landmark_features)
     seeing = list(given)
     with contextlib.suppress(InputError):  # one photo, or photos without overlap
         # Photos without dense depth get the landmarks they show, from which training takes distances.
@@ -264,7 +264,7 @@ def _extended(
         else:
             own = scene.landmarks
             if own is not None and len(more):
-                more = concatenated([own, more[~_present(own, more)]])
+                more = concatenate([own, more[~_present(own, more)]])
             grown = grown.with_parts(None, more if own is None or len(more) else own)
     before, after = (0 if m.landmarks is None else len(m.landmarks) for m in (scene, grown))
     log.info(f"{where}: {before} landmarks before, {after} now; {amount(len(info.cameras), 'image')}")

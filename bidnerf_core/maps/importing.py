@@ -31,11 +31,11 @@ from bidnerf_core.mapping import (
     Keypoints,
     TrackedKeypoints,
     TrackedViews,
-    detected,
+    detect,
     find_features,
     matches_of_points,
     surface_of_points,
-    tracked_views,
+    track_views,
 )
 from bidnerf_core.maps.description import MapInfo, cameras_of
 from bidnerf_core.maps.importers import ImportedField, Structure, bounds_about, importer_of, robust_box
@@ -206,7 +206,7 @@ def _of_structure(
     if tracked is None:
         points = [of_image[of_image >= 0].unique() for of_image in structure.observed]
         positions = structure.positions + offset
-        tracked = tracked_views(read.views, features, known=lambda images: matches_of_points(images, points, positions))
+        tracked = track_views(read.views, features, known=lambda images: matches_of_points(images, points, positions))
     scene, _ = scene.with_landmarks(read.views, tracked=tracked)
     if scene.landmarks is None:
         raise InputError("its images give no landmarks", where=capture.path)
@@ -222,7 +222,7 @@ def _described(structure: Structure, features: str, origin: Origin) -> tuple[Rea
     Raises ``InputError`` if the descriptors are not those of the detector ``features``.
     """
     capture, offset = structure.capture, -torch.tensor(origin, dtype=torch.float64)
-    probe = detected(find_features(features), torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0)))
+    probe = detect(find_features(features), torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0)))
     channels = structure.keypoints[0].descriptors.shape[1]
     if probe.descriptors.shape[1] != channels:
         raise InputError(

@@ -17,14 +17,14 @@ from torch import nn
 from bidnerf_core.captures import (
     CaptureReport,
     UpDirection,
-    given_up,
-    pose_updates,
     poses_of,
+    refinement_updates,
     stored_cameras,
     summary,
-    surveyed,
+    survey_capture,
     tried_landmarks,
     up_direction,
+    up_from_gravity,
 )
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, amount
@@ -52,8 +52,8 @@ from bidnerf_core.mapping import (
     bake,
     colour_noise,
     find_features,
-    rendered_views,
-    tracked_views,
+    render_views,
+    track_views,
     update_scatter,
 )
 from bidnerf_core.maps.description import Anchor, LandmarkSource, MapInfo, cameras_of, load_info
@@ -145,7 +145,7 @@ class Map:
         of the surface and from the cameras.
         """
         if self.info.gravity_up is not None:
-            return given_up(self.info.gravity_up)
+            return up_from_gravity(self.info.gravity_up)
         if not self.info.cameras:
             return None
         normals = None if self.surface is None else self.surface.surfels.normals
@@ -332,11 +332,11 @@ class Map:
                 return replace(self, landmarks=photos), None
         began, info, landmarks = time.monotonic(), self.info, None
         source: LandmarkSource = "photos" if views else "rendered images"
-        images = views or rendered_views(self.field, info.bounds, cameras_of(info))
+        images = views or render_views(self.field, info.bounds, cameras_of(info))
         if not images:
             raise self._no_cameras()
         if tracked is None:
-            tracked = tracked_views(images, info.landmark_features)
+            tracked = track_views(images, info.landmark_features)
         if views and not info.distances:
             tracked = tracked.at_distance(info.bounds.side / 2)  # the directions are still informative
         counter("trying the landmarks on images", "stage")(0, 1)
@@ -347,7 +347,7 @@ class Map:
         else:
             # Poses found in the map are compared with poses from the source of the training poses. If training
             # kept most of these, few poses have an update and their errors count as negligible.
-            by_source = update_scatter(pose_updates(info.cameras))
+            by_source = update_scatter(refinement_updates(info.cameras))
             landmarks = replace(landmarks, pose_covariance=landmarks.pose_covariance + by_source)
             if views:
                 landmarks = with_tracks_in(info, landmarks, [view.frame.name for view in views])
@@ -401,7 +401,7 @@ class Map:
         scene = replace(self, info=replace(self.info, colour_noise=noise))
         counter("surveying the photos", "stage")(0, 1)
         trial = HeldOutTrial() if self.landmarks is None else self.landmarks.trial
-        capture = surveyed(tracked, views, trial=trial, up=self.up)
+        capture = survey_capture(tracked, views, trial=trial, up=self.up)
         for line in summary(capture):
             log.info(line)
         return scene.with_parts(None, None, capture)

@@ -20,10 +20,10 @@ from bidnerf_core.backend import load_backend, quick_config
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import (
     RefinementChoice,
-    as_given,
-    located,
-    prepared,
+    given_cameras,
+    prepare_views,
     stored_cameras,
+    track_landmarks,
 )
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.datasets import HOLD_OUT_EVERY, POSERS, DatasetOptions, SparseChoice, lacks_poses
@@ -37,7 +37,7 @@ from bidnerf_core.mapping import (
     BakeConfig,
     TrackedViews,
     find_features,
-    tracked_views,
+    track_views,
 )
 from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info, longest_side
 from bidnerf_core.maps.map import USUAL_BAKE, Map, load_map
@@ -179,7 +179,7 @@ def train(
         part = f" in split {images.split!r}" if read.source else ""
         if not any(view.frame.has_depth for view in read.views):
             log.info(f"{read.place}: no measured depth{part}; training on colour only")
-        taken = prepared(
+        taken = prepare_views(
             read.views,
             options.refine_poses,
             features=options.features,
@@ -240,7 +240,7 @@ def _with_field(
     if unknown := [view.frame.name for view in read.views if view.frame.name not in own]:
         found, expected = f"image {unknown[0]!r} is none of those of {scene.name}", "images of that map"
         raise InputError(found, where=read.place, expected=expected)
-    tracked, views = located(views, info.landmark_features, True, read.depth_unit)
+    tracked, views = track_landmarks(views, info.landmark_features, True, read.depth_unit)
     bounds = estimate_bounds(views, read.background)
     info = replace(info, bounds=bounds, complete=False, hidden=read.hidden, sparse_depth=read.sparse_depth)
     return replace(scene, info=info), views, tracked
@@ -294,7 +294,7 @@ def resume(
         read, views = views_again(info, posed, images, options.depth_points, options.point_choice, out)
         _check_same_views(out, info, read, images.split)
         # These are the keypoints and views with which training began.
-        tracked, views = located(views, info.landmark_features, True, read.depth_unit)
+        tracked, views = track_landmarks(views, info.landmark_features, True, read.depth_unit)
         if info.complete or finish:
             scene = load_map(out, device)
             if not info.complete:
@@ -369,7 +369,7 @@ def poses_folder(out: Path) -> Path:
 
 def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> None:
     """Raise ``InputError`` if the views, their masks, sparse depth or background are not those with which training began."""
-    if stored_cameras(read.views) != as_given(info.cameras):
+    if stored_cameras(read.views) != given_cameras(info.cameras):
         part = f"split {split!r} has" if read.source else "these have"
         raise InputError(
             f"{part} frames or poses that differ from those {out} was started with",
@@ -407,7 +407,7 @@ def _completed(
     if baking is not None and scene.landmarks is None:
         scene, tracked = scene.with_landmarks(views, tracked=tracked)
     elif baking is not None and tracked is None and scene.info.capture is None:
-        tracked = tracked_views(views, scene.info.landmark_features)
+        tracked = track_views(views, scene.info.landmark_features)
     scene = replace(scene, folder=out or scene.folder)
     if not scene.info.complete:
         scene = train_field(views, scene, options, state)

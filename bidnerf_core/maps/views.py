@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera import UPRIGHT, checked_side
-from bidnerf_core.captures import StoredCamera, at_stored_poses
+from bidnerf_core.camera import UPRIGHT, check_side
+from bidnerf_core.captures import StoredCamera, apply_stored_poses
 from bidnerf_core.datasets import (
     Capture,
     DatasetOptions,
@@ -128,7 +128,7 @@ def read_views(
     Images without depth get depth from the points of the COLMAP model in folder ``depth_points``, see
     ``SparsePoints``. Raises ``InputError`` if there are no views, and if the views or the model cannot be used.
     """
-    split, background, largest = options.split, options.background, checked_side(options.largest)
+    split, background, largest = options.split, options.background, check_side(options.largest)
     if isinstance(data, str | Path):
         data, background = options.open(data), None
     elif options.camera is not None:
@@ -259,4 +259,4 @@ def views_again(
     if options.background is None and isinstance(data, str | Path) and info.backend:
         options = replace(options, background=info.bounds.background)
     read = read_views(data, options, depth_points, point_choice, folder).about(info.origin)
-    return read, at_stored_poses(read.views, info.cameras)
+    return read, apply_stored_poses(read.views, info.cameras)

@@ -103,7 +103,7 @@ class ColourTransforms(nn.Module):
         return self.log_gain.square().mean() + self.offset.square().mean()
 
 
-def fitted_colours(rgb: Float[Tensor, "*p 3"], photo: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
+def fit_colours(rgb: Float[Tensor, "*p 3"], photo: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
     """Apply to ``rgb`` the gain and offset per channel that best fit ``rgb`` to ``photo`` (least squares).
 
     The gain and offset serve as the colour transform of an image outside the training set.

@@ -33,22 +33,22 @@ def photo_measures(views: Sequence[View]) -> Float[Tensor, "3 v"]:
     return torch.tensor([_measured(view.frame) for view in views], dtype=torch.float64).reshape(-1, 3).mT
 
 
-def detail_kept(views: Sequence[View]) -> Float[Tensor, "v"]:
+def relative_detail(views: Sequence[View]) -> Float[Tensor, "v"]:
     """Return the energy of each photo's fine detail relative to that of nearby photos.
 
     The value is 1 for all photos except blurred outliers.
     """
     found = torch.tensor([sharpness(_clean(v.frame.rgb).mean(-1), v.frame.hidden) for v in views])
-    lacking = -excess(found, nearby(views))
-    return torch.where(blurred(lacking), torch.exp2(-lacking), 1.0)
+    lacking = -excess(found, nearby_photos(views))
+    return torch.where(are_blurred(lacking), torch.exp2(-lacking), 1.0)
 
 
-def blurred(lacking: Float[Tensor, "v"]) -> Bool[Tensor, "v"]:
+def are_blurred(lacking: Float[Tensor, "v"]) -> Bool[Tensor, "v"]:
     """Return which photos are outliers in ``lacking``, the fine detail (octaves of energy) that they lack compared with nearby photos."""
-    return standing_out(lacking, 0.5)
+    return are_outliers(lacking, 0.5)
 
 
-def standing_out(values: Float[Tensor, "v"], least: float) -> Bool[Tensor, "v"]:
+def are_outliers(values: Float[Tensor, "v"], least: float) -> Bool[Tensor, "v"]:
     """Return which values exceed both ``least`` and four times the robust standard deviation (about zero) of all values."""
     return values > max(least, 4 * mad_deviation(values))
 
@@ -104,7 +104,7 @@ Nearby: TypeAlias = Int[Tensor, "p 2"]
 """Pairs (photo, other photo), by index, of photos taken from nearby positions in similar directions."""
 
 
-def nearby(views: Sequence[View], group: Int[Tensor, "v"] | None = None) -> Nearby:
+def nearby_photos(views: Sequence[View], group: Int[Tensor, "v"] | None = None) -> Nearby:
     """Return, for each photo, about eight others taken from nearby positions in similar directions, as pairs of indices.
 
     If any of these are in the photo's own ``group``, only those are returned.

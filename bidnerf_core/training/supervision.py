@@ -15,7 +15,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.settings import NotNegative, Settings
 from bidnerf_core.training.loop import Replayable, Report, StepOutcome, cosine, fit
 from bidnerf_core.training.loss import ColourTransforms, distortion, supervised_loss
-from bidnerf_core.training.photos import detail_kept
+from bidnerf_core.training.photos import relative_detail
 from bidnerf_core.training.ray_bank import RayBank, TrainingBatch
 
 
@@ -48,7 +48,7 @@ class Supervision:
         self.side = bounds.side
         learned = config.exposure and not self.bank.has_alpha
         self.colours = ColourTransforms(len(views)).to(device) if learned else None
-        kept = detail_kept(views) if config.sharpness else None
+        kept = relative_detail(views) if config.sharpness else None
         # None if no image is blurred, so that the loss is then unweighted.
         self.image_weight = None if kept is None or bool((kept == 1).all()) else kept.float().to(device)
 

@@ -17,7 +17,7 @@ from bidnerf_core.fields import (
     OccupiedOnly,
     RaySampler,
     RaySamples,
-    encoded_width,
+    encoding_width,
     frequency_encoding,
     levels,
     octaves,
@@ -66,7 +66,7 @@ def rays_of_view(count: int = 200):  # type: ignore[no-untyped-def]
 def test_encoding_is_equation_4(frequencies: int, include_input: bool) -> None:
     given = torch.rand(9, 3, dtype=torch.float64) * 2 - 1
     found = frequency_encoding(given, octaves(frequencies, given), include_input)
-    assert found.shape == (9, encoded_width(frequencies, include_input))
+    assert found.shape == (9, encoding_width(frequencies, include_input))
     for row, point in zip(found.tolist(), given.tolist(), strict=True):
         expected = list(point) if include_input else []
         for k in range(frequencies):

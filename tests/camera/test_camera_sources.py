@@ -17,10 +17,10 @@ from bidnerf_core.camera import (
     UPRIGHT,
     CameraSource,
     Exif,
-    FoundCamera,
     Intrinsics,
     Orientation,
     Raster,
+    ResolvedCamera,
     read_camera,
     read_exif,
 )
@@ -38,7 +38,7 @@ def found(exif: Exif = Exif(), raster: Raster = PHOTO, **given: Any) -> Intrinsi
     return find_camera(raster, exif, **given).intrinsics
 
 
-def find_camera(raster: Raster, exif: Exif, **given: Any) -> FoundCamera:
+def find_camera(raster: Raster, exif: Exif, **given: Any) -> ResolvedCamera:
     return CameraSource(**given).find("a.jpg", raster, exif)
 
 

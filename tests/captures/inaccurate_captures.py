@@ -12,7 +12,7 @@ from bidnerf import SE3, View
 # Inside: the refinement of poses is tested without a training around it
 from bidnerf_core.captures import TrainingPoses
 from bidnerf_core.captures.training_views import training_poses
-from bidnerf_core.mapping import tracked_views
+from bidnerf_core.mapping import track_views
 from landmark_scene import Points, looking_in
 
 VIEWS = 16
@@ -37,7 +37,7 @@ def refined(
     noise: float, off: Tensor, moved: Tensor | None = None, least: float = 0.25
 ) -> tuple[TrainingPoses, list[View], SE3]:
     points, views, poses = capture(noise, off, moved)
-    return training_poses(tracked_views(views, points), views, least), views, poses
+    return training_poses(track_views(views, points), views, least), views, poses
 
 
 def turned(T: SE3, true: SE3) -> Tensor:

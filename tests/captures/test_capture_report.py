@@ -20,10 +20,10 @@ from bidnerf_core.captures import (
     CaptureReport,
     CoverageRecord,
     UpDirection,
-    given_up,
     sentences,
     summary,
-    surveyed,
+    survey_capture,
+    up_from_gravity,
 )
 
 # Inside: the measures of single photos and pairs, of which a report gives only the remarks
@@ -31,7 +31,7 @@ from bidnerf_core.captures.report import SUMMARY_LINES
 from bidnerf_core.captures.survey import groups
 from bidnerf_core.fields import Stratified, render_image
 from bidnerf_core.geometry import look_at
-from bidnerf_core.mapping import tracked_views
+from bidnerf_core.mapping import track_views
 from bidnerf_core.training import photo_measures
 from landmark_scene import Points, looking_in, ring
 from refusals import refused
@@ -50,7 +50,7 @@ def photos() -> tuple[View, ...]:
 
 
 def survey(views: list[View]) -> CaptureReport:
-    return surveyed(tracked_views(views), views)
+    return survey_capture(track_views(views), views)
 
 
 def changed(views: list[View], number: int, rgb: torch.Tensor) -> None:
@@ -112,7 +112,7 @@ def test_a_missing_side_is_named_by_the_photos_beside_it() -> None:
     views = ring(points := Points(noise=0.3), 60)[::2]
     left = [view for i, view in enumerate(views) if not 10 <= i < 15]
     named = [replace(view, frame=replace(view.frame, name=f"{i}")) for i, view in enumerate(left)]
-    report = surveyed(tracked_views(named, points), named)
+    report = survey_capture(track_views(named, points), named)
     assert report.coverage.arrangement == "around"
     (gap,) = report.coverage.gaps
     assert {gap.after, gap.before} == {"9", "10"}  # of those that are left
@@ -121,7 +121,7 @@ def test_a_missing_side_is_named_by_the_photos_beside_it() -> None:
 
 def test_one_side_is_no_gap() -> None:
     views = ring(points := Points(), 12)
-    report = surveyed(tracked_views(views, points), views)
+    report = survey_capture(track_views(views, points), views)
     assert report.coverage.arrangement == "one side"
     assert report.coverage.gaps == ()
     assert report.coverage.open_side is not None
@@ -130,7 +130,7 @@ def test_one_side_is_no_gap() -> None:
 
 def test_a_few_photos_that_overlap_are_not_isolated() -> None:
     views = ring(points := Points(), 4)
-    report = surveyed(tracked_views(views, points), views)
+    report = survey_capture(track_views(views, points), views)
     assert [(photo.group, photo.problems) for photo in report.photos] == [(0, ())] * 4
 
 
@@ -143,7 +143,7 @@ def surroundings(poses: list[SE3], stretch: float, up: UpDirection | None = None
     points = Points(count)
     points.positions = points.positions * points.positions.new_tensor([stretch, 1, 1])
     views = [replace(view := points.view(T), frame=replace(view.frame, name=f"{i}")) for i, T in enumerate(poses)]
-    return surveyed(tracked_views(views, points), views, up=up)
+    return survey_capture(track_views(views, points), views, up=up)
 
 
 def test_photos_from_inside_a_room_have_no_open_side() -> None:
@@ -170,7 +170,7 @@ def test_photos_along_a_corridor_are_inside_although_their_axes_meet_far_ahead()
 def test_photos_past_a_facade_are_from_one_side_and_above() -> None:
     """Parallel axes meet nowhere, but the scene is in front of all cameras."""
     poses = [towards((0.3 * i - 1.5, -5.0, 3.0), (0.0, 1.0, -0.6)) for i in range(11)]
-    report = surroundings(poses, 1, given_up((0, 0, 1)))
+    report = surroundings(poses, 1, up_from_gravity((0, 0, 1)))
     assert report.coverage.arrangement == "one side"
     assert report.coverage.heights_deg == pytest.approx((31, 31), abs=3)
 
@@ -185,7 +185,7 @@ def test_photos_of_two_places_are_two_groups() -> None:
     two.seen = one.seen  # both number their images in one list
     views += [two.view(looking_in(0.105 * i + 0.05), seed=i) for i in range(5)]
     views = [replace(view, frame=replace(view.frame, name=f"{i}")) for i, view in enumerate(views)]
-    report = surveyed(tracked_views(views, one), views)
+    report = survey_capture(track_views(views, one), views)
     assert names(report, "apart") == ["10", "11", "12", "13", "14"]
     assert [photo.group for photo in report.photos] == [0] * 10 + [1] * 5
     assert any("another place" in sentence for sentence in sentences(report))
@@ -196,7 +196,7 @@ def test_photos_from_one_place_have_no_parallax() -> None:
     T = looking_in(0.0)
     turns = [SE3.exp(torch.tensor([0, 0, 0, 0, 0.02 * i, 0.01 * i], dtype=torch.float64)) for i in range(9)]
     views = [points.view(T @ turn) for turn in turns]
-    report = surveyed(tracked_views(views, points), views)
+    report = survey_capture(track_views(views, points), views)
     assert report.coverage.arrangement == "one place"
     assert report.coverage.parallax_deg < 0.1
     assert not report.with_problem("isolated", "apart", "badly posed")
@@ -285,5 +285,5 @@ def test_exact_poses_of_small_images_are_not_called_wrong() -> None:
     """A pose by twenty landmarks scatters more than the usual one by forty."""
     small = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
     images = views(demo_object(), small, orbit(3.5, 30, seed=0))
-    found = surveyed(tracked_views(images), images)
+    found = survey_capture(track_views(images), images)
     assert [photo.name for photo in found.photos if "badly posed" in photo.problems] == []

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from bidnerf import SE3, View
-from bidnerf_core.captures import TrainingPoses, pose_contradiction, surveyed
+from bidnerf_core.captures import TrainingPoses, pose_contradiction, survey_capture
 
 # Inside: the choice of poses is tested without a training around it
 from bidnerf_core.captures.training_views import training_poses
 from bidnerf_core.localization import LandmarkMatcher, Loop, Outcome
-from bidnerf_core.mapping import DEFAULT_LANDMARKS, posed_keypoints, tracked_views
+from bidnerf_core.mapping import DEFAULT_LANDMARKS, detect_keypoints, track_views
 from landmark_scene import Points, looking_in
 
 EACH = 20
@@ -43,14 +43,14 @@ def capture(rooms: int, wrong: int | None = None) -> tuple[Points, list[View], l
 @functools.cache
 def trained(rooms: int, wrong: int | None = None) -> tuple[TrainingPoses, Points, list[View], list[SE3]]:
     points, views, poses = capture(rooms, wrong)
-    return training_poses(tracked_views(views, points), views), points, views, poses
+    return training_poses(track_views(views, points), views), points, views, poses
 
 
 def test_exact_poses_in_identical_rooms_stay() -> None:
     found, _, views, poses = trained(2)
     assert (found.replaced, found.refined) == ([], False)
     assert torch.equal(found.tracked.T_world_camera.matrix(), SE3.stack(poses).matrix())
-    report = surveyed(found.tracked, views)
+    report = survey_capture(found.tracked, views)
     assert not report.with_problem("badly posed", "turned", "isolated")
 
 
@@ -58,7 +58,7 @@ def test_the_order_of_the_photos_does_not_matter() -> None:
     """Successive photos of different rooms look alike, but their exact poses contradict none in their own room."""
     points, views, _ = capture(2)
     mixed = [views[EACH * (i % 2) + i // 2] for i in range(2 * EACH)]
-    assert pose_contradiction(posed_keypoints(mixed, points)) is None
+    assert pose_contradiction(detect_keypoints(mixed, points)) is None
 
 
 def test_a_photo_of_either_room_is_not_accepted_in_the_other() -> None:

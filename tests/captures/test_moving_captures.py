@@ -20,13 +20,13 @@ from bidnerf_core.camera import STILL
 from bidnerf_core.captures import (
     PoseRefinement,
     TrainingPoses,
-    at_stored_poses,
+    apply_stored_poses,
     pose_sentences,
     stored_cameras,
     training_views,
     tried_landmarks,
 )
-from bidnerf_core.captures.cameras import moved_from
+from bidnerf_core.captures.cameras import record_refinement
 from bidnerf_core.captures.training_views import common_motion, training_poses
 from bidnerf_core.fields import render, render_image
 from bidnerf_core.frames import all_pixels, observe
@@ -37,7 +37,7 @@ from bidnerf_core.mapping import (
     landmark_tensors,
     landmarks_from_tensors,
     pose_updates,
-    tracked_views,
+    track_views,
 )
 from bidnerf_core.training import RayBank
 from inaccurate_captures import VIEWS, capture, turned, updates
@@ -59,7 +59,7 @@ def moving(scale: float, pose_error: float = 0.0) -> tuple[Points, list[View], S
 @functools.cache
 def tracks(scale: float, pose_error: float = 0.0) -> tuple[TrackedViews, list[View], SE3]:
     points, views, true = moving(scale, pose_error)
-    return tracked_views(views, points), views, true
+    return track_views(views, points), views, true
 
 
 @functools.cache
@@ -86,12 +86,12 @@ def test_one_image_is_no_evidence_against_all_others() -> None:
     moved = torch.zeros(VIEWS, 6, dtype=torch.float64)
     moved[5] = 3 * motions(1.0)[5]
     points, views, _ = capture(NOISE, torch.zeros_like(moved), moved)
-    assert evidence_prior(tracked_views(views, points)) == STILL
+    assert evidence_prior(track_views(views, points)) == STILL
 
 
 def test_few_images_are_no_evidence() -> None:
     points, views, _ = moving(1.0)
-    assert evidence_prior(tracked_views(views[:5], points)) == STILL
+    assert evidence_prior(track_views(views[:5], points)) == STILL
 
 
 def test_motions_are_estimated_and_the_poses_become_more_accurate() -> None:
@@ -125,7 +125,7 @@ def test_wrong_intrinsics_are_no_motion(wrong: dict[str, Any], pose_error: float
     points, views, _ = moving(0.0, pose_error)
     camera = replace(PINHOLE, **wrong)
     views = [replace(view, frame=replace(view.frame, intrinsics=camera)) for view in views]
-    found = training_poses(tracked_views(views, points), views)
+    found = training_poses(track_views(views, points), views)
     assert bool((found.tracked.motion == 0).all())
 
 
@@ -154,7 +154,7 @@ def test_views_with_a_motion_are_tracked_with_it() -> None:
     points, views, _ = moving(1.0)
     moved = motions(1.0)[:4]
     known = [replace(view, motion=motion) for view, motion in zip(views[:4], moved, strict=True)]
-    assert torch.equal(tracked_views(known, points).motion, moved)
+    assert torch.equal(track_views(known, points).motion, moved)
 
 
 @pytest.mark.slow
@@ -162,8 +162,8 @@ def test_the_motion_is_stored_with_the_pose() -> None:
     found, views, _ = corrected(1.0)
     poses, moved = found.tracked.T_world_camera, found.tracked.motion
     trained = [replace(v, T_ref_camera=poses[i], motion=moved[i]) for i, v in enumerate(views)]
-    cameras = moved_from(views, stored_cameras(trained), found.pixels.tolist())
-    again = at_stored_poses(views, cameras)
+    cameras = record_refinement(views, stored_cameras(trained), found.pixels.tolist())
+    again = apply_stored_poses(views, cameras)
     for one, other in zip(again, trained, strict=True):
         assert one.motion is not None
         assert other.motion is not None
@@ -182,10 +182,10 @@ def test_training_gets_the_motions(monkeypatch: pytest.MonkeyPatch) -> None:
     points, views, _ = moving(1.0, 0.004)
     monkeypatch.setattr(
         training_views,
-        "tracked_views",
-        lambda given, features: tracked_views(given, points),
+        "track_views",
+        lambda given, features: track_views(given, points),
     )
-    found = training_views.prepared(views)
+    found = training_views.prepare_views(views)
     moved = [view.motion is not None and bool(view.motion.any()) for view in found.views]
     assert sum(moved) >= VIEWS - 1  # an image whose keypoints are all left out keeps its pose
     assert [camera.motion is not None and any(camera.motion) for camera in found.cameras] == moved
@@ -226,7 +226,7 @@ def test_the_columns_of_a_portrait_image_are_the_rows_of_its_sensor() -> None:
     points = Points(noise=NOISE)
     moved = motions(1.0)
     views = [points.view(looking_in(0.105 * i, 0.3 * (i % 3)), upright, seed=i, motion=moved[i]) for i in range(VIEWS)]
-    assert evidence_prior(tracked_views(views, points)) != STILL
+    assert evidence_prior(track_views(views, points)) != STILL
 
 
 @pytest.mark.slow
@@ -237,7 +237,7 @@ def test_a_trial_finds_the_motions_that_the_map_knows() -> None:
     poses = [looking_in(0.105 * i, 0.3 * (i % 3)) for i in range(count)]
     seen = [points.view(T, seed=i, motion=moved[i]) for i, T in enumerate(poses)]
     views = [replace(view, motion=motion) for view, motion in zip(seen, moved, strict=False)]
-    landmarks = tried_landmarks(tracked_views(views, points), views)
+    landmarks = tried_landmarks(track_views(views, points), views)
     assert landmarks.trial.found == 8
     assert landmarks.trial.rotation_deg < 0.08
     assert landmarks.correlation < 5
@@ -254,7 +254,7 @@ def test_landmarks_tell_how_many_of_their_images_moved() -> None:
 
 def test_slow_motions_are_taken_from_queries_of_a_moving_map() -> None:
     points, views, true = moving(0.2)
-    landmarks = tracked_views(views, points).at(true, motions(0.2)).landmarks(LandmarkConfig())
+    landmarks = track_views(views, points).at(true, motions(0.2)).landmarks(LandmarkConfig())
     seen = {}
     for share in (0.0, 1.0):
         matcher = LandmarkMatcher(replace(landmarks, correlation=1.0, moving=share))

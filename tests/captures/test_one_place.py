@@ -16,7 +16,7 @@ from bidnerf.testing import MapWithLandmarks, textured_map, unseen
 # Inside: whether photos show distances, before a map of them is trained
 from bidnerf_core.captures.coverage import shows_distances
 from bidnerf_core.datasets import DatasetOptions
-from bidnerf_core.mapping import LandmarkConfig, tracked_views
+from bidnerf_core.mapping import LandmarkConfig, track_views
 from bidnerf_core.maps import TrainOptions, load_info
 from landmark_scene import Points, looking_in, ring
 from refusals import refused
@@ -38,14 +38,14 @@ def turned(points: Points, moved: float = 0.0, depth: float | None = None) -> li
 def test_turning_about_one_place_shows_no_distances(moved: float, noise: float) -> None:
     points = Points(noise=noise)
     views = turned(points, moved)
-    assert not shows_distances(views, tracked_views(views, points))
+    assert not shows_distances(views, track_views(views, points))
 
 
 def test_depth_and_several_places_show_distances() -> None:
     points = Points(noise=0.4)
     around, near = ring(points), turned(points, depth=1.0)
-    assert shows_distances(around, tracked_views(around, points))
-    assert shows_distances(near, tracked_views(near, points))
+    assert shows_distances(around, track_views(around, points))
+    assert shows_distances(near, track_views(near, points))
     assert shows_distances(around, None)
     assert not shows_distances(turned(points), None)
 
@@ -53,7 +53,7 @@ def test_depth_and_several_places_show_distances() -> None:
 def test_landmarks_of_one_place_have_the_right_directions() -> None:
     points = Points()
     views = turned(points)
-    tracked = tracked_views(views, points)
+    tracked = track_views(views, points)
     with refused(found=f"no landmarks found in {len(views)} images", expected="different places"):
         tracked.landmarks(LandmarkConfig())
     found = tracked.at_distance(5.0).landmarks(LandmarkConfig())

@@ -11,12 +11,12 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_
 from torch import Tensor
 
 from bidnerf import SE3, register
-from bidnerf_core.captures import pose_contradiction, prepared
+from bidnerf_core.captures import pose_contradiction, prepare_views
 
 # Inside: every reading of poses is applied and taken back, also those that no message proposes
 from bidnerf_core.captures.pose_conventions import Y_AND_Z_REVERSED as REVERSED
 from bidnerf_core.captures.pose_conventions import PoseContradiction, readings
-from bidnerf_core.mapping import ImageKeypoints, posed_keypoints
+from bidnerf_core.mapping import ImageKeypoints, detect_keypoints
 from landmark_scene import Points, looking_in, ring
 from refusals import refused
 
@@ -28,7 +28,7 @@ CYCLED = torch.tensor([[0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
 def images(points: Points, poses: list[SE3]) -> list[ImageKeypoints]:
     """The keypoints of a ring of cameras, with other ``poses`` than the true ones."""
     views = ring(points, len(poses))
-    found = posed_keypoints(views, points)
+    found = detect_keypoints(views, points)
     return [replace(image, T_ref_camera=T) for image, T in zip(found, poses, strict=True)]
 
 
@@ -61,7 +61,7 @@ def test_inverse_matrices_are_recognised(axes: Tensor, height: float) -> None:
     """Also of cameras that turn about one axis only: other axes explain their rotations as well as the inverses do."""
     points = Points(COUNT, 0.4, 0.2)
     truth = [looking_in(0.105 * i, height * (i % 3)) for i in range(IMAGES)]
-    seen = posed_keypoints([points.view(T, seed=i) for i, T in enumerate(truth)], points)
+    seen = detect_keypoints([points.view(T, seed=i) for i, T in enumerate(truth)], points)
     given = [with_axes(T, axes).inverse() for T in truth]
     found = pose_contradiction([replace(p, T_ref_camera=T) for p, T in zip(seen, given, strict=True)])
     assert found is not None
@@ -100,7 +100,7 @@ def test_right_poses_before_a_wall_are_not_refused() -> None:
     places = [-2 + 0.3 * i for i in range(IMAGES)]
     poses = [looking_at([x, -0.3, -3.0], [0.5 * x + 1, 0.0, 0.0]) for x in places]
     views = [points.view(T, seed=i) for i, T in enumerate(poses)]
-    seen = posed_keypoints(views, points)
+    seen = detect_keypoints(views, points)
     assert pose_contradiction(seen) is None
     given = [with_axes(T, REVERSED) for T in poses]
     found = pose_contradiction([replace(p, T_ref_camera=T) for p, T in zip(seen, given, strict=True)])
@@ -113,7 +113,7 @@ def test_pure_rotation_and_pure_translation_are_not_refused() -> None:
     for step in ([0, 0, 0, 0, 0.02, 0], [0.05, 0, 0, 0, 0, 0], [0, 0, 0.05, 0, 0, 0]):
         poses = [start @ SE3.exp(i * torch.tensor(step, dtype=torch.float64)) for i in range(IMAGES)]
         views = [points.view(T, seed=i) for i, T in enumerate(poses)]
-        assert pose_contradiction(posed_keypoints(views, points)) is None
+        assert pose_contradiction(detect_keypoints(views, points)) is None
 
 
 def test_images_that_share_nothing_tell_nothing() -> None:
@@ -196,7 +196,7 @@ def irregular_poses(count: int = IMAGES) -> list[SE3]:
 def seen_from(truth: SE3, given: SE3, count: int) -> list[ImageKeypoints]:
     """The keypoints of images from true poses, with given ones."""
     points = Points(count, 0.4, 0.1)
-    found = posed_keypoints([points.view(truth[i], seed=i) for i in range(len(truth.translation))], points)
+    found = detect_keypoints([points.view(truth[i], seed=i) for i in range(len(truth.translation))], points)
     return [replace(image, T_ref_camera=given[i]) for i, image in enumerate(found)]
 
 
@@ -211,7 +211,7 @@ def test_images_in_no_order_are_judged_as_well() -> None:
     poses = [view.T_ref_camera for view in ring(points, 40)]
     order = torch.randperm(40, generator=torch.Generator().manual_seed(1)).tolist()
     views = [points.view(poses[i], seed=i) for i in order]
-    found = posed_keypoints(views, points)
+    found = detect_keypoints(views, points)
     assert pose_contradiction(found) is None
     mixed = [replace(image, T_ref_camera=found[(7 * i) % 40].T_ref_camera) for i, image in enumerate(found)]
     contradiction = pose_contradiction(mixed)
@@ -233,7 +233,7 @@ def test_training_refuses_contradicting_poses_unless_they_are_trusted() -> None:
     register("features", "points", points)
     wrong = [replace(view, T_ref_camera=view.T_ref_camera.inverse()) for view in views]
     with refused(found="the poses contradict the photos") as caught:
-        prepared(wrong, features="points")
+        prepare_views(wrong, features="points")
     assert "if they are inverses" in caught.error.found
     assert "--trust-poses" in caught.error.found
-    assert prepared(wrong, "never", features="points", trust_poses=True).cameras
+    assert prepare_views(wrong, "never", features="points", trust_poses=True).cameras

@@ -15,19 +15,19 @@ from bidnerf import SE3, Frame, Intrinsics, View
 from bidnerf_core.captures import (
     PoseRefinement,
     TrainingPoses,
-    as_given,
-    at_stored_poses,
+    apply_stored_poses,
+    given_cameras,
     moved_cameras,
     pose_sentences,
     stored_cameras,
 )
 
 # Inside: how far each pose was refined, and the checks of poses and depth that precede a training
-from bidnerf_core.captures.cameras import moved_from
-from bidnerf_core.captures.training_views import adjusted_poses, check_depth_unit, prepared, training_poses
+from bidnerf_core.captures.cameras import record_refinement
+from bidnerf_core.captures.training_views import adjust_poses, check_depth_unit, prepare_views, training_poses
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.mapping import LandmarkConfig, Sift, TrackedViews, tracked_views
+from bidnerf_core.mapping import LandmarkConfig, Sift, TrackedViews, track_views
 from inaccurate_captures import VIEWS, refined, turned, updates
 from landmark_scene import Points, looking_in, ring
 
@@ -109,8 +109,8 @@ def test_a_wrong_pose_among_inaccurate_ones() -> None:
 def test_too_few_images_are_left_alone() -> None:
     points = Points()
     views = ring(points, 3)
-    tracked = tracked_views(views, points)
-    assert adjusted_poses(tracked, LandmarkConfig()) is None
+    tracked = track_views(views, points)
+    assert adjust_poses(tracked, LandmarkConfig()) is None
     found = training_poses(tracked, views)
     assert (found.refined, found.consistency, found.replaced) == (False, None, [])
 
@@ -121,7 +121,7 @@ def test_nothing_in_common_leaves_the_poses_alone() -> None:
     named = torch.tensor([12, 0, 0], dtype=torch.uint8)
     blank = [replace(view, frame=view.frame.replace(rgb=named.expand_as(view.frame.rgb_bytes))) for view in views]
     points.seen.append(points.seen[0][torch.zeros(0, dtype=torch.long)])
-    found = training_poses(tracked_views(blank, points), blank)
+    found = training_poses(track_views(blank, points), blank)
     assert (found.refined, found.consistency, found.replaced) == (False, None, [])
 
 
@@ -133,8 +133,8 @@ def test_poses_that_are_not_refined_are_checked_by_at_most_sixty_views(
     frame = Frame("a", torch.zeros(3, 4, 3), camera, torch.ones(3, 4))
     checked = list[View]()
     module = "bidnerf_core.captures.training_views"
-    monkeypatch.setattr(f"{module}.posed_keypoints", lambda views, _: checked.extend(views) or [])
-    prepared([View(frame, looking_in(0.01 * i)) for i in range(count)], "never")
+    monkeypatch.setattr(f"{module}.detect_keypoints", lambda views, _: checked.extend(views) or [])
+    prepare_views([View(frame, looking_in(0.01 * i)) for i in range(count)], "never")
     assert min(count, 30) <= len(checked) <= 60
 
 
@@ -142,11 +142,11 @@ def test_stored_cameras_hold_both_poses_and_how_far_they_are_apart() -> None:
     found, views, _ = inaccurate()
     poses = found.tracked.T_world_camera
     moved = [replace(view, T_ref_camera=poses[i]) for i, view in enumerate(views)]
-    cameras = moved_from(views, stored_cameras(moved), found.pixels.tolist())
-    assert as_given(cameras) == stored_cameras(views)
-    again = at_stored_poses(views, cameras)
+    cameras = record_refinement(views, stored_cameras(moved), found.pixels.tolist())
+    assert given_cameras(cameras) == stored_cameras(views)
+    again = apply_stored_poses(views, cameras)
     assert all(torch.equal(a.T_ref_camera.matrix(), b.T_ref_camera.matrix()) for a, b in zip(again, moved, strict=True))
-    others = at_stored_poses(moved, cameras)  # other poses than the dataset's are those of another dataset
+    others = apply_stored_poses(moved, cameras)  # other poses than the dataset's are those of another dataset
     assert all(a.T_ref_camera is b.T_ref_camera for a, b in zip(others, moved, strict=True))
     update = (views[3].T_ref_camera.inverse() @ poses[3]).log()
     camera = moved_cameras(cameras)[3]
@@ -162,7 +162,7 @@ def test_stored_cameras_hold_both_poses_and_how_far_they_are_apart() -> None:
 
 def test_cameras_that_did_not_move_have_one_pose() -> None:
     views = ring(Points(), 4)
-    cameras = moved_from(views, stored_cameras(views), [0.0] * 4)
+    cameras = record_refinement(views, stored_cameras(views), [0.0] * 4)
     assert cameras == stored_cameras(views)
     assert moved_cameras(cameras) == []
     (line,) = pose_sentences(cameras, PoseRefinement(0.3, 0.3, True))
@@ -181,7 +181,7 @@ def test_poses_of_motion_capture_are_refined_and_those_of_a_renderer_are_not(
     dataset = open_dataset(data_dir / scene)
     views = dataset.views("train", dataset.frame_names("train")[:12])
     features = Sift(count=300)
-    found = training_poses(tracked_views(views, features), views)
+    found = training_poses(track_views(views, features), views)
     assert found.refined == refined
     assert found.consistency is not None
     if refined:
@@ -194,7 +194,7 @@ def test_poses_of_motion_capture_are_refined_and_those_of_a_renderer_are_not(
 def measured(ratio: float) -> TrackedViews:
     """Images whose measured depth is ``ratio`` times the true one."""
     points = Points(noise=0.3)
-    return tracked_views(ring(points, 8, depth=ratio), points)
+    return track_views(ring(points, 8, depth=ratio), points)
 
 
 @pytest.mark.parametrize("ratio", [1000.0, 0.001, 0.3048])

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from bidnerf_core.captures import given_up, up_direction
+from bidnerf_core.captures import up_direction, up_from_gravity
 from bidnerf_core.geometry import SE3
 
 WORLD = SE3.exp(torch.tensor([0.0, 0, 0, 0.7, -1.1, 0.4], dtype=torch.float64)).rotation
@@ -71,5 +71,5 @@ def test_walls_do_not_count_as_floors() -> None:
 
 
 def test_gravity_is_taken_as_it_is() -> None:
-    assert given_up((0, 9.81, 0)).direction == (0, 1, 0)
-    assert given_up((0, 9.81, 0)).source == "gravity"
+    assert up_from_gravity((0, 9.81, 0)).direction == (0, 1, 0)
+    assert up_from_gravity((0, 9.81, 0)).source == "gravity"

@@ -11,7 +11,7 @@ import tiny
 from bidnerf import SE3, Frame, Intrinsics, View
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.errors import InputError
-from bidnerf_core.mapping import LandmarkConfig, tracked_views
+from bidnerf_core.mapping import LandmarkConfig, track_views
 from landmark_scene import Points, ring
 
 CAMERA = Intrinsics(60.0, 60.0, 32.0, 24.0, 64, 48)
@@ -28,7 +28,7 @@ def captured() -> list[View]:
     """Views of the landmark scene with the landmarks that they see."""
     points = Points()
     views = ring(points)
-    seen = tracked_views(views, points).seen(LandmarkConfig())
+    seen = track_views(views, points).seen(LandmarkConfig())
     return [replace(view, landmarks=part) for view, part in zip(views, seen, strict=True)]
 
 

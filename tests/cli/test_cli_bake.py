@@ -20,10 +20,10 @@ from bidnerf import train
 from bidnerf.cli import main
 from bidnerf.scenes import HomogeneousBall
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.captures import located
+from bidnerf_core.captures import track_landmarks
 from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.frames import View
-from bidnerf_core.mapping import BakeConfig, TrackedViews, tracked_views
+from bidnerf_core.mapping import BakeConfig, TrackedViews, track_views
 from bidnerf_core.maps import Map, TrainOptions, load_info, load_map
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid import backend as hashgrid
@@ -90,7 +90,7 @@ def _landmarks_only(sharp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The surface is left alone, and what the map renders is as sharp as photos."""
     photos = open_dataset(sharp / "data", tiny.BACKGROUND).views("train")
     monkeypatch.setattr("bidnerf_core.maps.map.Map.with_surface", lambda scene, *_: scene)
-    monkeypatch.setattr("bidnerf_core.maps.map.rendered_views", lambda *_: photos[:12])
+    monkeypatch.setattr("bidnerf_core.maps.map.render_views", lambda *_: photos[:12])
 
 
 def test_a_baked_map_needs_no_start(sharp: Path, baked: Path, once: CommandResult, bidnerf: Run) -> None:
@@ -254,14 +254,14 @@ def test_landmarks_of_photos_are_built_once_for_training_and_baking(
 
     def tracked(views: Sequence[View], features: str, **options: Any) -> TrackedViews:
         built.append(len(views))
-        return tracked_views(views, features, **options)
+        return track_views(views, features, **options)
 
     def trained(field: Any, views: Sequence[View], *rest: Any) -> None:
         seen.append(sum(len(v.landmarks.distance) for v in views if v.landmarks is not None))
         hashgrid.train(field, views, *rest)
 
     for part in ("maps.map", "captures.training_views"):
-        monkeypatch.setattr(f"bidnerf_core.{part}.tracked_views", tracked)
+        monkeypatch.setattr(f"bidnerf_core.{part}.track_views", tracked)
     monkeypatch.setattr("bidnerf_core.maps.map.Map.with_surface", lambda scene, *_: scene)
     watched = SimpleNamespace(summary="", config_type=HashGridConfig, build=hashgrid.build, train=trained)
     monkeypatch.setattr("bidnerf_core.maps.training.load_backend", lambda *_: watched)
@@ -277,7 +277,7 @@ def test_landmarks_of_photos_are_built_once_for_training_and_baking(
 
 def test_images_with_silhouettes_are_trained_on_without_landmarks() -> None:
     bare = [replace(v, frame=replace(v.frame, depth=None)) for v in tiny.views(3)]
-    tracked, views = located(bare)
+    tracked, views = track_landmarks(bare)
     assert tracked is None
     assert all(view.landmarks is None for view in views)
 

@@ -15,11 +15,11 @@ import torch
 import tiny
 from bidnerf import SE3, View
 from bidnerf.cli import main
-from bidnerf_core.captures import PoseRefinement, TrainingPoses, as_given, stored_cameras
-from bidnerf_core.captures import prepared as prepared_for_training
+from bidnerf_core.captures import PoseRefinement, TrainingPoses, given_cameras, stored_cameras
+from bidnerf_core.captures import prepare_views as prepared_for_training
 from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.mapping import TrackedViews, tracked_views
+from bidnerf_core.mapping import TrackedViews, track_views
 from bidnerf_core.maps import cameras_of, load_info, read_part, read_views
 from commands import Run, assert_refused
 from landmark_scene import Points, ring
@@ -57,7 +57,7 @@ def views(shared: Path) -> list[View]:
 
 def test_a_map_holds_refined_and_given_poses(bidnerf: Run, refined: Path, views: list[View]) -> None:
     info = load_info(refined)
-    assert as_given(info.cameras) == stored_cameras(views)
+    assert given_cameras(info.cameras) == stored_cameras(views)
     for view, (_, T) in zip(views, cameras_of(info), strict=True):
         torch.testing.assert_close((view.T_ref_camera.inverse() @ T).log(), UPDATE, rtol=0, atol=1e-9)
     shown = bidnerf("info", refined).out
@@ -126,11 +126,11 @@ def test_a_damaged_given_pose_is_named(bidnerf: Run, refined: Path, tmp_path: Pa
     assert_refused(bidnerf("info", tmp_path / "map"), 1, file, described["cameras"][1]["name"], "rigid")
 
 
-def prepared(views: list[View], points: Points, monkeypatch: pytest.MonkeyPatch) -> None:
+def prepare_views(views: list[View], points: Points, monkeypatch: pytest.MonkeyPatch) -> None:
     """Prepare views of points for training, as the command does."""
     monkeypatch.setattr(
-        "bidnerf_core.captures.training_views.tracked_views",
-        lambda given, features: tracked_views(given, points),
+        "bidnerf_core.captures.training_views.track_views",
+        lambda given, features: track_views(given, points),
     )
     prepared_for_training(views)
 
@@ -139,16 +139,16 @@ def prepared(views: list[View], points: Points, monkeypatch: pytest.MonkeyPatch)
 def test_a_training_checks_axes_and_units_of_depth(monkeypatch: pytest.MonkeyPatch) -> None:
     points = Points(noise=0.3)
     views = ring(points, 14, depth=1.0)
-    prepared(views, points, monkeypatch)
+    prepare_views(views, points, monkeypatch)
     reversed_axes = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
     flipped = [
         replace(v, T_ref_camera=SE3(v.T_ref_camera.rotation @ reversed_axes, v.T_ref_camera.translation)) for v in views
     ]
     with pytest.raises(InputError, match="the poses contradict the photos"):
-        prepared(flipped, points, monkeypatch)
+        prepare_views(flipped, points, monkeypatch)
     millimetres = ring(points, 14, depth=1000.0)
     with pytest.raises(InputError, match="depth_unit_scale_factor"):
-        prepared(millimetres, points, monkeypatch)
+        prepare_views(millimetres, points, monkeypatch)
 
 
 def test_datasets_tell_the_unit_of_their_depth(shared: Path) -> None:

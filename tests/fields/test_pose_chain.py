@@ -8,7 +8,7 @@ import torch
 from bidnerf.results import pose_error
 from bidnerf.scenes import GaussianBlobs, orbit
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.fields import Objective, Observations, SceneBounds, colour_term, depth_term, render, widened
+from bidnerf_core.fields import Objective, Observations, SceneBounds, colour_term, depth_term, render, widen
 from bidnerf_core.frames import Frame, View, draw, uniform
 from bidnerf_core.geometry import SE3, Robust, look_at, perturb
 from bidnerf_core.localization import Problem, rig
@@ -35,7 +35,7 @@ def photograph(field: GaussianBlobs, T_world_camera: SE3, name: str = "frame", d
 def loss(problem: Problem, T_world_last: SE3, wide: float = 1.0) -> torch.Tensor:
     generator = torch.Generator().manual_seed(7)
     pixels = draw(problem.views, 60, uniform, generator, torch.float64)
-    rays = widened(pixels.rays(T_world_last, problem.bounds), wide)
+    rays = widen(pixels.rays(T_world_last, problem.bounds), wide)
     return PAPERS.loss(render(problem.field, rays, problem.bounds.background), pixels)
 
 
@@ -50,7 +50,7 @@ def test_gradient_by_the_pose_is_the_numerical_one(views: int, wide: float) -> N
     def by_tangent(xi: torch.Tensor) -> torch.Tensor:
         # The interval on each ray says the part that is sampled, without a derivative: hold it, as autograd does.
         pixels = draw(problem.views, 60, uniform, torch.Generator().manual_seed(7), torch.float64)
-        here = widened(pixels.rays(problem.start, problem.bounds), wide)
+        here = widen(pixels.rays(problem.start, problem.bounds), wide)
         moved = pixels.rays(problem.start.retract(xi), problem.bounds)
         rays = type(here)(moved.origins, moved.directions, here.near, here.far)
         return PAPERS.loss(render(field, rays, BOUNDS.background), pixels)

@@ -26,7 +26,7 @@ from bidnerf_core.fields import (
     render_picture,
     render_samples,
     rendering_weights,
-    widened,
+    widen,
 )
 from bidnerf_core.geometry import SE3
 from resampled import Resampled
@@ -200,7 +200,7 @@ def test_importance_sampling_gathers_where_the_weight_is() -> None:
 
 def test_wide_rays_are_twice_as_long_about_the_same_middle() -> None:
     rays = some_rays(30)
-    wide = widened(rays, 2.0)
+    wide = widen(rays, 2.0)
     inside = (wide.near > 0) & (rays.far > rays.near)
     length = (wide.far - wide.near)[inside] / (rays.far - rays.near)[inside]
     torch.testing.assert_close(length, torch.full_like(length, 2.0))

@@ -22,7 +22,7 @@ from bidnerf_core.frames import DRAWERS, DrawerName, MaskFolder, WhollyHidden, m
 from bidnerf_core.localization.by_surface import is_blank
 from bidnerf_core.localization.terms.images import Thumbnail
 from bidnerf_core.localization.terms.rays import averaged
-from bidnerf_core.mapping import SIFT, image_keypoints, tracked_views
+from bidnerf_core.mapping import SIFT, image_keypoints, track_views
 from bidnerf_core.maps import rendering_scores
 
 # Inside: each quantity computed from pixels, which is equal whatever a mask hides
@@ -280,7 +280,7 @@ def test_no_keypoint_reaches_into_what_is_hidden() -> None:
     hidden[30:90, 40:120] = True
     view = View(Frame("noise", rgb, camera, hidden=hidden), like.T_ref_camera)
     whole = replace(view, frame=replace(view.frame, hidden=None))
-    of_map = tracked_views([view], SIFT).observations.images[0].keypoints
+    of_map = track_views([view], SIFT).observations.images[0].keypoints
     of_query = image_keypoints(view, SIFT).keypoints
     for keypoints in (of_map, of_query):
         assert 20 < len(keypoints) < 0.8 * len(image_keypoints(whole, SIFT).keypoints)

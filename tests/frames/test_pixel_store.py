@@ -15,7 +15,7 @@ from PIL import Image
 
 import tiny
 from bidnerf.testing import DEVICE, Elsewhere
-from bidnerf_core.camera import CameraBatch, Intrinsics, checked_side
+from bidnerf_core.camera import CameraBatch, Intrinsics, check_side
 from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds
@@ -34,7 +34,7 @@ from bidnerf_core.maps import TrainOptions, read_views
 from bidnerf_core.maps import views as views_of_map
 
 # Inside: blocks are made so small that the images of a test fill several
-from bidnerf_core.training import RayBank, excess, nearby, ray_bank
+from bidnerf_core.training import RayBank, excess, nearby_photos, ray_bank
 from photo_files import noise
 
 CAMERA = Intrinsics(30.0, 31.0, 12.3, 8.1, 24, 16)
@@ -166,7 +166,7 @@ def test_neighbours_are_the_same_block_by_block(monkeypatch: pytest.MonkeyPatch)
     whole = tracks.likely_pairs([view.T_ref_camera for view in views], 8)
     monkeypatch.setattr(tracks, "ROWS", 7)
     assert torch.equal(tracks.likely_pairs([view.T_ref_camera for view in views], 8), whole)
-    near, values = nearby(views), torch.arange(40.0)
+    near, values = nearby_photos(views), torch.arange(40.0)
     for photo in range(40):
         others = {j if i == photo else i for i, j in whole.tolist() if photo in (i, j)}
         assert set(near[near[:, 0] == photo, 1].tolist()) == others
@@ -200,7 +200,7 @@ def test_large_images_are_read_at_the_size_that_is_of_use(
         assert side == 20 or 0.9 < count * 3 * side**2 * 120 / 192 / 10_000 <= 1
     for wrong in (0, 2.5, True):
         with pytest.raises(InputError, match=r"largest is .*, expected a positive whole number of pixels"):
-            checked_side(wrong)  # type: ignore[arg-type]
+            check_side(wrong)  # type: ignore[arg-type]
 
 
 def test_a_map_of_reduced_images_is_resumed_at_their_size(tmp_path: Path) -> None:

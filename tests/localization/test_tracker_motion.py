@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from bidnerf import SE3
-from bidnerf_core.geometry import retracted, update_between
+from bidnerf_core.geometry import retract, update_between
 
 # Inside: predictions and covariances of the filter, which show in no answer by themselves
 from bidnerf_core.localization.tracking.motion import LONGEST_GAP, Clock, Motion, PoseEstimate, pixel_radius
@@ -145,7 +145,7 @@ def test_maps_of_single_poses_equal_those_of_batches(angle: float) -> None:
     tangent = torch.randn(6, generator=generator, dtype=torch.float64)
     tangent[3:] *= angle / tangent[3:].norm()
     T = path(1.5)
-    moved = retracted(T, tangent)
+    moved = retract(T, tangent)
     assert torch.allclose(moved.matrix(), T.retract(tangent).matrix(), atol=1e-12)
     assert torch.allclose(update_between(T, moved), tangent, atol=1e-9)
 

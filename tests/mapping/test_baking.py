@@ -24,10 +24,10 @@ from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
 # Inside: the size of cells and the noise of depth are compared with those of the scene
 from bidnerf_core.mapping.surface.posed_depth import (
     PosedDepthImage,
-    chosen_grid,
+    choose_grid,
     depth_noise,
     footprint,
-    measured_image,
+    posed_measurement,
     spacing,
     surface_bytes,
 )
@@ -154,7 +154,7 @@ def images(noise: float, generator: Generator, count: int = 16) -> list[PosedDep
         depth = view.frame.depth
         assert depth is not None
         noisy = torch.where(depth > 0, depth + noise * torch.randn(depth.shape, generator=generator), 0)
-        found.append(measured_image(View(replace(view.frame, depth=noisy), view.T_ref_camera), 1e9))
+        found.append(posed_measurement(View(replace(view.frame, depth=noisy), view.T_ref_camera), 1e9))
     return found
 
 
@@ -175,7 +175,7 @@ def test_a_single_image_has_no_noise(generator: Generator) -> None:
 
 def test_the_footprint_is_that_of_the_full_image_and_the_spacing_that_of_the_thinned_one() -> None:
     view = baked.images(SCENE, 1, seed=0)[0]
-    thinned = [measured_image(view, view.frame.intrinsics.width * view.frame.intrinsics.height / 9)]
+    thinned = [posed_measurement(view, view.frame.intrinsics.width * view.frame.intrinsics.height / 9)]
     assert view.frame.depth is not None
     distance = float(view.frame.depth[view.frame.depth > 0].median())
     assert footprint(thinned, 0.9) == pytest.approx(distance / baked.CAMERA.fx, rel=0.02)
@@ -190,29 +190,29 @@ def scattered(count: int, generator: Generator) -> Tensor:
 
 def test_few_points_make_cells_coarser_but_no_coarser_than_their_spacing(generator: Generator) -> None:
     many, few = scattered(100_000, generator), scattered(1000, generator)
-    assert chosen_grid(many, baked.BOUNDS, 0.02, 0.2, 200.0).cell == 0.02
-    grid = chosen_grid(few, baked.BOUNDS, 0.02, 0.2, 200.0)
+    assert choose_grid(many, baked.BOUNDS, 0.02, 0.2, 200.0).cell == 0.02
+    grid = choose_grid(few, baked.BOUNDS, 0.02, 0.2, 200.0)
     assert 0.02 < grid.cell < 0.2
     assert len(few) >= 1.32 * len(grid.numbers(few).unique())
-    assert chosen_grid(few[:1], baked.BOUNDS, 0.02, 0.1, 200.0).cell == 0.1
+    assert choose_grid(few[:1], baked.BOUNDS, 0.02, 0.1, 200.0).cell == 0.1
 
 
 def test_memory_is_bounded_and_a_warning_says_so(generator: Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     points = scattered(20_000, generator)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        free = chosen_grid(points, baked.BOUNDS, 0.03, 0.03, 200.0)
+        free = choose_grid(points, baked.BOUNDS, 0.03, 0.03, 200.0)
     with pytest.warns(InputWarning, match=r"MB with cells of 0\.03; cells of .* within 0\.2 MB.*--megabytes"):
-        bounded = chosen_grid(points, baked.BOUNDS, 0.03, 0.03, 0.2)
+        bounded = choose_grid(points, baked.BOUNDS, 0.03, 0.03, 0.2)
     assert surface_bytes(points, bounded) <= 0.2e6 < surface_bytes(points, free)
     assert bounded.cell < 0.18  # no coarser than needed
     with pytest.raises(InputError, match="allow more megabytes"):
-        chosen_grid(points, baked.BOUNDS, 0.03, 0.03, 1e-5)
+        choose_grid(points, baked.BOUNDS, 0.03, 0.03, 1e-5)
     posed_depth = import_module("bidnerf_core.mapping.surface.posed_depth")
     assert posed_depth.MOST_CELLS <= 2**31
     monkeypatch.setattr(posed_depth, "MOST_CELLS", 2**22)
     with pytest.warns(InputWarning, match="too many cells"):
-        assert math.prod(chosen_grid(points, baked.BOUNDS, 0.01, 0.01, 200.0).shape) <= 2**22
+        assert math.prod(choose_grid(points, baked.BOUNDS, 0.01, 0.01, 200.0).shape) <= 2**22
 
 
 def walls(size: tuple[float, float, float], step: float) -> Tensor:

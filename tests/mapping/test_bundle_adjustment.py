@@ -10,10 +10,10 @@ from torch import Tensor
 
 from bidnerf import SE3
 from bidnerf_core.camera import STILL, MotionPrior, poses_of_rows
-from bidnerf_core.mapping import Adjustment, PosePrior, Sightings, adjusted
+from bidnerf_core.mapping import Adjustment, PosePrior, Sightings, adjust_bundle
 
 # Inside: the linear system and its elimination are compared with numerical derivatives
-from bidnerf_core.mapping.geometry.bundle_adjustment import SMALL_DECREASE, linearized
+from bidnerf_core.mapping.geometry.bundle_adjustment import SMALL_DECREASE, linearize
 from landmark_scene import looking_in
 
 VIEWS, POINTS, FOCAL = 12, 150, 300.0
@@ -53,9 +53,9 @@ class Capture:
         T = given[image]
         return Sightings(point, image, T.rotation.mT, T.translation, flat, focal, times)
 
-    def adjusted(self, given: SE3, prior: PosePrior, tolerance: float = SMALL_DECREASE) -> Adjustment:
+    def adjust_bundle(self, given: SE3, prior: PosePrior, tolerance: float = SMALL_DECREASE) -> Adjustment:
         """What an adjustment finds, from the ``given`` poses and the true points."""
-        return adjusted(self.seen(given), at_rest(given, self.points), prior, self.accuracy, tolerance=tolerance)
+        return adjust_bundle(self.seen(given), at_rest(given, self.points), prior, self.accuracy, tolerance=tolerance)
 
     @property
     def accuracy(self) -> float:
@@ -111,9 +111,9 @@ def test_the_gradient_is_the_numerical_one(motion: MotionPrior) -> None:
     def cost(of_images: Tensor, of_points: Tensor) -> float:
         T = capture.poses.retract(of_images[:, :6])
         moved = Adjustment(T, points + of_points, AT_REST_ALL if motion == STILL else of_images[:, 6:])
-        return linearized(seen, moved, held, 1.0, 3.0).cost
+        return linearize(seen, moved, held, 1.0, 3.0).cost
 
-    system = linearized(seen, at_rest(capture.poses, points), held, 1.0, 3.0)
+    system = linearize(seen, at_rest(capture.poses, points), held, 1.0, 3.0)
     unknowns = 6 if motion == STILL else 12
     still = torch.zeros(VIEWS, unknowns, dtype=torch.float64)
     fixed, step = torch.zeros(POINTS, 3, dtype=torch.float64), 1e-6
@@ -133,7 +133,7 @@ def test_the_gradient_is_the_numerical_one(motion: MotionPrior) -> None:
 def test_the_schur_complement_gives_the_step_of_the_whole_equations(motion: MotionPrior, size: int) -> None:
     capture = Capture(noise=1.0)
     given = capture.poses.retract(errors())
-    system = linearized(capture.seen(given), at_rest(given, capture.points), prior(given, motion), 1.0)
+    system = linearize(capture.seen(given), at_rest(given, capture.points), prior(given, motion), 1.0)
     rows, columns = size * VIEWS, 3 * POINTS
     whole = torch.zeros(rows + columns, rows + columns, dtype=torch.float64)
     for i, block in enumerate(system.image_blocks):
@@ -155,7 +155,7 @@ def test_the_schur_complement_gives_the_step_of_the_whole_equations(motion: Moti
 
 def test_exact_poses_do_not_move() -> None:
     capture = Capture()
-    found = capture.adjusted(capture.poses, prior(capture.poses))
+    found = capture.adjust_bundle(capture.poses, prior(capture.poses))
     assert max(off(found.T_world_camera, capture.poses)) < 1e-9
     torch.testing.assert_close(found.points, capture.points, rtol=0, atol=1e-9)
 
@@ -164,7 +164,7 @@ def test_exact_sightings_take_errors_of_poses_back() -> None:
     """What is left is what no image shows: a motion and a scale of everything, about which the prior has an opinion."""
     capture = Capture()
     given = capture.poses.retract(errors())
-    found = capture.adjusted(given, prior(given), tolerance=1e-12).T_world_camera
+    found = capture.adjust_bundle(given, prior(given), tolerance=1e-12).T_world_camera
     translation, rotation = off(relative(found), relative(capture.poses))
     before = off(relative(given), relative(capture.poses))
     assert translation < 0.15 * before[0]  # the scale
@@ -174,8 +174,8 @@ def test_exact_sightings_take_errors_of_poses_back() -> None:
 def test_motions_are_found_with_the_poses() -> None:
     capture = Capture(noise=0.3, moving=True)
     given = capture.poses.retract(errors())
-    still = capture.adjusted(given, prior(given))
-    moving = capture.adjusted(given, prior(given, MotionPrior(MILLIMETRES, RADIANS)))
+    still = capture.adjust_bundle(given, prior(given))
+    moving = capture.adjust_bundle(given, prior(given, MotionPrior(MILLIMETRES, RADIANS)))
     assert bool((still.motion == 0).all())
     assert moving.cost < 0.7 * still.cost
     true, found, none = (capture.shifts(m) for m in (motions(), moving.motion, AT_REST_ALL))
@@ -186,14 +186,14 @@ def test_motions_are_found_with_the_poses() -> None:
 
 def test_cameras_at_rest_are_found_at_rest() -> None:
     capture = Capture()
-    found = capture.adjusted(capture.poses, prior(capture.poses, MotionPrior(MILLIMETRES, RADIANS)))
+    found = capture.adjust_bundle(capture.poses, prior(capture.poses, MotionPrior(MILLIMETRES, RADIANS)))
     assert float(found.motion.abs().max()) < 1e-9
 
 
 def test_the_mean_motion_is_zero() -> None:
     capture = Capture(noise=0.3)
     given = capture.poses.retract(errors())
-    found = capture.adjusted(given, replace(prior(given), translation=1.0, rotation=0.5))
+    found = capture.adjust_bundle(given, replace(prior(given), translation=1.0, rotation=0.5))
     mean = (found.T_world_camera.translation - given.translation).mean(0)
     typical = (found.T_world_camera.translation - given.translation).norm(dim=-1).median()
     assert float(mean.norm()) < 1e-2 * float(typical)
@@ -203,10 +203,10 @@ def test_a_moved_world_has_moved_poses() -> None:
     capture = Capture(noise=0.5)
     given = capture.poses.retract(errors())
     T = SE3.exp(torch.tensor([3.0, -1.0, 2.0, 0.5, 1.0, -0.3], dtype=torch.float64))
-    here = capture.adjusted(given, prior(given))
+    here = capture.adjust_bundle(given, prior(given))
     moved = T @ given
     start = at_rest(moved, T.apply(capture.points))
-    there = adjusted(capture.seen(moved), start, prior(moved), capture.accuracy)
+    there = adjust_bundle(capture.seen(moved), start, prior(moved), capture.accuracy)
     assert max(off(there.T_world_camera, T @ here.T_world_camera)) < 1e-6
     assert there.cost == pytest.approx(here.cost, rel=1e-6)
 
@@ -216,7 +216,7 @@ def test_outliers_and_a_wrong_pose_do_not_pull_the_others_away() -> None:
     wrong = errors()
     wrong[5] = torch.tensor([0.2, 0, 0.1, 0, 0.05, 0], dtype=torch.float64)
     given = capture.poses.retract(wrong)
-    found = capture.adjusted(given, prior(given)).T_world_camera
+    found = capture.adjust_bundle(given, prior(given)).T_world_camera
     translation, rotation = off(found, capture.poses)
     assert translation < 1.5 * MILLIMETRES  # the common motion remains
     assert rotation < RADIANS
@@ -227,7 +227,7 @@ def test_an_image_without_sightings_stays() -> None:
     given = capture.poses.retract(errors())
     seen = capture.seen(given)
     start = at_rest(given, capture.points)
-    found = adjusted(seen[seen.view != 3], start, prior(given), capture.accuracy).T_world_camera
+    found = adjust_bundle(seen[seen.view != 3], start, prior(given), capture.accuracy).T_world_camera
     assert max(off(found[3], given[3])) < 1e-12
     assert max(off(found[4], given[4])) > 1e-3
 
@@ -243,6 +243,6 @@ def test_points_without_parallax_do_no_harm() -> None:
     seen = replace(capture.seen(turned), image=local[:, :2] / local[:, 2:])
     given = turned.retract(errors())
     start = at_rest(given, capture.points)
-    found = adjusted(seen, start, prior(given), capture.accuracy).T_world_camera
+    found = adjust_bundle(seen, start, prior(given), capture.accuracy).T_world_camera
     assert bool(found.is_rigid().all())
     assert off(relative(found), relative(turned))[1] < 0.5 * off(relative(given), relative(turned))[1]

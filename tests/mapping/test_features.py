@@ -13,17 +13,17 @@ import torch
 import tiny
 from bidnerf import InputError
 from bidnerf_core.mapping import (
-    FoundOnce,
+    CachedFeatures,
     Keypoints,
     Sift,
     byte_of_zero,
-    detected,
+    detect,
+    limit_features,
     nearest_centre,
     paired_squared_distances,
-    quantized,
+    quantize,
     squared_distances,
-    strongest,
-    tracked_views,
+    track_views,
     unrelated_distance,
 )
 from conditions import CountedDetector
@@ -95,7 +95,7 @@ def test_root_normalised_descriptors_are_unit() -> None:
 def test_zero_and_scale_of_descriptors_are_measured(signed: bool, generator: torch.Generator) -> None:
     exact = torch.randn(4000, 64, generator=generator)
     exact = exact if signed else exact.abs()
-    bytes_ = quantized(exact / exact.norm(dim=-1, keepdim=True))
+    bytes_ = quantize(exact / exact.norm(dim=-1, keepdim=True))
     assert byte_of_zero(bytes_) == (128 if signed else 0)
     pairs = squared_distances(bytes_[:2000], bytes_[2000:])
     assert unrelated_distance(bytes_) == pytest.approx(float(pairs.mean().sqrt()), rel=0.01)
@@ -112,7 +112,7 @@ def test_zero_of_bits_is_half_of_them_and_of_nothing_0(generator: torch.Generato
 def test_quantising_keeps_the_order_of_signed_descriptors(generator: torch.Generator) -> None:
     exact = torch.randn(40, 64, generator=generator)
     exact = exact / exact.norm(dim=-1, keepdim=True)
-    bytes_ = quantized(exact)
+    bytes_ = quantize(exact)
     close = torch.cdist(bytes_.float(), bytes_.float()) / 256
     torch.testing.assert_close(close, torch.cdist(exact, exact), atol=0.03, rtol=0)
 
@@ -139,11 +139,11 @@ def test_a_detector_that_returns_no_keypoints_of_the_image_is_told(found: Any, s
         return found
 
     image = torch.zeros(30, 40, 3)
-    assert detected(lambda rgb: SOUND, image) is SOUND
+    assert detect(lambda rgb: SOUND, image) is SOUND
     with pytest.raises(InputError, match=f"detector stranger: .*{said}"):
-        detected(stranger, image)
+        detect(stranger, image)
     with pytest.raises(InputError, match=f"detector stranger: .*{said}"):
-        strongest(stranger, 3)(image)
+        limit_features(stranger, 3)(image)
 
 
 def test_descriptors_of_different_lengths_are_told() -> None:
@@ -153,16 +153,16 @@ def test_descriptors_of_different_lengths_are_told() -> None:
         return replace(SOUND, descriptors=torch.zeros(5, next(lengths), dtype=torch.uint8))
 
     with pytest.raises(InputError, match="descriptors have 8 and 9 channels in different images"):
-        tracked_views(tiny.views(3), stranger)
+        track_views(tiny.views(3), stranger)
 
 
 def test_equal_images_have_the_same_keypoints_and_others_their_own() -> None:
     detector, image = CountedDetector(), textured(0)
-    once = FoundOnce(detector)
+    once = CachedFeatures(detector)
     found = once(image)
     assert once(image) is found
     assert once(image.clone()) is found
     assert once(image.flip(1)) is not found
     assert len(detector.images) == 2
-    assert FoundOnce(detector, [(image, found)])(image) is found
+    assert CachedFeatures(detector, [(image, found)])(image) is found
     assert len(detector.images) == 2

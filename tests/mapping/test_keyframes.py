@@ -17,7 +17,7 @@ from bidnerf.testing import BOUNDS, CAMERA, ground, training_views, unseen
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import SceneBounds, Stratified
 from bidnerf_core.localization import LandmarkMatcher, Loop
-from bidnerf_core.mapping import build_landmarks, colour_noise, rendered_views
+from bidnerf_core.mapping import build_landmarks, colour_noise, render_views
 from localizations import assert_near
 
 BALL = HomogeneousBall(0.5, 400.0, rgb=(0.8, 0.3, 0.2), sampler=Stratified(256))
@@ -27,7 +27,7 @@ TINY = Intrinsics(6.0, 6.0, 2.5, 2.5, 5, 5)
 
 def test_keyframes_show_the_field_from_the_cameras() -> None:
     cameras = [(TINY, T) for T in orbit(2.0, 3)]
-    found = rendered_views(BALL, CUBE, cameras)
+    found = render_views(BALL, CUBE, cameras)
     assert len(found) == 3
     for view, (intrinsics, T) in zip(found, cameras, strict=True):
         assert view.frame.intrinsics == intrinsics
@@ -42,11 +42,11 @@ def test_keyframes_show_the_field_from_the_cameras() -> None:
 def test_keyframes_are_as_many_and_as_large_as_is_useful_at_most() -> None:
     """Many cameras are thinned out evenly, and a large image is rendered with fewer pixels."""
     cameras = [(TINY, T) for T in orbit(2.0, 201)]
-    found = rendered_views(HomogeneousBall(0.5, 1.0, sampler=Stratified(1)), CUBE, cameras)
+    found = render_views(HomogeneousBall(0.5, 1.0, sampler=Stratified(1)), CUBE, cameras)
     assert len(found) <= 100
     assert torch.equal(found[1].T_ref_camera.matrix(), cameras[3][1].matrix())
     large = Intrinsics(2400.0, 2400.0, 1200.0, 5.0, 2400, 10)
-    small = rendered_views(HomogeneousBall(0.5, 1.0, sampler=Stratified(1)), CUBE, [(large, orbit(2.0, 1)[0])])
+    small = render_views(HomogeneousBall(0.5, 1.0, sampler=Stratified(1)), CUBE, [(large, orbit(2.0, 1)[0])])
     camera = small[0].frame.intrinsics
     assert camera.width == 400
     assert camera.width / camera.fx == pytest.approx(large.width / large.fx)
@@ -55,7 +55,7 @@ def test_keyframes_are_as_many_and_as_large_as_is_useful_at_most() -> None:
 
 def test_landmarks_of_keyframes_find_a_photo() -> None:
     """They stand in for the photos of a map that came without."""
-    views = rendered_views(ground(), BOUNDS, [(CAMERA, view.T_ref_camera) for view in training_views()[:6]])
+    views = render_views(ground(), BOUNDS, [(CAMERA, view.T_ref_camera) for view in training_views()[:6]])
     found = Loop([View(unseen().frame, SE3.identity())], LandmarkMatcher(build_landmarks(views)))()
     assert found is not None
     assert_near(found.T_world_rig, unseen().T_ref_camera, 0.02, 0.5)

@@ -19,14 +19,14 @@ from bidnerf_core.mapping import (
     build_landmarks,
     likely_pairs,
     robust_covariance,
-    tracked_views,
+    track_views,
     update_scatter,
 )
 
 # Inside: triangulation, tracks and cells, each against an exhaustive computation
-from bidnerf_core.mapping.geometry.triangulation import intersected, parallax, refined_points
+from bidnerf_core.mapping.geometry.triangulation import parallax, refine_points, triangulate
 from bidnerf_core.mapping.landmarks.landmark_map import MOST_IN_CELL, LandmarkCells
-from bidnerf_core.mapping.landmarks.tracks import Matches, _mean_descriptors, joined_tracks
+from bidnerf_core.mapping.landmarks.tracks import Matches, _mean_descriptors, link_tracks
 from bidnerf_core.progress import Progress, job_context
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
@@ -57,7 +57,7 @@ def test_errors_are_as_large_as_the_deviations_say() -> None:
 def test_each_image_sees_landmarks_as_far_away_as_they_are() -> None:
     points = Points(noise=0.4)
     views = ring(points)
-    seen, off = tracked_views(views, points).seen(LandmarkConfig()), []
+    seen, off = track_views(views, points).seen(LandmarkConfig()), []
     assert len(seen) == len(views)
     for view, part in zip(views, seen, strict=True):
         local = view.T_ref_camera.inverse().apply(points.positions)
@@ -158,7 +158,7 @@ def test_covariance_of_a_triangulated_point_is_that_of_many_trials() -> None:
         [looking_in(0.15 * i) for i in range(4)],
     )
     seen = sightings(point, cameras, 0.5, 3000)
-    found, unit = refined_points(seen, intersected(seen, 3000), 50.0)
+    found, unit = refine_points(seen, triangulate(seen, 3000), 50.0)
     sampled = (found - point).mT @ (found - point) / len(found)
     expected = 0.25 * unit.mean(0)
     whitened = torch.linalg.solve(torch.linalg.cholesky(expected), sampled)
@@ -173,9 +173,9 @@ def test_one_wrong_observation_of_six_does_not_pull_a_point_away() -> None:
     )
     seen = sightings(point, cameras, 0.0, 1)
     seen.image[2] += 0.1  # 30 pixels
-    found = intersected(seen, 1)
+    found = triangulate(seen, 1)
     for scale in (5.0, 1.0, 0.2):
-        found, _ = refined_points(seen, found, scale)
+        found, _ = refine_points(seen, found, scale)
     assert float((found[0] - point).norm()) < 1e-3
 
 
@@ -189,7 +189,7 @@ def test_a_match_that_would_join_two_keypoints_of_an_image_is_left_out() -> None
     def match(a: int, b: int, ambiguity: float) -> Matches:
         return Matches(torch.tensor([[a, b]]), torch.tensor([ambiguity]))
 
-    track = joined_tracks([(0, 1, match(0, 0, 0.1)), (1, 2, match(0, 0, 0.2)), (0, 2, match(1, 0, 0.5))], [2, 1, 1])
+    track = link_tracks([(0, 1, match(0, 0, 0.1)), (1, 2, match(0, 0, 0.2)), (0, 2, match(1, 0, 0.5))], [2, 1, 1])
     assert track[0] == track[2] == track[3]
     assert track[1] != track[0]
 

@@ -23,7 +23,7 @@ from bidnerf import SE3, Frame, View
 from bidnerf.cli import main
 from bidnerf_core.datasets import read_posed_images, stored_keypoints
 from bidnerf_core.errors import InputError
-from bidnerf_core.mapping import DEFAULT_LANDMARKS, Keypoints, tracked_views
+from bidnerf_core.mapping import DEFAULT_LANDMARKS, Keypoints, track_views
 from bidnerf_core.maps import IMPORTERS
 from photo_room import CAMERA, looking, photograph, walk, write_photos
 from refusals import refused
@@ -82,7 +82,7 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Model:
     views = [
         View(Frame.open(folder / "images" / f"{number:03d}.png", camera=CAMERA), T) for number, T in enumerate(poses)
     ]
-    tracked = tracked_views(views)
+    tracked = track_views(views)
     seen, positions = tracked.triangulated(DEFAULT_LANDMARKS)
     images, keypoints = [f"# {COUNT}"], [image.keypoints for image in tracked.observations.images]
     first = np.cumsum([0, *map(len, keypoints)])

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bidnerf import SE3, Frame, Intrinsics, View
 from bidnerf_core.camera import exposure_times, poses_of_rows
-from bidnerf_core.mapping import Keypoints, quantized
+from bidnerf_core.mapping import Keypoints, quantize
 
 PINHOLE = Intrinsics(300.0, 300.0, 200.0, 150.0, 400, 300)
 SIZE = 0.04  # metres: of what a keypoint describes
@@ -29,7 +29,7 @@ class Points:
         generator = torch.Generator().manual_seed(1)
         self.positions = 2 * torch.rand(self.count, 3, dtype=torch.float64, generator=generator) - 1
         random = torch.rand(self.count, 64, generator=generator) ** 4
-        self.descriptors = quantized(random / random.norm(dim=-1, keepdim=True))
+        self.descriptors = quantize(random / random.norm(dim=-1, keepdim=True))
         self.seen: list[Keypoints] = []
 
     def view(

@@ -15,7 +15,7 @@ from bidnerf.testing import ground
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import render
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.training import Silent, Supervision, SupervisionConfig, TrainingStep, detail_kept
+from bidnerf_core.training import Silent, Supervision, SupervisionConfig, TrainingStep, relative_detail
 from landmark_scene import looking_in
 from test_supervision import BACKENDS
 
@@ -36,7 +36,7 @@ def photos(blur: float = 0.0) -> list[View]:
 
 
 def test_only_the_blurred_photo_weighs_less() -> None:
-    kept = detail_kept(photos(2.0))
+    kept = relative_detail(photos(2.0))
     others = torch.arange(COUNT) != BLURRED
     assert torch.equal(kept[others], torch.ones(COUNT - 1, dtype=kept.dtype))
     assert 0 < float(kept[BLURRED]) < 2**-0.5  # half an octave is the least that counts
@@ -45,7 +45,7 @@ def test_only_the_blurred_photo_weighs_less() -> None:
 def test_exposure_does_not_count_as_blur() -> None:
     views = photos()
     dark = replace(views[3], frame=replace(views[3].frame, rgb=0.3 * views[3].frame.rgb))
-    assert bool((detail_kept([*views[:3], dark, *views[4:]]) == 1).all())
+    assert bool((relative_detail([*views[:3], dark, *views[4:]]) == 1).all())
 
 
 def test_the_loss_is_that_of_weighted_squares() -> None:
@@ -89,7 +89,7 @@ def test_every_backend_weighs_blurred_photos_less(name: str) -> None:
 
 
 def test_the_more_a_photo_is_blurred_the_less_it_weighs() -> None:
-    weights = [float(detail_kept(photos(blur))[BLURRED]) for blur in (0.0, 1.5, 3.0)]
+    weights = [float(relative_detail(photos(blur))[BLURRED]) for blur in (0.0, 1.5, 3.0)]
     assert weights[0] == 1
     assert weights[0] > weights[1] > weights[2]
 

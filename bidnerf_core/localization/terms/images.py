@@ -17,7 +17,7 @@ from torch.nn.functional import conv2d, grid_sample, interpolate, normalize, pad
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.devices import constant
 from bidnerf_core.fields import RadianceField, SceneBounds, render
-from bidnerf_core.frames import View, continued
+from bidnerf_core.frames import View, inpaint
 from bidnerf_core.geometry import SE3, inlier_weight
 from bidnerf_core.localization.terms.exposure import fit_exposure
 from bidnerf_core.mapping import Normal, P, States, SurfaceMap, cast
@@ -39,7 +39,7 @@ class Thumbnail:
         camera = view.frame.intrinsics
         small = replace(camera.scaled(min(1.0, width / max(camera.width, camera.height))), distortion=())
         # Averaged first, so that every pixel of the image contributes.
-        rgb = continued(view.frame).cpu().float().permute(2, 0, 1)[None]
+        rgb = inpaint(view.frame).cpu().float().permute(2, 0, 1)[None]
         rgb = interpolate(rgb, (small.height, small.width), mode="area")
         flat = small.unproject(small.pixel_centres())
         if camera.distortion:

@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool2d, interpolate, normalize, pad
 
 from bidnerf_core.devices import moved
 from bidnerf_core.fields import Observations, RadianceField, SceneBounds, device_of, render
-from bidnerf_core.frames import Frame, View, continued
+from bidnerf_core.frames import Frame, View, inpaint
 from bidnerf_core.geometry import Robust
 from bidnerf_core.localization.terms.exposure import eliminate, fit_exposure
 from bidnerf_core.localization.terms.rendering import channels, differentiate
@@ -301,7 +301,7 @@ def averaged(frame: Frame, size: int) -> Float[Tensor, "h w 3"]:
     """Return the colours averaged over squares of ``size`` pixels and interpolated between them; hidden pixels are filled in."""
     height, width = frame.rgb_bytes.shape[:2]
     size = min(size, height, width)
-    rgb = continued(frame).cpu().float().permute(2, 0, 1)[None]
+    rgb = inpaint(frame).cpu().float().permute(2, 0, 1)[None]
     small = avg_pool2d(rgb, size, ceil_mode=True, count_include_pad=False)
     # Enlarged to whole squares, then cropped to the image, so that squares stay in place.
     covered = (small.shape[2] * size, small.shape[3] * size)

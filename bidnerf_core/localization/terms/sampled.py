@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from bidnerf_core.devices import constant
-from bidnerf_core.fields import Objective, Observations, Rays, masked_mean, render, widened
+from bidnerf_core.fields import Objective, Observations, Rays, masked_mean, render, widen
 from bidnerf_core.frames import DRAWERS, draw
 from bidnerf_core.geometry import SE3, Robust
 from bidnerf_core.localization.problem import Problem
@@ -76,4 +76,4 @@ class SampledLoss:
 
     def _rays(self, observed: Observations, T_world_last: SE3) -> Rays:
         rays = observed.rays(T_world_last, self._bounds)
-        return rays if self.rays.wide == 1 else widened(rays, self.rays.wide)
+        return rays if self.rays.wide == 1 else widen(rays, self.rays.wide)

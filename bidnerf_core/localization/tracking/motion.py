@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry import SE3, retracted, update_between
+from bidnerf_core.geometry import SE3, retract, update_between
 from bidnerf_core.io import LARGEST_NUMBER
 
 
@@ -102,7 +102,7 @@ class Motion:
         if abs(seconds) > LONGEST_GAP:  # the velocity is unknown
             motion = Motion.at(PoseEstimate(self.T_world_camera, self.noise[:6, :6], self.bias), self.reach)
         step = motion.velocity * seconds
-        T = retracted(motion.T_world_camera, step)
+        T = retract(motion.T_world_camera, step)
         back = _adjoint_of_inverse(step)
         transition = torch.eye(12, dtype=torch.float64)
         transition[:6, :6] = back
@@ -132,7 +132,7 @@ class Motion:
         noise = rest @ self.noise @ rest.T + gain @ measured.noise @ gain.T
         shared = rest[:6, :6] @ _root(self.bias) + gain[:6] @ _root(measured.bias)
         return Motion(
-            retracted(self.T_world_camera, delta[:6]).polished(),
+            retract(self.T_world_camera, delta[:6]).polished(),
             self.velocity + delta[6:],
             _symmetric(noise),
             shared @ shared.T,
@@ -212,7 +212,7 @@ def _scaled(translation: float, rotation: float) -> Float[Tensor, "6 6"]:
 
 
 def _adjoint_of_inverse(step: Float[Tensor, "6"]) -> Float[Tensor, "6 6"]:
-    return retracted(SE3.identity(), -step).adjoint()
+    return retract(SE3.identity(), -step).adjoint()
 
 
 def _symmetric(matrix: Tensor) -> Tensor:

@@ -28,7 +28,7 @@ from bidnerf_core.localization.tracking.state import (
     load_tracker_state,
     save_state,
 )
-from bidnerf_core.mapping import grey_image, strongest
+from bidnerf_core.mapping import grey_image, limit_features
 
 
 class Tracker:
@@ -62,7 +62,7 @@ class Tracker:
         matcher = localizer.matcher if localizer.matches_landmarks else None
         self._landmarks = None if matcher is None else matcher.landmarks
         # The 600 strongest keypoints of an image are matched with landmarks.
-        features = None if matcher is None else strongest(matcher.features, 600)
+        features = None if matcher is None else limit_features(matcher.features, 600)
         self._measure = Measurer(self._scene, self._landmarks, features, localizer.depth_sensor)
         surface, bounds = self._scene.surface, self._scene.bounds
         corners = torch.tensor([bounds.lower, bounds.upper])

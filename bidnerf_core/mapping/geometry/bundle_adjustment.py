@@ -18,7 +18,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import STILL, MotionPrior, poses_of_rows
 from bidnerf_core.geometry import SE3, cauchy_loss, inlier_weight
-from bidnerf_core.mapping.geometry.triangulation import Sightings, summed
+from bidnerf_core.mapping.geometry.triangulation import Sightings, sum_by
 from bidnerf_core.mapping.resection.states import by_camera_point, by_update, pinhole
 
 SMALL_DECREASE = 1e-4
@@ -49,7 +49,7 @@ class Adjustment:
     cost: float = 0.0
 
 
-def adjusted(
+def adjust_bundle(
     sightings: Sightings,
     start: Adjustment,
     prior: PosePrior,
@@ -64,13 +64,13 @@ def adjusted(
     The iteration ends at a relative decrease of the cost below ``tolerance``. Motions stay fixed unless ``prior`` frees them.
     """
     state, damping = start, 1e-4
-    system = linearized(sightings, state, prior, noise, correlation)
+    system = linearize(sightings, state, prior, noise, correlation)
     for _ in range(30):  # about ten suffice from poses that are off by a few pixels
         of_images, of_points = system.step(damping)
         motion = state.motion + of_images[:, 6:] if of_images.shape[1] > 6 else state.motion
         poses = state.T_world_camera.retract(of_images[:, :6])
         moved = Adjustment(poses, state.points + of_points, motion)
-        tried = linearized(sightings, moved, prior, noise, correlation)
+        tried = linearize(sightings, moved, prior, noise, correlation)
         if not tried.cost <= system.cost:
             damping *= 10
             if damping > 1e6:  # relative to the diagonal; no smaller step is tried
@@ -122,7 +122,7 @@ class AdjustmentSystem:
         return bsr_array(parts, shape=(blocks.shape[1] * rows, 3 * columns))
 
 
-def linearized(
+def linearize(
     sightings: Sightings, state: Adjustment, prior: PosePrior, noise: float, correlation: float = 1.0
 ) -> AdjustmentSystem:
     """Linearize the cost at a state: return its normal equations, weighted as in iteratively reweighted least squares."""
@@ -149,10 +149,10 @@ def linearized(
     column = off[..., None]
     return AdjustmentSystem(
         cost + prior_cost,
-        summed((view_weighted @ column)[..., 0], view, views) + pull,
-        summed((point_weighted @ column)[..., 0], point, count),
-        summed(view_weighted @ by_view, view, views) + torch.diag_embed(precision),
-        summed(point_weighted @ by_point, point, count),
+        sum_by((view_weighted @ column)[..., 0], view, views) + pull,
+        sum_by((point_weighted @ column)[..., 0], point, count),
+        sum_by(view_weighted @ by_view, view, views) + torch.diag_embed(precision),
+        sum_by(point_weighted @ by_point, point, count),
         view_weighted @ by_point,
         view,
         point,

@@ -46,21 +46,21 @@ class Sightings:
         return torch.where(front[:, None], (flat - self.image) * self.focal[:, None], torch.inf)
 
 
-def summed(values: Tensor, index: Tensor, count: int) -> Tensor:
+def sum_by(values: Tensor, index: Tensor, count: int) -> Tensor:
     """Sum the ``values`` of each of ``count`` points or views; ``index`` holds the number of each value's point or view."""
     return torch.zeros((count, *values.shape[1:]), dtype=values.dtype).index_add_(0, index, values)
 
 
-def intersected(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
+def triangulate(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
     """Triangulate ``count`` points: return the position (metres, world) nearest to all rays of each, by linear least squares."""
     d = sightings.directions()
     across = torch.eye(3, dtype=d.dtype) - d[:, :, None] * d[:, None]
-    matrix = summed(across, sightings.point, count)
-    right = summed((across @ sightings.centre[..., None])[..., 0], sightings.point, count)
+    matrix = sum_by(across, sightings.point, count)
+    right = sum_by((across @ sightings.centre[..., None])[..., 0], sightings.point, count)
     return torch.linalg.solve(_damped(matrix), right)
 
 
-def refined_points(
+def refine_points(
     sightings: Sightings, points: Float[Tensor, "n 3"], scale: float, steps: int = 8
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Minimize the reprojection errors under a Cauchy loss of ``scale`` pixels by ``steps`` Gauss-Newton iterations.
@@ -83,22 +83,22 @@ def _normal_equations(
     weight = front * inlier_weight(off.square().sum(-1), scale)
     jacobian = by_camera_point(flat, depth / sightings.focal) @ sightings.rotation
     weighted = jacobian.mT * weight[:, None, None]
-    matrix = summed(weighted @ jacobian, sightings.point, len(points))
-    return matrix, summed((weighted @ off[..., None])[..., 0], sightings.point, len(points))
+    matrix = sum_by(weighted @ jacobian, sightings.point, len(points))
+    return matrix, sum_by((weighted @ off[..., None])[..., 0], sightings.point, len(points))
 
 
 def parallax(sightings: Sightings, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     """Return twice the largest angle (radians) between a point's rays and their mean; 0 for points without observations."""
     away = points[sightings.point] - sightings.centre
     d = away / torch.linalg.vector_norm(away, dim=-1, keepdim=True).clamp(min=1e-300)
-    mean = summed(d, sightings.point, len(points))
+    mean = sum_by(d, sightings.point, len(points))
     mean = mean / torch.linalg.vector_norm(mean, dim=-1, keepdim=True).clamp(min=1e-300)
     off = torch.linalg.vector_norm(torch.linalg.cross(d, mean[sightings.point]), dim=-1)
     largest = torch.zeros(len(points), dtype=d.dtype)
     return 2 * largest.scatter_reduce(0, sightings.point, off, "amax").clamp(max=1).asin()
 
 
-def fitting(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:
+def fits_points(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:
     """Return a mask of the observations within ``tolerance`` pixels of the projection of their point."""
     return torch.linalg.vector_norm(sightings.residuals(points), dim=-1) <= tolerance
 

@@ -17,32 +17,32 @@ from bidnerf_core.frames import SeenLandmarks, View
 from bidnerf_core.geometry import SE3, chi_squared_quantile, inlier_weight
 from bidnerf_core.mapping.geometry.triangulation import (
     Sightings,
-    fitting,
-    intersected,
+    fits_points,
     noise,
     parallax,
-    refined_points,
-    summed,
+    refine_points,
+    sum_by,
+    triangulate,
 )
 from bidnerf_core.mapping.landmarks.features import (
     USUAL_FEATURES,
+    CachedFeatures,
     Features,
-    FoundOnce,
     ImageKeypoints,
     Sift,
     find_features,
     image_keypoints,
 )
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, concatenated
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, concatenate
 from bidnerf_core.mapping.landmarks.tracks import (
     Matches,
     TrackedKeypoints,
+    back_project,
     epipolar_matches,
-    fused_landmarks,
-    joined_tracks,
+    fuse_landmarks,
     keypoint_depth_noise,
     likely_pairs,
-    placed,
+    link_tracks,
     seen_landmarks,
 )
 from bidnerf_core.mapping.resection.reprojection import resections
@@ -81,7 +81,7 @@ def pose_updates(
     sightings, image = tracked.sightings, tracked.image
     count = torch.bincount(image)
     seen = torch.bincount(sightings.point)[sightings.point].double()
-    views = summed(seen, image, len(count)) / count
+    views = sum_by(seen, image, len(count)) / count
     factor = ((1 + 1 / views) / (1 - 1 / views)).sqrt()
     known, updates = (count >= LEAST_VISIBLE_POINTS).nonzero()[:, 0], dict[int, Float[Tensor, "6"]]()
     known = known[:: 1 if most is None else max(1, ceil(len(known) / most))]
@@ -133,7 +133,7 @@ def build_landmarks(
 
     ``report`` is called with a sentence if landmarks had to be dropped. Raises ``InputError`` if no landmark was found.
     """
-    return tracked_views(views, features, config).landmarks(config, report)
+    return track_views(views, features, config).landmarks(config, report)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +152,7 @@ class TrackedViews:
 
     def detector_of(self, view: View, number: int) -> Features:
         """Return a detector for queries with ``view``, which is image ``number``; the detector reuses the image's keypoints."""
-        return FoundOnce(self.detector, [(view.frame.rgb, self.observations.images[number].keypoints)])
+        return CachedFeatures(self.detector, [(view.frame.rgb, self.observations.images[number].keypoints)])
 
     def landmarks(self, config: LandmarkConfig, report: Callable[[str], None] = lambda sentence: None) -> LandmarkMap:
         """Return the landmarks built from the tracks. Raises ``InputError`` if there are none."""
@@ -229,7 +229,7 @@ class TrackedViews:
         return replace(self, observations=self.observations[left])
 
 
-def tracked_views(
+def track_views(
     views: Sequence[View],
     features: str | Features = USUAL_FEATURES,
     config: LandmarkConfig = DEFAULT_LANDMARKS,
@@ -267,11 +267,11 @@ def _joined(
     listed = pairs.tolist()
     matches = _mapped(lambda ij: epipolar_matches(images[ij[0]], images[ij[1]]), listed, step)
     found = [(i, j, m) for (i, j), m in zip(listed, matches, strict=True)]
-    label = joined_tracks([*known, *found], [len(image.keypoints) for image in images])
+    label = link_tracks([*known, *found], [len(image.keypoints) for image in images])
     return TrackedKeypoints(images, label, torch.arange(len(label)))
 
 
-def posed_keypoints(views: Sequence[View], features: Features) -> list[ImageKeypoints]:
+def detect_keypoints(views: Sequence[View], features: Features) -> list[ImageKeypoints]:
     """Detect the keypoints of ``views`` without matching them."""
     return _mapped(lambda view: image_keypoints(view, features), views)
 
@@ -282,15 +282,15 @@ def _located(observations: TrackedKeypoints, config: LandmarkConfig, known: Floa
     sightings = kept.sightings
     pixel_noise = noise(sightings, positions)
     triangulated = replace(
-        fused_landmarks(kept, positions, pixel_noise**2 * covariance, pixel_noise),
+        fuse_landmarks(kept, positions, pixel_noise**2 * covariance, pixel_noise),
         # With 200 images, the deviations are known to 7 %.
         pose_covariance=update_scatter(list(pose_updates(kept, positions, 200).values())),
     )
     relative = keypoint_depth_noise(kept, positions)
     left = ~torch.isin(observations.number, kept.number)
     rest = observations[left & (_tracked(observations) | config.singles)]
-    rest, positions, covariance = placed(rest, relative, pixel_noise)
-    return concatenated([triangulated, fused_landmarks(rest, positions, covariance, pixel_noise)])
+    rest, positions, covariance = back_project(rest, relative, pixel_noise)
+    return concatenate([triangulated, fuse_landmarks(rest, positions, covariance, pixel_noise)])
 
 
 def _tracked(observations: TrackedKeypoints) -> Bool[Tensor, "m"]:
@@ -309,11 +309,11 @@ def _triangulated(
     observations, former = observations[_tracked(observations)].compacted()
     count = observations.count
     covariance = torch.zeros((count, 3, 3), dtype=torch.float64)
-    points = intersected(observations.sightings, count) if known is None else known[former]
+    points = triangulate(observations.sightings, count) if known is None else known[former]
     # Observations with larger reprojection errors (pixels) leave their tracks, round by round.
     for tolerance in (10.0, 4.0, 2.0) if known is None else (2.0,):
         scale, steps = tolerance / 2, 8 if known is None else 0
-        points, covariance = refined_points(observations.sightings, points, scale, steps)
+        points, covariance = refine_points(observations.sightings, points, scale, steps)
         observations = observations[_inliers(observations.sightings, points, tolerance)]
     wide = parallax(observations.sightings, points) >= least
     observations, numbers = observations[wide[observations.point]].compacted()
@@ -325,9 +325,9 @@ def _inliers(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: floa
 
     If a point has only two, both must fit to within 1.5 pixels.
     """
-    fit = fitting(sightings, points, tolerance)
+    fit = fits_points(sightings, points, tolerance)
     seen = torch.bincount(sightings.point[fit], minlength=len(points))
-    fit &= (seen[sightings.point] != 2) | fitting(sightings, points, min(tolerance, 1.5))
+    fit &= (seen[sightings.point] != 2) | fits_points(sightings, points, min(tolerance, 1.5))
     return fit & (torch.bincount(sightings.point[fit], minlength=len(points)) >= 2)[sightings.point]
 
 

@@ -52,7 +52,7 @@ class Keypoints:
 class Features(Protocol):
     """A detector that finds and describes keypoints, always with the same number of descriptor channels.
 
-    It must be safe to call from several threads at once. ``quantized`` turns float descriptors into bytes.
+    It must be safe to call from several threads at once. ``quantize`` turns float descriptors into bytes.
     """
 
     def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints: ...
@@ -101,7 +101,7 @@ class Sift(Settings):
         raw = torch.from_numpy(np.asarray(descriptors, dtype=np.float32)[order])
         total = raw.sum(-1, keepdim=True).clamp(min=torch.finfo(raw.dtype).tiny)
         # Euclidean distances of the roots are Hellinger distances.
-        return Keypoints(torch.from_numpy(pixels), torch.from_numpy(sizes), quantized((raw / total).sqrt()))
+        return Keypoints(torch.from_numpy(pixels), torch.from_numpy(sizes), quantize((raw / total).sqrt()))
 
 
 SIFT = Sift()
@@ -121,7 +121,7 @@ def find_features(name: str, wanted_by: str = "") -> Features:
     return FEATURES.load(name, wanted_by)
 
 
-def detected(features: Features, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
+def detect(features: Features, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
     """Run the detector on an image. Raises ``PluginError`` unless it returns ``Keypoints`` that lie inside the image."""
     found, who = features(rgb), f"detector {getattr(features, '__name__', type(features).__name__)}"
     if not isinstance(found, Keypoints):
@@ -135,7 +135,7 @@ def detected(features: Features, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
         raise PluginError(
             f"pixels, sizes and descriptors are {enumeration(kinds)}",
             where=who,
-            expected="tensors (n, 2), (n) and (n, d), the last in torch.uint8; quantized converts floats",
+            expected="tensors (n, 2), (n) and (n, d), the last in torch.uint8; quantize converts floats",
         )
     size = torch.tensor([rgb.shape[1], rgb.shape[0]])
     if not bool(((found.pixels >= 0) & (found.pixels <= size)).all()):
@@ -151,16 +151,16 @@ class _Strongest:
     count: int
 
     def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
-        found = detected(self.features, rgb)
+        found = detect(self.features, rgb)
         return found[torch.arange(min(self.count, len(found)))]
 
 
-def strongest(features: Features, count: int) -> Features:
+def limit_features(features: Features, count: int) -> Features:
     """Return a detector that returns at most the ``count`` strongest keypoints."""
     return features.at_most(count) if isinstance(features, LimitedFeatures) else _Strongest(features, count)
 
 
-class FoundOnce:
+class CachedFeatures:
     """A detector that caches the keypoints of each image during one query.
 
     ``known`` holds images with keypoints that are already known. Threads may share the detector.
@@ -178,7 +178,7 @@ class FoundOnce:
             return self._found[-1][1]
 
 
-def quantized(descriptors: Float[Tensor, "n d"]) -> UInt8[Tensor, "n d"]:
+def quantize(descriptors: Float[Tensor, "n d"]) -> UInt8[Tensor, "n d"]:
     """Return unit descriptors as bytes; if any channel is negative, all channels are shifted, which preserves distances."""
     negative = len(descriptors) > 0 and float(descriptors.min()) < 0
     scaled = descriptors * (NORM / 2 if negative else NORM) + (128 if negative else 0)
@@ -260,7 +260,7 @@ def image_keypoints(view: View, features: Features) -> ImageKeypoints:
     """Detect the keypoints of ``view`` whose neighbourhoods contain no hidden pixel."""
     frame = view.frame
     hidden = None if frame.hidden is None else frame.hidden.cpu()
-    keypoints = detected(features, frame.rgb)
+    keypoints = detect(features, frame.rgb)
     if hidden is not None and len(keypoints):
         # Keypoints stay if their neighbourhoods contain no hidden pixel.
         visible = np.ascontiguousarray((~hidden.numpy()).astype(np.uint8))

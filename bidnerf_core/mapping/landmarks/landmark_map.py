@@ -244,7 +244,7 @@ PER_LANDMARK = ("positions", "deviations", "descriptors", "directions", "cones",
 """The tensors of a map that have one row per landmark."""
 
 
-def concatenated(maps: list[LandmarkMap]) -> LandmarkMap:
+def concatenate(maps: list[LandmarkMap]) -> LandmarkMap:
     """Return the landmarks of all ``maps`` (descriptors of the same length), with the other fields of the first map."""
     joined: dict[str, Any] = {name: torch.cat([getattr(m, name) for m in maps]) for name in PER_LANDMARK}
     tracks, first = list[Tracks](), 0

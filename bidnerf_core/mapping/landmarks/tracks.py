@@ -15,7 +15,7 @@ from bidnerf_core.camera import poses_of_rows
 from bidnerf_core.depth import UNKNOWN
 from bidnerf_core.frames import SeenLandmarks
 from bidnerf_core.geometry import SE3, mad_deviation
-from bidnerf_core.mapping.geometry.triangulation import Sightings, summed
+from bidnerf_core.mapping.geometry.triangulation import Sightings, sum_by
 from bidnerf_core.mapping.landmarks.features import MANY, ImageKeypoints, byte_of_zero, squared_distances
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, Tracks
 
@@ -153,7 +153,7 @@ def _on_line(a: ImageKeypoints, b: ImageKeypoints) -> Bool[Tensor, "n m"]:
     return (across.abs_() <= band) & (along >= least)
 
 
-def joined_tracks(matches: Sequence[tuple[int, int, Matches]], sizes: Sequence[int]) -> Int[Tensor, "m"]:
+def link_tracks(matches: Sequence[tuple[int, int, Matches]], sizes: Sequence[int]) -> Int[Tensor, "m"]:
     """Link pairwise matches into tracks and return the track label of each keypoint.
 
     ``matches`` holds, for each matched pair, the indices of its two images and the matches between their keypoints; ``sizes``
@@ -253,7 +253,7 @@ class TrackedKeypoints:
         return torch.cat([p.keypoints.descriptors for p in self.images])[self.number]
 
 
-def fused_landmarks(
+def fuse_landmarks(
     observations: TrackedKeypoints,
     positions: Float[Tensor, "n 3"],
     covariance: Float[Tensor, "n 3 3"],
@@ -315,7 +315,7 @@ def _mean_descriptors(descriptors: UInt8[Tensor, "m d"], point: Int[Tensor, "m"]
 
 
 def _mean(values: Float[Tensor, "m c"], index: Int[Tensor, "m"], count: int) -> Float[Tensor, "n c"]:
-    return summed(values, index, count) / torch.bincount(index, minlength=count).clamp(min=1)[:, None]
+    return sum_by(values, index, count) / torch.bincount(index, minlength=count).clamp(min=1)[:, None]
 
 
 ENOUGH_DEPTHS = 30
@@ -342,7 +342,7 @@ def depth_ratio(observations: TrackedKeypoints, points: Float[Tensor, "n 3"]) ->
     return float((depth[known] / z[known]).median()) if int(known.sum()) >= ENOUGH_DEPTHS else None
 
 
-def placed(
+def back_project(
     observations: TrackedKeypoints, relative: float, pixel_noise: float
 ) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Back-project keypoints; return the inliers, the weighted mean point of each track (metres, world), and its covariance.
@@ -375,7 +375,7 @@ def _weighted(
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Return the weighted mean of each point's values, and the covariance of that mean."""
     count = int(point.max()) + 1 if len(point) else 0
-    total = summed(information, point, count)
-    weighted = summed((information @ values[..., None])[..., 0], point, count)
+    total = sum_by(information, point, count)
+    weighted = sum_by((information @ values[..., None])[..., 0], point, count)
     covariance = torch.linalg.inv(total)
     return (covariance @ weighted[..., None])[..., 0], covariance

@@ -73,7 +73,7 @@ class Vocabulary:
         return nearest_centre(descriptors, self.words)
 
 
-def pooled_views(
+def pool_views(
     vocabulary: Vocabulary, landmarks: LandmarkMap, cameras: Sequence[tuple[Intrinsics, SE3]]
 ) -> Float[Tensor, "v p"]:
     """Return the VLAD vectors of the landmarks visible to a map's cameras (T_world_camera), and of all landmarks last.

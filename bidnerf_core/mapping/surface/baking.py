@@ -20,15 +20,15 @@ from bidnerf_core.frames import Frame, View, draw, uniform
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping.surface.posed_depth import (
     WITNESSES,
-    agreed,
-    chosen_grid,
+    choose_grid,
     comparison_noise,
+    confirm_points,
     finest_cell,
-    measured_image,
-    rendered_image,
+    posed_measurement,
+    render_posed,
     spacing,
 )
-from bidnerf_core.mapping.surface.surface_map import SurfaceMap, fused_surfels, merged
+from bidnerf_core.mapping.surface.surface_map import SurfaceMap, fuse_surfels, merge_cells
 from bidnerf_core.mapping.surface.surfel_index import MOST_CELLS, SurfelIndex
 from bidnerf_core.progress import counter
 from bidnerf_core.settings import Above, Range, Settings
@@ -37,7 +37,7 @@ Camera = tuple[Intrinsics, SE3]
 """Intrinsics and T_world_camera."""
 
 
-def rendered_views(field: RadianceField, bounds: SceneBounds, cameras: Sequence[Camera]) -> list[View]:
+def render_views(field: RadianceField, bounds: SceneBounds, cameras: Sequence[Camera]) -> list[View]:
     """Render colour and depth of ``field`` at up to 100 of ``cameras``, at regular intervals, for a map without photos."""
     chosen = cameras[:: max(1, math.ceil(len(cameras) / 100))]
     views, count = list[View](), counter("rendering", "views")
@@ -91,11 +91,11 @@ def bake(
     if not total:
         raise InputError("no images to bake a surface from:", expected="at least one camera or view")
     images, count = (
-        [measured_image(view, config.measured / total) for view in views],
+        [posed_measurement(view, config.measured / total) for view in views],
         counter("baking", "views"),
     )
     for number, (intrinsics, T) in enumerate(cameras, start=1):
-        images.append(rendered_image(field, bounds, intrinsics, T, config.rays / total))
+        images.append(render_posed(field, bounds, intrinsics, T, config.rays / total))
         count(len(views) + number, total)
     cell = max(finest_cell(images, config.opacity), VoxelGrid.filling(bounds, config.cells).cell)
     tolerance = 2 * max(cell, comparison_noise(images, config.opacity))
@@ -103,7 +103,7 @@ def bake(
     for number, posed in enumerate(images):
         solid = posed.solid(config.opacity)
         seen = posed.points(solid)
-        kept = agreed(seen, number, images, tolerance, config.agreement)
+        kept = confirm_points(seen, number, images, tolerance, config.agreement)
         parts.append(seen[kept])
         colours.append(posed.image.rgb[solid][kept])
     points, rgb = torch.cat(parts), torch.cat(colours)
@@ -145,8 +145,8 @@ def _fused(
     config: BakeConfig,
 ) -> SurfaceMap:
     """Fuse points into a surface; ``cells`` are the finest and the coarsest permitted cell size (metres)."""
-    grid = chosen_grid(points, bounds, *cells, config.megabytes)
-    _, (positions, colours) = merged(grid.numbers(points), points, rgb)
-    surfels = fused_surfels(positions, colours)
+    grid = choose_grid(points, bounds, *cells, config.megabytes)
+    _, (positions, colours) = merge_cells(grid.numbers(points), points, rgb)
+    surfels = fuse_surfels(positions, colours)
     poses = torch.stack([T.matrix() for T in keyframes]) if keyframes else torch.zeros(0, 4, 4)
     return SurfaceMap(surfels, SurfelIndex.of(surfels.positions, grid), poses)

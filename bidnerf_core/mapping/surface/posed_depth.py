@@ -79,7 +79,7 @@ def mean_focal(intrinsics: Intrinsics) -> float:
     return math.sqrt(intrinsics.fx * intrinsics.fy)
 
 
-def rendered_image(
+def render_posed(
     field: RadianceField, bounds: SceneBounds, intrinsics: Intrinsics, T_world_camera: SE3, pixels: float
 ) -> PosedDepthImage:
     """Render the field from a pose at a resolution of about ``pixels`` pixels."""
@@ -88,7 +88,7 @@ def rendered_image(
     return PosedDepthImage(small, T_world_camera.to("cpu", torch.float64), image, mean_focal(intrinsics))
 
 
-def measured_image(view: View, pixels: float) -> PosedDepthImage:
+def posed_measurement(view: View, pixels: float) -> PosedDepthImage:
     """Return a view's colours and measured depth, subsampled to about ``pixels`` pixels."""
     frame = view.frame
     small = _shrunk(frame.intrinsics, pixels)
@@ -106,7 +106,7 @@ def _shrunk(intrinsics: Intrinsics, pixels: float) -> Intrinsics:
     return intrinsics.scaled(min(1.0, math.sqrt(pixels / (intrinsics.width * intrinsics.height))))
 
 
-def agreed(
+def confirm_points(
     points: Float[Tensor, "p 3"],
     number: int,
     images: Sequence[PosedDepthImage],
@@ -203,7 +203,7 @@ def _spread(
     return min(mad_deviation(near) / math.sqrt(2), 2 * UNKNOWN.noise.deviation(distance))
 
 
-def chosen_grid(
+def choose_grid(
     points: Float[Tensor, "p 3"], bounds: SceneBounds, finest: float, coarsest: float, megabytes: float
 ) -> VoxelGrid:
     """Return a grid with cells of ``finest`` metres, or coarser if points (metres, world) or memory are scarce.

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bidnerf_core.devices import Resident, constant, may_wait, moved, working_device
 from bidnerf_core.fields import VoxelGrid
-from bidnerf_core.geometry import multiplied
+from bidnerf_core.geometry import scale_point
 from bidnerf_core.mapping.surface.surfel_index import SurfelIndex, index_bytes
 
 
@@ -35,7 +35,7 @@ def surfel_bytes(count: int) -> int:
     return 72 * count
 
 
-def merged(cells: Int[Tensor, "p"], *values: Float[Tensor, "p _"]) -> tuple[Int[Tensor, "n"], list[Tensor]]:
+def merge_cells(cells: Int[Tensor, "p"], *values: Float[Tensor, "p _"]) -> tuple[Int[Tensor, "n"], list[Tensor]]:
     """Return the occupied cells, in ascending order, and the means of the points' ``values`` in each."""
     found, place, counts = cells.unique(return_inverse=True, return_counts=True)
     means = [
@@ -44,7 +44,7 @@ def merged(cells: Int[Tensor, "p"], *values: Float[Tensor, "p _"]) -> tuple[Int[
     return found, means
 
 
-def fused_surfels(positions: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"]) -> Surfels:
+def fuse_surfels(positions: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"]) -> Surfels:
     """Make surfels of merged points: fit a plane to the neighbours of each point and project it onto that plane."""
     points = positions.numpy()
     # One of the twelve is the point itself.
@@ -86,7 +86,7 @@ class SurfaceMap(Resident):
         parts, grid, keyframes = self.surfels, self.grid, self.keyframes.clone()
         keyframes[:, :3, 3] *= factor
         surfels = replace(parts, positions=parts.positions * factor, rgb_gradient=parts.rgb_gradient / factor)
-        moved_grid = VoxelGrid(multiplied(grid.lower, factor), grid.cell * factor, grid.shape)
+        moved_grid = VoxelGrid(scale_point(grid.lower, factor), grid.cell * factor, grid.shape)
         return replace(self, surfels=surfels, index=replace(self.index, grid=moved_grid), keyframes=keyframes)
 
     def to(self, device: torch.device | str) -> SurfaceMap:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.devices import without_waiting
-from bidnerf_core.fields import Rays, SceneBounds, SplatField, render, scaled_field
+from bidnerf_core.fields import Rays, SceneBounds, SplatField, render, scale_field
 from bidnerf_core.geometry import SE3
 from bidnerf_gaussians import Gaussians, GaussiansConfig, GaussiansField, quaternions
 from bidnerf_gaussians.pieces import LEAST_ALPHA, Meeting, PieceField
@@ -149,7 +149,7 @@ def test_splats_are_the_gaussians_as_points(some: Callable[..., Gaussians]) -> N
     gaussians = some(40, degree=1)
     field = field_of(gaussians)
     assert isinstance(field, SplatField)
-    found, grown = field.splats(), scaled_field(field, 2.0)
+    found, grown = field.splats(), scale_field(field, 2.0)
     assert isinstance(grown, SplatField)
     torch.testing.assert_close(found.positions, gaussians.means)
     torch.testing.assert_close(found.radius**3, gaussians.log_scales.exp().prod(-1))

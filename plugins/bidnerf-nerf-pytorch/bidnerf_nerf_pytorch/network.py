@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from bidnerf_core.fields import encoded_width, frequency_encoding
+from bidnerf_core.fields import encoding_width, frequency_encoding
 from bidnerf_core.fields import octaves as powers_of_two
 from bidnerf_core.settings import Count, Range, Settings
 
@@ -42,8 +42,8 @@ class Network(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        width, seen = config.width, encoded_width(config.position_frequencies, config.position_input)
-        turned = encoded_width(config.direction_frequencies, config.direction_input)
+        width, seen = config.width, encoding_width(config.position_frequencies, config.position_input)
+        turned = encoding_width(config.direction_frequencies, config.direction_input)
         self.layer1 = nn.Linear(seen, width)
         inputs = [width + seen * (number in config.skips) for number in range(1, config.layers)]
         self.layers_xyz = nn.ModuleList(nn.Linear(count, width) for count in inputs)

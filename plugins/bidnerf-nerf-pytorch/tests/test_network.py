@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from bidnerf_core.fields import encoded_width
+from bidnerf_core.fields import encoding_width
 from bidnerf_nerf_pytorch.network import Network, NetworkConfig, encoded
 
 
@@ -23,7 +23,7 @@ def test_encoding_is_that_of_nerf_pytorch(frequencies: int, include_input: bool,
     else:
         factors = torch.linspace(1, last, frequencies, dtype=torch.float64).tolist()
     found = encoded(points, frequencies, include_input, octaves)
-    assert found.shape == (7, encoded_width(frequencies, include_input))
+    assert found.shape == (7, encoding_width(frequencies, include_input))
     for row, point in zip(found.tolist(), points.tolist(), strict=True):
         expected = list(point) if include_input else []
         for factor in factors:

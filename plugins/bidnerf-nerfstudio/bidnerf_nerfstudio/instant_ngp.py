@@ -13,7 +13,7 @@ from torch import Generator, Tensor, nn
 
 from bidnerf_core.backend import RecipeBackend
 from bidnerf_core.devices import constant, may_wait
-from bidnerf_core.fields import Rays, RaySampler, RaySamples, SceneBounds, crossed_box, device_of, gathered
+from bidnerf_core.fields import Rays, RaySampler, RaySamples, SceneBounds, device_of, gather_valid, intersect_box
 from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, NotNegative, Positive, Range
 from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig
@@ -107,7 +107,7 @@ class OccupiedSteps:
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
         """Return the intervals in occupied cells."""
         lower, upper = (constant(corner, rays.origins) for corner in self.grid.widest)
-        enter, leave = crossed_box(rays.origins, rays.directions, lower, upper)
+        enter, leave = intersect_box(rays.origins, rays.directions, lower, upper)
         near = torch.maximum(rays.near, enter)
         far = torch.maximum(near, torch.minimum(rays.far, leave))
         begin, end = self._place(near)[..., None], self._place(far)[..., None]
@@ -126,7 +126,7 @@ class OccupiedSteps:
         if not may_wait(near.device):
             return samples
         width = int(samples.valid.sum(-1).amax()) if near.numel() else 0
-        return RaySamples(*(part[..., :width] for part in gathered(samples).parts))
+        return RaySamples(*(part[..., :width] for part in gather_valid(samples).parts))
 
     def _place(self, distance: Tensor) -> Tensor:
         if not self.cone_angle:

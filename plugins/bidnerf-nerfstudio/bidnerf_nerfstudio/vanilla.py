@@ -22,7 +22,7 @@ from bidnerf_core.fields import (
     SceneBounds,
     Stratified,
     device_of,
-    encoded_width,
+    encoding_width,
     frequency_encoding,
     render,
 )
@@ -74,12 +74,12 @@ class VanillaNetwork(nn.Module):
 
     def __init__(self, config: VanillaConfig) -> None:
         super().__init__()
-        inputs, width = encoded_width(POSITION), config.width
+        inputs, width = encoding_width(POSITION), config.width
         skip = SKIP if config.layers > SKIP else None
         self.base = Perceptron(inputs, width, width, config.layers, skip)
         self.density = nn.Linear(width, 1)
         self.head = Perceptron(
-            width + encoded_width(DIRECTION), config.colour_width, config.colour_width, config.colour_layers
+            width + encoding_width(DIRECTION), config.colour_width, config.colour_width, config.colour_layers
         )
         self.colour = nn.Linear(config.colour_width, 3)
 
@@ -127,7 +127,7 @@ def reordered(weight: Float[Tensor, "o i"], count: int, weights: Weights) -> Flo
     nerfstudio has the sines of all frequencies of x, then of y and z, the cosines likewise, and then the
     point. Columns after those of the encoding are unchanged.
     """
-    width = encoded_width(count)
+    width = encoding_width(count)
     if weight.dim() != 2 or weight.shape[1] < width:
         raise weights.error(f"a layer is {tuple(weight.shape)}", expected=f"{width} inputs or more")
     waves = torch.arange(2 * 3 * count).reshape(2, 3, count).transpose(1, 2).reshape(-1)

@@ -28,7 +28,7 @@ from torch.nn import Sequential
 from torch.nn.functional import interpolate, max_pool2d, normalize, pad, pixel_shuffle
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from bidnerf_core.mapping import FIRST_CENTRE, Keypoints, quantized
+from bidnerf_core.mapping import FIRST_CENTRE, Keypoints, quantize
 from bidnerf_core.settings import Range, Settings
 
 CELL = 8
@@ -90,7 +90,7 @@ class XFeat(Settings):
         return Keypoints(
             (peaks + offsets + FIRST_CENTRE)[order] / scale,
             torch.full((len(order),), SIZE) / scale.mean(),
-            quantized(normalize(channels, dim=-1)),
+            quantize(normalize(channels, dim=-1)),
         )
 
 

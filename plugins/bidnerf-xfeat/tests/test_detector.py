@@ -20,8 +20,8 @@ from bidnerf_core.mapping import (
     SIFT,
     build_landmarks,
     byte_of_zero,
+    limit_features,
     squared_distances,
-    strongest,
     unrelated_distance,
 )
 from bidnerf_xfeat.detector import XFeat
@@ -81,7 +81,7 @@ def test_descriptors_are_signed_bytes() -> None:
 
 
 def test_fewer_keypoints_are_the_strongest() -> None:
-    every, few = XFeat()(image()), strongest(XFeat(), 50)(image())
+    every, few = XFeat()(image()), limit_features(XFeat(), 50)(image())
     assert torch.equal(few.pixels, every.pixels[:50])
     assert torch.equal(few.descriptors, every.descriptors[:50])
 
@@ -145,4 +145,4 @@ def test_both_detectors_keep_to_themselves() -> None:
     assert torch.allclose(
         4 * between, squared_distances(classic.descriptors, classic.descriptors), rtol=0.05, atol=2000
     )
-    assert len(strongest(WithSift(), 40)(image())) == 40
+    assert len(limit_features(WithSift(), 40)(image())) == 40
