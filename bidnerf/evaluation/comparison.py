@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from itertools import count, product
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,7 @@ from bidnerf_core.frames import View, draw, uniform
 from bidnerf_core.geometry import SE3, symbol
 from bidnerf_core.io import to_plain, write_file
 from bidnerf_core.localization import origin_of
-from bidnerf_core.maps import DESCRIPTION, Map, load_info
+from bidnerf_core.maps import DESCRIPTION, Map, load_info, name_maps
 from bidnerf_core.progress import (
     Cancel,
     Progress,
@@ -162,7 +162,11 @@ def compare(
     importable main module. Maps in memory, and all maps if the data is in memory, run in this process. One trial runs at a time, so that a change
     in the machine's load affects all maps alike. Raises ``InputError`` and ``Cancelled`` as ``evaluate`` does.
     """
-    named = named_maps(scenes)
+    if isinstance(scenes, str | Path | Map):
+        raise InputError(f"scenes is the one map {name_of(scenes)}", expected="a list of maps, or a dictionary of them")
+    if not scenes:
+        raise InputError("no maps to compare", expected="at least one")
+    named = scenes if isinstance(scenes, Mapping) else name_maps(scenes)
     plan = plan or Plan()
     if plan.sizes is None:
         plan = replace(plan, sizes=plan.starts()[:1])
@@ -251,27 +255,3 @@ def map_bytes(stored: Scene) -> int:
         return 0
     folder = Path(stored)
     return sum((folder / name).stat().st_size for name in (DESCRIPTION, load_info(folder).weights))
-
-
-def named_maps(scenes: Sequence[Scene] | Mapping[str, Scene]) -> dict[str, Scene]:
-    """Return the maps by unique name: the given names, else folder names, or numbered backend names for maps in memory.
-
-    A folder name has as few trailing parts of the path as make all folder names unique. Raises ``InputError`` without maps, for a
-    single map that is not in a list, and for a folder that is named twice.
-    """
-    if isinstance(scenes, str | Path | Map):
-        raise InputError(f"scenes is the one map {name_of(scenes)}", expected="a list of maps, or a dictionary of them")
-    if not scenes:
-        raise InputError("no maps to compare", expected="at least one")
-    if isinstance(scenes, Mapping):
-        return dict(scenes)
-    folders = {str(scene): Path(scene).resolve().parts for scene in scenes if not isinstance(scene, Map)}
-    if len(set(folders.values())) < sum(not isinstance(scene, Map) for scene in scenes):
-        raise InputError(f"{', '.join(map(str, scenes))}: one is named twice", where="maps", expected="different ones")
-    length = next(n for n in count(1) if len({parts[-n:] for parts in folders.values()}) == len(folders))
-    found: dict[str, Scene] = {}
-    for scene in scenes:
-        base = name_of(scene) if isinstance(scene, Map) else "/".join(folders[str(scene)][-length:])
-        names = (f"{base} {number}" if number > 1 else base for number in count(1))
-        found[next(name for name in names if name not in found)] = scene
-    return found

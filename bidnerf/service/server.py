@@ -54,7 +54,7 @@ def service_app(
         raise InputError(f"config is a {type(config).__name__}", expected=f"settings of {method}, or a dictionary")
     limits = limits or ServiceLimits()
     order = {
-        "maps": named(scenes),
+        "maps": maps_by_name(scenes),
         "method": method,
         "device": device,
         "max_pixels": limits.max_pixels,
@@ -158,13 +158,16 @@ def run_app(
                 raise
 
 
-def named(scenes: Scenes) -> dict[str, Path]:
+def maps_by_name(scenes: Scenes) -> dict[str, Path]:
     """Return the folders of maps by name. Raises ``UsageError`` for names that are invalid or not unique."""
+    from bidnerf_core.maps import name_maps  # imported here, since help pages do not need it
+
     if isinstance(scenes, Mapping):
         pairs = [*scenes.items()]
     else:
-        folders = [scenes] if isinstance(scenes, str | Path) else scenes
-        pairs = [_name_and_folder(str(folder)) for folder in folders]
+        given = [_name_and_folder(str(scene)) for scene in ([scenes] if isinstance(scenes, str | Path) else scenes)]
+        others = iter(name_maps([folder for name, folder in given if not name]))
+        pairs = [(name or next(others), folder) for name, folder in given]
     if not pairs:
         raise UsageError("no MAP", expected="folders of maps")
     names = [name for name, _ in pairs]
@@ -179,7 +182,6 @@ def named(scenes: Scenes) -> dict[str, Path]:
 
 
 def _name_and_folder(given: str) -> tuple[str, str]:
+    """Split ``NAME=MAP``; the name is empty for a folder alone, whose own name may contain an equals sign."""
     name, equals, folder = given.partition("=")
-    if equals and not Path(given).is_dir():  # a folder's own name may contain an equals sign
-        return name, folder
-    return Path(given).resolve().name, given
+    return (name, folder) if equals and not Path(given).is_dir() else ("", given)

@@ -381,15 +381,16 @@ class Capture:
         return shot.read(self.background, min((side for side in sides if side is not None), default=None))
 
 
-def unique_names(paths: Sequence[tuple[str, ...]]) -> list[str]:
+def unique_names(paths: Sequence[tuple[str, ...]], separator: str = "_") -> list[str]:
     """Return a name for each path (folders, then stem): its stem, prefixed with just enough folders to make it unique.
 
-    Names that still collide, such as those of a/b.png and a_b.png, get the suffixes "-2" and so on.
+    ``separator`` joins folders and stem. Names that still collide, such as those of a/b.png and a_b.png, get the suffixes
+    "-2" and so on.
     """
     names = [path[-1] for path in paths]
     for depth in range(2, max(map(len, paths), default=0) + 1):
         count = Counter(names)
-        names = ["_".join(p[-depth:]) if count[n] > 1 else n for n, p in zip(names, paths, strict=True)]
+        names = [separator.join(p[-depth:]) if count[n] > 1 else n for n, p in zip(names, paths, strict=True)]
     used, seen = set(names), dict[str, None]()
     for name in names:
         own, number = name, 2

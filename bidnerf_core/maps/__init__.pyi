@@ -1,6 +1,7 @@
 from .collection import MapCollection as MapCollection
 from .collection import Placement as Placement
 from .collection import maps_in as maps_in
+from .collection import name_maps as name_maps
 from .description import DESCRIPTION as DESCRIPTION
 from .description import Anchor as Anchor
 from .description import MapInfo as MapInfo

@@ -8,13 +8,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import unique_names
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
@@ -34,6 +35,8 @@ from bidnerf_core.maps.store import read_part
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context
 
 log = logging.getLogger("bidnerf")
+
+_Scene = TypeVar("_Scene", bound=Map | str | Path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +99,7 @@ class MapCollection:
         if asked < 1:
             raise InputError(f"asked is {asked}", expected="1 or more")
         self.method, self.config, self.asked = method, config, asked
-        self._maps = _named([scenes] if isinstance(scenes, str | Path) else scenes)
+        self._maps = _maps_by_name(scenes)
         self._given_localizers = localizers or {}
         self._localizer = functools.lru_cache(maxsize=6)(self._loaded)  # this many maps stay in memory after use
         self._infos = {
@@ -214,28 +217,39 @@ def maps_in(folder: Path) -> list[Path]:
     return sorted(path.parent for path in folder.glob(f"*/{DESCRIPTION}"))
 
 
-def _named(maps: Sequence[Map | str | Path] | Mapping[str, Map]) -> Mapping[str, Map | Path]:
-    """Return the maps by folder name, preceded by as many parent folders as needed to distinguish them."""
-    if isinstance(maps, Mapping):
-        return maps
-    placed, found = list[tuple[tuple[str, ...], Map | Path]](), dict[str, Map | Path]()
-    for given in maps:
-        scenes: list[Map | Path] = [given] if isinstance(given, Map) else [*maps_in(Path(given))]
-        if not scenes:
-            raise InputError("no map in it", where=given, expected="a map or a folder of maps")
-        for scene in scenes:
-            folder = scene.folder if isinstance(scene, Map) else scene
-            data = scene.info.data if isinstance(scene, Map) else ""
-            placed.append(((data or "map",) if folder is None else folder.resolve().parts, scene))
-    if not placed:
+def name_maps(scenes: Sequence[_Scene]) -> dict[str, _Scene]:
+    """Return maps by name: that of the folder, with as many parent folders as are needed to make it unique.
+
+    A map in memory is named after its data, preceded by its backend if needed; maps that cannot be distinguished in this
+    way are numbered. Raises ``InputError`` for a map that is given twice.
+    """
+    paths, known = list[tuple[str, ...]](), set[object]()
+    for scene in scenes:
+        folder = scene.folder if isinstance(scene, Map) else Path(scene)
+        if folder is not None:
+            paths.append(folder.resolve().parts)
+        elif isinstance(scene, Map):
+            paths.append((scene.info.backend, scene.info.data or "map"))
+        identity = id(scene) if folder is None else paths[-1]
+        if identity in known:
+            raise InputError(f"two maps are named {paths[-1][-1]!r}", expected="each map once")
+        known.add(identity)
+    return dict(zip(unique_names(paths, "/"), scenes, strict=True))
+
+
+def _maps_by_name(scenes: str | Path | Sequence[Map | str | Path] | Mapping[str, Map]) -> Mapping[str, Map | Path]:
+    """Return the maps by name; each of ``scenes`` may be a folder of maps."""
+    if isinstance(scenes, Mapping):
+        return scenes
+    found = list[Map | Path]()
+    for scene in [scenes] if isinstance(scenes, str | Path) else scenes:
+        own: list[Map | Path] = [scene] if isinstance(scene, Map) else [*maps_in(Path(scene))]
+        if not own:
+            raise InputError("no map in it", where=scene, expected="a map or a folder of maps")
+        found += own
+    if not found:
         raise InputError("no maps", expected="at least one")
-    for parts, scene in placed:
-        alike = [others for others, _ in placed if others[-1] == parts[-1]]
-        counts = (n for n in range(1, len(parts) + 2) if [others[-n:] for others in alike].count(parts[-n:]) == 1)
-        if (count := next(counts, None)) is None:
-            raise InputError(f"two maps are named {parts[-1]!r}", expected="each map once")
-        found[Path(*parts[-count:]).as_posix()] = scene
-    return found
+    return name_maps(found)
 
 
 def _unrecognised(reason: str, method: str) -> Localization:

@@ -331,8 +331,9 @@ def test_maps_in_memory_and_in_folders_are_compared(shared: Path, tmp_path: Path
     plan = quick(trials=2)
     scene, data = bn.load_map(shared / "map"), shared / "data"
     seen: list[str] = []
-    found = bn.compare([scene, shared / "map", scene], data, plan, progress=lambda p: seen.append(str(p)))
-    assert len({row.map for row in found.rows}) == 3
+    maps = {"one": scene, "folder": shared / "map", "same": scene}
+    found = bn.compare(maps, data, plan, progress=lambda p: seen.append(str(p)))
+    assert [row.map for row in found.rows] == list(maps)
     assert len(seen) == 6
     first, other, third = map(placeless, found.results)
     assert first == other == third

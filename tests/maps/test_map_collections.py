@@ -24,7 +24,7 @@ from bidnerf_core.captures import stored_cameras
 from bidnerf_core.fields import NoField
 from bidnerf_core.mapping import BakeConfig, bake, build_landmarks
 from bidnerf_core.mapping.landmarks.vocabulary import visible
-from bidnerf_core.maps import Map, MapInfo, maps_in
+from bidnerf_core.maps import Map, MapInfo, maps_in, name_maps
 from commands import Run
 from refusals import refused
 
@@ -157,7 +157,10 @@ def test_folders_of_one_name_are_told_apart_by_those_around_them(
     named = {"A/day/MAP", "B/day/MAP", "night/MAP", "other", "ground0"}
     assert set(bn.MapCollection([*folders, grounds[0]]).names) == named
     memory = replace(grounds[0], info=replace(grounds[0].info, data="other"))
-    assert bn.MapCollection([folders[-1], memory]).names == ("B/other", "other")
+    assert bn.MapCollection([folders[-1], memory]).names == ("B/other", "ground/other")
+    trained_again = replace(memory, info=replace(memory.info, backend="other"))
+    assert list(name_maps([memory, trained_again])) == ["ground/other", "other/other"]
+    assert list(name_maps([memory, replace(memory)])) == ["ground/other", "ground/other-2"]
     with refused(found="two maps are named 'MAP'", expected="each map once"):
         bn.MapCollection([folders[0], folders[1], folders[0]])
 

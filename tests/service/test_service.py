@@ -39,7 +39,7 @@ from bidnerf.service import ServiceError, ServiceLimits, public_message, service
 # Inside: workers are killed, and the description is compared with the parameters that are read
 from bidnerf.service.models import Localization, MapFacts, PhotoForm
 from bidnerf.service.pool import Pool
-from bidnerf.service.server import named
+from bidnerf.service.server import maps_by_name
 from bidnerf.service.web import SAFE, Gate
 from bidnerf.service.worker import main as hold_maps
 from bidnerf_core.camera import WAYS, WAYS_OF_PHOTO
@@ -712,14 +712,16 @@ def test_a_token_that_is_given_is_not_shown(tmp_path: Path, bidnerf: Run, monkey
 
 
 def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidnerf: Run) -> None:
-    assert named({"a": "x"}) == named(["a=x"]) == {"a": Path("x")}
+    assert maps_by_name({"a": "x"}) == maps_by_name(["a=x"]) == {"a": Path("x")}
+    assert list(maps_by_name(["x/a", "b=y/a"])) == ["a", "b"]
     for maps, part in (
         ([], "no MAP"),
         ({"a/b": "x"}, "its name is 'a/b'"),
-        (["x/a", "y/a"], "its name is 'a'"),
+        (["x/a", "y/a"], "its name is 'x/a'"),
+        (["a=x", "a=y"], "its name is 'a'"),
     ):
         with pytest.raises(InputError, match=part):
-            named(maps)
+            maps_by_name(maps)
     with pytest.raises(InputError, match="expected at least 16"):
         service_app("MAP", token="short")
     assert service_app("MAP", method="bid", config=settings_of("bid", QUICK)) is not None
