@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from bidnerf.evaluation import FAULTS
+from bidnerf_core.datasets import READERS
 from bidnerf_core.registry import list_plugins
 
 ROOT = Path(__file__).parents[1]
@@ -507,6 +508,22 @@ def catalogue(_: Records) -> str:
             neutral = "all"
         rows.append((f"`{name}`", fault.summary, unit, "" if fault.is_switch else neutral, sizes))
     return _lines(("name", "fault", "size", "neutral size", "sizes tried"), rows)
+
+
+@table
+def formats(_: Records) -> str:
+    """The formats of datasets, as their readers describe them."""
+    readers = {info.name: READERS[info.name] for info in list_plugins("readers") if info.is_bundled}
+    rows = [(f"`{name}`", reader.summary, reader.expected) for name, reader in readers.items()]
+    return _lines(("reader", "format", "recognized by"), rows)
+
+
+@table
+def pose_files(_: Records) -> str:
+    """The formats of pose files, by the ending of the file's name."""
+    bundled = [info for info in list_plugins("writers") if info.is_bundled]
+    rows = [(f"`{info.name}`", info.summary.removeprefix("Write ").rstrip(".")) for info in bundled]
+    return _lines(("name ends with", "content"), rows)
 
 
 @table

@@ -79,4 +79,11 @@ def _numbers(file: Path, text: str, key: str, count: int) -> list[float]:
     return numbers_in(f"{file}: {key}", found[1] if found else "", count)
 
 
-reader = Format("mav0/cam0/data.csv with mav0/cam0/sensor.yaml (EuRoC)", _find, _read, ["camera"])
+reader = Format(
+    "EuRoC and others in the ASL layout: poses of the body, interpolated",
+    "mav0/cam0/data.csv with mav0/cam0/sensor.yaml (EuRoC)",
+    _find,
+    _read,
+    ["camera"],
+    precedence=30,  # a recording with metric poses
+)

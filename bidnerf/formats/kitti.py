@@ -83,4 +83,10 @@ def _calibration(file: Path, camera: str, size: tuple[int, int]) -> tuple[Intrin
     raise InputError(f"has no row {camera}", where=file, expected="the projection matrix of the images")
 
 
-reader = Format("calib.txt with image_2 or image_0 (KITTI odometry)", _find, _read)
+reader = Format(
+    "KITTI odometry: poses of poses.txt or ../../poses/NN.txt, times of times.txt",
+    "calib.txt with image_2 or image_0 (KITTI odometry)",
+    _find,
+    _read,
+    precedence=30,  # a recording with metric poses
+)

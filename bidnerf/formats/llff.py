@@ -48,4 +48,10 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     return Capture(path, shots, options.colour, pose_file=file)
 
 
-reader = Format(f"images with {POSES} (LLFF)", lambda path: first_file(path, POSES), _read)
+reader = Format(
+    "LLFF and Mip-NeRF 360, without depth",
+    f"images with {POSES} (LLFF)",
+    lambda path: first_file(path, POSES),
+    _read,
+    precedence=16,  # made from a COLMAP model, without the distortion of its lens
+)

@@ -122,4 +122,10 @@ def _camera(sensor: ElementTree.Element, where: str) -> Camera | None:
     return camera_of(where, numbers, (width, height), (k1, k2, p2, p1, k3), first_centre=0)
 
 
-reader = Format("photos with a .xml of a chunk's cameras (Agisoft Metashape)", _find, _read)
+reader = Format(
+    "cameras exported by Agisoft Metashape ('Agisoft XML'), without depth",
+    "photos with a .xml of a chunk's cameras (Agisoft Metashape)",
+    _find,
+    _read,
+    precedence=10,  # its file has no name of its own, so formats with one come first
+)

@@ -103,4 +103,10 @@ def _camera(record: Record) -> Camera:
     return camera_of(record.where, numbers, (width, height), (k1, k2, p1, p2, k3), first_centre=0)
 
 
-reader = Format("images with reconstruction.json (OpenSfM, OpenDroneMap)", _find, _read)
+reader = Format(
+    "OpenSfM and OpenDroneMap: the largest reconstruction, with times, without depth",
+    "images with reconstruction.json (OpenSfM, OpenDroneMap)",
+    _find,
+    _read,
+    precedence=13,  # after LLFF, which is made from COLMAP's reconstruction
+)

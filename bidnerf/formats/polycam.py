@@ -93,4 +93,10 @@ def _find(path: Path) -> Path | None:
     return None
 
 
-reader = Format("keyframes/images and keyframes/cameras, or the corrected ones (Polycam, raw data)", _find, _read)
+reader = Format(
+    "raw data of Polycam: optimized poses first, depth of confidence 255 up to 5 m",
+    "keyframes/images and keyframes/cameras, or the corrected ones (Polycam, raw data)",
+    _find,
+    _read,
+    precedence=30,  # a recording with metric poses
+)

@@ -78,4 +78,10 @@ def _shot(row: Row, values: dict[str, str], image: Path) -> Shot:
     return Shot(image=image, camera=camera, T_world_camera=pose)
 
 
-reader = Format("photos with a .csv of #name,x,y,alt,heading,pitch,roll,f (RealityCapture)", _find, _read)
+reader = Format(
+    "cameras exported by RealityCapture, without depth",
+    "photos with a .csv of #name,x,y,alt,heading,pitch,roll,f (RealityCapture)",
+    _find,
+    _read,
+    precedence=25,  # exported by hand, so preferred to a model of COLMAP
+)

@@ -153,4 +153,11 @@ def _cameras(metadata: Record, count: int) -> list[list[float]]:
     return [[metadata.checked_number(value, "an intrinsic") for value in row[:4]] for row in rows]
 
 
-reader = Format("a .r3d file, or metadata with rgbd/0.jpg ... (Record3D)", _find, _read, suffixes=(".r3d",))
+reader = Format(
+    "Record3D: depth of confidence 2 up to 5 m (extra 'record3d')",
+    "a .r3d file, or metadata with rgbd/0.jpg ... (Record3D)",
+    _find,
+    _read,
+    suffixes=(".r3d",),
+    precedence=30,  # a recording with metric poses
+)

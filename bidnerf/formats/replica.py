@@ -73,4 +73,11 @@ def _camera(path: Path) -> tuple[Intrinsics, float]:
     return camera_of(own.where, numbers[:4], (width, height)), 1 / numbers[4]
 
 
-reader = Format("traj.txt with results/frame000000.jpg (Replica)", _find, _read, ["depth_unit"])
+reader = Format(
+    "Replica of iMAP and NICE-SLAM: depth in the steps of cam_params.json",
+    "traj.txt with results/frame000000.jpg (Replica)",
+    _find,
+    _read,
+    ["depth_unit"],
+    precedence=30,  # a recording with metric poses
+)

@@ -85,8 +85,10 @@ def _camera(file: Path, image: Path) -> Intrinsics:
 
 
 reader = Format(
+    "exported ScanNet: depth in millimetres, registered to the colour camera",
     "color/0.jpg with pose/0.txt and intrinsic/intrinsic_color.txt (ScanNet)",
     _find,
     _read,
     ("register_depth", "depth_unit"),
+    precedence=30,  # a recording with metric poses
 )

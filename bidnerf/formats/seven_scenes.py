@@ -132,8 +132,10 @@ def _listed(file: Path, folders: dict[int, Path]) -> list[int]:
 
 
 reader = Format(
+    "7-Scenes: splits of TrainSplit.txt and TestSplit.txt, depth registered to the colour camera",
     "frame-000000.color.png ... in the folder or in seq-01 ... (7-Scenes)",
     _find,
     _read,
     ("camera", "register_depth", "depth_unit"),
+    precedence=30,  # a recording with metric poses
 )

@@ -84,4 +84,10 @@ def _find(path: Path) -> Path | None:
     return first_file(path, "odometry.csv") if is_file(path / "camera_matrix.csv") else None
 
 
-reader = Format("rgb.mp4 with odometry.csv and camera_matrix.csv (Stray Scanner)", _find, _read)
+reader = Format(
+    "Stray Scanner: depth of confidence 2 up to 5 m (extra 'video')",
+    "rgb.mp4 with odometry.csv and camera_matrix.csv (Stray Scanner)",
+    _find,
+    _read,
+    precedence=30,  # a recording with metric poses
+)

@@ -94,8 +94,10 @@ def _in_splits(path: Path, shots: list[Shot]) -> list[Shot]:
 
 
 reader = Format(
+    "12-Scenes: the first sequence of split.txt is the test, depth registered to the colour camera",
     "info.txt with data/frame-000000.color.jpg ... (12-Scenes)",
     _find,
     _read,
     ("camera", "register_depth", "depth_unit"),
+    precedence=35,  # its images have the names of 7-Scenes' ones
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Generic, Literal, Protocol, TypeVar, runtime_checkable
 
@@ -19,7 +20,7 @@ from bidnerf_core.io import IMAGE_SUFFIXES, is_file
 from bidnerf_core.io import Background as Background  # for authors of readers
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 
-Found = TypeVar("Found")
+Match = TypeVar("Match")
 OpenQuestion = Literal["camera", "focal", "register_depth", "depth_unit"]
 """An option of ``DatasetOptions`` that a format may leave open."""
 
@@ -168,10 +169,20 @@ class Reader(Protocol):
     """The extensions (".r3d") of single files that hold a whole dataset; the paths of such files are passed
     to the reader."""
 
+    precedence: int = 0
+    """If several readers recognize a folder, the one of highest precedence reads it; a tie is an error. Bundled readers
+    state 10 to 50: first the formats into which others are converted, then those of recordings, whose poses are metric,
+    and last those of reconstructions from their photos."""
+
     @property
     def expected(self) -> str:
         """The files in a folder of this format, for error messages."""
         ...
+
+    @property
+    def summary(self) -> str:
+        """One line about the format, for lists of plugins; by default ``expected``."""
+        return self.expected
 
     def recognises(self, path: Path) -> bool:
         """Return whether a folder has this format; no image is opened."""
@@ -186,23 +197,26 @@ class Reader(Protocol):
 
 
 @dataclass(eq=False)
-class Format(Generic[Found]):
-    """A bundled reader, defined by a function that recognizes a folder and a function that reads what the first one found."""
+class Format(Generic[Match]):
+    """A bundled reader, made of a function that recognizes a folder and a function that reads it."""
 
+    summary: str
     expected: str
-    find: Callable[[Path], Found | None]
-    """Returns what identifies the format in a folder, such as its metadata file; a false value without it."""
-    load: Callable[[Path, Found, DatasetOptions], Capture]
+    find: Callable[[Path], Match | None]
+    """Returns what identifies the format in a folder, such as its metadata file, or a false value."""
+    load: Callable[[Path, Match, DatasetOptions], Capture]
+    """Reads a folder, given what ``find`` returned for it."""
     accepts: Collection[OpenQuestion] = ()
     suffixes: Collection[str] = ()
+    precedence: int = 0
 
     def recognises(self, path: Path) -> bool:
         return bool(self.find(path))
 
     def read(self, path: Path, options: DatasetOptions) -> Capture:
-        found = self.find(path)
-        assert found is not None  # ensured by recognises
-        return self.load(path, found, options)
+        match = self.find(path)
+        assert match is not None  # ensured by recognises
+        return self.load(path, match, options)
 
 
 def first_file(path: Path, *names: str) -> Path | None:
@@ -215,57 +229,48 @@ def _defects(reader: Any) -> Iterator[str]:
     yield from interface_defects(reader, ("accepts", "expected"), methods)
 
 
-ORDER = (
-    "transforms",
-    "tum",
-    "twelve-scenes",
-    "seven-scenes",
-    "record3d",
-    "polycam",
-    "stray-scanner",
-    "euroc",
-    "kitti",
-    "reality-capture",
-    "scannet",
-    "replica",
-    "colmap",
-    "llff",
-    "opensfm",
-    "metashape",
-)
-"""The bundled readers in the order in which they are tried; a folder may hold files of several formats."""
-
-READERS: Plugins[Reader] = Plugins("readers", _defects, first=ORDER)
+READERS: Plugins[Reader] = Plugins("readers", _defects)
 """The readers by name."""
 
 
 def find_reader(folder: Path) -> Reader | None:
-    """Return the reader that recognizes a folder: the first bundled reader, else the only third-party reader, else None.
+    """Return the reader of highest precedence that recognizes a folder, or None.
 
-    A reader that cannot be loaded or fails is reported by an ``InputWarning``. Raises ``InputError`` if
-    several third-party readers recognize the folder.
+    A third-party reader that cannot be loaded or fails is reported by an ``InputWarning`` when its turn comes. Raises
+    ``InputError`` if several readers of the same precedence recognize the folder.
     """
-    for name in (name for name in ORDER if name in READERS):
-        if may_hold(READERS[name], folder) and READERS[name].recognises(folder):
-            return READERS[name]
-    claims = dict[str, Reader]()
-    for name in (name for name in READERS if name not in ORDER):
+    readers = dict[str, Reader | PluginError]()
+    for name in READERS:
         try:
-            reader = READERS.load(name)
-            if may_hold(reader, folder) and reader.recognises(folder):
-                claims[name] = reader
+            readers[name] = READERS.load(name)
         except PluginError as error:
-            warnings.warn(str(error), InputWarning, stacklevel=2)
-        except Exception as error:
-            why = f"{type(error).__name__}: {error}"
-            remark(folder, f"reader {name!r} failed to examine it: {why}")
-    if len(claims) > 1:
-        raise InputError(
-            f"is recognized by the readers {enumeration(list(claims))}",
-            where=folder,
-            expected="one; uninstall the others",
-        )
-    return next(iter(claims.values()), None)
+            readers[name] = error
+
+    def precedence(name: str) -> int:
+        return getattr(readers[name], "precedence", Reader.precedence)
+
+    for _, names in groupby(sorted(readers, key=precedence, reverse=True), precedence):
+        claims = {name: reader for name in names if (reader := _if_recognised(name, readers[name], folder))}
+        if len(claims) > 1:
+            found = f"is recognized by the readers {enumeration(list(claims))}"
+            raise InputError(found, where=folder, expected="one format, or one reader installed for it")
+        if claims:
+            return next(iter(claims.values()))
+    return None
+
+
+def _if_recognised(name: str, reader: Reader | PluginError, path: Path) -> Reader | None:
+    """Return the reader if it recognizes a path; a third-party reader that fails does not, and is reported."""
+    if isinstance(reader, PluginError):
+        warnings.warn(str(reader), InputWarning, stacklevel=3)
+        return None
+    try:
+        return reader if may_hold(reader, path) and reader.recognises(path) else None
+    except Exception as error:
+        if isinstance(reader, Format):
+            raise
+        remark(path, f"reader {name!r} failed to examine it: {type(error).__name__}: {error}")
+        return None
 
 
 def may_hold(reader: Reader, path: Path) -> bool:

@@ -26,6 +26,7 @@ from bidnerf_core.datasets.capture import with_files
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.maps import read_views
+from bidnerf_core.registry import list_plugins
 from scan_layouts import LAYOUTS, PERIOD, message, read_all, small_views
 
 COUNT = 10
@@ -59,6 +60,10 @@ def test_the_contract_of_readers(layout: tuple[str, Path]) -> None:
     subject = type("Subject", (ReaderContract,), attributes)()
     for law in LAWS:
         getattr(subject, law)()
+
+
+def test_every_bundled_reader_has_a_layout() -> None:
+    assert {layout.reader for layout in LAYOUTS.values()} == {x.name for x in list_plugins("readers") if x.is_bundled}
 
 
 def test_what_is_read_is_what_was_written(layout: tuple[str, Path], written: list[View]) -> None:

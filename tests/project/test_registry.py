@@ -200,10 +200,14 @@ def test_every_group_is_listed_loaded_and_refused_alike(site: Site, group: str) 
 def test_bundled_plugins_are_registered_as_a_strangers_are_and_their_names_are_taken(site: Site, group: str) -> None:
     infos = [info for info in list_plugins(group) if info.is_bundled]
     assert infos
+    summaries = dict[int, str]()
     for info in infos:
         assert (info.fault, info.distribution) == (None, "bidnerf")
-        assert info.summary
-        assert load_plugin(group, info.name) is not None
+        plugin = load_plugin(group, info.name)
+        says = getattr(plugin, "summary", None) or plugin.__doc__
+        assert (info.summary, "\n" in info.summary) == (says.partition("\n")[0], False)
+        summaries[id(plugin)] = info.summary
+    assert len(set(summaries.values())) == len(summaries)
     site.module("stranger_thing.py", ANYTHING)
     site.plugin(infos[0].name, "stranger_thing:thing", group=group)
     found = "also claimed by stranger 1.0 (stranger_thing:thing)"
@@ -415,10 +419,22 @@ def test_two_readers_that_claim_a_folder_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("nothing_registered")
-def test_bundled_readers_come_before_others(tmp_path: Path) -> None:
-    register("readers", "first", Claiming(RuntimeError("must not be asked")))
-    (tmp_path / "transforms.json").write_text("{}")
-    assert find_reader(tmp_path) is load_plugin("readers", "transforms")
+def test_readers_are_tried_in_the_order_of_their_precedence(tmp_path: Path) -> None:
+    """Bundled readers come before those that state none."""
+    register("readers", "failing", Claiming(RuntimeError("must not be called")))
+    for name in ("rgb.txt", "transforms.json"):
+        (tmp_path / name).write_text("{}")
+    transforms, tum, own = load_plugin("readers", "transforms"), load_plugin("readers", "tum"), Claiming()
+    assert find_reader(tmp_path) is transforms
+    register("readers", "own", own)
+    for precedence, first in ((tum.precedence - 1, transforms), (transforms.precedence + 1, own)):
+        own.precedence = precedence
+        assert find_reader(tmp_path) is first
+    own.precedence = transforms.precedence
+    with refused(where=tmp_path, found="by the readers transforms and own", expected="one"):
+        find_reader(tmp_path)
+    (tmp_path / "transforms.json").unlink()
+    assert find_reader(tmp_path) is own
 
 
 @pytest.mark.usefixtures("nothing_registered")

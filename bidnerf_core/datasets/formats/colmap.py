@@ -171,4 +171,10 @@ def shot_of(model: Path, image: ModelImage, file: Path | None, cameras: dict[int
     )
 
 
-reader = Format("images with a sparse model in sparse/0 (COLMAP)", colmap_models, _read)
+reader = Format(
+    "COLMAP projects: the largest model, in its own unit, with the depth of stereo/depth_maps",
+    "images with a sparse model in sparse/0 (COLMAP)",
+    colmap_models,
+    _read,
+    precedence=20,  # other programs' reconstructions are often made from this one, or lack its lenses
+)

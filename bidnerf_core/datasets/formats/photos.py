@@ -94,7 +94,18 @@ def _read_video(path: Path, found: bool, options: DatasetOptions) -> Capture:
     return Capture(path, shots)
 
 
-reader = Format("image files", _find, _read, ("camera", "focal", "register_depth", "depth_unit"))
+reader = Format(
+    "images without poses; the depth of NAME.png is NAME.depth.png, in millimetres",
+    "image files",
+    _find,
+    _read,
+    ("camera", "focal", "register_depth", "depth_unit"),
+)
 video_reader = Format(
-    f"a video ({', '.join(VIDEO_SUFFIXES)})", is_video, _read_video, ("camera", "focal"), VIDEO_SUFFIXES
+    "videos without poses, whose camera is given (extra 'video')",
+    f"a video ({', '.join(VIDEO_SUFFIXES)})",
+    is_video,
+    _read_video,
+    ("camera", "focal"),
+    VIDEO_SUFFIXES,
 )

@@ -137,5 +137,11 @@ def _header(image: Path) -> tuple[tuple[int, int] | None, bool]:
     return (header.width, header.height), header.has_alpha
 
 
-expected = "transforms.json or transforms_train.json, transforms_val.json, transforms_test.json"
-reader = Format(expected, _find, _read, ["depth_unit"])
+reader = Format(
+    "NeRF-Synthetic, nerfstudio, instant-ngp, NeRFCapture, KIRI Engine, and datasets that bidnerf writes",
+    "transforms.json or transforms_train.json, transforms_val.json, transforms_test.json",
+    _find,
+    _read,
+    ["depth_unit"],
+    precedence=50,  # datasets of other formats are converted to this one in place
+)

@@ -134,8 +134,10 @@ def associate(times: Sequence[float], others: Sequence[float], largest: float) -
 
 
 reader = Format(
+    "TUM RGB-D: poses interpolated, depth nearest in time, in steps of 1/5000 m",
     "rgb.txt with depth.txt and groundtruth.txt (TUM RGB-D)",
     _find,
     _read,
     ("camera", "register_depth", "depth_unit"),
+    precedence=40,  # recordings of other formats get these lists for SLAM programs
 )
