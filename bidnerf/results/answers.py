@@ -122,6 +122,7 @@ class Answers:
         self.scene, self.is_sequence = scene, is_sequence
         self.given: list[Answer | Failure] = []
         self.unread = 0  # frames of a sequence whose files could not be read
+        self._next = 0  # number of the next answer
         self._lost_at: int | None = None
         self._camera_sources: set[str] = set()
 
@@ -137,6 +138,7 @@ class Answers:
     def append(self, answer: Answer | Failure) -> None:
         """Append an answer or a failure."""
         self.given.append(answer)
+        self._next = 1 + (answer.number if isinstance(answer, Answer) else self._next)
 
     def add(
         self,
@@ -151,8 +153,7 @@ class Answers:
         ``number`` is the frame's index in its sequence, by default one more than the last. ``time`` is in
         seconds, ``truth`` is the true T_world_camera.
         """
-        if number is None:
-            number = self.answers[-1].number + 1 if self.given else 0
+        number = self._next if number is None else number
         if frame.camera_source and frame.camera_source not in self._camera_sources:
             self._camera_sources.add(frame.camera_source)
             log.info("%s: %s", frame.name, frame.camera_source)

@@ -34,7 +34,7 @@ class PosedImage:
     """An image with its camera and an estimated pose."""
 
     name: str
-    number: int  # index in the run or sequence, from 0; serves as the timestamp if names are not times
+    number: int  # index in the run or sequence, from 0; serves as the time stamp of images without times
     intrinsics: Intrinsics  # of the upright image
     T_world_camera: SE3  # OpenCV axes
     file: Path | None = None
@@ -90,28 +90,45 @@ def frame_of(images: Sequence[PosedImage], direction: str = "camera to world") -
     return f"{direction}, {OPENCV_AXES}, lengths in {lengths}"
 
 
-def write_tum(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write a TUM trajectory: rows ``timestamp tx ty tz qx qy qz qw`` (unit quaternions with the scalar last).
+def time_stamps(images: Sequence[PosedImage]) -> tuple[list[tuple[float, PosedImage]], bool]:
+    """Return the images with their time stamps (seconds) in ascending order, and whether the stamps are times.
 
-    The timestamp is the image's time if all have one, else its name if all names are numbers, as in the TUM
-    RGB-D datasets, else the image's number (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats).
-    In the last case, a comment before the row names the image, since other programs skip comments.
+    Trajectory formats need stamps that increase. A time is that of the image or, as in the TUM RGB-D data sets, its
+    name, if that is a number with a fraction. If an image has neither, or two have the same time, the stamps are the
+    numbers of the images.
     """
-    timed = all(image.time is not None for image in images)
-    named = not timed and all(re.fullmatch(r"\d+(\.\d+)?", image.name) for image in images)
-    rows = [f"# timestamp tx ty tz qx qy qz qw ({frame_of(images)})"]
+    times = dict[float, PosedImage]()
     for image in images:
-        if not (timed or named):
+        time = image.time
+        if time is None and re.fullmatch(r"\d+\.\d+", image.name):
+            time = float(image.name)
+        if time is not None:
+            times[round(time, 6)] = image
+    are_times = len(times) == len(images)
+    stamped = times.items() if are_times else [(float(image.number), image) for image in images]
+    return sorted(stamped, key=lambda pair: pair[0]), are_times
+
+
+def write_tum(path: Path, images: Sequence[PosedImage]) -> None:
+    """Write a TUM trajectory: rows of time stamp, position, and unit quaternion with the scalar last.
+
+    See ``time_stamps`` and https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. If the stamps are not
+    times, a comment before each row names the image, since other programs skip comments.
+    """
+    stamped, are_times = time_stamps(images)
+    rows = [f"# timestamp tx ty tz qx qy qz qw ({frame_of(images)})"]
+    for stamp, image in stamped:
+        if not are_times:
             rows.append(f"# {printable(image.name if image.file is None else image.file.name)}")
-        stamp = f"{image.time:.6f}" if timed else image.name if named else str(image.number)
         numbers = (*image.pose.translation.tolist(), *image.pose.quaternion("xyzw").tolist())
-        rows.append(" ".join((stamp, *(f"{number:.12g}" for number in numbers))))
+        rows.append(" ".join((f"{stamp:.{6 * are_times}f}", *(f"{number:.12g}" for number in numbers))))
     write_file(path, "\n".join([*rows, ""]).encode())
 
 
 def write_pose_json(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write a JSON list of ``{"frame", "time", "T_world_camera", "covariance", "unit"}``, one per line; poses have OpenCV axes.
+    """Write a JSON list of poses with OpenCV axes, times and covariances.
 
+    Each line holds an object with "frame", "time", "T_world_camera", "covariance" and "unit".
     ``time`` (seconds) and ``covariance`` (6x6, tangent of translation in ``unit``, then rotation in rad, at
     the camera) are null if unknown, and every matrix is null if it is not finite.
     """
@@ -128,7 +145,7 @@ def write_pose_json(path: Path, images: Sequence[PosedImage]) -> None:
 
 
 def write_pose_transforms(path: Path, images: Sequence[PosedImage], **more: Any) -> None:
-    """Write a ``transforms.json`` in nerfstudio's format: poses with OpenGL axes, and one camera per image.
+    """Write a dataset in nerfstudio's format: poses with OpenGL axes, and one camera per image.
 
     Each ``file_path`` is relative to the folder of the file, and ``more`` holds further entries. The entries
     describe the image files as stored, so the poses and cameras of photos with an EXIF orientation are rotated.
@@ -152,12 +169,12 @@ def _defects(writer: Any) -> Iterator[str]:
 PoseWriter: TypeAlias = Callable[[Path, Sequence[PosedImage]], None]
 """A function that writes poses to a file atomically."""
 
-POSE_WRITERS: Plugins[PoseWriter] = Plugins(
-    "writers",
-    _defects,
-    first=("transforms.json", "images.txt", ".json", ".txt", ".tum", ".kitti.txt", ".euroc.csv"),
-)
-"""Writers by file-name ending; if several match, the longest ending is used."""
+POSE_WRITERS: Plugins[PoseWriter] = Plugins("writers", _defects)
+"""Writers by file-name ending; if several match, the longest ending is used.
+
+The first line of a writer's docstring describes its format in lists. ``list_plugins("writers")`` lists the endings without
+importing the writers.
+"""
 
 
 def pose_format(path: Path) -> str:

@@ -6,14 +6,14 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-from bidnerf.results.pose_files import PosedImage, common_unit
+from bidnerf.results.pose_files import PosedImage, common_unit, time_stamps
 from bidnerf_core.errors import InputWarning
 from bidnerf_core.geometry import symbol
 from bidnerf_core.io import write_file
 
 
 def write_kitti_poses(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write KITTI poses: per image, a row with the twelve numbers of a 3x4 camera-to-world matrix, without times."""
+    """Write KITTI poses: rows of the twelve numbers of 3x4 camera-to-world matrices, without times."""
     numbers = [image.number for image in images]
     if numbers != list(range(len(numbers))):
         skipped = next(place for place, number in enumerate(numbers) if place != number)
@@ -28,15 +28,13 @@ def write_kitti_poses(path: Path, images: Sequence[PosedImage]) -> None:
 
 
 def write_euroc_poses(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write camera (not body) poses in EuRoC format: rows of nanoseconds, position and quaternion (w, x, y, z).
+    """Write camera (not body) poses in EuRoC's format: rows of nanoseconds, position, and quaternion (w, x, y, z).
 
-    An image without a time gets its number as its time in seconds. The header names the unit of the positions,
-    which is ``[m]`` only for metric maps.
+    See ``time_stamps`` for the times. The header names the unit of the positions, which is ``[m]`` only for metric maps.
     """
     positions = ",".join(f"p_RS_R_{axis} [{symbol(common_unit(images))}]" for axis in "xyz")
     rows = [f"#timestamp [ns],{positions},q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"]
-    for image in images:
-        time = image.number if image.time is None else image.time
+    for time, image in time_stamps(images)[0]:
         numbers = [*image.pose.translation.tolist(), *image.pose.quaternion("wxyz").tolist()]
         rows.append(",".join([str(round(time * 10**9)), *(f"{number:.12g}" for number in numbers)]) + "\n")
     write_file(path, "".join(rows).encode())

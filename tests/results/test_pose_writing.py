@@ -59,16 +59,33 @@ def test_a_tum_trajectory_is_what_scipy_reads(tmp_path: Path) -> None:
     assert np.allclose(np.linalg.norm(rows[:, 4:], axis=1), 1)
 
 
-def test_names_that_are_times_are_the_timestamps(tmp_path: Path) -> None:
-    def lines_of(names: list[str]) -> list[str]:
-        write_tum(tmp_path / "poses.txt", images(names))
-        return (tmp_path / "poses.txt").read_text().splitlines()
-
-    times = ["1305031102.175304", "1305031102.211214"]
-    assert [line.split()[0] for line in lines_of(times)[1:]] == times
-    lines = lines_of(["7", "x"])
-    assert lines[1] == "# 7"  # the name, where the time stamp is only a number
-    assert lines[2].startswith("0 ")
+@pytest.mark.parametrize(
+    ("names", "times", "stamps"),
+    [
+        (["1305031102.211214", "1305031102.175304"], [None, None], [1305031102.175304, 1305031102.211214]),
+        (["b", "a"], [7.5, 0.25], [0.25, 7.5]),
+        (["7.5", "x"], [None, None], [0, 1]),
+        (["0002", "0001"], [None, None], [0, 1]),
+        (["1.5", "1.5"], [None, None], [0, 1]),
+        (["a", "b"], [1.5, 1.5], [0, 1]),
+        (["a", "b"], [1e9, None], [0, 1]),
+    ],
+)
+def test_time_stamps_are_times_where_all_images_have_one(
+    names: list[str], times: list[float | None], stamps: list[float], tmp_path: Path
+) -> None:
+    """evo and the tools of TUM RGB-D refuse stamps that do not increase. A comment names images without a time."""
+    given = [replace(image, time=time) for image, time in zip(images(names), times, strict=True)]
+    write_poses(tmp_path / "path.tum", given)
+    write_poses(tmp_path / "path.euroc.csv", given)
+    written, nanoseconds = np.loadtxt(tmp_path / "path.tum"), np.loadtxt(tmp_path / "path.euroc.csv", delimiter=",")
+    assert written[:, 0].tolist() == stamps
+    assert (nanoseconds[:, 0] * 1e-9).tolist() == pytest.approx(stamps, abs=1e-6)
+    order = (0, 1) if stamps == [0, 1] else (1, 0)
+    for row, n in zip(written, order, strict=True):
+        np.testing.assert_allclose(row[1:4], given[n].T_world_camera.translation, atol=1e-10)
+    comments = [line for line in (tmp_path / "path.tum").read_text().splitlines()[1:] if line.startswith("#")]
+    assert comments == ([f"# {name}" for name in names] if stamps == [0, 1] else [])
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
@@ -201,7 +218,7 @@ def test_the_head_of_euroc_poses_names_the_unit_of_the_map(unit: Any, written: s
 
 
 def test_an_unknown_ending_is_refused(tmp_path: Path) -> None:
-    endings = "transforms.json, images.txt, .json, .txt"
+    endings = ".euroc.csv, .json, .kitti.txt, .tum, .txt, images.txt, transforms.json"
     with refused(where=tmp_path / "poses.csv", expected=f"a name that ends with {endings}"):
         write_poses(tmp_path / "poses.csv", images(["a", "b"]))
 
