@@ -32,7 +32,7 @@ from typing import Any
 import _lab
 from scipy.stats import fisher_exact, mannwhitneyu
 
-from bidnerf.cli.running import displayed
+from bidnerf.cli import displayed
 from bidnerf.evaluation import (
     NEVER,
     Group,

@@ -1,4 +1,4 @@
-"""Plugins by name: backends, readers, posers, methods, features, faults, writers, importers, exporters and service protocols.
+"""Plugins by name: backends, readers, posers, methods, features, faults, writers, importers, exporters, service protocols and commands.
 
 A distribution provides an object through an entry point of the group ``bidnerf.GROUP``, as bidnerf itself does
 for the bundled objects. A script or a notebook adds an object with ``register``. Listing reads only metadata (and
@@ -12,11 +12,14 @@ import contextlib
 import dataclasses
 import functools
 import inspect
+import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.machinery import ModuleSpec, PathFinder
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Generic, TypeAlias, TypeVar
+from types import CodeType, FunctionType
+from typing import Any, Generic, TypeAlias, TypeVar, cast
 
 from bidnerf_core.errors import InputError, spelling_hint, unknown_name
 
@@ -31,6 +34,7 @@ GROUPS: Mapping[str, str] = {
     "importers": "importer",
     "exporters": "exporter",
     "services": "protocol",
+    "commands": "command",
 }
 """The groups of plugins, each with the noun for one of its objects. The entry-point group is named ``bidnerf.GROUP``."""
 
@@ -71,10 +75,13 @@ class PluginInfo:
 
     @property
     def summary(self) -> str:
-        """A one-line description: the plugin's own if it is bundled or registered in this process, else its distribution's.
+        """A one-line description: the plugin's own if it can be read, else its distribution's.
 
-        Reading the summary of a bundled plugin imports the plugin.
+        The description of an installed function is the first line of its docstring, which is read without importing it. Other plugins
+        are imported if they are bundled, but not if another distribution provides them.
         """
+        if self.fault is None and self.version and (text := _function_doc(self.value)):
+            return text.partition("\n")[0]
         if self.fault is None and (self.is_bundled or not self.version):
             with contextlib.suppress(PluginError):  # reported when the plugin is loaded for use
                 plugin = load_plugin(self.group, self.name)
@@ -82,9 +89,34 @@ class PluginInfo:
                 return str(text).strip().partition("\n")[0]
         return self.about
 
+    @property
+    def description(self) -> str:
+        """The summary, with the distribution if it is not bidnerf's own, and the fault if there is one."""
+        source = "" if self.is_bundled else f"[{self.distribution} {self.version}".strip() + "]"
+        fault = "" if self.fault is None else f"fault: {self.fault}"
+        return " ".join(filter(None, (self.summary.replace("``", "'"), source, fault)))
+
     def __str__(self) -> str:
         origin = f"from {self.distribution} {self.version}" if self.version else "registered in this process"
         return f"{GROUPS[self.group]} '{self.name}' ({self.value}, {origin})"
+
+
+def _function_doc(value: str) -> str:
+    """Return the docstring of the function ``module:function`` without importing anything, or "" for any other object."""
+    module, _, name = value.partition(":")
+    path: Sequence[str] | None = None
+    spec: ModuleSpec | None = None
+    for package in itertools.accumulate(module.split("."), "{}.{}".format):
+        spec = PathFinder.find_spec(package, path)
+        if spec is None:
+            return ""
+        path = spec.submodule_search_locations
+    assert spec is not None
+    read: Any = getattr(spec.loader, "get_code", lambda _: None)
+    for code in getattr(read(spec.name), "co_consts", ()):
+        if isinstance(code, CodeType) and code.co_name == name and code.co_flags & inspect.CO_OPTIMIZED:
+            return inspect.getdoc(FunctionType(code, {})) or ""
+    return ""
 
 
 def register(group: str, name: str, value: Any, replace: bool = False) -> None:
@@ -150,10 +182,13 @@ def _declared(group: str) -> tuple[PluginInfo, ...]:
     If several versions of a distribution are installed, the first on ``sys.path`` counts.
     """
     infos, points = list[PluginInfo](), list[tuple[EntryPoint, str, str, str]]()
+    metadata = dict[Any, Any]()
     try:
         for p in entry_points(group=f"bidnerf.{group}"):
-            dist: Any = p.dist
-            points.append((p, dist.name, dist.version, dist.metadata.get("Summary", "")))
+            if p.dist not in metadata:  # which is parsed at each access
+                metadata[p.dist] = cast(Any, p.dist).metadata
+            dist = metadata[p.dist]
+            points.append((p, dist["Name"], dist["Version"], dist.get("Summary", "")))
     except Exception as error:
         why = f"the metadata of an installed package cannot be read ({_described(error)})"
         raise PluginError(why, expected="a sound one; reinstall or remove it") from error

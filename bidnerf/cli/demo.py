@@ -49,9 +49,9 @@ def run_demo(
     seed: Seed = 0,
     overwrite: Annotated[Flag, Option(None, "replace the contents of --out")] = False,
 ) -> None:
-    """Train a closed-form scene, localize unseen frames in it, and draw the result.
+    """Train a map of a closed-form scene, and localize frames in it.
 
-    The frames are RGB-D images from poses that training never saw. Each is localized twice: by method auto without a start, and
+    The results are drawn. The frames are RGB-D images from poses that training never saw. Each is localized twice: by method auto without a start, and
     by method bid from a start far from its pose.
     """
     from bidnerf.scenes import demo_object, orbit, views

@@ -126,9 +126,9 @@ def run_evaluate(
     dataset: Annotated[DatasetOptions, Without("largest", "background")] = TEST_IMAGES,
     method: MethodOptions,
 ) -> None:
-    """Localize many frames from perturbed starts, or from none, and write one JSON line per trial.
+    """Localize many frames of a dataset, and write one JSON line a trial.
 
-    Finished trials are always kept: the same command resumes where it stopped. 'bidnerf report' makes tables and figures from the
+    Trials begin at perturbed starts, or at none. Finished trials are always kept: the same command resumes where it stopped. 'bidnerf report' makes tables and figures from the
     results.
     """
     from bidnerf.evaluation import evaluate
@@ -176,9 +176,9 @@ def run_compare(
     images: Annotated[DatasetOptions, Without("largest", "background")] = TEST_IMAGES,
     method: MethodOptions,
 ) -> None:
-    """Localize the same frames from the same starts in several maps, and compare success, time and memory.
+    """Localize the same frames in several maps, and compare the results.
 
-    Each map has its own process, and the maps take turns at each start.
+    The starts are the same; success, steps, time and memory are compared. Each map has its own process, and the maps take turns at each start.
     """
     from bidnerf.evaluation import compare, comparison_figure
     from bidnerf_core.io import output_folder, to_plain
@@ -224,9 +224,9 @@ def run_report(
         Names, Option("DATA...", "datasets of the results, from which the worst frames are shown", "no pictures")
     ] = (),
 ) -> None:
-    """Write tables and figures of results as one page that works offline.
+    """Write tables and figures of an evaluation as one page.
 
-    Trials are compared by map, data, start, method and settings. A trial in several files counts once.
+    The page works offline. Trials are compared by map, data, start, method and settings. A trial in several files counts once.
     """
     # Imported when a report is made, since help pages do not need it.
     from bidnerf.evaluation import ResultTable, chosen_criterion, read_runs, write_report

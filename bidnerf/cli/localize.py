@@ -21,7 +21,8 @@ from bidnerf.cli.options import (
 )
 from bidnerf.cli.output import check_folder, check_output, print_json, say, show
 from bidnerf.cli.parser import Option, Without
-from bidnerf.cli.running import displayed, uninterrupted
+from bidnerf.cli.running import displayed
+from bidnerf.cli.signals import uninterrupted
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount, enumeration
 
@@ -124,9 +125,9 @@ def run_localize(
     method: MethodOptions,
     seed: Seed = 0,
 ) -> None:
-    """Find the poses of photos or dataset frames in a map, or in the one of several maps that they show.
+    """Find the poses of photos, or of a dataset's frames, in a map.
 
-    QUERY is image files, folders of photos, or a dataset. A photo's camera comes from its EXIF unless it is given; if EXIF has no
+    If several maps are given, each image is localized in the one that it shows. QUERY is image files, folders of photos, or a dataset. A photo's camera comes from its EXIF unless it is given; if EXIF has no
     focal length, method auto begins with the camera of the map's images. Dataset frames named by --frame form a rig: their
     relative poses come from the dataset, and the pose found is that of the last one's camera. Poses are camera to world with
     OpenCV axes (x right, y down, z forward). Points are in the camera's axes, unless a .npz also holds T_camera_sensor.

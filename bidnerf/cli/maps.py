@@ -40,7 +40,10 @@ def run_info(
     json: Json = False,
     draw: Annotated[Path | None, Option("PNG", "file for a picture of the capture from above", "no picture")] = None,
 ) -> None:
-    """Describe a map and the photos it was built from. The whole map is loaded, so that damage is detected."""
+    """Describe a map and the photos it was built from.
+
+    The whole map is loaded, so that damage is detected.
+    """
     from bidnerf.results import draw_capture
     from bidnerf_core.maps import load_map
 
@@ -80,7 +83,10 @@ def run_export(
     out: Annotated[Path, Option("DIR", "folder for the files")],
     overwrite: Annotated[Flag, Option(None, "write into a non-empty folder")] = False,
 ) -> None:
-    """Export the surface, landmarks and cameras of a map for other software, in the map's frame and unit."""
+    """Export a map's surface, landmarks and cameras for other software.
+
+    The files are in the map's frame and unit.
+    """
     from bidnerf.results import export_map
 
     check_folder(out, (map,))
@@ -111,9 +117,9 @@ def run_scale(
     out: Annotated[Path | None, Option("MAP2", "leave the map unchanged and write a new one")] = None,
     overwrite: Annotated[Flag, Option(None, "replace the map in --out")] = False,
 ) -> None:
-    """Convert a map to metres: its field, bounds, surface, landmarks, capture record and anchor.
+    """Convert a map to metres.
 
-    Poses, covariances and errors are then in metres, and the depth of sensors fits. One of --distance, --poses and --factor
+    All of it is converted: field, bounds, surface, landmarks, capture record and anchor. Poses, covariances and errors are then in metres, and the depth of sensors fits. One of --distance, --poses and --factor
     gives the length of a unit.
     """
     from bidnerf.results import read_positions
@@ -236,7 +242,7 @@ def run_bake(
     images: Annotated[DatasetOptions, Without("background")],
     config: BakeSettings = None,
 ) -> None:
-    """Find the surface and the landmarks of a map, and store them in the map.
+    """Find the surface and the landmarks of a map, and store them in it.
 
     Depth is rendered from the poses of the training images; what several of these views agree on is kept. With --data,
     measured depth is used directly where views have it, and landmarks are built from the photos; without --data they are built
@@ -277,9 +283,9 @@ def run_extend(
     images: Annotated[DatasetOptions, Without("masks", "mask_hides", "largest", "background")],
     config: BakeSettings = None,
 ) -> None:
-    """Add photos of the same scene to a map: localize them, continue training the field, and update landmarks and surface.
+    """Add photos of the same scene to a map.
 
-    Photos are left out if they cannot be read, if they are not localized in the map, or if the map was built from them. The map
+    The photos are localized, training of the field continues with them, and the landmarks and the surface are updated. Photos are left out if they cannot be read, if they are not localized in the map, or if the map was built from them. The map
     is replaced only when everything is done: after Ctrl-C, or a kill, it is unchanged, and localizers may keep reading it
     meanwhile.
     """
@@ -351,7 +357,7 @@ def run_import(
     ],
     config: Annotated[Any, Settings(_importer_settings, "settings of the importer")] = None,
 ) -> None:
-    """Build a map from a field that was trained elsewhere, or from an existing COLMAP model.
+    """Build a map from a COLMAP model, or from a field trained elsewhere.
 
     The installed importer that recognizes the file reads it. The command reports what it found: counts, what was left out, and
     the extent, since most files store no unit. With --photos, landmarks are built from photos, as in 'train'; otherwise from

@@ -17,7 +17,7 @@ def run_plugins(
     ] = None,
     json: Json = False,
 ) -> None:
-    """List everything registered by name: backends, readers, methods, features, faults, writers, importers and exporters."""
+    """List all plugins: backends, readers, methods, commands and others."""
     groups = list(GROUPS) if group is None else [group]
     _print_infos([info for of in groups for info in list_plugins(of)], json, "group", all_kinds=group is None)
 
@@ -33,12 +33,5 @@ def _print_infos(infos: list[PluginInfo], json: bool, *more: str, all_kinds: boo
         keys = (*more, "name", "summary", "distribution", "version", "value", "fault")
         print_json([{key: getattr(info, key) for key in keys} for info in infos])
         return
-    table = []
-    for info in infos:
-        text = info.summary.replace("``", "'")
-        if not info.is_bundled:
-            text += f" [{f'{info.distribution} {info.version}'.strip()}]"
-        if info.fault is not None:
-            text += f" fault: {info.fault}"
-        table.append([*([info.group] if all_kinds else []), info.name, text.strip()])
+    table = [[*([info.group] if all_kinds else []), info.name, info.description] for info in infos]
     print_table([*(["group"] if all_kinds else []), "name", "summary"], table, wide="summary")

@@ -1,15 +1,12 @@
-"""Support for running commands: signals stop the work in a way that lets results be saved, and its progress is displayed."""
+"""Support for running commands: their progress is displayed, and Ctrl-C stops them where their work can be saved."""
 
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 import sys
 import threading
 import time
 from collections.abc import Iterator
-from types import FrameType
 
 from rich.progress import (
     BarColumn,
@@ -22,74 +19,9 @@ from rich.progress import (
 from rich.progress import Progress as Bar
 
 from bidnerf.cli.output import console, say
+from bidnerf.cli.signals import Interrupted, installed_handler
 from bidnerf_core.errors import Cancelled
 from bidnerf_core.progress import Progress, duration_text, job_context
-
-# Windows has no SIGHUP.
-ASKED_TO_STOP = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-
-
-class Interrupted(KeyboardInterrupt):
-    """Raised when a signal asks the command to stop."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(signal.Signals(number).name)
-        self.number = number
-
-
-class _Handler:
-    """A signal handler that raises ``Interrupted`` in the process that installed it, at once or when the work allows it."""
-
-    def __init__(self) -> None:
-        self.process = os.getpid()
-        self.writes = False  # every signal waits until results are written
-        self.works = False  # the first Ctrl-C waits until the work next checks whether to stop
-        self.waiting: int | None = None
-
-    def __call__(self, number: int, frame: FrameType | None) -> None:
-        if os.getpid() != self.process:  # a forked worker ends as it would without this handler
-            signal.signal(number, signal.SIG_DFL)
-            os.kill(os.getpid(), number)
-        elif self.writes or (self.works and number == signal.SIGINT and self.waiting is None):
-            self.waiting = number
-        else:
-            raise Interrupted(number)
-
-
-@contextlib.contextmanager
-def interruptions() -> Iterator[None]:
-    """Make SIGINT, SIGTERM and SIGHUP raise ``Interrupted``. Signals that are ignored, as under nohup, stay ignored.
-
-    Has no effect outside the main thread, the only thread that may handle signals.
-    """
-    in_main = threading.current_thread() is threading.main_thread()
-    usual, handler = (signal.SIG_DFL, signal.default_int_handler), _Handler()
-    handled = [number for number in ASKED_TO_STOP if in_main and signal.getsignal(number) in usual]
-    before = {number: signal.signal(number, handler) for number in handled}
-    try:
-        yield
-    finally:
-        for number, handler_before in before.items():
-            signal.signal(number, handler_before)
-
-
-def _handler() -> _Handler:
-    """Return the handler that ``interruptions`` installed, or one that receives no signals."""
-    handlers = map(signal.getsignal, ASKED_TO_STOP)
-    return next((found for found in handlers if isinstance(found, _Handler)), _Handler())
-
-
-@contextlib.contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Defer interruptions to the end of the context, so that results are written completely."""
-    handler = _handler()
-    handler.writes = True
-    try:
-        yield
-    finally:
-        handler.writes = False
-    if handler.waiting is not None:
-        raise Interrupted(handler.waiting)
 
 
 class Display:
@@ -164,7 +96,7 @@ def working(
 
     Once the work has stopped at a check, a line states what was kept, and ``Interrupted`` is raised.
     """
-    handler, announced = _handler(), threading.Event()
+    handler, announced = installed_handler(), threading.Event()
 
     def cancel() -> bool:
         if handler.waiting is not None and not announced.is_set():  # not in the handler, which may interrupt a print

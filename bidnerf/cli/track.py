@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from bidnerf.cli.options import CameraOptions, MapFolder, refuse
 from bidnerf.cli.output import check_output, print_json, print_table, say
 from bidnerf.cli.parser import Flag, Option, Settings, Without
-from bidnerf.cli.running import displayed, uninterrupted
+from bidnerf.cli.running import displayed
+from bidnerf.cli.signals import uninterrupted
 from bidnerf_core import localization
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount
@@ -116,7 +117,7 @@ def run_track(
     images: Annotated[DatasetOptions, Without("split", "largest", "background")],
     tracking: TrackingOptions,
 ) -> None:
-    """Find the poses of a sequence's frames in a map, in chronological order.
+    """Find the poses of a sequence's frames in a map, in order of time.
 
     Each pose is predicted from those before it, refined and validated. A frame whose pose is not accepted counts as lost; the
     following ones are searched for in the whole map. If the sequence has true poses, a table shows the errors.

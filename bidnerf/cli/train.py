@@ -40,9 +40,9 @@ def run_poses(
     overwrite: Annotated[Flag, Option(None, "replace the poses in --out")] = False,
     json: Json = False,
 ) -> None:
-    """Find the poses of photos by structure from motion, and write them as a dataset.
+    """Find the poses of photos by structure from motion.
 
-    The dataset refers to the photos in place; its poses.json lists those that were left out, and why. The unit of length is
+    They are written as a dataset. The dataset refers to the photos in place; its poses.json lists those that were left out, and why. The unit of length is
     arbitrary. Ctrl-C stops, and the same command resumes. 'bidnerf train PHOTOS' performs this step first.
     """
     from bidnerf.structure import find_poses

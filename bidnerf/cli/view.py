@@ -78,9 +78,9 @@ def run_view(
         DatasetOptions, Without("register_depth", "masks", "mask_hides", "largest", "background")
     ] = TEST_IMAGES,
 ) -> None:
-    """View a map in a browser, drop photos on it, and see how and why a pose was found or rejected. Ctrl-C stops it.
+    """View a map, and localizations in it, in a browser.
 
-    The photos and frames of QUERY can be selected there. Photos dropped on the page take the camera given here, whose field of
+    The page shows how and why a pose was found or rejected, also of photos that are dropped on it. Ctrl-C stops it. The photos and frames of QUERY can be selected there. Photos dropped on the page take the camera given here, whose field of
     view can be changed there. With --save, QUERY is localized immediately, and the saved page shows the same without a server.
     """
     from bidnerf.evaluation import read_results
@@ -191,9 +191,9 @@ def run_serve(
     *,
     limits: ServiceLimits,
 ) -> None:
-    """Serve localization over HTTP: photos in, the JSON of 'bidnerf localize' out. Ctrl-C stops it.
+    """Serve localization over HTTP: photos in, poses out.
 
-    A photo is sent as a form or as the body of a request, with its camera, depth image or start if known:
+    Answers are the JSON of 'bidnerf localize'. Ctrl-C stops the service. A photo is sent as a form or as the body of a request, with its camera, depth image or start if known:
     curl -F photo=@photo.jpg -F hfov=68 http://127.0.0.1:8000/localize
 
     /docs describes all paths, as does /openapi.json, and /health and /metrics are for monitoring. Each request is logged as a line of

@@ -1,3 +1,4 @@
+from .command_contract import CommandContract as CommandContract
 from .contract import BackendContract as BackendContract
 from .contracts import FaultContract as FaultContract
 from .contracts import FeaturesContract as FeaturesContract

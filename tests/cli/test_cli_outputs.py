@@ -25,7 +25,7 @@ import torch
 from bidnerf import SE3, Frame, InputError, Intrinsics, Localization, Localizer, Outcome, Tracker
 from bidnerf.cli import main
 from bidnerf.cli.output import check_folder, check_output
-from bidnerf.cli.running import Interrupted, interruptions, uninterrupted
+from bidnerf.cli.signals import Interrupted, interruptions, uninterrupted
 from bidnerf.results import Answers
 from bidnerf_core.datasets import DatasetFrames, Query, read_trajectory
 from bidnerf_core.errors import UsageError

@@ -19,7 +19,6 @@ REASON = re.compile(r"^ *# Inside: .{10,}", re.MULTILINE)
 """How a test file says why it needs parts that its package does not offer."""
 
 EXCEPTIONS = {
-    "benchmarks/paper_tables.py": "shows the progress of the command line",
     "tests/conftest.py": "does in this process what a process of a comparison does",
     "tests/formats/test_scan_readers.py": "pictures that are no files, which every reader may have",
     "tests/frames/test_masks.py": "hides pixels from everything that reads them, in whichever package",
@@ -102,7 +101,7 @@ def test_exceptions_are_needed() -> None:
     assert [name for name in EXCEPTIONS if not deep_imports(ROOT / name)] == []
 
 
-@pytest.mark.parametrize("package", [*(name for name in PACKAGES if not name.endswith(".cli")), "bidnerf"])
+@pytest.mark.parametrize("package", [*PACKAGES, "bidnerf"])
 def test_what_a_face_names_is_there(package: str) -> None:
     face = importlib.import_module(package)
     assert [name for name in face.__all__ if not hasattr(face, name)] == []

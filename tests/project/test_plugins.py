@@ -102,7 +102,9 @@ def test_the_template_can_be_renamed_as_it_says(tmp_path: Path) -> None:
     assert "template" not in text.lower()
     environment = installed([mine], tmp_path / "site")
     (distribution,) = metadata.distributions(path=[str(tmp_path / "site")])
-    (point,) = distribution.entry_points
-    assert (point.group, point.name, point.value) == ("bidnerf.backends", "mine", "bidnerf_mine:backend")
+    assert {(point.group, point.name, point.value) for point in distribution.entry_points} == {
+        ("bidnerf.backends", "mine", "bidnerf_mine:backend"),
+        ("bidnerf.commands", "mine-parameters", "bidnerf_mine.command:count_parameters"),
+    }
     pytest_ = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", str(mine)]
     assert "passed" in quietly([*pytest_, "-k", "build", str(mine / "tests")], cwd=mine, env=environment)

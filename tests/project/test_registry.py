@@ -15,7 +15,6 @@ from typing import Any
 
 import pytest
 
-from bidnerf.cli import _warnings_as_lines
 from bidnerf.results import write_poses
 from bidnerf_core.backend import Backend, load_backend
 from bidnerf_core.datasets import Capture, DatasetOptions, Reader, find_reader, open_dataset, open_sequence
@@ -31,6 +30,7 @@ from bidnerf_core.registry import (
     load_plugin,
     register,
 )
+from commands import Run
 from refusals import refused
 
 FOG = '''"""A field of fog.
@@ -438,22 +438,24 @@ def test_readers_are_tried_in_the_order_of_their_precedence(tmp_path: Path) -> N
 
 
 @pytest.mark.usefixtures("nothing_registered")
-def test_a_reader_that_fails_is_named_once_and_passed_over(
-    site: Site, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_reader_that_fails_is_named_once_and_passed_over(site: Site, tmp_path: Path, bidnerf: Run) -> None:
     site.module("stranger_broken.py", BROKEN)
     site.plugin("broken", "stranger_broken:reader", group="readers")
     register("readers", "failing", Claiming(OSError("no disk")))
-    with _warnings_as_lines("bidnerf localize"):  # as in a command
+
+    def look() -> None:
+        """Look for readers of three folders."""
         for name in ("first", "second", "third"):
             (tmp_path / name).mkdir()
             assert find_reader(tmp_path / name) is None
         warnings.warn("another remark", InputWarning, stacklevel=1)
-    told = capsys.readouterr().err.splitlines()
-    assert sum("'broken' (stranger_broken:reader, from stranger 1.0)" in line for line in told) == 1
-    assert any("'failing'" in line and "OSError: no disk" in line for line in told)
-    assert len(set(told)) == len(told)
-    assert told[-1] == "bidnerf localize: another remark"
+
+    register("commands", "look", look)
+    lines = bidnerf("look").err.splitlines()
+    assert sum("'broken' (stranger_broken:reader, from stranger 1.0)" in line for line in lines) == 1
+    assert any("'failing'" in line and "OSError: no disk" in line for line in lines)
+    assert len(set(lines)) == len(lines)
+    assert lines[-1] == "bidnerf look: another remark"
     register("readers", "sound", Claiming())
     with pytest.warns(InputWarning):
         assert find_reader(tmp_path) is load_plugin("readers", "sound")

@@ -1,0 +1,11 @@
+from .options import Device as Device
+from .options import Json as Json
+from .options import MapFolder as MapFolder
+from .output import print_json as print_json
+from .output import say as say
+from .output import show as show
+from .parser import Flag as Flag
+from .parser import Option as Option
+from .program import COMMANDS as COMMANDS
+from .program import main as main
+from .running import displayed as displayed

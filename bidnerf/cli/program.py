@@ -1,0 +1,175 @@
+"""``main``, which finds a command among the installed ones, runs it and turns errors into exit statuses."""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import io
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TextIO
+
+from bidnerf.cli.signals import Interrupted, interruptions
+from bidnerf_core.errors import Cancelled, InputError, InputWarning, UsageError, printable, spelling_hint
+from bidnerf_core.registry import Plugins, list_plugins
+
+
+def _command_defects(command: Any) -> Iterator[str]:
+    """Yield the reasons why an object is not a command: a function with a docstring and annotated parameters."""
+    from bidnerf.cli.parser import parameters_of  # imported here for the sake of a quick --version
+
+    if not inspect.isfunction(command):
+        yield f"it is a {type(command).__name__}, expected a function"
+    elif not inspect.getdoc(command):
+        yield "it has no docstring, from which its help is made"
+    else:
+        parameters_of(command)
+
+
+COMMANDS: Plugins[Callable[..., None]] = Plugins("commands", _command_defects)
+"""The functions that run the installed commands, by name."""
+DONE, BAD_INPUT, WRONG_USAGE, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
+"""Exit statuses; the last two are 128 plus the number of the signal, as is customary for shells. SIGTERM and SIGHUP lead to
+143 and 129."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return the exit status; a user error is reported in one line instead of a traceback."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    _open_streams()
+    name = "bidnerf"
+    try:
+        if given and not given[0].startswith("-") and given[0] in COMMANDS:
+            name += f" {given[0]}"
+        with interruptions(), _warnings_as_lines(name), _remarks_as_lines():
+            status = _dispatch(given)
+            sys.stdout.flush()  # here, where a full disk can still be reported
+            return status
+    except KeyboardInterrupt as stopped:
+        return _failed(name, "interrupted", 128 + stopped.number if isinstance(stopped, Interrupted) else INTERRUPTED)
+    except Cancelled as stopped:
+        return _failed(name, str(stopped), INTERRUPTED)
+    except BrokenPipeError:
+        return READER_GONE
+    except OSError as error:  # a full disk, a folder without write permission
+        where = f"{error.filename}: " if error.filename else ""
+        return _failed(name, f"{where}{error.strerror or error}", BAD_INPUT)
+    except InputError as error:
+        return _failed(name, str(error), WRONG_USAGE if isinstance(error, UsageError) else BAD_INPUT)
+    except RuntimeError as error:
+        if type(error).__name__ != "OutOfMemoryError":  # torch's class; importing torch would delay --help
+            raise
+        return _failed(name, f"the GPU's memory is full, try --device cpu ({error})", BAD_INPUT)
+    finally:
+        try:
+            sys.stdout.flush()
+        except (OSError, ValueError):
+            _discard(sys.stdout)
+
+
+def _dispatch(given: list[str]) -> int:
+    if not given or given[0] in ("-h", "--help"):
+        print(_usage(), file=sys.stdout if given else sys.stderr)
+        return DONE if given else WRONG_USAGE
+    if given[0] == "--version":
+        from importlib.metadata import version
+
+        print(f"bidnerf {version('bidnerf')}")
+        return DONE
+    if given[0] not in COMMANDS:
+        unknown = f"no command {given[0]!r}{spelling_hint(given[0], COMMANDS)}"
+        return _failed("bidnerf", unknown, WRONG_USAGE, f"\n{_usage()}")
+    if any("\0" in word for word in given):
+        raise UsageError("an argument holds a NUL character", expected="text")
+    from bidnerf.cli.parser import parse  # imported here for the sake of a quick --version
+
+    command = COMMANDS.load(given[0])
+    try:
+        parse(given[0], command, given[1:])
+    except SystemExit as stopped:  # after help, or from a plugin
+        return stopped.code if isinstance(stopped.code, int) else DONE if stopped.code is None else BAD_INPUT
+    return DONE
+
+
+def _usage() -> str:
+    """Return the list of all commands, which imports none of them."""
+    infos = list_plugins("commands")
+    width = max((len(info.name) for info in infos), default=0)
+    lines = [f"  {info.name.ljust(width)}  {info.description}" for info in infos]
+    return "\n".join(["usage: bidnerf COMMAND ...", "", *lines, "", "'bidnerf COMMAND --help' describes a command."])
+
+
+@contextlib.contextmanager
+def _warnings_as_lines(name: str) -> Iterator[None]:
+    """Print each distinct ``InputWarning`` once, as one line on stderr, without the source line that Python would add."""
+    told = set[str]()
+    with warnings.catch_warnings():
+
+        def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
+            if not issubclass(category, InputWarning):
+                lines = warnings.formatwarning(message, category, *where[:2]).split("\n")
+                sys.stderr.write("\n".join(map(printable, lines)))
+            elif str(message) not in told:  # a broken plugin is reported again with every folder
+                told.add(str(message))
+                _failed(name, str(message), DONE)
+
+        warnings.simplefilter("always", InputWarning)
+        warnings.showwarning = show  # type: ignore[assignment]
+        yield
+
+
+@contextlib.contextmanager
+def _remarks_as_lines() -> Iterator[None]:
+    """Print each message that the library logs as one line on stderr."""
+    logger, handler = logging.getLogger("bidnerf"), _Lines()
+    before = logger.level, logger.propagate
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    logger.propagate = False
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before[0])  # unlike an assignment, this clears the logger's cache
+        logger.propagate = before[1]
+
+
+class _Lines(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        # Imported here because importing rich takes longer than --help should.
+        from bidnerf.cli.output import say
+
+        say(record.getMessage())
+
+
+def _failed(name: str, message: str, status: int, more: str = "") -> int:
+    """Print the reason for a failure, or a warning, on one line, and return ``status``, even if stderr is closed."""
+    with contextlib.suppress(OSError):
+        print(f"{name}: {printable(' '.join(message.splitlines()))}", file=sys.stderr)
+        print(more, end=more and "\n", file=sys.stderr, flush=True)
+    return status
+
+
+def _open_streams() -> None:
+    """Make stdout and stderr accept every character.
+
+    Streams that the shell closed (``>&-``), which are None in Python, are replaced by streams that discard
+    everything. Characters that a stream cannot encode are written as backslash escapes.
+    """
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+        elif isinstance(stream, io.TextIOWrapper) and stream.errors in ("strict", "surrogateescape"):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _discard(stream: TextIO) -> None:
+    """Discard the remaining buffer of a stream, since flushing it when Python exits would fail again."""
+    with contextlib.suppress(OSError, ValueError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)

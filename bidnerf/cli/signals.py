@@ -1,0 +1,76 @@
+"""Signals that stop a command, in a way that lets its results be saved."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from types import FrameType
+
+# Windows has no SIGHUP.
+STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+
+
+class Interrupted(KeyboardInterrupt):
+    """Raised when a signal asks the command to stop."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+class Handler:
+    """A signal handler that raises ``Interrupted`` in the process that installed it, at once or when the work allows it."""
+
+    def __init__(self) -> None:
+        self.process = os.getpid()
+        self.writes = False  # every signal waits until results are written
+        self.works = False  # the first Ctrl-C waits until the work next checks whether to stop
+        self.waiting: int | None = None
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if os.getpid() != self.process:  # a forked worker ends as it would without this handler
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+        elif self.writes or (self.works and number == signal.SIGINT and self.waiting is None):
+            self.waiting = number
+        else:
+            raise Interrupted(number)
+
+
+@contextlib.contextmanager
+def interruptions() -> Iterator[None]:
+    """Make SIGINT, SIGTERM and SIGHUP raise ``Interrupted``. Signals that are ignored, as under nohup, stay ignored.
+
+    Has no effect outside the main thread, the only thread that may handle signals.
+    """
+    in_main = threading.current_thread() is threading.main_thread()
+    usual, handler = (signal.SIG_DFL, signal.default_int_handler), Handler()
+    handled = [number for number in STOP_SIGNALS if in_main and signal.getsignal(number) in usual]
+    before = {number: signal.signal(number, handler) for number in handled}
+    try:
+        yield
+    finally:
+        for number, handler_before in before.items():
+            signal.signal(number, handler_before)
+
+
+def installed_handler() -> Handler:
+    """Return the handler that ``interruptions`` installed, or one that receives no signals."""
+    handlers = map(signal.getsignal, STOP_SIGNALS)
+    return next((each for each in handlers if isinstance(each, Handler)), Handler())
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Defer interruptions to the end of the context, so that results are written completely."""
+    handler = installed_handler()
+    handler.writes = True
+    try:
+        yield
+    finally:
+        handler.writes = False
+    if handler.waiting is not None:
+        raise Interrupted(handler.waiting)
