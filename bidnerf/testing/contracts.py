@@ -195,7 +195,7 @@ class FeaturesContract(Named):
                 (
                     descriptors.dtype == torch.uint8,
                     f"descriptors are {descriptors.dtype}, expected bytes;"
-                    " bidnerf_core.mapping.landmarks.features.quantize converts numbers to bytes",
+                    " bidnerf_core.mapping.quantize converts numbers to bytes",
                 ),
             )
             inside = (pixels >= 0).all() and (pixels <= torch.tensor([width, height])).all()

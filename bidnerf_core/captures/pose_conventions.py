@@ -22,7 +22,7 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_
 from torch import Tensor
 
 from bidnerf_core.geometry import SE3
-from bidnerf_core.mapping import LEAST_BASELINE, ImageKeypoints, likely_pairs, squared_distances
+from bidnerf_core.mapping import LEAST_BASELINE, ImageKeypoints, likely_pairs, mutual_nearest, squared_distances
 
 MOST_PAIRS = 40
 """Largest number of image pairs examined from those suggested by poses and image order, and again from those
@@ -172,7 +172,7 @@ def _similar(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
     chosen = range(0, len(images), max(1, -(-len(images) // 60)))
     strongest = [images[i].keypoints.descriptors[:300] for i in chosen]
     pairs = itertools.combinations(range(len(chosen)), 2)
-    found = {(a, b): len(_mutual(strongest[a], strongest[b])[0]) for a, b in pairs}
+    found = {(a, b): len(_unambiguous(strongest[a], strongest[b])[0]) for a, b in pairs}
     kept = set[tuple[int, int]]()
     for number in range(len(chosen)):
         own = sorted((pair for pair in found if number in pair), key=lambda pair: -found[pair])
@@ -180,16 +180,15 @@ def _similar(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
     return [(chosen[a], chosen[b]) for a, b in sorted(kept, key=lambda pair: -found[pair])]
 
 
-def _mutual(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
+def _unambiguous(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
     """Return the indices of descriptors that are mutual nearest neighbours and pass the ratio test of Lowe 2004."""
     if min(len(a), len(b)) < 2:
         return torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long)
     distance = squared_distances(a, b)
-    nearest = distance.topk(2, largest=False)
-    partner = nearest.indices[:, 0]
-    mutual = distance.argmin(0)[partner] == torch.arange(len(partner))
-    rows = (mutual & (nearest.values[:, 0] < 0.8**2 * nearest.values[:, 1])).nonzero()[:, 0]
-    return rows, partner[rows]
+    nearest = distance.topk(2, largest=False).values
+    rows, partner = mutual_nearest(distance)
+    passed = nearest[rows, 0] < 0.8**2 * nearest[rows, 1]
+    return rows[passed], partner[passed]
 
 
 def match_pair(images: Sequence[ImageKeypoints], i: int, j: int) -> MatchedPair | None:
@@ -197,7 +196,7 @@ def match_pair(images: Sequence[ImageKeypoints], i: int, j: int) -> MatchedPair 
     a, b = images[i], images[j]
     if min(len(a.keypoints), len(b.keypoints)) < ENOUGH_MATCHES:
         return None
-    rows, partner = _mutual(a.keypoints.descriptors, b.keypoints.descriptors)
+    rows, partner = _unambiguous(a.keypoints.descriptors, b.keypoints.descriptors)
     if len(rows) < ENOUGH_MATCHES:
         return None
     first, second, focal = a.rays[rows], b.rays[partner], min(a.focal, b.focal)

@@ -144,9 +144,8 @@ def inpaint(frame: Frame) -> Float[Tensor, "h w 3"]:
     """Return the colours of a frame with hidden pixels filled in from the nearest visible ones."""
     if frame.hidden is None:
         return frame.rgb
-    _, (rows, columns) = distance_transform_edt(frame.hidden.cpu().numpy(), return_indices=True)
-    nearest = (torch.from_numpy(index).long().to(frame.rgb.device) for index in (rows, columns))
-    return frame.rgb[tuple(nearest)]
+    _, nearest = distance_transform_edt(frame.hidden.cpu().numpy(), return_indices=True)
+    return frame.colours_at(*torch.from_numpy(nearest).long())
 
 
 def among(choose: Callable[[Frame], Int[Tensor, "n 2"]]) -> PixelDrawer:

@@ -7,7 +7,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -21,23 +20,21 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import (
-    BLOCK,
-    NORM,
     CachedFeatures,
     Features,
+    HalfPrecisionSearch,
     ImageKeypoints,
+    InvertedFile,
     Keypoints,
     LandmarkMap,
     Sights,
     States,
-    byte_of_zero,
     detect,
     find_features,
     image_keypoints,
     imaged,
-    k_means,
-    nearest_centre,
     paired_squared_distances,
+    smallest,
     squared_distances,
 )
 
@@ -166,11 +163,11 @@ class LandmarkMatcher:
         self._descriptors = landmarks.descriptors
         self._cached_features: CachedFeatures | None = None  # see ``for_query``
         # None: the search is exhaustive, as it is for up to 4,000 landmarks.
-        self._index: _Products | _Cells | None = None
+        self._index: HalfPrecisionSearch | InvertedFile | None = None
         if self.device.type != "cpu":
-            self._index = _Products(landmarks.descriptors)
+            self._index = HalfPrecisionSearch(landmarks.descriptors)
         elif len(landmarks) > 4_000:
-            self._index = _Cells(landmarks.descriptors, seed)
+            self._index = InvertedFile(landmarks.descriptors, seed)
 
     @property
     def device(self) -> torch.device:
@@ -205,85 +202,12 @@ class LandmarkMatcher:
             )
         # Comparing up to four million pairs is faster than searching cells.
         few = len(descriptors) * len(self.landmarks) <= 4_000_000
-        if self._index is None or (few and isinstance(self._index, _Cells)):
-            distance, landmark = _smallest(squared_distances(descriptors, self._descriptors), count)
+        if self._index is None or (few and isinstance(self._index, InvertedFile)):
+            distance, landmark = smallest(squared_distances(descriptors, self._descriptors), count)
         else:
             distance, landmark = self._index.nearest(descriptors.to(self.device), count)
         missing = (0, count - distance.shape[1])
         return pad(distance, missing, value=torch.inf), pad(landmark, missing)
-
-
-class _Products:
-    """Descriptors in half precision, which represents bytes exactly; products of unit vectors are rounded by a thousandth."""
-
-    def __init__(self, descriptors: UInt8[Tensor, "n d"]) -> None:
-        self._zero, self._descriptors = byte_of_zero(descriptors.cpu()), descriptors
-        self._half = self._unit(descriptors)
-        self._squares = torch.cat([part.float().square().sum(-1) for part in self._half.split(BLOCK)])
-
-    def _unit(self, descriptors: UInt8[Tensor, "q d"]) -> Float[Tensor, "q d"]:
-        return (descriptors.half() - self._zero) / NORM
-
-    def nearest(self, descriptors: UInt8[Tensor, "q d"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
-        """Return the exact squared distances and the indices of the nearest landmarks, on the CPU."""
-        found, n = [], len(self._half)
-        # At most 2^26 products are computed at a time, which bounds the memory.
-        for part in descriptors.split(max(1, 2**26 // max(1, n))):
-            alike = 2 * (self._unit(part) @ self._half.T).float() - self._squares
-            # Products in half precision may be out of order: four more landmarks are looked up, and all are compared exactly.
-            index = alike.topk(min(count + 4, n)).indices
-            exact = (part[:, None].float() - self._descriptors[index].float()).square().sum(-1)
-            distance, best = exact.topk(min(count, n), largest=False)
-            found.append(torch.stack([distance.long(), index.gather(1, best)]))
-        distances, indices = torch.cat(found, 1).cpu()
-        return distances.float(), indices
-
-
-class _Cells:
-    """An inverted file: descriptors sorted by cell."""
-
-    def __init__(self, descriptors: UInt8[Tensor, "n d"], seed: int) -> None:
-        # In large maps, cells have 500 landmarks on average, since comparing more would take most of the time.
-        count = round(max(math.sqrt(len(descriptors)), len(descriptors) / 500))
-        generator = torch.Generator().manual_seed(seed)
-        self._centres = k_means(descriptors, count, generator)
-        cell = nearest_centre(descriptors, self._centres)
-        order = cell.argsort(stable=True)
-        self._order = order
-        self._descriptors = descriptors[order]
-        self._squares = torch.cat([part.float().square().sum(-1) for part in self._descriptors.split(BLOCK // 256)])
-        self._last = torch.bincount(cell, minlength=count).cumsum(0).tolist()
-
-    def nearest(self, descriptors: UInt8[Tensor, "q d"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
-        queries = len(descriptors)
-        # Twelve cells are searched for each keypoint.
-        probed = _smallest(squared_distances(descriptors, self._centres), 12)[1]
-        cell, order = probed.flatten().sort(stable=True)
-        query = order // probed.shape[1]
-        distances = torch.full((probed.numel(), count), torch.inf, device=probed.device)
-        index = torch.zeros(distances.shape, dtype=torch.long, device=probed.device)
-        values = descriptors.float()
-        bounds = torch.searchsorted(cell, torch.arange(len(self._centres) + 1, device=cell.device)).tolist()
-        for number, (begin, end) in enumerate(pairwise(bounds)):
-            first, last = self._last[number - 1] if number else 0, self._last[number]
-            if begin == end or first == last:
-                continue
-            others = self._descriptors[first:last].float()
-            # The squares of the keypoint's own descriptor do not change the order, and are added at the end.
-            partial = torch.addmm(self._squares[first:last], values[query[begin:end]], others.T, alpha=-2)
-            found = _smallest(partial, count)
-            width = found[0].shape[1]
-            distances[order[begin:end], :width] = found[0]
-            index[order[begin:end], :width] = found[1] + first
-        best = distances.view(queries, -1).topk(count, dim=1, largest=False)
-        squares = values.square().sum(-1, keepdim=True)
-        return (best.values + squares).clamp_(min=0), self._order[index.view(queries, -1).gather(1, best.indices)]
-
-
-def _smallest(distances: Float[Tensor, "q n"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
-    """Return the ``count`` smallest values of each row (all, if there are fewer), ascending, and their columns."""
-    found = distances.topk(min(count, distances.shape[1]), dim=1, largest=False)
-    return found.values, found.indices
 
 
 @dataclass(frozen=True, eq=False)

@@ -348,7 +348,8 @@ class Map:
             # Poses found in the map are compared with poses from the source of the training poses. If training
             # kept most of these, few poses have an update and their errors count as negligible.
             by_source = update_scatter(refinement_updates(info.cameras))
-            landmarks = replace(landmarks, pose_covariance=landmarks.pose_covariance + by_source)
+            if by_source is not None:
+                landmarks = replace(landmarks, pose_covariance=landmarks.pose_covariance + by_source)
             if views:
                 landmarks = with_tracks_in(info, landmarks, [view.frame.name for view in views])
             else:

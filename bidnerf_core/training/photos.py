@@ -30,7 +30,15 @@ def photo_measures(views: Sequence[View]) -> Float[Tensor, "3 v"]:
     The rows are the sharpness (see ``sharpness``) and the fractions of overexposed and underexposed pixels, whose brightest
     channel is at the upper or lower end of its range.
     """
-    return torch.tensor([_measured(view.frame) for view in views], dtype=torch.float64).reshape(-1, 3).mT
+    rows = []
+    for frame in (view.frame for view in views):
+        image, inside = frame.rgb_bytes.cpu(), torch.ones(frame.rgb_bytes.shape[:2], dtype=torch.bool)
+        inside &= True if frame.alpha is None else frame.alpha.cpu() > 0.5
+        inside &= True if frame.hidden is None else ~frame.hidden.cpu()
+        brightest = (image[inside] if inside.any() else image).amax(-1)
+        clipped = [float(which.double().mean()) for which in (brightest >= 254, brightest <= 4)]
+        rows.append([sharpness(_grey(frame), frame.hidden), *clipped])
+    return torch.tensor(rows, dtype=torch.float64).reshape(-1, 3).mT
 
 
 def relative_detail(views: Sequence[View]) -> Float[Tensor, "v"]:
@@ -38,7 +46,7 @@ def relative_detail(views: Sequence[View]) -> Float[Tensor, "v"]:
 
     The value is 1 for all photos except blurred outliers.
     """
-    found = torch.tensor([sharpness(_clean(v.frame.rgb).mean(-1), v.frame.hidden) for v in views])
+    found = torch.tensor([sharpness(_grey(v.frame), v.frame.hidden) for v in views])
     lacking = -excess(found, nearby_photos(views))
     return torch.where(are_blurred(lacking), torch.exp2(-lacking), 1.0)
 
@@ -51,15 +59,6 @@ def are_blurred(lacking: Float[Tensor, "v"]) -> Bool[Tensor, "v"]:
 def are_outliers(values: Float[Tensor, "v"], least: float) -> Bool[Tensor, "v"]:
     """Return which values exceed both ``least`` and four times the robust standard deviation (about zero) of all values."""
     return values > max(least, 4 * mad_deviation(values))
-
-
-def _measured(frame: Frame) -> tuple[float, float, float]:
-    image = _clean(frame.rgb)
-    inside = np.ones(image.shape[:2], bool) if frame.alpha is None else frame.alpha.cpu().numpy() > 0.5
-    inside &= True if frame.hidden is None else ~frame.hidden.cpu().numpy()
-    brightest = (image[inside] if inside.any() else image.reshape(-1, 3)).max(-1)
-    clipped = float((brightest >= 254 / 255).mean()), float((brightest <= 4 / 255).mean())
-    return sharpness(image.mean(-1), frame.hidden), *clipped
 
 
 def sharpness(grey: np.ndarray, hidden: Bool[Tensor, "h w"] | None = None) -> float:
@@ -95,9 +94,9 @@ def _energy(image: np.ndarray, rows: int, columns: int, step: int, counted: np.n
     return float(np.square(inner).mean()) if inner.size else 0.0
 
 
-def _clean(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
-    image: np.ndarray = rgb.detach().cpu().float().nan_to_num(0.0).clamp(0, 1).numpy()
-    return image
+def _grey(frame: Frame) -> np.ndarray:
+    """Return the mean of the colour channels, in [0, 1]."""
+    return np.asarray(frame.rgb.detach().cpu().numpy().mean(-1))
 
 
 Nearby: TypeAlias = Int[Tensor, "p 2"]
@@ -135,7 +134,7 @@ def exposures(views: Sequence[View], seen: TrackedKeypoints) -> Float[Tensor, "v
     light = torch.zeros(len(image), dtype=torch.float64)  # log2 of the linear light around each keypoint
     for index in image.unique().tolist():
         own = image == index
-        smooth = cv2.blur(_clean(views[index].frame.rgb).mean(-1), (5, 5))
+        smooth = cv2.blur(_grey(views[index].frame), (5, 5))
         u, v = seen.pixels[own].floor().long().unbind(-1)
         rows, columns = v.clamp(0, smooth.shape[0] - 1).numpy(), u.clamp(0, smooth.shape[1] - 1).numpy()
         # The exponent is approximately that of sRGB. Quantization makes the darkest pixels incomparable, so they count as equal.

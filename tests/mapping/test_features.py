@@ -11,13 +11,15 @@ import pytest
 import torch
 
 import tiny
-from bidnerf import InputError
+from bidnerf import SE3, Frame, InputError, Intrinsics, View
 from bidnerf_core.mapping import (
+    SIFT,
     CachedFeatures,
     Keypoints,
     Sift,
     byte_of_zero,
     detect,
+    image_keypoints,
     limit_features,
     nearest_centre,
     paired_squared_distances,
@@ -77,7 +79,7 @@ def test_nearest_centres_are_found_in_blocks_that_bound_the_memory(
         parts.append(len(part))
         return squared_distances(part, others)
 
-    module = "bidnerf_core.mapping.landmarks.vocabulary"
+    module = "bidnerf_core.mapping.landmarks.descriptors"
     monkeypatch.setattr(f"{module}.BLOCK", block)
     monkeypatch.setattr(f"{module}.squared_distances", counted)
     found = nearest_centre(descriptors, centres)
@@ -166,3 +168,18 @@ def test_equal_images_have_the_same_keypoints_and_others_their_own() -> None:
     assert len(detector.images) == 2
     assert CachedFeatures(detector, [(image, found)])(image) is found
     assert len(detector.images) == 2
+
+
+def test_bytes_reach_detectors_that_take_them_without_a_detour_through_floats(monkeypatch: pytest.MonkeyPatch) -> None:
+    image = (255 * textured(0)).round().to(torch.uint8)
+    view = View(Frame("bytes", image, Intrinsics.from_focal(100.0, 160, 120)), SE3.identity())
+    floats = CountedDetector()
+    image_keypoints(view, floats)
+    assert floats.images[0].dtype == torch.float32
+    expected = SIFT(view.frame.rgb)
+    monkeypatch.setattr(type(vars(Frame)["rgb"]), "__get__", lambda *_: pytest.fail("converted to floats"))
+    for detector in (SIFT, limit_features(SIFT, 20), CachedFeatures(SIFT)):
+        keypoints = image_keypoints(view, detector).keypoints
+        assert len(keypoints) > 5
+        for name in ("pixels", "sizes", "descriptors"):
+            assert torch.equal(getattr(keypoints, name), getattr(expected, name)[: len(keypoints)])

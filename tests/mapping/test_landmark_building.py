@@ -222,10 +222,20 @@ def test_scatter_of_updates_is_that_of_the_images_that_moved_if_most_did() -> No
     noise = torch.randn((400, 6), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     updates = list(noise * deviations)
     found = update_scatter(updates)
+    assert found is not None
     torch.testing.assert_close(found.diagonal().sqrt(), deviations, rtol=0.15, atol=0)
-    assert torch.equal(update_scatter([*updates, *[None] * 400]), found)
+    half = update_scatter([*updates, *[None] * 400])
+    assert half is not None
+    assert torch.equal(half, found)
     for few in ([*updates, *[None] * 401], updates[:7], []):
-        assert torch.equal(update_scatter(few), torch.zeros((6, 6), dtype=torch.float64))
+        assert update_scatter(few) is None
+
+
+def test_few_images_do_not_make_their_poses_exact() -> None:
+    points = Points(noise=0.4)
+    few, many = (build_landmarks(ring(points, count), points).pose_covariance.diagonal().sqrt() for count in (6, 12))
+    assert bool((few > 0).all())
+    assert 0.1 < float((few / many).min()) <= float((few / many).max()) < 10
 
 
 @pytest.mark.parametrize("zero", [0, 128])

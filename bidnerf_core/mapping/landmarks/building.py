@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from math import ceil, radians
 from typing import Annotated, TypeVar
 
@@ -12,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from bidnerf_core.camera import MotionPrior
 from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.frames import SeenLandmarks, View
 from bidnerf_core.geometry import SE3, chi_squared_quantile, inlier_weight
@@ -30,6 +32,7 @@ from bidnerf_core.mapping.landmarks.features import (
     Features,
     ImageKeypoints,
     Sift,
+    detect,
     find_features,
     image_keypoints,
 )
@@ -58,12 +61,13 @@ _Item = TypeVar("_Item")
 Result = TypeVar("Result")
 
 
-def update_scatter(updates: Sequence[Float[Tensor, "6"] | None]) -> Float[Tensor, "6 6"]:
-    """Return a robust covariance of pose updates; zero if there are too few, or if fewer than half of the images have an update."""
+def update_scatter(updates: Sequence[Float[Tensor, "6"] | None]) -> Float[Tensor, "6 6"] | None:
+    """Return a robust covariance of pose updates.
+
+    It is None, which means unknown, if there are too few updates, or if fewer than half of the images have one.
+    """
     known = [update for update in updates if update is not None]
-    if len(known) < max(ENOUGH_IMAGES, len(updates) / 2):
-        return torch.zeros((6, 6), dtype=torch.float64)
-    return robust_covariance(torch.stack(known))
+    return robust_covariance(torch.stack(known)) if len(known) >= max(ENOUGH_IMAGES, len(updates) / 2) else None
 
 
 def pose_updates(
@@ -152,7 +156,8 @@ class TrackedViews:
 
     def detector_of(self, view: View, number: int) -> Features:
         """Return a detector for queries with ``view``, which is image ``number``; the detector reuses the image's keypoints."""
-        return CachedFeatures(self.detector, [(view.frame.rgb, self.observations.images[number].keypoints)])
+        known = (view.frame.rgb_bytes, self.observations.images[number].keypoints)
+        return CachedFeatures(partial(detect, self.detector), [known])
 
     def landmarks(self, config: LandmarkConfig, report: Callable[[str], None] = lambda sentence: None) -> LandmarkMap:
         """Return the landmarks built from the tracks. Raises ``InputError`` if there are none."""
@@ -279,18 +284,22 @@ def detect_keypoints(views: Sequence[View], features: Features) -> list[ImageKey
 def _located(observations: TrackedKeypoints, config: LandmarkConfig, known: Float[Tensor, "p 3"] | None) -> LandmarkMap:
     """Return the triangulated or ``known`` landmarks, followed by landmarks from the measured depth of the remaining keypoints."""
     kept, positions, covariance = _triangulated(observations, radians(config.parallax), known)
-    sightings = kept.sightings
-    pixel_noise = noise(sightings, positions)
-    triangulated = replace(
-        fuse_landmarks(kept, positions, pixel_noise**2 * covariance, pixel_noise),
-        # With 200 images, the deviations are known to 7 %.
-        pose_covariance=update_scatter(list(pose_updates(kept, positions, 200).values())),
-    )
+    pixel_noise = noise(kept.sightings, positions)
+    triangulated = fuse_landmarks(kept, positions, pixel_noise**2 * covariance, pixel_noise)
+    # With 200 images, the deviations are known to 7 %.
+    scatter = update_scatter(list(pose_updates(kept, positions, 200).values()))
     relative = keypoint_depth_noise(kept, positions)
     left = ~torch.isin(observations.number, kept.number)
     rest = observations[left & (_tracked(observations) | config.singles)]
-    rest, positions, covariance = back_project(rest, relative, pixel_noise)
-    return concatenate([triangulated, fuse_landmarks(rest, positions, covariance, pixel_noise)])
+    rest, places, covariance = back_project(rest, relative, pixel_noise)
+    landmarks = concatenate([triangulated, fuse_landmarks(rest, places, covariance, pixel_noise)])
+    if scatter is None and len(
+        landmarks
+    ):  # unknown: a prior assumes that each pose is as accurate as a single keypoint
+        depth = torch.cat([kept.sightings.in_camera(positions)[:, 2], rest.sightings.in_camera(places)[:, 2]])
+        angle = pixel_noise / float(torch.cat([kept.sightings.focal, rest.sightings.focal]).median())
+        scatter = MotionPrior(angle * float(depth.median()), angle).deviations.square().diag()
+    return landmarks if scatter is None else replace(landmarks, pose_covariance=scatter)
 
 
 def _tracked(observations: TrackedKeypoints) -> Bool[Tensor, "m"]:

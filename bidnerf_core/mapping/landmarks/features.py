@@ -5,30 +5,26 @@ Any detector that turns an image into ``Keypoints``, a learned one included, can
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from threading import Lock
-from typing import Annotated, Protocol, runtime_checkable
+from typing import Annotated, ClassVar, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Tensor
 
 from bidnerf_core.camera import AT_REST, Intrinsics, exposure_times, reduced_size
 from bidnerf_core.errors import enumeration
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.frames import Frame, View, as_floats
 from bidnerf_core.geometry import SE3
+from bidnerf_core.mapping.landmarks.descriptors import quantize
 from bidnerf_core.registry import USUAL_FEATURES as USUAL_FEATURES
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 from bidnerf_core.settings import Range, Settings
 
-NORM = 512.0
-"""Norm of a quantised descriptor, as usual for SIFT: it makes good use of the range of a byte."""
-MANY = 2**16
-"""Number of descriptors converted to floats at a time; converting all those of a large map at once would take gigabytes."""
 FIRST_CENTRE = 0.5
 """Offset from OpenCV's pixel coordinates to ours: the centre of the first pixel is (0, 0) there, (0.5, 0.5) here."""
 
@@ -67,6 +63,13 @@ class LimitedFeatures(Features, Protocol):
         ...
 
 
+@runtime_checkable
+class ByteFeatures(Features, Protocol):
+    """Optional extension of ``Features``: a detector that also takes bytes, which spares large photos a conversion to floats."""
+
+    takes_bytes: bool
+
+
 @dataclass(frozen=True)
 class Sift(Settings):
     """OpenCV's SIFT (Lowe 2004), with the root normalisation of Arandjelovic and Zisserman 2012."""
@@ -78,11 +81,12 @@ class Sift(Settings):
     # maximum pixels along the longer side; larger images are downscaled first: a phone's twelve megapixels contain no more
     # keypoints of the sizes that maps use, and take half a minute
     largest: Annotated[int, Range(16, 10**5)] = 800
+    takes_bytes: ClassVar[bool] = True
 
     def at_most(self, count: int) -> Sift:
         return replace(self, count=count)
 
-    def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
+    def __call__(self, rgb: Shaped[Tensor, "h w 3"]) -> Keypoints:
         # Precise upscaling maps index x to 2 x; without it, all keypoints of the first octave are a quarter of a pixel
         # off. A detector object is not thread-safe, and is cheap to create.
         sift = cv2.SIFT.create(nfeatures=self.count, contrastThreshold=self.contrast, enable_precise_upscale=True)
@@ -121,9 +125,13 @@ def find_features(name: str, wanted_by: str = "") -> Features:
     return FEATURES.load(name, wanted_by)
 
 
-def detect(features: Features, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
-    """Run the detector on an image. Raises ``PluginError`` unless it returns ``Keypoints`` that lie inside the image."""
-    found, who = features(rgb), f"detector {getattr(features, '__name__', type(features).__name__)}"
+def detect(features: Features, rgb: Shaped[Tensor, "h w 3"]) -> Keypoints:
+    """Run the detector on an image (bytes, or floats in [0, 1]).
+
+    Raises ``PluginError`` unless the detector returns ``Keypoints`` that lie inside the image.
+    """
+    found = features(rgb if isinstance(features, ByteFeatures) else as_floats(rgb))
+    who = f"detector {getattr(features, '__name__', type(features).__name__)}"
     if not isinstance(found, Keypoints):
         raise PluginError(
             f"returned a {type(found).__name__}", where=who, expected="Keypoints(pixels, sizes, descriptors)"
@@ -149,8 +157,9 @@ def detect(features: Features, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
 class _Strongest:
     features: Features
     count: int
+    takes_bytes: ClassVar[bool] = True
 
-    def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
+    def __call__(self, rgb: Shaped[Tensor, "h w 3"]) -> Keypoints:
         found = detect(self.features, rgb)
         return found[torch.arange(min(self.count, len(found)))]
 
@@ -163,74 +172,32 @@ def limit_features(features: Features, count: int) -> Features:
 class CachedFeatures:
     """A detector that caches the keypoints of each image during one query.
 
-    ``known`` holds images with keypoints that are already known. Threads may share the detector.
+    ``features`` is called with images as they are given, in bytes or floats, and ``known`` holds images with keypoints that are
+    already known. Threads may share the detector.
     """
 
-    def __init__(self, features: Features, known: Iterable[tuple[Tensor, Keypoints]] = ()) -> None:
-        self._features, self._found, self._lock = features, list(known), Lock()
+    takes_bytes = True
 
-    def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
+    def __init__(self, features: Callable[[Tensor], Keypoints], known: Iterable[tuple[Tensor, Keypoints]] = ()) -> None:
+        self._features, self._cache, self._lock = features, list(known), Lock()
+
+    def __call__(self, rgb: Shaped[Tensor, "h w 3"]) -> Keypoints:
         with self._lock:
-            for seen, keypoints in self._found:
-                if seen is rgb or (seen.shape == rgb.shape and torch.equal(seen.to(rgb), rgb)):
+            for image, keypoints in self._cache:
+                if image is rgb or (image.shape == rgb.shape and torch.equal(image.to(rgb), rgb)):
                     return keypoints
-            self._found.append((rgb, self._features(rgb)))
-            return self._found[-1][1]
+            self._cache.append((rgb, self._features(rgb)))
+            return self._cache[-1][1]
 
 
-def quantize(descriptors: Float[Tensor, "n d"]) -> UInt8[Tensor, "n d"]:
-    """Return unit descriptors as bytes; if any channel is negative, all channels are shifted, which preserves distances."""
-    negative = len(descriptors) > 0 and float(descriptors.min()) < 0
-    scaled = descriptors * (NORM / 2 if negative else NORM) + (128 if negative else 0)
-    return scaled.round().clamp(0, 255).to(torch.uint8)
-
-
-def unrelated_distance(descriptors: UInt8[Tensor, "n d"]) -> float:
-    """Return the root mean square distance between unrelated descriptors, which is the scale of a detector's distances."""
-    total, squares = torch.zeros(descriptors.shape[1], dtype=torch.float64), 0.0
-    for part in descriptors.cpu().split(MANY):
-        total += part.sum(0)
-        squares += float(part.double().square().sum())
-    count = max(1, len(descriptors))
-    return math.sqrt(max(0.0, 2 * (squares / count - float((total / count).square().sum()))))
-
-
-def byte_of_zero(descriptors: UInt8[Tensor, "n d"]) -> int:
-    """Return the byte that represents 0 in descriptors of equal norm: 0 for SIFT, 128 for descriptors with negative channels.
-
-    It is the centre of the sphere on which the descriptors lie: the byte ``z`` that minimizes the variance of the squared norms of
-    ``descriptors - z``.
-    """
-    parts = [part.double() for part in descriptors.split(MANY)]
-    sums = torch.cat([part.sum(1) for part in parts]) if parts else torch.zeros(0, dtype=torch.float64)
-    if not len(sums) or float(sums.var(unbiased=False)) == 0:
-        return 0
-    squares = torch.cat([part.square().sum(1) for part in parts])
-    slope = ((squares - squares.mean()) * (sums - sums.mean())).mean() / sums.var(unbiased=False)
-    return round(min(255.0, max(0.0, float(slope) / 2)))
-
-
-def squared_distances(
-    a: UInt8[Tensor, "n d"] | Float[Tensor, "n d"], b: UInt8[Tensor, "m d"] | Float[Tensor, "m d"]
-) -> Float[Tensor, "n m"]:
-    """Return squared Euclidean distances between all pairs; exact for bytes, whose sums of squares fit a float32."""
-    x, y = a.float(), b.float()
-    return torch.addmm((x * x).sum(-1)[:, None] + (y * y).sum(-1), x, y.T, alpha=-2).clamp_(min=0)
-
-
-def paired_squared_distances(
-    a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"], rows: Int[Tensor, "p"], columns: Int[Tensor, "p"]
-) -> Float[Tensor, "p"]:
-    """Return the squared Euclidean distance of each pair ``a[rows]``, ``b[columns]``."""
-    return (a[rows].float() - b[columns].float()).square_().sum(-1)
-
-
-def grey_image(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
-    """Return the brightness of an image as bytes (h, w)."""
-    # Strips of the image are copied one by one, since copying a whole phone photo takes a gigabyte.
-    strips = rgb.detach().cpu().split(max(1, 2**22 // rgb.shape[1]))
-    clean = (part.float().nan_to_num(0.0).clamp_(0, 1).mul_(255).round_().to(torch.uint8) for part in strips)
-    return np.concatenate([cv2.cvtColor(part.contiguous().numpy(), cv2.COLOR_RGB2GRAY) for part in clean])
+def grey_image(rgb: Shaped[Tensor, "h w 3"]) -> np.ndarray:
+    """Return the brightness of an image (bytes, or floats in [0, 1]) as bytes (h, w)."""
+    rgb = rgb.detach().cpu()
+    if rgb.dtype != torch.uint8:
+        # Strips of the image are converted one by one, since converting a whole phone photo at once takes a gigabyte.
+        strips = rgb.split(max(1, 2**22 // rgb.shape[1]))
+        rgb = torch.cat([x.float().nan_to_num(0.0).clamp_(0, 1).mul_(255).round_().to(torch.uint8) for x in strips])
+    return cv2.cvtColor(rgb.contiguous().numpy(), cv2.COLOR_RGB2GRAY)
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +227,7 @@ def image_keypoints(view: View, features: Features) -> ImageKeypoints:
     """Detect the keypoints of ``view`` whose neighbourhoods contain no hidden pixel."""
     frame = view.frame
     hidden = None if frame.hidden is None else frame.hidden.cpu()
-    keypoints = detect(features, frame.rgb)
+    keypoints = detect(features, frame.rgb_bytes)
     if hidden is not None and len(keypoints):
         # Keypoints stay if their neighbourhoods contain no hidden pixel.
         visible = np.ascontiguousarray((~hidden.numpy()).astype(np.uint8))

@@ -17,7 +17,8 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.devices import moved, working_device
 from bidnerf_core.geometry import KEYPOINTS_PER_INDEPENDENT, SE3
-from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES, unrelated_distance
+from bidnerf_core.mapping.landmarks.descriptors import unrelated_distance
+from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
 
 MOST_IN_CELL = 128
 """Maximum number of landmarks in a cell."""

@@ -16,7 +16,8 @@ from bidnerf_core.depth import UNKNOWN
 from bidnerf_core.frames import SeenLandmarks
 from bidnerf_core.geometry import SE3, mad_deviation
 from bidnerf_core.mapping.geometry.triangulation import Sightings, sum_by
-from bidnerf_core.mapping.landmarks.features import MANY, ImageKeypoints, byte_of_zero, squared_distances
+from bidnerf_core.mapping.landmarks.descriptors import MANY, byte_of_zero, mutual_nearest, squared_distances
+from bidnerf_core.mapping.landmarks.features import ImageKeypoints
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, Tracks
 
 EPIPOLAR_BAND = 2.0
@@ -74,10 +75,8 @@ def epipolar_matches(a: ImageKeypoints, b: ImageKeypoints) -> Matches:
         return Matches(torch.zeros((0, 2), dtype=torch.long), torch.zeros(0))
     distance = squared_distances(a.keypoints.descriptors, b.keypoints.descriptors)
     banded = distance.masked_fill(~_on_line(a, b), torch.inf)
-    best, partner = banded.min(dim=1)
-    mutual = banded.argmin(dim=0)[partner] == torch.arange(len(partner))
-    rows = (mutual & best.isfinite()).nonzero()[:, 0]
-    best, partner = best[rows], partner[rows]
+    rows, partner = mutual_nearest(banded)
+    best = banded[rows, partner]
     # Duplicates do not make a match ambiguous: SIFT returns one keypoint for each dominant orientation, and keypoints within the
     # radius of a keypoint's neighbourhood also have similar descriptors.
     reach = (b.keypoints.sizes[partner, None] / 2).clamp(min=4.0)  # pixels
@@ -105,10 +104,8 @@ def matches_of_points(
         pixels = image.intrinsics.project(local).nan_to_num(torch.inf)
         # Exact differences: products would round by about a pixel, and give NaN for points behind the camera.
         distance = torch.cdist(pixels.float(), image.keypoints.pixels, compute_mode="donot_use_mm_for_euclid_dist")
-        best, partner = distance.min(dim=1)
-        mutual = distance.argmin(dim=0)[partner] == torch.arange(len(points))
-        kept = (mutual & (best <= EPIPOLAR_BAND)).nonzero()[:, 0]
-        rows.append(torch.stack([points[kept], torch.full_like(kept, number), partner[kept]], dim=-1))
+        shown, partner = mutual_nearest(distance.masked_fill(~(distance <= EPIPOLAR_BAND), torch.inf))
+        rows.append(torch.stack([points[shown], torch.full_like(shown, number), partner], dim=-1))
     if not rows:
         return []
     found = torch.cat(rows)

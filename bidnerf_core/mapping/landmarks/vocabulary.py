@@ -18,33 +18,8 @@ from torch.nn.functional import normalize
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.geometry import SE3
-from bidnerf_core.mapping.landmarks.features import squared_distances
+from bidnerf_core.mapping.landmarks.descriptors import k_means, nearest_centre
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
-
-BLOCK = 2**20
-"""Number of distances to cell centres computed at a time, which bounds the memory."""
-
-
-def k_means(descriptors: UInt8[Tensor, "n d"], count: int, generator: torch.Generator) -> Float[Tensor, "c d"]:
-    """Return the centres of k-means clusters (Lloyd 1982) of a sample of twenty descriptors per cluster.
-
-    A cluster that becomes empty keeps its centre.
-    """
-    sample = torch.randperm(len(descriptors), generator=generator)[: 20 * count]
-    values = descriptors[sample.to(descriptors.device)].float()
-    centres = values[:count].clone()
-    for _ in range(6):  # the cells need to be balanced, not optimal
-        cell = nearest_centre(values, centres)
-        sizes = torch.bincount(cell, minlength=count)
-        total = torch.zeros_like(centres).index_add_(0, cell, values)
-        centres = torch.where(sizes[:, None] > 0, total / sizes.clamp(min=1)[:, None], centres)
-    return centres
-
-
-def nearest_centre(descriptors: Tensor, centres: Float[Tensor, "c d"]) -> Int[Tensor, "n"]:
-    """Return the index of the centre nearest to each descriptor."""
-    rows = max(1, BLOCK // len(centres))
-    return torch.cat([squared_distances(part, centres).argmin(1) for part in descriptors.split(rows)])
 
 
 @dataclass(frozen=True, eq=False)
