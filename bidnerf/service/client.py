@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import io
 import json
 import struct
@@ -10,6 +11,7 @@ import urllib.error
 import urllib.request
 import uuid
 import zlib
+from email.utils import parsedate_to_datetime
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -28,7 +30,8 @@ class ServiceError(Exception):
 class ServiceClient:
     """A client that requests poses from a ``bidnerf serve`` service at ``url``.
 
-    Requests to a busy service are retried for up to ``timeout`` seconds. All methods raise ``ServiceError`` on failure.
+    Requests to a busy service are retried for up to ``timeout`` seconds. All methods raise ``ServiceError`` if
+    the service returns no result.
     """
 
     def __init__(self, url: str = "http://127.0.0.1:8000", token: str | None = None, timeout: float = 120.0) -> None:
@@ -46,12 +49,12 @@ class ServiceClient:
     ) -> dict[str, Any]:
         """Localize a photo and return the same JSON as ``bidnerf localize``.
 
-            ``photo`` is a file, its bytes, or a uint8 array (h, w) or (h, w, 3). ``map`` names the map to search, by
-            default whichever map the photo shows. ``depth`` is a file, its bytes, or an array (h, w) of planar z: floats
-        in metres or integers in millimetres, unless ``depth_unit`` is given.
-            ``camera`` is a camera file or its content, and ``start`` is T_world_camera as 4x4 rows. ``known`` takes
-            further values by keyword: ``name`` (of the frame in the answer), ``focal`` (pixels of the stored image),
-            ``hfov`` (degrees), ``depth_unit`` (metres per step of the depth image) and ``seed``.
+        ``photo`` is a file, its bytes, or a uint8 array (h, w) or (h, w, 3). ``map`` names the map to search, by
+        default whichever map the photo shows. ``depth`` is a file, its bytes, or an array (h, w) of planar z: floats
+        in metres or integers in millimetres, unless ``depth_unit`` is given. ``camera`` is a camera file or its
+        content, and ``start`` is T_world_camera as 4x4 rows. ``known`` takes further values by keyword: ``name`` (of
+        the frame in the answer), ``focal`` (pixels of the stored image), ``hfov`` (degrees), ``depth_unit`` (metres
+        per step of the depth image) and ``seed``.
         """
         edge = uuid.uuid4().hex
         rows = getattr(start, "tolist", lambda: start)()
@@ -81,23 +84,50 @@ class ServiceClient:
 
     def ask(self, path: str, body: bytes | None = None, kind: str = "application/json") -> dict[str, Any]:
         """Get the JSON object at a path such as /maps; with a ``body``, post the body there and return the JSON response."""
-        headers = {"Content-Type": kind} | ({"Authorization": f"Bearer {self.token}"} if self.token else {})
-        request = urllib.request.Request(self.url + path, body, headers)
         until = time.monotonic() + self.timeout
         while True:
+            status, retry_after, content = self._fetch(path, body, kind)
             try:
-                with urllib.request.urlopen(request, timeout=self.timeout) as answer:
-                    found: dict[str, Any] = json.load(answer)
-                    return found
+                answer = json.loads(content)
+            except ValueError:
+                answer = None
+            if status < 300 and isinstance(answer, dict):
+                return answer
+            wait = _seconds(retry_after)
+            if status not in (429, 503) or time.monotonic() + wait > until:
+                break
+            time.sleep(wait)
+        text = content.decode(errors="replace").strip()
+        if isinstance(answer, dict):
+            text = str(answer.get("detail") or answer.get("title") or text)
+        if status < 300:
+            text = f"the answer is {text[:60]!r}, expected a JSON object; is this the address of a service?"
+        raise ServiceError(status, text or f"the answer has the status {status}")
+
+    def _fetch(self, path: str, body: bytes | None, kind: str) -> tuple[int, str, bytes]:
+        """Send a request once, and return the status, the Retry-After header and the content of the response."""
+        headers = {"Content-Type": kind} | ({"Authorization": f"Bearer {self.token}"} if self.token else {})
+        try:
+            request = urllib.request.Request(self.url + path, body, headers)
+            try:
+                response = urllib.request.urlopen(request, timeout=self.timeout)
             except urllib.error.HTTPError as error:
-                wait = float(error.headers.get("Retry-After") or 0)
-                if error.code not in (429, 503) or time.monotonic() + wait > until:
-                    text = error.read().decode(errors="replace")
-                    is_problem = "problem+json" in error.headers.get("Content-Type", "")
-                    raise ServiceError(error.code, json.loads(text)["detail"] if is_problem else text) from error
-                time.sleep(wait)
-            except OSError as error:
-                raise ServiceError(0, f"{self.url}: {getattr(error, 'reason', error)}") from error
+                response = error  # a response of another status
+            with response:
+                return response.status, response.headers.get("Retry-After", ""), response.read()
+        except (OSError, ValueError, http.client.HTTPException) as error:
+            raise ServiceError(0, f"{self.url}: {getattr(error, 'reason', None) or error}") from error
+
+
+def _seconds(retry_after: str) -> float:
+    """Return the seconds to wait before another attempt, from a Retry-After header with a number or a date; 1 or more."""
+    try:
+        wait = (
+            parsedate_to_datetime(retry_after).timestamp() - time.time() if ":" in retry_after else float(retry_after)
+        )
+    except (ValueError, OverflowError, OSError):  # there is no such header, or it is malformed
+        wait = 0.0
+    return max(1.0, wait)
 
 
 def _part(edge: str, name: str, content: bytes, file: str | None = None) -> bytes:
