@@ -84,7 +84,7 @@ def run_view(
     view can be changed there. With --save, QUERY is localized immediately, and the saved page shows the same without a server.
     """
     from bidnerf.evaluation import read_results
-    from bidnerf.viewer import LiveView, page_of, serve_view, shown_row, shown_trajectory
+    from bidnerf.viewer import LiveView, MapView, map_json, row_json, serve_view, trajectory_json
     from bidnerf_core.camera import CameraSource
     from bidnerf_core.datasets import DatasetFrames, in_other_split
     from bidnerf_core.localization import Localizer
@@ -95,8 +95,8 @@ def run_view(
     if page.save is not None:
         check_output(page.save, (*query, *queries.depth, page.results, page.trajectory))
     info = load_info(map)
-    path = None if page.trajectory is None else shown_trajectory(page.trajectory, info.unit, info.origin)
-    rows = () if page.results is None else tuple(shown_row(row) for row in read_results([page.results]))
+    path = None if page.trajectory is None else trajectory_json(page.trajectory, info.unit, info.origin)
+    rows = () if page.results is None else tuple(row_json(row) for row in read_results([page.results]))
     scene = load_map(map, server.device)
     localizer = Localizer(scene, server.method, warm_up=page.save is None)
     source = None
@@ -123,20 +123,20 @@ def run_view(
         return
     answers = () if source is None else _localized(localizer, source)
     with console.status("drawing the map"):
-        page_of(scene, answers, path, rows).save(page.save)
+        MapView(map_json(scene), answers, trajectory=path, results=rows).save(page.save)
     show(f"look at {page.save}")
 
 
 def _localized(localizer: Localizer, source: QuerySource) -> tuple[dict[str, Any], ...]:
     """Localize all queries, and return the page's JSON values of each. Raises ``InputError`` if none can be read."""
     from bidnerf.results import BAD_INPUT
-    from bidnerf.viewer import read_and_localized
+    from bidnerf.viewer import answer_image
 
     answers, total = [], len(source.names)
     with displayed():
         count = counter("localizing and rendering", "images")
         for place in range(total):
-            answers.append(read_and_localized(localizer, source, place))
+            answers.append(answer_image(localizer, source, place))
             count(place + 1, total)
     unread = [answer for answer in answers if answer["outcome"] == BAD_INPUT]
     if unread and len(unread) == len(answers):

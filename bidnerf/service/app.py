@@ -7,7 +7,9 @@ import contextlib
 import json
 import logging
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+import traceback
+import uuid
+from collections.abc import AsyncIterator
 from importlib.metadata import version
 from typing import Any
 
@@ -16,32 +18,36 @@ from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.types import Scope
 
-from bidnerf.service.models import Localization, MapFacts, Refused, checked
+from bidnerf.service.models import Localization, MapFacts, Refused, validate
 from bidnerf.service.pool import Pool
 from bidnerf.service.protocols import PROTOCOLS, ServiceProtocol
 from bidnerf.service.settings import ServiceLimits
 from bidnerf.service.web import (
+    OPEN,
     Application,
-    answered,
-    body_of,
-    errors,
-    json_body,
+    await_result,
+    error_responses,
+    json_request,
     log,
-    photo_body,
-    photo_of,
+    photo_request,
     problem,
+    read_body,
+    read_photo,
 )
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import parse_json
 
+FAILURES = error_responses(400, 404, 408, 413, 422, 429, 503, 504)
+"""The responses to a request for a pose that is refused or fails."""
 
-def application(order: dict[str, Any], limits: ServiceLimits, token: str | None) -> FastAPI:
+
+def application(order: dict[str, Any], limits: ServiceLimits, token: str | None) -> Application:
     """Build the service for the maps, method and device in ``order``, the message that ``worker.main`` receives.
 
     Clients must send the ``token``, unless it is None. The workers run between ASGI startup and shutdown. Startup
     raises ``InputError`` if a map cannot be served.
     """
-    pool, names = Pool(order, limits), list(order["maps"])
+    pool = Pool(order, limits)
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -51,29 +57,10 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
         finally:
             await pool.close()
 
-    def report(scope: Scope, status: int, seconds: float) -> None:
-        """Count a request, and log it as one line of JSON."""
-        path = getattr(scope.get("route"), "path", "unknown" if status not in (401, 403) else "refused")
-        pool.requests.labels(path=path, status=status).inc()
-        if scope["method"] == "POST":
-            pool.seconds.observe(seconds)
-        if scope["method"] == "POST" or status >= 400:
-            client = scope.get("client")
-            line = {
-                "time": round(time.time(), 3),
-                "client": client and f"{client[0]}:{client[1]}",
-                "method": scope["method"],
-                "path": scope["path"][:200],
-                "status": status,
-                "seconds": round(seconds, 4),
-                **scope.get("state", {}).get("facts", {}),
-            }
-            log.log(logging.ERROR if status >= 500 else logging.INFO, "%s", json.dumps(line))
-
     app = Application(
         "bidnerf",
         token,
-        report=report,
+        report=report_request,
         lifespan=lifespan,
         description=(
             "Poses of photos in radiance fields. Poses are camera to world with OpenCV axes (x right, y down, z forward).\n"
@@ -83,26 +70,24 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
     )
     app.state.pool, app.state.limits = pool, limits
 
-    async def known(map: str = Path(json_schema_extra={"enum": [*names]})) -> str:
-        """Return ``map`` if a map of that name is served. Raises ``Refused`` otherwise."""
-        if map not in names:
-            raise Refused(404, f"no map with that name, expected one of {', '.join(names)}")
+    async def find_map(map: str = Path(json_schema_extra={"enum": [*pool.map_facts]})) -> str:
+        _require_map(pool, map)
         return map
 
     @app.get("/", response_model=dict[str, Any], summary="The version, the maps and where this description is.")
     async def index() -> Response:
-        return JSONResponse({"bidnerf": version("bidnerf"), "maps": names, "description": "/openapi.json"})
+        return JSONResponse({"bidnerf": version("bidnerf"), "maps": [*pool.map_facts], "description": "/openapi.json"})
 
     @app.get(
-        "/health",
+        OPEN,
         response_model=dict[str, str | int],
-        responses=errors(503),
+        responses=error_responses(503),
         summary="Whether the service can answer; needs no token.",
     )
     async def health() -> Response:
         if not pool.workers:
             return problem(503, "no worker is currently alive", {"Retry-After": "1"})
-        return JSONResponse({"status": "ok", "workers": len(pool.workers), "waiting": pool.waiting})
+        return JSONResponse({"status": "ok", "workers": len(pool.workers), "waiting": pool.queue.waiting})
 
     @app.get("/metrics", response_class=PlainTextResponse, summary="Counters and times for Prometheus.")
     async def metrics() -> Response:
@@ -110,86 +95,120 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
 
     @app.get("/maps", response_model=dict[str, MapFacts], summary="The maps by name, with facts about each.")
     async def maps() -> Response:
-        return JSONResponse(pool.described)
+        return JSONResponse(pool.map_facts)
 
-    @app.get("/maps/{map}", response_model=MapFacts, responses=errors(404), summary="Facts about a map.")
-    async def facts(map: str = Depends(known)) -> Response:
-        return JSONResponse(pool.described[map])
+    @app.get("/maps/{map}", response_model=MapFacts, responses=error_responses(404), summary="Facts about a map.")
+    async def facts(map: str = Depends(find_map)) -> Response:
+        return JSONResponse(pool.map_facts[map])
 
-    async def localize(request: Request) -> Response:
-        with pool.place() as facts:
-            upload = await photo_of(request, app.state.limits)
-            usual = names[0] if len(names) == 1 else None  # None stands for the map that the photo shows
-            name = request.path_params.get("map", upload.parameters.get("map", usual))
-            task = {"map": name if name is None else await known(name), "upload": upload}
-            return JSONResponse(await _answer(request, facts, task))
-
-    def ask(name: str, protocol: ServiceProtocol) -> Callable[[Request], Awaitable[Response]]:
-        async def asked(request: Request) -> Response:
-            with pool.place() as facts:
-                body = parse_json(await body_of(request, app.state.limits), "", "a JSON object")
-                checked(protocol.request, body)
-                map = request.path_params.get("map", request.query_params.get("map"))
-                if map is None and len(names) > 1:
-                    raise InputError("several maps are served", expected=f"map as one of {', '.join(names)}")
-                task = {"map": await known(names[0] if map is None else map), "protocol": name, "body": body}
-                answer = await _answer(request, facts, task)
-            accepts = protocol.media_type.partition(";")[0] in request.headers.get("accept", "")
-            return JSONResponse(answer, media_type=protocol.media_type if accepts else "application/json")
-
-        return asked
-
-    async def running() -> Response:
-        return JSONResponse({"status": "running"})
-
-    failures = errors(400, 404, 408, 413, 422, 429, 504)
-    query = {
-        "name": "map",
-        "in": "query",
-        "required": len(names) > 1,
-        "schema": {"type": "string", "enum": names},
-    }
-    for prefix in ("", "/maps/{map}"):
-        in_map: dict[str, Any] = {"dependencies": [Depends(known)] if prefix else []}
+    for prefix, of_map in (("", []), ("/maps/{map}", [Depends(find_map)])):
         app.post(
             f"{prefix}/localize",
-            openapi_extra=photo_body("map") if prefix else photo_body(),
+            openapi_extra=photo_request(*["map"] if prefix else []),
             response_model=Localization,
-            responses=failures,
+            responses=FAILURES,
+            dependencies=of_map,
             summary="Find the pose of a photo.",
-            **in_map,
             description="The response is that of 'bidnerf localize --json', in several maps if none is named. Never use a pose whose\n"
             "'converged' is false. Each field is given once, in the query or in the form; at most one of focal, hfov and camera.",
         )(localize)
         for name, protocol in PROTOCOLS.items():
-            app.get(
-                f"{prefix}/{name}",
-                response_model=dict[str, str],
-                responses=errors(404),
-                **in_map,
-                summary=f"Whether the endpoint is up: {protocol.summary}",
-            )(running)
-            app.post(
-                f"{prefix}/{name}",
-                response_model=protocol.response,
-                summary=protocol.summary,
-                **in_map,
-                openapi_extra={**json_body(protocol.request), "parameters": [] if prefix else [query]},
-                responses={200: {"content": {protocol.media_type: {}}}, **failures},
-            )(ask(name, protocol))
+            _add_protocol(app, f"{prefix}/{name}", name, protocol, of_map)
     return app
 
 
-async def _answer(request: Request, facts: dict[str, Any], task: dict[str, Any]) -> Any:
-    """Return the JSON body of a worker's answer, and add ``facts`` to the request's log entry. Raises ``Refused`` if the request fails."""
+def _add_protocol(app: FastAPI, path: str, name: str, protocol: ServiceProtocol, of_map: list[Any]) -> None:
+    """Add the routes of a protocol at ``path``; ``of_map`` are the dependencies of a path that names the map."""
+    names = [*app.state.pool.map_facts]
+    query = {"name": "map", "in": "query", "required": len(names) > 1, "schema": {"type": "string", "enum": names}}
+
+    @app.get(
+        path,
+        response_model=dict[str, str],
+        responses=error_responses(404),
+        dependencies=of_map,
+        summary=f"Whether the endpoint is up: {protocol.summary}",
+    )
+    async def status() -> Response:
+        return JSONResponse({"status": "running"})
+
+    @app.post(
+        path,
+        response_model=protocol.response,
+        responses={200: {"content": {protocol.media_type: {}}}, **FAILURES},
+        dependencies=of_map,
+        summary=protocol.summary,
+        openapi_extra={**json_request(protocol.request), "parameters": [] if of_map else [query]},
+    )
+    async def answer(request: Request) -> Response:
+        with app.state.pool.queue.slot():
+            body = parse_json(await read_body(request, app.state.limits), "", "a JSON object")
+            validate(protocol.request, body)
+            map = request.path_params.get("map", request.query_params.get("map"))
+            if map is None and len(names) > 1:
+                raise InputError("several maps are served", expected=f"map as one of {', '.join(names)}")
+            task = {"map": names[0] if map is None else map, "protocol": name, "body": body}
+            content = await _ask_worker(request, task)
+        accepts = protocol.media_type.partition(";")[0] in request.headers.get("accept", "")
+        return JSONResponse(content, media_type=protocol.media_type if accepts else "application/json")
+
+
+async def localize(request: Request) -> Response:
+    """Find the pose of the photo in a request, in the map named by the path or the form, else in the map that the photo shows."""
     pool: Pool = request.app.state.pool
-    upload = task.get("upload")
-    facts |= {"map": task["map"], "bytes": 0 if upload is None else sum(map(len, upload.files.values()))}
+    with pool.queue.slot():
+        upload = await read_photo(request, request.app.state.limits)
+        usual = next(iter(pool.map_facts)) if len(pool.map_facts) == 1 else None
+        map = request.path_params.get("map", upload.parameters.get("map", usual))
+        return JSONResponse(await _ask_worker(request, {"map": map, "upload": upload}))
+
+
+async def _ask_worker(request: Request, task: dict[str, Any]) -> Any:
+    """Return the JSON body of a worker's answer to a task. Raises ``Refused`` if there is no such map or the request fails."""
+    pool: Pool = request.app.state.pool
+    map, upload = task["map"], task.get("upload")
+    if map is not None:
+        _require_map(pool, map)
+    size = 0 if upload is None else sum(len(content) for content in upload.files.values())
+    # The log entry of the request, which is completed while a worker answers.
+    facts = {"id": uuid.uuid4().hex, "attempts": 0, "waited": None, "map": map, "bytes": size}
     request.state.facts = facts
     work = asyncio.create_task(pool.answer(task, facts))
-    answer: dict[str, Any] = await answered(request, work, request.app.state.limits.timeout)
-    pool.outcomes.labels(map=task["map"] or "", outcome=answer["outcome"]).inc()
+    answer: dict[str, Any] = await await_result(request, work, request.app.state.limits.timeout)
+    pool.outcomes.labels(map=map or "", outcome=answer["outcome"]).inc()
     facts |= {key: answer[key] for key in ("outcome", "worker", "fault") if key in answer}
     if answer["status"] != 200:
         raise Refused(answer["status"], answer["detail"], None, **answer.get("more", {}))
     return answer["body"]
+
+
+def _require_map(pool: Pool, name: str) -> None:
+    """Raise ``Refused`` unless a map of that name is served."""
+    if name not in pool.map_facts:
+        raise Refused(404, f"no map with that name, expected one of {', '.join(pool.map_facts)}")
+
+
+def report_request(scope: Scope, status: int, seconds: float, error: Exception | None) -> None:
+    """Count a request, and log it as one line of JSON, unless it only read something and succeeded."""
+    pool: Pool = scope["app"].state.pool
+    path = getattr(scope.get("route"), "path", "unknown" if status not in (401, 403) else "refused")
+    pool.requests.labels(path=path, status=status).inc()
+    if scope["method"] == "POST":
+        pool.seconds.observe(seconds)
+    if scope["method"] == "POST" or status >= 400:
+        client = scope.get("client")
+        line = {
+            "time": round(time.time(), 3),
+            "client": client and f"{client[0]}:{client[1]}",
+            "method": scope["method"],
+            "path": scope["path"][:200],
+            "status": status,
+            "seconds": round(seconds, 4),
+            **scope.get("state", {}).get("facts", {}),
+        }
+        if error is not None:
+            line |= {
+                "fault": f"{type(error).__name__}: {error}",
+                "traceback": "".join(traceback.format_exception(error)),
+            }
+        log.log(logging.ERROR if status >= 500 else logging.INFO, "%s", json.dumps(line))

@@ -58,14 +58,14 @@ class Upload:
         return int(self.parameters.get("seed") or 0)
 
 
-def _decimal(value: Any) -> Any:
+def _require_decimal(value: Any) -> Any:
     """Accept only plain ASCII decimal numbers; Python's ``float`` also accepts underscores and digits of other scripts."""
     if isinstance(value, str) and not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", value, re.ASCII):
         raise PydanticCustomError("number", "a number")
     return value
 
 
-def _without_aliases(text: str) -> str:
+def _forbid_yaml(text: str) -> str:
     """Reject YAML, whose aliases and merge keys can expand without limit."""
     if text.lstrip("\ufeff \t\r\n").startswith(("%YAML", "---")):
         raise PydanticCustomError("camera", "JSON, or a row of COLMAP's cameras.txt")
@@ -73,10 +73,10 @@ def _without_aliases(text: str) -> str:
 
 
 Model = TypeVar("Model", bound=BaseModel)
-Number = Annotated[float, BeforeValidator(_decimal)]
+Number = Annotated[float, BeforeValidator(_require_decimal)]
 
 
-def _only_given_defaults(schema: dict[str, Any]) -> None:
+def _drop_null_defaults(schema: dict[str, Any]) -> None:
     for each in schema["properties"].values():
         if each.get("default", 0) is None:
             del each["default"]
@@ -85,17 +85,17 @@ def _only_given_defaults(schema: dict[str, Any]) -> None:
 class PhotoForm(BaseModel):
     """A photo and what may be known about it, as a form; all fields but the files may also be in the query of a request."""
 
-    model_config = ConfigDict(extra="forbid", json_schema_extra=_only_given_defaults)
+    model_config = ConfigDict(extra="forbid", json_schema_extra=_drop_null_defaults)
 
     map: str = Field(ABSENT, description="by default the one that the photo shows")
     name: str = Field(ABSENT, min_length=1, max_length=LONGEST_NAME, description="the frame's name in the answer")
     focal: Number = Field(ABSENT, ge=1e-3, le=1e9, description="focal length in pixels of the stored image")
     hfov: Number = Field(ABSENT, ge=1e-3, le=WIDEST, description="horizontal field of view in degrees")
     depth_unit: Number = Field(ABSENT, ge=1e-9, le=1e9, description="metres per step of the depth image")
-    seed: Annotated[int, BeforeValidator(_decimal)] = Field(
+    seed: Annotated[int, BeforeValidator(_require_decimal)] = Field(
         ABSENT, ge=0, le=LARGEST_SEED, description="seed of every random choice"
     )
-    camera: Annotated[str, AfterValidator(_without_aliases)] = Field(
+    camera: Annotated[str, AfterValidator(_forbid_yaml)] = Field(
         ABSENT, description="the content of a camera file: transforms.json, cameras.json or cameras.txt"
     )
     start: str = Field(ABSENT, description="JSON with a 4x4 T_world_camera to start from")
@@ -137,7 +137,7 @@ EXPECTED = {
 """What was expected, in words, by pydantic's error type; errors of other types already have a message of ours."""
 
 
-def checked(model: type[Model], values: Any) -> Model:
+def validate(model: type[Model], values: Any) -> Model:
     """Validate ``values`` as an instance of ``model``. Raises an ``InputError`` that names the first invalid value."""
     try:
         return model.model_validate(values)
@@ -147,17 +147,17 @@ def checked(model: type[Model], values: Any) -> Model:
     if kind == "extra_forbidden":
         known = list(model.model_fields)
         hint = spelling_hint(name, known, f", expected any of {', '.join(known)}")
-        raise InputError(f"unknown parameter {short(name)}{hint}")
+        raise InputError(f"unknown parameter {abbreviate(name)}{hint}")
     if kind == "missing":
         raise InputError(f"no {name!r}", expected="all that the description requires")
     text = first["msg"].removeprefix("Value error, ")
     text = EXPECTED[kind].format(**first.get("ctx", {})) if kind in EXPECTED else text
     if kind == "cameras":  # concerns several fields, which the message names
         raise InputError(text)
-    raise InputError(f"{name or 'the body'} is {short(first['input'])}", expected=text)
+    raise InputError(f"{name or 'the body'} is {abbreviate(first['input'])}", expected=text)
 
 
-def short(value: Any) -> str:
+def abbreviate(value: Any) -> str:
     """Return a value as one line of JSON, truncated if it is long."""
     shown = json.dumps(value, default=str)
     return shown if len(shown) <= 60 else shown[:57] + "..."
@@ -197,7 +197,7 @@ Row6 = Annotated[list[float], Field(min_length=6, max_length=6)]
 class Localization(BaseModel):
     """The pose of a photo, and whether it can be trusted: the JSON of 'bidnerf localize'."""
 
-    model_config = ConfigDict(json_schema_extra=_only_given_defaults)
+    model_config = ConfigDict(json_schema_extra=_drop_null_defaults)
 
     frame: str
     T_world_camera: Annotated[list[Row4], Field(min_length=4, max_length=4, description="camera to world")]

@@ -19,8 +19,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import uuid
-from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -28,6 +26,7 @@ import psutil
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
 from bidnerf.service.models import Refused
+from bidnerf.service.queue import RequestQueue
 from bidnerf.service.settings import ServiceLimits
 from bidnerf_core.errors import InputError
 
@@ -58,6 +57,7 @@ class Worker:
 
     def kill(self) -> None:
         """Kill the process."""
+        self.ended = True
         self._writer.close()
         with contextlib.suppress(psutil.NoSuchProcess):
             self._process.kill()
@@ -68,11 +68,10 @@ class Pool:
 
     def __init__(self, order: dict[str, Any], limits: ServiceLimits) -> None:
         """Create a pool that is not yet started; ``order`` is the message for the process that loads the maps, see ``worker.main``."""
-        self.described: dict[str, Any] = {}
-        self.places, self.taken, self.waiting = limits.processes + limits.queue, 0, 0
+        self.map_facts: dict[str, Any] = dict.fromkeys(order["maps"])
+        self.queue = RequestQueue[Worker](limits.processes + limits.queue, self.retry_after)
         self.workers = list[Worker]()
         self._order, self._limits = order, limits
-        self._idle = asyncio.Queue[Worker]()
         self._keepers = list[asyncio.Task[None]]()
         self._maps: tuple[subprocess.Popen[bytes], socket.socket] | None = None
         self._loading = asyncio.Lock()
@@ -86,28 +85,19 @@ class Pool:
         self.seconds = times("bidnerf_request_seconds", "From the arrival of a request to its answer.")
         self.waited = times("bidnerf_queue_seconds", "Waiting for a worker.")
         gauge = partial(Gauge, registry=self.registry)
-        gauge("bidnerf_queue_length", "Requests that wait for a worker.").set_function(lambda: self.waiting)
+        gauge("bidnerf_queue_length", "Requests that wait for a worker.").set_function(lambda: self.queue.waiting)
         text = "Requests that are uploading, waiting or at work."
-        gauge("bidnerf_requests_in_progress", text).set_function(lambda: self.taken)
+        gauge("bidnerf_requests_in_progress", text).set_function(lambda: self.queue.taken)
         gauge("bidnerf_workers", "Workers that are alive.").set_function(lambda: len(self.workers))
 
     def metric(self, name: str, **labels: str) -> float:
         """Return the current value of a metric, or 0 if it was never counted."""
         return self.registry.get_sample_value(f"bidnerf_{name}", labels) or 0.0
 
-    @contextlib.contextmanager
-    def place(self) -> Iterator[dict[str, Any]]:
-        """Reserve a slot for a request in the block, and yield the facts for its log entry. Raises ``Refused`` if no slot is free."""
-        if self.taken >= self.places:
-            mean = self.metric("request_seconds_sum") / max(1.0, self.metric("request_seconds_count")) or 1.0
-            seconds = max(1, min(60, round(mean * self._limits.queue / self._limits.processes)))
-            headers = {"Retry-After": str(seconds), "Connection": "close"}
-            raise Refused(429, f"all {self.places} places are taken, try again later", headers)
-        self.taken += 1
-        try:
-            yield {"id": uuid.uuid4().hex, "attempts": 0, "waited": None}
-        finally:
-            self.taken -= 1
+    def retry_after(self) -> int:
+        """Return the seconds after which a client that found no free slot may try again, from the mean duration of a request."""
+        mean = self.metric("request_seconds_sum") / max(1.0, self.metric("request_seconds_count")) or 1.0
+        return max(1, min(60, round(mean * self._limits.queue / self._limits.processes)))
 
     async def answer(self, task: Any, facts: dict[str, Any]) -> dict[str, Any]:
         """Return a worker's answer to a request. Raises ``Refused`` if every worker that took the request died.
@@ -118,29 +108,20 @@ class Pool:
         began = time.perf_counter()
         os.makedirs(tempfile.gettempdir(), exist_ok=True)  # something may have removed it
         for attempt in (1, 2, 3):  # the request is refused if three workers die of it
-            facts["attempts"] = attempt
-            self.waiting += 1
-            try:
-                while (worker := await self._idle.get()).ended:
-                    pass
-            finally:
-                self.waiting -= 1
-            if facts["waited"] is None:
-                waited = time.perf_counter() - began
-                facts["waited"] = round(waited, 4)
-                self.waited.observe(waited)
-            with tempfile.TemporaryDirectory(prefix="bidnerf-serve-", ignore_cleanup_errors=True) as folder:
-                try:
-                    answer = await worker.ask((task, folder))
-                except LOST:
-                    worker.kill()
-                    continue
-                except asyncio.CancelledError as error:
-                    worker.stopped = str(error) or "cancelled"
-                    worker.kill()
-                    raise
-            self._idle.put_nowait(worker)
-            return answer
+            async with self.queue.executor() as worker:
+                if attempt == 1:
+                    facts["waited"] = round(time.perf_counter() - began, 4)
+                    self.waited.observe(facts["waited"])
+                facts["attempts"] = attempt
+                with tempfile.TemporaryDirectory(prefix="bidnerf-serve-", ignore_cleanup_errors=True) as folder:
+                    try:
+                        return await worker.ask((task, folder))
+                    except LOST:
+                        worker.kill()
+                    except asyncio.CancelledError as error:
+                        worker.stopped = str(error) or "cancelled"
+                        worker.kill()
+                        raise
         raise Refused(422, "the request crashed every worker that took it")
 
     async def start(self) -> None:
@@ -168,13 +149,12 @@ class Pool:
         while True:
             worker, reader = new or await self._replacement()
             self.workers.append(worker)
-            self._idle.put_nowait(worker)
+            self.queue.add(worker)
             try:
                 with contextlib.suppress(*LOST):
                     while (line := await reader.readline()) and not worker.reply.done():
                         worker.reply.set_result(line)
             finally:
-                worker.ended = True
                 self.workers.remove(worker)
                 worker.kill()
             reason = worker.stopped or ("ended" if worker.reply.done() else "died")
@@ -201,16 +181,16 @@ class Pool:
             await asyncio.sleep(PAUSE)
 
     async def _fork(self) -> tuple[Worker, asyncio.StreamReader]:
-        """Fork a worker and return it with the stream of its answers. Raises the same errors as ``_greeting``."""
+        """Fork a worker and return it with the stream of its answers. Raises the same errors as ``_read_greeting``."""
         assert self._maps is not None
         ours, theirs = socket.socketpair()
         with theirs:
             socket.send_fds(self._maps[1], [b"w"], [theirs.fileno()])
-        found, reader, writer = await _greeting(ours, FORK_SECONDS)
-        return Worker(found["pid"], writer), reader
+        greeting, reader, writer = await _read_greeting(ours, FORK_SECONDS)
+        return Worker(greeting["pid"], writer), reader
 
     async def _load(self) -> None:
-        """Start the process that loads the maps. Raises the same errors as ``_greeting``."""
+        """Start the process that loads the maps. Raises the same errors as ``_read_greeting``."""
         ours, theirs = socket.socketpair()
         with theirs:
             process = subprocess.Popen(
@@ -222,9 +202,9 @@ class Pool:
             )
         self._maps = process, ours
         ours.sendall(pickle.dumps(self._order))
-        found, _, writer = await _greeting(ours.dup(), None)
+        greeting, _, writer = await _read_greeting(ours.dup(), None)
         writer.close()
-        self.described = found["maps"]
+        self.map_facts = greeting["maps"]
 
     def _end_maps(self, group: bool = False) -> None:
         """Kill the process that holds the maps and, if ``group`` is set, also the workers that it forked."""
@@ -240,7 +220,7 @@ class Pool:
         control.close()
 
 
-async def _greeting(
+async def _read_greeting(
     connection: socket.socket, seconds: float | None
 ) -> tuple[dict[str, Any], asyncio.StreamReader, asyncio.StreamWriter]:
     """Return the first message of a new process, and streams that accept messages of up to 16 MiB.
@@ -250,10 +230,10 @@ async def _greeting(
     reader, writer = await asyncio.open_connection(sock=connection, limit=2**24)
     try:
         async with asyncio.timeout(seconds):
-            found: dict[str, Any] = json.loads(await reader.readline())
-        if "error" in found:
-            raise InputError(found["error"])
+            greeting: dict[str, Any] = json.loads(await reader.readline())
+        if "error" in greeting:
+            raise InputError(greeting["error"])
     except BaseException:
         writer.close()
         raise
-    return found, reader, writer
+    return greeting, reader, writer

@@ -13,12 +13,12 @@ from dataclasses import is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from bidnerf.service.settings import ServiceLimits, checked_token
+from bidnerf.service.settings import ServiceLimits, check_token
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.settings import to_flat
 
 if TYPE_CHECKING:
-    from fastapi import FastAPI
+    from bidnerf.service.web import Application
 
 PORT = 8000
 NEEDS = "the service needs the extra 'serve' (pip install 'bidnerf[serve]')"
@@ -36,7 +36,7 @@ def service_app(
     device: str = "cpu",
     limits: ServiceLimits | None = None,
     token: str | None = None,
-) -> FastAPI:
+) -> Application:
     """Return an ASGI application that serves the maps in the given folders, to run in your own server.
 
     ``method`` is the name of a localization method, which runs on ``device``. ``config`` holds the settings of the
@@ -46,10 +46,9 @@ def service_app(
     only requests addressed to localhost are answered. Raises ``InputError`` for invalid names and settings, and if
     the extra ``serve`` is not installed. ASGI startup raises ``InputError`` if a map cannot be loaded.
     """
-    try:
-        from bidnerf.service.app import application
-    except ImportError as error:
-        raise InputError(NEEDS) from error
+    require_server(NEEDS)
+    from bidnerf.service.app import application
+
     if config is not None and not isinstance(config, Mapping) and not is_dataclass(config):
         raise InputError(f"config is a {type(config).__name__}", expected=f"settings of {method}, or a dictionary")
     limits = limits or ServiceLimits()
@@ -60,7 +59,7 @@ def service_app(
         "max_pixels": limits.max_pixels,
         "config": dict(to_flat(config) if is_dataclass(config) else config or {}),
     }
-    return application(order, limits, checked_token(token))
+    return application(order, limits, check_token(token))
 
 
 def serve(
@@ -84,29 +83,35 @@ def serve(
     """
     if not hasattr(os, "fork"):
         raise InputError("this system has no fork, but workers share the maps' memory by forking; use Linux or macOS")
-    token = token_for(host, token, NEEDS)
+    require_server(NEEDS)
+    token = choose_token(host, token)
     app = service_app(scenes, token=token, **options)
     run_app(app, host, port, lambda address: ready and ready(address, token), stop)
 
 
-def token_for(host: str | None, token: str | None, needs: str) -> str | None:
-    """Return the token that clients need: ``token`` if given, else None for a local ``host`` and a new token for others.
-
-    Raises ``InputError``, with the text ``needs`` if the web server is not installed, and also if the token is too
-    short.
-    """
+def require_server(needs: str) -> None:
+    """Raise ``InputError`` with the text ``needs`` if the web server is not installed."""
     try:
-        import uvicorn  # noqa: F401 (tried before the maps are read)
+        import uvicorn  # noqa: F401 (only tried)
 
-        from bidnerf.service.web import is_loopback
+        import bidnerf.service.web  # noqa: F401
     except ImportError as error:
         raise InputError(needs) from error
+
+
+def choose_token(host: str | None, token: str | None) -> str | None:
+    """Return the token that clients need: ``token`` if given, else None for a local ``host`` and a new token for others.
+
+    Raises ``InputError`` if the token is too short.
+    """
+    from bidnerf.service.web import is_loopback
+
     is_local = host is None or is_loopback(host)
-    return checked_token(token or (None if is_local else secrets.token_urlsafe(24)))
+    return check_token(token or (None if is_local else secrets.token_urlsafe(24)))
 
 
 def run_app(
-    app: FastAPI,
+    app: Application,
     host: str | None,
     port: int,
     ready: Callable[[str], Any],
@@ -120,15 +125,18 @@ def run_app(
     """
     import uvicorn
 
-    class Server(uvicorn.Server):
-        async def on_tick(self, counter: int) -> bool:
-            return await super().on_tick(counter) or (stop is not None and stop.is_set())
-
     async def run(bound: socket.socket) -> None:
-        async with app.router.lifespan_context(app):
+        async with app.lifespan(app):
             name, number = bound.getsockname()[:2]
             ready(f"http://[{name}]:{number}" if ":" in name else f"http://{name}:{number}")  # connections wait by now
+            watch = asyncio.create_task(exit_on_stop())
             await server.serve(sockets=[bound])
+            watch.cancel()
+
+    async def exit_on_stop() -> None:
+        while stop is None or not stop.is_set():
+            await asyncio.sleep(0.1)
+        server.should_exit = True
 
     options = uvicorn.Config(
         app,
@@ -143,7 +151,7 @@ def run_app(
         timeout_keep_alive=15,
         timeout_graceful_shutdown=grace,
     )
-    server, host = Server(options), host or "127.0.0.1"
+    server, host = uvicorn.Server(options), host or "127.0.0.1"
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         listening = socket.create_server((host, port), family=family)
@@ -159,15 +167,18 @@ def run_app(
 
 
 def maps_by_name(scenes: Scenes) -> dict[str, Path]:
-    """Return the folders of maps by name. Raises ``UsageError`` for names that are invalid or not unique."""
-    from bidnerf_core.maps import name_maps  # imported here, since help pages do not need it
+    """Return the folders of maps by name. Raises ``UsageError`` for names that are invalid or not unique.
 
+    ``bidnerf_core.maps.name_maps`` would make equal names unique by parent folders, but not into names for a URL.
+    """
+    pairs = list[tuple[str, str | Path]]()
     if isinstance(scenes, Mapping):
-        pairs = [*scenes.items()]
+        pairs += scenes.items()
     else:
-        given = [_name_and_folder(str(scene)) for scene in ([scenes] if isinstance(scenes, str | Path) else scenes)]
-        others = iter(name_maps([folder for name, folder in given if not name]))
-        pairs = [(name or next(others), folder) for name, folder in given]
+        for scene in map(str, [scenes] if isinstance(scenes, str | Path) else scenes):
+            name, equals, path = scene.partition("=")
+            is_named = equals and not Path(scene).is_dir()  # a folder's own name may contain an equals sign
+            pairs.append((name, path) if is_named else (Path(scene).resolve().name, scene))
     if not pairs:
         raise UsageError("no MAP", expected="folders of maps")
     names = [name for name, _ in pairs]
@@ -179,9 +190,3 @@ def maps_by_name(scenes: Scenes) -> dict[str, Path]:
                 expected="another one for each map, of letters, digits, '.', '-' and '_'; give it a name: NAME=MAP",
             )
     return {name: Path(folder) for name, folder in pairs}
-
-
-def _name_and_folder(given: str) -> tuple[str, str]:
-    """Split ``NAME=MAP``; the name is empty for a folder alone, whose own name may contain an equals sign."""
-    name, equals, folder = given.partition("=")
-    return (name, folder) if equals and not Path(given).is_dir() else ("", given)

@@ -47,7 +47,7 @@ class ServiceLimits(Settings):
         return self.max_megapixels * 1e6
 
 
-def checked_token(token: str | None) -> str | None:
+def check_token(token: str | None) -> str | None:
     """Return ``token`` if it is valid. Raises ``InputError`` if it is too short or cannot be sent in a header."""
     if token is not None and (len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable()):
         raise InputError(

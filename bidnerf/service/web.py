@@ -9,7 +9,7 @@ import ipaddress
 import json
 import logging
 import time
-from collections.abc import AsyncGenerator, Callable, Mapping
+from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import PurePosixPath
@@ -20,7 +20,6 @@ import jinja2
 from fastapi import FastAPI, Request
 from starlette.datastructures import MutableHeaders, UploadFile
 from starlette.exceptions import HTTPException
-from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import ClientDisconnect, HTTPConnection
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -31,8 +30,8 @@ from bidnerf.service.models import (
     Problem,
     Refused,
     Upload,
-    checked,
-    short,
+    abbreviate,
+    validate,
 )
 from bidnerf.service.settings import MEBIBYTE, ServiceLimits
 from bidnerf_core.errors import InputError
@@ -63,8 +62,14 @@ ERRORS = {
     504: ("took too long", "The answer took too long."),
 }
 """Titles and descriptions of errors, by HTTP status."""
-Report = Callable[[Scope, int, float], None]
-"""A function that receives the scope, status and duration (seconds) of each request."""
+Report = Callable[[Scope, int, float, Exception | None], None]
+"""A function that receives the scope, the status, the duration (seconds) and the internal error of each request."""
+
+
+def report_fault(scope: Scope, status: int, seconds: float, error: Exception | None) -> None:
+    """Log a request only if it ended with an internal error."""
+    if error is not None:
+        log.error("internal error while answering %s", scope["path"][:200], exc_info=error)
 
 
 class Application(FastAPI):
@@ -75,10 +80,10 @@ class Application(FastAPI):
         title: str,
         token: str | None,
         cookie: str | None = None,
-        report: Report | None = None,
+        report: Report = report_fault,
         **more: Any,
     ) -> None:
-        self.refused = 401 if token is not None else 403
+        self.refused, self.lifespan = 401 if token is not None else 403, more["lifespan"]
         super().__init__(
             title=title,
             version=version("bidnerf"),
@@ -88,12 +93,12 @@ class Application(FastAPI):
             redirect_slashes=False,
             generate_unique_id_function=lambda route: f"{min(route.methods or ()).lower()} {route.path}",
             separate_input_output_schemas=False,
-            responses=errors(self.refused, 500),
+            responses=error_responses(self.refused, 500),
             **more,
         )
         self.add_middleware(Gate, token=token, cookie=cookie, report=report)
         for kind in (Refused, InputError, HTTPException):
-            self.add_exception_handler(kind, _failure)
+            self.add_exception_handler(kind, _answer_error)
 
         @self.get("/openapi.json", summary="This description, in the format of OpenAPI 3.1.")
         async def openapi() -> dict[str, Any]:
@@ -134,12 +139,11 @@ class Application(FastAPI):
 class Gate:
     """ASGI middleware that checks access to each request, sets headers on each response, and reports its status and duration.
 
-    If ``cookie`` names a cookie, a browser needs to send the token only once, in the address ``/?token=TOKEN``.
+    A HEAD request is answered as the GET request of the same path, whose body the server leaves out. If ``cookie`` names a
+    cookie, a browser needs to send the token only once, in the address ``/?token=TOKEN``.
     """
 
-    def __init__(
-        self, app: ASGIApp, token: str | None, cookie: str | None = None, report: Report | None = None
-    ) -> None:
+    def __init__(self, app: ASGIApp, token: str | None, cookie: str | None, report: Report) -> None:
         self.app, self.token, self.cookie, self.report = app, token, cookie, report
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -149,7 +153,8 @@ class Gate:
         if scope["type"] != "http":  # the startup and the shutdown
             await self.app(scope, receive, send)
             return
-        began, status = time.perf_counter(), 0
+        began, status, fault = time.perf_counter(), 0, None
+        served = {**scope, "method": "GET"} if scope["method"] == "HEAD" else scope
 
         async def answer(message: Message) -> None:
             nonlocal status
@@ -160,23 +165,36 @@ class Gate:
                 message = {**message, "headers": headers.raw}
             await send(message)
 
+        try:
+            await self._admit(served)(served, receive, answer)
+        except Exception as error:  # an internal error: the operator has to see where it happened
+            fault = error
+            if not status:
+                await problem(500, "internal error")(served, receive, answer)
+        except asyncio.CancelledError:  # the server stops, and nothing waits for the end of this task
+            if not status:
+                more = {"Retry-After": "5", "Connection": "close"}
+                await problem(503, "the service is being stopped", more)(served, receive, answer)
+        self.report({**served, "method": scope["method"]}, status, time.perf_counter() - began, fault)
+
+    def _admit(self, scope: Scope) -> ASGIApp:
+        """Return what answers a request: the application, a redirect that logs a browser in, or the reason for a refusal."""
         # The name contains the port, since cookies are sent to all ports of a host.
         cookie = None if self.cookie is None else f"{self.cookie}_{scope['server'][1]}"
+        request = HTTPConnection(scope)
+        token, given = self.token, request.query_params.get("token", "")
+        brings_token = scope["path"] == "/" and hmac.compare_digest(given.encode(), (token or "").encode())
+        if cookie is not None and token is not None and brings_token:
+            secure = "https" in (scope["scheme"], request.headers.get("x-forwarded-proto"))
+            page = RedirectResponse("/", 303, {"Referrer-Policy": "no-referrer"})
+            page.set_cookie(cookie, token, httponly=True, samesite="strict", secure=secure)
+            return page
         refused = refusal(scope, self.token, cookie)
-        try:
-            if cookie is not None and self.token is not None and _brings_token(scope, self.token):
-                await _logged_in(scope, cookie, self.token)(scope, receive, answer)
-            elif refused is None:
-                await self.app(scope, receive, answer)
-            else:
-                more = {"Connection": "close"} | ({"WWW-Authenticate": "Bearer"} if refused[0] == 401 else {})
-                await problem(*refused, more)(scope, receive, answer)
-        except Exception as error:  # an internal error: the operator has to see where it happened
-            log.exception("%s", json.dumps({"fault": f"{type(error).__name__}: {error}"}))
-            if not status:
-                await problem(500, "internal error")(scope, receive, answer)
-        if self.report is not None:
-            self.report(scope, status, time.perf_counter() - began)
+        if refused is None:
+            return self.app
+        return problem(
+            *refused, {"Connection": "close"} | ({"WWW-Authenticate": "Bearer"} if refused[0] == 401 else {})
+        )
 
 
 def problem(status: int, detail: str, headers: Mapping[str, str] | None = None, **more: Any) -> Response:
@@ -186,7 +204,7 @@ def problem(status: int, detail: str, headers: Mapping[str, str] | None = None, 
     return Response(json.dumps(body), status, headers, PROBLEM)
 
 
-async def _failure(request: Request, error: Exception) -> Response:
+async def _answer_error(request: Request, error: Exception) -> Response:
     """Return the error response for a ``Refused``, ``InputError`` or ``HTTPException`` that a request raised."""
     if isinstance(error, Refused):
         return problem(error.status, error.detail, error.headers, **error.more)
@@ -232,20 +250,6 @@ def refusal(scope: Scope, token: str | None, cookie: str | None = None) -> tuple
     return None if is_own_page else (403, "requests from pages of other sites are rejected")
 
 
-def _brings_token(scope: Scope, token: str) -> bool:
-    """Return whether a request is for ``/?token=TOKEN``, the address with which a browser logs in."""
-    given = HTTPConnection(scope).query_params.get("token", "")
-    return scope["path"] == "/" and hmac.compare_digest(given.encode(), token.encode())
-
-
-def _logged_in(scope: Scope, cookie: str, token: str) -> Response:
-    """Return a redirect to the page that stores the token in a cookie, which the browser then sends instead of the header."""
-    secure = "https" in (scope["scheme"], HTTPConnection(scope).headers.get("x-forwarded-proto"))
-    away = RedirectResponse("/", 303, {"Referrer-Policy": "no-referrer"})
-    away.set_cookie(cookie, token, httponly=True, samesite="strict", secure=secure)
-    return away
-
-
 def is_loopback(host: str | None) -> bool:
     """Return whether a host name or address is a loopback address."""
     with contextlib.suppress(ValueError):
@@ -256,7 +260,7 @@ def is_loopback(host: str | None) -> bool:
 # Requests.
 
 
-async def body_of(request: Request, limits: ServiceLimits) -> bytes:
+async def read_body(request: Request, limits: ServiceLimits) -> bytes:
     """Read the body of a request. Raises ``Refused`` if the body is too large or does not arrive in time."""
     close = {"Connection": "close"}  # the rest of the body is not read
     most = f"expected at most {limits.max_megabytes:g} MiB"
@@ -264,7 +268,7 @@ async def body_of(request: Request, limits: ServiceLimits) -> bytes:
     try:
         announced = int(text)
     except ValueError as error:
-        raise Refused(400, f"Content-Length is {short(text)}, expected a number", close) from error
+        raise Refused(400, f"Content-Length is {abbreviate(text)}, expected a number", close) from error
     if announced > limits.max_bytes:
         raise Refused(413, f"the request has {announced / MEBIBYTE:,.0f} MiB, {most}", close)
     content = bytearray()
@@ -281,15 +285,15 @@ async def body_of(request: Request, limits: ServiceLimits) -> bytes:
     return bytes(content)
 
 
-async def photo_of(request: Request, limits: ServiceLimits) -> Upload:
+async def read_photo(request: Request, limits: ServiceLimits) -> Upload:
     """Read a photo and its metadata from a form, or from the body and the query parameters of a request.
 
-    Raises ``Refused`` in the same cases as ``body_of``, and ``InputError`` for missing or invalid fields.
+    Raises ``Refused`` in the same cases as ``read_body``, and ``InputError`` for missing or invalid fields.
     """
-    content = await body_of(request, limits)
+    content = await read_body(request, limits)
     kind, stem = request.headers.get("content-type", "").partition(";")[0].strip().lower(), ""
     items: list[tuple[str, Any]] = request.query_params.multi_items()
-    items += await _parts(request, content) if kind == "multipart/form-data" else [("photo", content)]
+    items += await _read_form(request, content) if kind == "multipart/form-data" else [("photo", content)]
     values = dict[str, Any]()
     for name, value in items:
         if name in values:
@@ -301,36 +305,38 @@ async def photo_of(request: Request, limits: ServiceLimits) -> Upload:
         raise InputError("no photo", expected="its bytes as the body, or a form with a file 'photo'")
     if "depth_unit" in values and "depth" not in values:
         raise InputError("depth_unit was given without depth", expected="the depth image that it belongs to")
-    parameters = checked(PhotoForm, values).model_dump(exclude_unset=True)
+    parameters = validate(PhotoForm, values).model_dump(exclude_unset=True)
     sent: dict[str, bytes] = {name: parameters.pop(name) for name in ("photo", "depth") if name in parameters}
     # The stem of a file's name is text in the answer, never a file name; a given name takes precedence.
     return Upload(({"name": stem} if stem else {}) | parameters, sent)
 
 
-async def _parts(request: Request, content: bytes) -> list[tuple[str, str | UploadFile]]:
-    async def once() -> AsyncGenerator[bytes, None]:
-        yield content
+async def _read_form(request: Request, content: bytes) -> list[tuple[str, str | UploadFile]]:
+    """Return the fields of a form with the body ``content``. Raises ``InputError`` for a malformed form."""
+
+    async def receive() -> Message:
+        return {"type": "http.request", "body": content}
 
     most = len(PhotoForm.model_fields)
     try:
-        parser = MultiPartParser(request.headers, once(), max_files=most, max_fields=most, max_part_size=MEBIBYTE)
-        return (await parser.parse()).multi_items()
-    except (MultiPartException, KeyError, ValueError, LookupError) as error:
-        reason = getattr(error, "message", None) or "no boundary, or a violation of RFC 7578"
+        form = await Request(request.scope, receive).form(max_files=most, max_fields=most, max_part_size=MEBIBYTE)
+    except (HTTPException, KeyError, ValueError, LookupError) as error:
+        reason = getattr(error, "detail", None) or "no boundary, or a violation of RFC 7578"
         raise InputError(f"not a readable form: {reason}") from error
+    return form.multi_items()
 
 
-async def answered(request: Request, work: asyncio.Future[Any], seconds: float | None = None) -> Any:
+async def await_result(request: Request, work: asyncio.Future[Any], seconds: float | None = None) -> Any:
     """Return the result of ``work``, or cancel it if the client disconnects or ``seconds`` pass first.
 
     Raises ``Refused`` if the work is cancelled.
     """
 
-    async def left() -> None:
+    async def wait_for_disconnect() -> None:
         while (await request.receive())["type"] != "http.disconnect":
             pass
 
-    leaving, reason = asyncio.create_task(left()), "cancelled"
+    leaving, reason = asyncio.create_task(wait_for_disconnect()), "cancelled"
     try:
         await asyncio.wait({work, leaving}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
         if work.done():
@@ -347,7 +353,7 @@ async def answered(request: Request, work: asyncio.Future[Any], seconds: float |
 # The OpenAPI description.
 
 
-def photo_body(*without: str) -> dict[str, Any]:
+def photo_request(*without: str) -> dict[str, Any]:
     """Return the OpenAPI parameters and body of a request with a photo, except the fields named in ``without``."""
     form = PhotoForm.model_json_schema()
     for name in without:
@@ -370,13 +376,13 @@ def photo_body(*without: str) -> dict[str, Any]:
     }
 
 
-def json_body(model: Any) -> dict[str, Any]:
+def json_request(model: Any) -> dict[str, Any]:
     """Return the OpenAPI body of a request with JSON that matches ``model``."""
     schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
     return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}}}}
 
 
-def errors(*statuses: int) -> dict[int | str, dict[str, Any]]:
+def error_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return the OpenAPI descriptions of error responses, for the ``responses`` argument of a route."""
     headers = {401: "WWW-Authenticate", 429: "Retry-After", 503: "Retry-After"}
     return {

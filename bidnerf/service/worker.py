@@ -30,25 +30,25 @@ from bidnerf_core.localization import Localizer, settings_of
 from bidnerf_core.maps import Map, MapCollection, load_map
 
 
-class Worker:
-    """The localizers that answer requests, loaded before workers are forked."""
+class LoadedMaps:
+    """The maps of a service with their localizers, which answer requests; they are loaded before workers are forked."""
 
-    def __init__(self, maps: Mapping[str, Localizer], max_pixels: float) -> None:
+    def __init__(self, localizers: Mapping[str, Localizer], max_pixels: float) -> None:
         """Store the localizers by map name; several maps form a collection, for photos whose map is not known."""
-        self.maps, self.max_pixels, first = maps, max_pixels, next(iter(maps.values()))
+        self.localizers, self.max_pixels, first = localizers, max_pixels, next(iter(localizers.values()))
         self.together: MapCollection | None = None
-        if len(maps) > 1:
-            scenes = {name: _scene(localizer) for name, localizer in maps.items()}
-            self.together = MapCollection(scenes, first.method, first.config, localizers=dict(maps))
+        if len(localizers) > 1:
+            scenes = {name: _scene(localizer) for name, localizer in localizers.items()}
+            self.together = MapCollection(scenes, first.method, first.config, localizers=dict(localizers))
 
     def describe(self) -> dict[str, Any]:
         """Return the facts about each map that clients may see, by map name; the other facts reveal photos and folders."""
-        found = {}
-        for name, localizer in self.maps.items():
+        described = dict[str, Any]()
+        for name, localizer in self.localizers.items():
             scene = _scene(localizer)
             facts = scene.describe().plain() | {"anchor": to_plain(scene.anchor)}
-            found[name] = {key: facts[key] for key in MapFacts.model_fields}
-        return found
+            described[name] = {key: facts[key] for key in MapFacts.model_fields}
+        return described
 
     def answer(self, task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         """Return the status and the body of the response to a request; the request's files may be written to ``folder``.
@@ -67,15 +67,15 @@ class Worker:
             if (protocol := task.get("protocol")) is None:
                 _, body = localize(task["upload"])
             else:
-                body = PROTOCOLS[protocol].answer(task["body"], _scene(self.maps[task["map"]]), localize)
-            found: dict[str, Any] = {"status": 200, "body": body}
+                body = PROTOCOLS[protocol].answer(task["body"], _scene(self.localizers[task["map"]]), localize)
+            reply: dict[str, Any] = {"status": 200, "body": body}
         except Refused as error:
-            found = {"status": error.status, "detail": error.detail, "more": error.more}
+            reply = {"status": error.status, "detail": error.detail, "more": error.more}
         except InputError as error:
-            found = {"status": 422, "detail": public_message(error, folder)}
+            reply = {"status": 422, "detail": public_message(error, folder)}
         except Exception as error:  # the worker goes on, and the log states what happened
-            found = {"status": 500, "detail": "internal error", "fault": f"{type(error).__name__}: {error}"}
-        return found | {"outcome": outcomes[-1] if outcomes else "bad input" if found["status"] < 500 else "fault"}
+            reply = {"status": 500, "detail": "internal error", "fault": f"{type(error).__name__}: {error}"}
+        return reply | {"outcome": outcomes[-1] if outcomes else "bad input" if reply["status"] < 500 else "fault"}
 
     def localize(self, name: str | None, upload: Upload, folder: Path) -> tuple[Answer, dict[str, Any]]:
         """Localize a photo in the map ``name`` or, if it is None, in whichever of the maps the photo shows.
@@ -83,11 +83,11 @@ class Worker:
         Returns the answer, and its JSON values as printed by ``bidnerf localize --json``.
         """
         several = self.together if name is None else None
-        localizer = next(iter(self.maps.values())) if name is None else self.maps[name]
+        localizer = next(iter(self.localizers.values())) if name is None else self.localizers[name]
         usual = CameraSource(assumed=localizer.assumed_cameras if several is None else several.cameras)
         photos, start = read_upload(upload, usual, folder, self.max_pixels)
         if several is not None and start is not None:
-            raise InputError("start was given without map", expected=f"map as one of {', '.join(self.maps)}")
+            raise InputError("start was given without map", expected=f"map as one of {', '.join(self.localizers)}")
         if several is not None:
             answers: Any = localize_each(several, photos, seed=upload.seed)
         else:
@@ -114,16 +114,16 @@ def main() -> None:
     with control.makefile("rwb") as stream:
         order = pickle.load(stream)
         try:
-            worker = _loaded(order)
+            maps = _load(order)
         except (InputError, OSError, RuntimeError, MemoryError) as error:
             _send(stream, {"error": str(error) or type(error).__name__})
             return
         gc.collect()
         gc.freeze()  # otherwise garbage collection in a worker would write to, and so copy, every page with objects
-        _send(stream, {"maps": worker.describe()})
+        _send(stream, {"maps": maps.describe()})
     while True:
-        asked, descriptors, _, _ = socket.recv_fds(control, 1, 1)
-        if not asked:
+        message, descriptors, _, _ = socket.recv_fds(control, 1, 1)
+        if not message:
             with contextlib.suppress(OSError):
                 os.killpg(0, signal.SIGKILL)  # including those that are busy
             return
@@ -132,13 +132,13 @@ def main() -> None:
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             try:
                 with socket.socket(fileno=descriptors[0]).makefile("rwb") as stream:
-                    _serve(worker, order["device"], stream)
+                    _serve(maps, order["device"], stream)
             finally:
                 os._exit(0)
         os.close(descriptors[0])
 
 
-def _loaded(order: Mapping[str, Any]) -> Worker:
+def _load(order: Mapping[str, Any]) -> LoadedMaps:
     """Load the maps named in ``order``. Raises ``InputError`` if a map cannot be served."""
     import logging
     import warnings
@@ -152,14 +152,14 @@ def _loaded(order: Mapping[str, Any]) -> Worker:
     cv2.setNumThreads(1)
     config = settings_of(order["method"], order["config"])
     warm_up = order["device"] == "cpu"
-    maps = {
+    localizers = {
         name: Localizer(load_map(folder), order["method"], config, warm_up=warm_up)
         for name, folder in order["maps"].items()
     }
-    return Worker(maps, order["max_pixels"])
+    return LoadedMaps(localizers, order["max_pixels"])
 
 
-def _serve(worker: Worker, device: str, stream: BufferedRWPair) -> None:
+def _serve(maps: LoadedMaps, device: str, stream: BufferedRWPair) -> None:
     """Answer requests until the connection ends.
 
     On an accelerator, whose state does not survive a fork, the localizers are created again first.
@@ -167,9 +167,10 @@ def _serve(worker: Worker, device: str, stream: BufferedRWPair) -> None:
     try:
         if device != "cpu":
             moved = {
-                name: Localizer(_scene(each), each.method, each.config, device) for name, each in worker.maps.items()
+                name: Localizer(_scene(each), each.method, each.config, device)
+                for name, each in maps.localizers.items()
             }
-            worker = Worker(moved, worker.max_pixels)
+            maps = LoadedMaps(moved, maps.max_pixels)
     except (InputError, RuntimeError) as error:
         _send(stream, {"error": str(error)})
         return
@@ -177,7 +178,7 @@ def _serve(worker: Worker, device: str, stream: BufferedRWPair) -> None:
     with contextlib.suppress(EOFError, ConnectionError):
         while True:
             task, folder = pickle.load(stream)
-            _send(stream, worker.answer(task, Path(folder)))
+            _send(stream, maps.answer(task, Path(folder)))
 
 
 def _send(stream: BufferedRWPair, message: Mapping[str, Any]) -> None:

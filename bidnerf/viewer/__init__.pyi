@@ -1,9 +1,10 @@
 from .app import LiveView as LiveView
 from .pages import MapView as MapView
-from .pages import page_of as page_of
-from .pages import read_and_localized as read_and_localized
-from .pages import shown_row as shown_row
+from .pages import answer_image as answer_image
+from .pages import row_json as row_json
 from .pages import view as view
-from .scene import shown_trajectory as shown_trajectory
+from .scene import map_json as map_json
+from .scene import trajectory_json as trajectory_json
 from .server import PORT as PORT
+from .server import require_viewer as require_viewer
 from .server import serve_view as serve_view

@@ -4,32 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import math
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf.results import pose_error
-from bidnerf.viewer.evidence import (
-    APART,
-    HERE,
-    TURNED_DEG,
-    acceptance_figures,
-    contests,
-    earlier,
-    last_answer,
-    probable_poses,
-)
-from bidnerf.viewer.pictures import Json, drawing, packed, photograph, quick_image
+from bidnerf.viewer.evidence import HERE, acceptance_figures, contests, last_answer, name_earlier, probable_poses
+from bidnerf.viewer.pictures import Json, jpeg_json, pack, png_json, quick_image
 from bidnerf.viewer.scene import frustum, rows_of
-from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import RenderedImage, has_field, render_picture
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3, symbol
 from bidnerf_core.io import reduced, resampled
 from bidnerf_core.localization import (
     ADVICE,
+    DISPLACEMENT,
     METHODS,
     MIRROR,
     LandmarkAnswer,
@@ -37,112 +27,145 @@ from bidnerf_core.localization import (
     SceneMap,
     SearchRecord,
     origin_of,
+    same_pose,
 )
 from bidnerf_core.mapping import project
 from bidnerf_core.registry import PluginError
 
+OBSERVED = 320
+"""Longer side (pixels) of the image and of its rendering in a page, since rendering takes time."""
 MOST_STEPS = 200
 """Maximum number of steps of a descent that are shown; longer descents are subsampled at a regular stride."""
 
 
+NO_ANSWER: Json = {
+    "name": "",
+    "outcome": "",
+    "accepted": False,
+    "reason": "",
+    "meaning": "",
+    "advice": "",
+    "method": "",
+    "method_summary": "",
+    "seconds": 0.0,
+    "loss": None,
+    "unit": "units",
+    "confidence": None,
+    "pose": None,
+    "truth": None,
+    "error": None,
+    "shape": None,
+    "camera": "",
+    "ellipsoid": None,
+    "observed": None,
+    "rendered": None,
+    "depth": None,
+    "steps": (),
+    "path": (),
+    "matches": None,
+    "figures": (),
+    "contests": (),
+    "runner_up": None,
+}
+"""All JSON values of an answer, see ``answer_json``, with their values for an image of which nothing is known."""
+
+
 def no_answer(name: str, outcome: str, reason: str) -> Json:
-    """Return the JSON values for an image that could not be localized, in the format of ``shown_answer``."""
-    texts = dict.fromkeys(("meaning", "advice", "method", "method_summary", "camera"), "")
-    unknown = (
-        "loss",
-        "confidence",
-        "pose",
-        "truth",
-        "error",
-        "shape",
-        "ellipsoid",
-        "observed",
-        "rendered",
-        "depth",
-        "matches",
-        "runner_up",
-    )
-    lists = dict[str, tuple[Any, ...]].fromkeys(("steps", "path", "figures", "contests"), ())
-    found = {
-        "name": name,
-        "outcome": outcome,
-        "accepted": False,
-        "reason": reason,
-        "seconds": 0.0,
-        "unit": "units",
-    }
-    return texts | dict.fromkeys(unknown) | lists | found
+    """Return the JSON values for an image that could not be localized, in the format of ``answer_json``."""
+    return NO_ANSWER | {"name": name, "outcome": outcome, "reason": reason}
 
 
-def shown_answer(
+def answer_json(
     scene: SceneMap,
     name: str,
-    found: Localization,
+    localization: Localization,
     frame: Frame | None = None,
     record: SearchRecord | None = None,
     truth: SE3 | None = None,
-    quick: bool = False,
 ) -> Json:
-    """Return the JSON values of a localization, with renderings if its ``frame`` is known.
+    """Return the JSON values of a localization, without the renderings that ``add_renderings`` adds.
 
-    ``record`` is the record of the search, and ``truth`` the true T_world_camera. A ``quick`` answer renders the
-    surface instead of the field. Poses are shown in the map's own coordinates, see ``Map.origin``.
+    ``frame`` is the image that was localized, if it is known, ``record`` is the record of the search, and ``truth`` the
+    true T_world_camera. Poses are shown in the map's own coordinates, see ``Map.origin``.
 
     In the result, ``pose`` and ``truth`` are the 16 numbers of T_world_camera in row-major order, or None if not
     finite or not known. ``error`` holds the position error (in the map's unit) and the orientation error (degrees),
     and ``path`` the positions from the start to the pose found. ``camera`` describes the intrinsics that were used,
     ``meaning`` explains why a pose was rejected, and ``advice`` suggests what to try.
     """
-    found = found.translated(-origin_of(scene))
-    truth = None if truth is None else truth.translated(-origin_of(scene))
-    T = found.T_world_camera.to("cpu", torch.float64)
+    origin, unit = -origin_of(scene), localization.unit
+    localization = localization.translated(origin)
+    T = localization.T_world_camera.to("cpu", torch.float64)
     finite = bool(T.matrix().isfinite().all())
-    observed, rendered, depth, camera = None, None, None, ""
+    positions = localization.poses.translation.detach().cpu().double()
+    answer = NO_ANSWER | {
+        "name": name,
+        "outcome": str(localization.outcome),
+        "accepted": localization.converged and finite,
+        "reason": localization.reason,
+        "method": localization.method,
+        "seconds": localization.seconds,
+        "loss": _finite(localization.loss),
+        "unit": symbol(unit),
+        "confidence": _finite(localization.confidence),
+        "steps": _steps(localization, record),
+        "path": tuple((x, y, z) for x, y, z in positions[positions.isfinite().all(-1)].tolist()),
+        "figures": acceptance_figures(localization, record),
+        "contests": contests(localization, record),
+    }
+    with contextlib.suppress(PluginError):  # the method may not be installed here
+        answer["method_summary"] = METHODS.load(localization.method).summary
+    if advice := ADVICE.get(localization.outcome):
+        answer |= {"meaning": advice.meaning, "advice": advice.first}
+    if truth is not None:
+        truth = truth.translated(origin)
+        answer["truth"] = rows_of(truth)
+        if finite:
+            error = pose_error(T, truth, unit)
+            answer["error"] = float(error.translation), float(error.rotation_deg)
     if frame is not None:
         camera = frame.camera_source or "intrinsics as given"
-        if found.intrinsics is not None:
-            camera = f"intrinsics taken or estimated by the localization, focal length times {found.focal_factor:.3f}"
-        frame = found.frame_as_taken(frame)
-        small = frame.intrinsics.at_most(320)  # pixels on the longer side, since rendering takes time
-        observed = photograph(reduced(frame.rgb, small.width, small.height))
-        if finite:
-            rendered, depth = _compared(scene, small, T, frame, quick)
-    error = None if truth is None or not finite else pose_error(T, truth, found.unit)
-    advice = ADVICE.get(found.outcome)
-    other = None if record is None or not finite else _runner_up(scene, found, record, frame, quick)
-    answer, summary = last_answer(record), ""
-    with contextlib.suppress(PluginError):  # the method may not be installed here
-        summary = METHODS.load(found.method).summary
-    places = found.poses.translation.detach().cpu().double()
-    return {
-        "name": name,
-        "outcome": str(found.outcome),
-        "accepted": found.converged and finite,
-        "reason": found.reason,
-        "meaning": "" if advice is None else advice.meaning,
-        "advice": "" if advice is None else advice.first,
-        "method": found.method,
-        "method_summary": summary,
-        "seconds": found.seconds,
-        "loss": _finite(found.loss),
-        "unit": symbol(found.unit),
-        "confidence": _finite(found.confidence),
-        "pose": rows_of(T) if finite else None,
-        "truth": None if truth is None else rows_of(truth),
-        "error": None if error is None else (float(error.translation), float(error.rotation_deg)),
-        "shape": None if frame is None else frustum(frame.intrinsics),
-        "camera": camera,
-        "ellipsoid": ellipsoid(T, found.covariance) if finite else None,
-        "observed": observed,
-        "rendered": rendered,
-        "depth": depth,
-        "steps": _steps(found, record),
-        "path": tuple((x, y, z) for x, y, z in places[places.isfinite().all(-1)].tolist()),
-        "matches": None if frame is None or answer is None or not finite else _matches(scene, found, answer),
-        "figures": acceptance_figures(found, record),
-        "contests": contests(found, record),
-        "runner_up": other,
-    }
+        if localization.intrinsics is not None:
+            camera = (
+                f"intrinsics taken or estimated by the localization, focal length times {localization.focal_factor:.3f}"
+            )
+        frame = localization.frame_as_taken(frame)
+        small = frame.intrinsics.at_most(OBSERVED)
+        observed = jpeg_json(reduced(frame.rgb, small.width, small.height))
+        answer |= {"camera": camera, "shape": frustum(frame.intrinsics), "observed": observed}
+    if finite:
+        answer |= {"pose": rows_of(T), "ellipsoid": ellipsoid(T, localization.covariance)}
+        if record is not None:
+            answer["runner_up"] = _runner_up(scene, localization, record)
+            if frame is not None and record.answers:
+                answer["matches"] = _matches(scene, localization, record.answers[-1])
+    return answer
+
+
+def add_renderings(
+    answer: Json, scene: SceneMap, localization: Localization, frame: Frame, quick: bool = False
+) -> Json:
+    """Return the JSON values of a localization together with renderings from its pose and from that of the runner-up.
+
+    ``frame`` is the image that was localized. ``quick`` renderings show the surface instead of the field.
+    """
+    frame = localization.frame_as_taken(frame)
+
+    def render(pose: tuple[float, ...], most: int) -> tuple[Json, Json | None]:
+        camera, rows = frame.intrinsics.at_most(most), torch.tensor(pose, dtype=torch.float64).reshape(4, 4)
+        T = SE3(rows[:3, :3], rows[:3, 3])
+        if quick or not has_field(scene.field):
+            return jpeg_json(quick_image(scene, camera, T)), None
+        image = render_picture(scene.field, camera, T, scene.bounds)
+        return jpeg_json(image.rgb), depth_difference(image, frame)
+
+    other = answer["runner_up"]
+    if other is not None:
+        answer = answer | {"runner_up": other | {"rendered": render(other["pose"], 240)[0]}}
+    if answer["pose"] is None:
+        return answer
+    rendered, depth = render(answer["pose"], OBSERVED)
+    return answer | {"rendered": rendered, "depth": depth}
 
 
 def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> Json | None:
@@ -188,25 +211,18 @@ def depth_difference(image: RenderedImage, frame: Frame) -> Json | None:
     towards = torch.where((share > 0)[..., None], far, near)
     rgb = middle + share.abs()[..., None] * (towards - middle)
     pixels = torch.cat([rgb, known[..., None].float()], dim=-1)
-    picture = drawing((pixels * 255 + 0.5).to(torch.uint8).numpy())
+    picture = png_json((pixels * 255 + 0.5).to(torch.uint8).numpy())
     return {"picture": picture, "range": most, "median": float(off.abs().median())}
 
 
-def _compared(scene: SceneMap, camera: Intrinsics, T: SE3, frame: Frame, quick: bool) -> tuple[Json, Json | None]:
-    if quick or not has_field(scene.field):
-        return photograph(quick_image(scene, camera, T)), None
-    image = render_picture(scene.field, camera, T, scene.bounds)
-    return photograph(image.rgb), depth_difference(image, frame)
-
-
-def _steps(found: Localization, record: SearchRecord | None) -> tuple[Json, ...]:
+def _steps(localization: Localization, record: SearchRecord | None) -> tuple[Json, ...]:
     """Return the steps of the search (or else of the descent), then the pose together with its rivals, then the pose found."""
-    last = found.T_world_camera.to("cpu", torch.float64)
+    last = localization.T_world_camera.to("cpu", torch.float64)
     shown = [] if record is None else [_step(s.caption, s.T, s.scores.tolist(), s.kept) for s in record.steps]
     if not shown:  # no search: the steps of the descent, evenly spread
-        count = min(len(found.losses), len(found.poses.translation) - 1)
+        count = min(len(localization.losses), len(localization.poses.translation) - 1)
         for number in range(0, count, max(1, math.ceil(count / MOST_STEPS))):
-            T, loss = found.poses[number : number + 1], float(found.losses[number])
+            T, loss = localization.poses[number : number + 1], float(localization.losses[number])
             if bool(T.matrix().isfinite().all()):
                 shown.append(_step(f"step {number} of {count}", T, [loss], 1, loss))
     if not bool(last.matrix().isfinite().all()):
@@ -222,7 +238,7 @@ def _steps(found: Localization, record: SearchRecord | None) -> tuple[Json, ...]
 
 def _step(caption: str, T: SE3, scores: list[float], kept: int, loss: float | None = None) -> Json:
     """Return one step: the poses that were considered together, the best first, their scores, and the ``loss`` of a descent."""
-    poses = packed(T.matrix()[:, :3].detach().cpu().double().flatten(1).numpy())
+    poses = pack(T.matrix()[:, :3].detach().cpu().double().flatten(1).numpy())
     known = tuple(map(_finite, scores))
     return {"caption": caption, "poses": poses, "scores": known, "kept": kept, "loss": _finite(loss)}
 
@@ -231,7 +247,7 @@ def _finite(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
 
 
-def _matches(scene: SceneMap, found: Localization, answer: LandmarkAnswer) -> Json | None:
+def _matches(scene: SceneMap, localization: Localization, answer: LandmarkAnswer) -> Json | None:
     """Return the last image's matches at the last pose from landmarks: matches by projection, then further ones by descriptor.
 
     ``keypoints`` and the ``projections`` of their landmarks (NaN behind the camera) are fractions of the image size,
@@ -260,43 +276,32 @@ def _matches(scene: SceneMap, found: Localization, answer: LandmarkAnswer) -> Js
         shares = [torch.stack([1 - share[:, 0], share[:, 1]], dim=-1) for share in shares]
     every = max(1, math.ceil(len(keypoint) / 600))  # at most 600 are drawn
     return {
-        "keypoints": packed(shares[0][::every].numpy()),
-        "projections": packed(shares[1][::every].numpy()),
-        "accepted": packed(agree[::every].to(torch.uint8).numpy()),
+        "keypoints": pack(shares[0][::every].numpy()),
+        "projections": pack(shares[1][::every].numpy()),
+        "accepted": pack(agree[::every].to(torch.uint8).numpy()),
         "agreeing": int(agree.sum()),
         "refused": int((~agree).sum()),
         "by_appearance": by_descriptors,
-        "pose": earlier(found, answer),
+        "pose": name_earlier(localization, answer),
     }
 
 
-def _runner_up(
-    scene: SceneMap, found: Localization, record: SearchRecord, frame: Frame | None, quick: bool
-) -> Json | None:
+def _runner_up(scene: SceneMap, localization: Localization, record: SearchRecord) -> Json | None:
     """Return a rival pose: an earlier one from landmarks, else the next most probable one, else the best other one searched."""
-    answer = last_answer(record)
-    if answer is not None:
-        if given_up := earlier(found, answer):
-            return _rendered(scene, answer.T_world_rig.to("cpu"), given_up, frame, quick)
+    if answer := last_answer(record):
+        if given_up := name_earlier(localization, answer):
+            return _other_pose(given_up, answer.T_world_rig.to("cpu"))
         for mode, T, probability in probable_poses(answer):
             if mode != answer.posterior.mode and answer.modes[mode].name != MIRROR:
-                shown = _rendered(scene, T, "the next most probable pose by landmarks", frame, quick)
-                return shown | {"probability": probability}
-    T = found.T_world_camera.to("cpu", torch.float64)
-    x, y, z = scene.bounds.centre
-    reach = APART * float((T.translation - torch.tensor([x, y, z], dtype=torch.float64)).norm())
+                return _other_pose("the next most probable pose by landmarks", T, probability)
+    T = localization.T_world_camera.to("cpu", torch.float64)
+    middle = T.inverse().apply(torch.tensor(scene.bounds.centre, dtype=torch.float64))
     for step in reversed([step for step in record.steps if len(step.scores) > 1]):
-        off = pose_error(step.T, T)
-        different = (off.translation > reach) | (off.rotation_deg > TURNED_DEG)
+        different = ~same_pose(T, step.T, middle, 2 * DISPLACEMENT)
         if bool(different.any()):
-            place = int(different.nonzero()[0])
-            return _rendered(scene, step.T[place], "the best different pose of the search", frame, quick)
+            return _other_pose("the best different pose of the search", step.T[int(different.nonzero()[0])])
     return None
 
 
-def _rendered(scene: SceneMap, T: SE3, reason: str, frame: Frame | None, quick: bool) -> Json:
-    """Return the JSON values of an alternative pose, without a probability, and with a rendering if ``frame`` is given."""
-    picture = None
-    if frame is not None:
-        picture, _ = _compared(scene, frame.intrinsics.at_most(240), T, frame, quick)
-    return {"reason": reason, "pose": rows_of(T), "rendered": picture, "probability": None}
+def _other_pose(reason: str, T: SE3, probability: float | None = None) -> Json:
+    return {"reason": reason, "pose": rows_of(T), "rendered": None, "probability": probability}

@@ -8,11 +8,9 @@ import logging
 import math
 import re
 import tempfile
-import threading
 import uuid
-from collections.abc import AsyncIterator, Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,35 +21,39 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 
 from bidnerf.results import BAD_INPUT
 from bidnerf.service import (
+    OPEN,
     Application,
     Refused,
+    RequestQueue,
     ServiceLimits,
-    answered,
-    body_of,
-    checked,
-    errors,
-    json_body,
-    photo_body,
-    photo_of,
+    ThreadExecutor,
+    await_result,
+    error_responses,
+    json_request,
+    photo_request,
     public_message,
+    read_body,
+    read_photo,
     read_upload,
+    validate,
 )
 from bidnerf.viewer.answer import no_answer
-from bidnerf.viewer.pages import MapView, localized, map_of
+from bidnerf.viewer.pages import MapView, answer_query, require_map
 from bidnerf.viewer.pictures import Json, field_image, jpeg, quick_image
-from bidnerf.viewer.scene import shown_map, thumbnail_jpeg
+from bidnerf.viewer.scene import map_json, thumbnail_jpeg
 from bidnerf_core.camera import CameraSource, Intrinsics
 from bidnerf_core.datasets import Query, QuerySource
 from bidnerf_core.errors import Cancelled, InputError
 from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.io import parse_json, to_plain
 from bidnerf_core.localization import Localizer, SearchRecord
-from bidnerf_core.progress import job_context
 
 log = logging.getLogger("bidnerf.viewer")
 
-PLACES = 10
+SLOTS = 10
 """Maximum number of photos that are uploading, waiting or being localized."""
+MOST_ANSWERS = 64
+"""Maximum number of finished localizations whose answers stay in memory."""
 LARGEST_RENDERING = 1024
 """Longer side (pixels) of renderings from the virtual camera of the page."""
 
@@ -75,28 +77,29 @@ Read = Callable[[], tuple[Query, SE3 | None, int]]
 """A function that returns the input of a localization: a query, a start pose or None, and the seed of the search."""
 
 
-@dataclass
+@dataclass(eq=False)
 class ShownJob:
-    """A localization job and its state, which the page polls."""
+    """A localization and its state, which the page polls."""
 
     id: str
     name: str
     state: Literal["waiting", "searching", "rendering", "done"] = "waiting"
     record: SearchRecord | None = None
     answer: Json | None = None
+    task: asyncio.Task[None] = field(init=False)
 
     def plain(self, known: str) -> dict[str, Any]:
         """Return the state as JSON values, and the answer unless the client already knows it for this state (``known``)."""
         caption = self.record.steps[-1].caption if self.record is not None and self.record.steps else ""
-        said = {"id": self.id, "name": self.name, "state": self.state, "caption": caption}
-        return said if self.state == known else said | {"answer": to_plain(self.answer)}
+        state = {"id": self.id, "name": self.name, "state": self.state, "caption": caption}
+        return state if self.state == known else state | {"answer": to_plain(self.answer)}
 
     def run(self, localizer: Localizer, read: Read) -> None:
         """Localize the query that ``read`` returns, and store the answer; if localization fails, the answer states the error."""
         self.state = "searching"
         try:
             query, start, seed = read()
-            self.answer = localized(localizer, query, start, seed, self._follow)
+            self.answer = answer_query(localizer, query, start, seed, self._follow)
         except Cancelled:
             self.answer = no_answer(self.name, "stopped", "the viewer was closed")
         except InputError as error:
@@ -112,42 +115,34 @@ class ShownJob:
 
 
 class Jobs:
-    """Runs localizations one at a time in a background thread; ``shown`` holds the jobs by id."""
+    """The localizations of a viewer, which one thread performs in turn; ``shown`` holds them by id."""
 
     def __init__(self, localizer: Localizer) -> None:
         self.shown = dict[str, ShownJob]()
-        self._localizer, self._closed = localizer, threading.Event()
-        self._thread = ThreadPoolExecutor(1, "localizing")
+        self.queue = RequestQueue[ThreadExecutor](SLOTS, lambda: 5)
+        self._localizer, self._thread = localizer, ThreadExecutor("localizing")
+        self.queue.add(self._thread)
 
-    @contextlib.contextmanager
-    def place(self, name: str) -> Iterator[ShownJob]:
-        """Yield a new job, which is removed if the block raises an error. Raises ``Refused`` if too many jobs are pending."""
-        if sum(each.state != "done" for each in self.shown.values()) >= PLACES:
-            headers = {"Retry-After": "5", "Connection": "close"}
-            raise Refused(429, f"all {PLACES} places are taken, try again later", headers)
+    def start(self, name: str, read: Read, slot: contextlib.ExitStack) -> ShownJob:
+        """Localize the query that ``read`` returns in the background, and leave the ``slot`` of the queue afterwards."""
+        done = [job.id for job in self.shown.values() if job.state == "done"]
+        for old in done[:-MOST_ANSWERS]:
+            del self.shown[old]
         job = ShownJob(uuid.uuid4().hex, name)
         self.shown[job.id] = job
-        try:
-            yield job
-        except BaseException:
-            del self.shown[job.id]
-            raise
+        job.task = asyncio.create_task(self._run(job, read, slot))
+        return job
 
-    def put(self, job: ShownJob, read: Read) -> None:
-        """Queue the localization of the query that ``read`` returns."""
-        done = [each.id for each in self.shown.values() if each.state == "done"]
-        for old in done[: max(0, len(self.shown) - 64)]:  # the answers of 64 localizations stay in memory
-            del self.shown[old]
-        self._thread.submit(self._run, job, read)
+    async def _run(self, job: ShownJob, read: Read, slot: contextlib.ExitStack) -> None:
+        with slot:
+            async with self.queue.executor() as thread:
+                await thread.run(lambda: job.run(self._localizer, read))
 
     def close(self) -> None:
-        """Discard the waiting localizations, and ask the one in progress to stop."""
-        self._closed.set()
-        self._thread.shutdown(wait=False, cancel_futures=True)
-
-    def _run(self, job: ShownJob, read: Read) -> None:
-        with job_context(cancel=self._closed.is_set):
-            job.run(self._localizer, read)
+        """Cancel the localizations that are at work or waiting."""
+        for job in self.shown.values():
+            job.task.cancel()
+        self._thread.close()
 
 
 class VirtualCamera(BaseModel):
@@ -174,29 +169,26 @@ class VirtualCamera(BaseModel):
         return Intrinsics(focal, focal, self.width / 2, self.height / 2, self.width, self.height)
 
 
-def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits | None = None) -> FastAPI:
+def viewer_app(live: LiveView, token: str | None = None, limits: ServiceLimits | None = None) -> Application:
     """Return the viewer as an ASGI application; ``limits`` apply to uploads.
 
     Without a ``token``, only requests addressed to localhost are answered.
     """
     limits = limits or ServiceLimits()
-    scene, localizer, names = (
-        map_of(shown.localizer),
-        shown.localizer,
-        () if shown.source is None else tuple(shown.source.names),
-    )
-    usual = replace(shown.camera or CameraSource(), assumed=localizer.assumed_cameras)
+    scene, source = require_map(live.localizer), live.source
+    names = () if source is None else tuple(source.names)
+    usual = replace(live.camera or CameraSource(), assumed=live.localizer.assumed_cameras)
     others = replace(usual, hfov=None)  # the page sends the field of view
     state = MapView(
-        shown_map(scene, thumbnails=0),
+        map_json(scene, thumbnails=0),
         live=True,
         queries=names,
-        trajectory=shown.trajectory,
-        results=shown.results,
+        trajectory=live.trajectory,
+        results=live.results,
         hfov=usual.hfov,
         camera_given=others.is_given,
     )
-    jobs, painter = Jobs(localizer), ThreadPoolExecutor(1, "rendering")
+    jobs, painter = Jobs(live.localizer), ThreadExecutor("rendering")
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -204,7 +196,7 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
             yield
         finally:
             jobs.close()
-            painter.shutdown(wait=False, cancel_futures=True)
+            painter.close()
 
     app = Application(
         "bidnerf view",
@@ -214,40 +206,36 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
         description="A map, and localizations in it.",
     )
 
-    def queued(job: ShownJob, read: Read) -> Response:
-        jobs.put(job, read)
-        return JSONResponse({"job": job.id}, 202)
-
     @app.get("/", response_class=HTMLResponse, summary="The page.")
     async def page() -> Response:
         # The page states a policy for its own scripts.
         headers = {"Content-Security-Policy": "frame-ancestors 'none'", "Referrer-Policy": "no-referrer"}
         return HTMLResponse(state.html(), headers=headers)
 
-    @app.get("/health", summary="Whether the viewer is up; needs no token.")
+    @app.get(OPEN, summary="Whether the viewer is up; needs no token.")
     async def health() -> Response:
         return JSONResponse({"status": "ok"})
 
-    @app.get("/api/thumbnail/{number}", responses=errors(404), summary="A rendering from a camera of the map.")
+    @app.get("/api/thumbnail/{number}", responses=error_responses(404), summary="A rendering from a camera of the map.")
     async def thumbnail(number: str) -> Response:
         cameras = scene.info.cameras
         camera = cameras[_index(number, len(cameras), "camera of the map")]
-        content = await asyncio.get_running_loop().run_in_executor(painter, thumbnail_jpeg, scene, camera)
+        content = await painter.run(lambda: thumbnail_jpeg(scene, camera))
         return Response(content, headers={"Cache-Control": "private, max-age=3600"}, media_type="image/jpeg")
 
     @app.post(
         "/api/photo",
         status_code=202,
-        openapi_extra=photo_body("map"),
-        responses=errors(400, 408, 413, 429),
+        openapi_extra=photo_request("map"),
+        responses=error_responses(400, 408, 413, 429, 503),
         summary="Queue the localization of a photo.",
     )
     async def photo(request: Request) -> Response:
-        with jobs.place("photo") as job:
-            upload = await photo_of(request, limits)
+        with contextlib.ExitStack() as slot:
+            slot.enter_context(jobs.queue.slot())
+            upload = await read_photo(request, limits)
             if "map" in upload.parameters:
                 raise InputError("map is given", expected="none, since the viewer shows one map")
-            job.name = upload.name
 
             def read() -> tuple[Query, SE3 | None, int]:
                 with tempfile.TemporaryDirectory(prefix="bidnerf-view-") as folder:
@@ -259,50 +247,40 @@ def viewer_app(shown: LiveView, token: str | None = None, limits: ServiceLimits 
                 views = tuple(view.over(scene.bounds.background) for view in query.views)
                 return Query(upload.name, views, query.truth, query.depth_rays), start, upload.seed
 
-            return queued(job, read)
+            return JSONResponse({"job": jobs.start(upload.name, read, slot.pop_all()).id}, 202)
 
     @app.post(
         "/api/query/{number}",
         status_code=202,
-        responses=errors(404, 429),
+        responses=error_responses(404, 429),
         summary="Queue the localization of an image with which the viewer was started.",
     )
     async def query(number: str) -> Response:
         index = _index(number, len(names), "image with which the viewer was started")
-        with jobs.place(names[index]) as job:
-            assert shown.source is not None
-            source = shown.source
-            return queued(job, lambda: (source.read(index), None, 0))
+        assert source is not None
+        slot = contextlib.ExitStack()
+        slot.enter_context(jobs.queue.slot())
+        job = jobs.start(names[index], lambda: (source.read(index), None, 0), slot)
+        return JSONResponse({"job": job.id}, 202)
 
-    @app.get("/api/job/{id}", responses=errors(404), summary="The state of a localization, and its answer.")
+    @app.get("/api/job/{id}", responses=error_responses(404), summary="The state of a localization, and its answer.")
     async def job(id: str, known: str = "") -> Response:
-        found = jobs.shown.get(id)
-        if found is None:
+        if id not in jobs.shown:
             raise Refused(404, "no such localization")
-        return JSONResponse(found.plain(known))
+        return JSONResponse(jobs.shown[id].plain(known))
 
     @app.post(
         "/api/view",
-        openapi_extra=json_body(VirtualCamera),
-        responses=errors(400, 408, 413),
+        openapi_extra=json_request(VirtualCamera),
+        responses=error_responses(400, 408, 413, 503),
         summary="A rendering from a virtual camera.",
     )
     async def view(request: Request) -> Response:
-        body = parse_json(await body_of(request, replace(limits, max_megabytes=0.1)), "", "a camera")
-        camera = checked(VirtualCamera, body)
-        intrinsics, T, cancelled = camera.intrinsics, camera.T_world_camera, threading.Event()
-
-        def render() -> bytes | None:
-            with contextlib.suppress(Cancelled), job_context(cancel=cancelled.is_set):
-                if not cancelled.is_set():
-                    return jpeg((quick_image if camera.quick else field_image)(scene, intrinsics, T))
-            return None
-
-        try:
-            content = await answered(request, asyncio.get_running_loop().run_in_executor(painter, render))
-        finally:
-            cancelled.set()
-        return Response(content, media_type="image/jpeg")
+        body = parse_json(await read_body(request, replace(limits, max_megabytes=0.1)), "", "a camera")
+        camera = validate(VirtualCamera, body)
+        intrinsics, T, render = camera.intrinsics, camera.T_world_camera, quick_image if camera.quick else field_image
+        work = asyncio.create_task(painter.run(lambda: jpeg(render(scene, intrinsics, T))))
+        return Response(await await_result(request, work), media_type="image/jpeg")
 
     return app
 

@@ -6,7 +6,8 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from bidnerf.results import pose_error
+import torch
+
 from bidnerf.viewer.pictures import Json
 from bidnerf.viewer.scene import rows_of
 from bidnerf_core.geometry import SE3, symbol
@@ -23,11 +24,10 @@ from bidnerf_core.localization import (
     SearchRecord,
     Support,
     odds,
+    same_pose,
 )
 
 HERE, EARLIER = "the pose found", "an earlier pose by landmarks, which was given up"
-APART, TURNED_DEG = 0.1, 10.0
-"""Distance (as a fraction of the distance to the scene) and angle beyond which two poses count as different answers."""
 
 
 def last_answer(record: SearchRecord | None) -> LandmarkAnswer | None:
@@ -35,32 +35,32 @@ def last_answer(record: SearchRecord | None) -> LandmarkAnswer | None:
     return None if record is None or not record.answers else record.answers[-1]
 
 
-def contests(found: Localization, record: SearchRecord | None) -> tuple[Json, ...]:
+def contests(localization: Localization, record: SearchRecord | None) -> tuple[Json, ...]:
     """Return up to three comparisons: between poses by landmarks, of the pose with other explanations, and between cameras."""
-    shown, answer, support = list[Json](), last_answer(record), found.diagnostics
+    shown, answer, support = list[Json](), last_answer(record), localization.diagnostics
     if answer is not None and len(answer.modes) > 1:
-        shown.append(_of_modes(found, answer))
+        shown.append(_compare_modes(localization, answer))
     if isinstance(support, Support) and "displaced" in support.measures:
-        shown.append(_of_support(support))
+        shown.append(_compare_rivals(support))
     if answer is not None:
-        shown.append(_of_cameras(found, answer))
+        shown.append(_compare_cameras(localization, answer))
     return tuple(shown)
 
 
-def earlier(found: Localization, answer: LandmarkAnswer) -> str:
+def name_earlier(localization: Localization, answer: LandmarkAnswer) -> str:
     """Return ``EARLIER`` if the pose from landmarks differs from the pose found, else an empty string."""
-    off = pose_error(answer.T_world_rig.to("cpu"), found.T_world_camera.to("cpu"))
-    near = float(off.translation) <= APART * answer.distance and float(off.rotation_deg) <= TURNED_DEG
-    return "" if near else EARLIER
+    T, other = localization.T_world_camera.to("cpu", torch.float64), answer.T_world_rig.to("cpu", torch.float64)
+    middle = torch.tensor([0.0, 0.0, answer.distance], dtype=torch.float64)
+    return "" if bool(same_pose(T, other[None], middle)) else EARLIER
 
 
 def probable_poses(answer: LandmarkAnswer) -> list[tuple[int, SE3, float]]:
     """Return the index, the most probable pose and the probability of each mode, in order of decreasing probability."""
-    posterior, found = answer.posterior, list[tuple[int, SE3, float]]()
+    posterior, poses = answer.posterior, list[tuple[int, SE3, float]]()
     for mode in range(len(answer.modes)):
         probability = float(posterior.probability[posterior.states.mode == mode].sum())
-        found.append((mode, posterior.place(mode).to("cpu"), probability))
-    return sorted(found, key=lambda each: -each[2])
+        poses.append((mode, posterior.place(mode).to("cpu"), probability))
+    return sorted(poses, key=lambda each: -each[2])
 
 
 def _contest(
@@ -74,13 +74,13 @@ def _contest(
     return {"question": question, "answers": shown, "remark": remark, "of_pose": of_pose}
 
 
-def _of_modes(found: Localization, answer: LandmarkAnswer) -> Json:
+def _compare_modes(localization: Localization, answer: LandmarkAnswer) -> Json:
     shown, here, best = [], answer.T_world_rig.to("cpu"), answer.posterior.mode
     for mode, T, probability in probable_poses(answer):
-        apart = float((T.translation - here.translation).norm())
-        name = f"a pose {apart:.3g} {symbol(found.unit)} away"
+        distance = float((T.translation - here.translation).norm())
+        name = f"a pose {distance:.3g} {symbol(localization.unit)} away"
         if mode == best:
-            name = earlier(found, answer) or HERE
+            name = name_earlier(localization, answer) or HERE
         name = "the mirror image" if answer.modes[mode].name == MIRROR else name
         shown.append((name, probability, None if mode == best else rows_of(T)))
     others = {mode.name == MIRROR for mode in answer.modes[1:]}
@@ -88,7 +88,7 @@ def _of_modes(found: Localization, answer: LandmarkAnswer) -> Json:
     return _contest("This pose, another, or the mirror image?" if len(others) > 1 else question, shown)
 
 
-def _of_cameras(found: Localization, answer: LandmarkAnswer) -> Json:
+def _compare_cameras(localization: Localization, answer: LandmarkAnswer) -> Json:
     posterior, names = answer.posterior, answer.explanations.names
     own = posterior.probability * (posterior.states.mode == posterior.mode)
     shown = dict[str, float]()
@@ -98,11 +98,11 @@ def _of_cameras(found: Localization, answer: LandmarkAnswer) -> Json:
         shown[name] = shown.get(name, 0.0) + probability
     # Explanations that are less probable than one in a thousand are not listed.
     likely = [each for each in sorted(shown.items(), key=lambda each: -each[1]) if each[1] >= 0.001]
-    pose = earlier(found, answer)
+    pose = name_earlier(localization, answer)
     return _contest("Whose camera took it?", likely, f"Weighed at {pose}." if pose else "", of_pose=False)
 
 
-def _of_support(support: Support) -> Json:
+def _compare_rivals(support: Support) -> Json:
     names = {
         "displaced": f"the pose moved by {DISPLACEMENT:.0%} of its distance to the scene",
         "other": "another pose of the search",
@@ -238,24 +238,24 @@ class Figure:
         return Figure(name, format(value, spec), bound, passed, bar(value, limit, is_least), meaning)
 
 
-def acceptance_figures(found: Localization, record: SearchRecord | None) -> tuple[Figure, ...]:
+def acceptance_figures(localization: Localization, record: SearchRecord | None) -> tuple[Figure, ...]:
     """Return the measures of the pose found and, if landmarks did not find it, of the last pose that they found; failures first."""
-    measured, answer = found.diagnostics, last_answer(record)
+    measured, answer = localization.diagnostics, last_answer(record)
     figures = list[Figure]()
-    if found.confidence is not None and not isinstance(measured, Support):
+    if localization.confidence is not None and not isinstance(measured, Support):
         meaning = "probability that the pose is right, from all figures together"
-        figures.append(Figure.of(("confidence", ".1%", meaning), found.confidence, ACCEPTED))
+        figures.append(Figure.of(("confidence", ".1%", meaning), localization.confidence, ACCEPTED))
     if isinstance(measured, Evidence):
-        figures += _of_landmarks(measured)
+        figures += _landmark_figures(measured)
     elif isinstance(measured, Support):
-        figures += _without_landmarks(measured)
+        figures += _support_figures(measured)
     if answer is not None and not isinstance(measured, Evidence):
-        pose = earlier(found, answer)
-        figures += [replace(figure, pose=pose) for figure in _of_landmarks(answer.evidence)]
+        pose = name_earlier(localization, answer)
+        figures += [replace(figure, pose=pose) for figure in _landmark_figures(answer.evidence)]
     return tuple(sorted(figures, key=lambda figure: figure.passed is not False))  # what failed comes first
 
 
-def _of_landmarks(evidence: Evidence) -> Iterator[Figure]:
+def _landmark_figures(evidence: Evidence) -> Iterator[Figure]:
     bounds = {bound.measure: bound for bound in LANDMARK_BOUNDS}
     for measure, text in MEASURES.items():
         value, bound = getattr(evidence, measure), bounds.get(measure)
@@ -271,7 +271,7 @@ def _of_landmarks(evidence: Evidence) -> Iterator[Figure]:
             yield Figure.of(text, value, bound.limit, bound.is_least)
 
 
-def _without_landmarks(measured: Support) -> Iterator[Figure]:
+def _support_figures(measured: Support) -> Iterator[Figure]:
     for bound, value in measured.bounds:
         if bound.measure in WITHOUT_LANDMARKS:
             yield Figure.of(WITHOUT_LANDMARKS[bound.measure], value, bound.limit, bound.is_least)

@@ -8,7 +8,7 @@ import html
 import json
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from bidnerf.results import BAD_INPUT
-from bidnerf.viewer.answer import no_answer, shown_answer
+from bidnerf.viewer.answer import add_renderings, answer_json, no_answer
 from bidnerf.viewer.pictures import Json
-from bidnerf.viewer.scene import shown_map, shown_trajectory
+from bidnerf.viewer.scene import map_json, trajectory_json
 from bidnerf_core.datasets import Query, QuerySource
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import Frame, View
@@ -71,7 +71,7 @@ class MapView:
             "state": json.dumps(to_plain(self), allow_nan=False, separators=(",", ":")).translate(escapes),
             "scripts": f'<script>{library}</script>\n<script type="module">{scripts}</script>',
         }
-        return re.sub(r"<!-- (\w+) -->", lambda found: parts[found[1]], _part("index.html"))
+        return re.sub(r"<!-- (\w+) -->", lambda comment: parts[comment[1]], _part("index.html"))
 
     def save(self, path: str | Path) -> Path:
         """Write the page atomically to a file that opens without a server or a network.
@@ -118,31 +118,28 @@ def view(
     localizer with its own settings, and ``trajectory`` is a file of poses. Raises ``InputError`` if ``scene`` is
     neither a map nor a localizer, and for a frame that cannot be localized at all.
     """
-    scene_map = map_of(scene)
+    scene_map = require_map(scene)
     answers = list[Json]()
     if localization is not None:
         name = "localization" if frame is None else frame.name
-        answers.append(shown_answer(scene_map, name, localization, frame))
+        answer = answer_json(scene_map, name, localization, frame)
+        answers.append(answer if frame is None else add_renderings(answer, scene_map, localization, frame))
     elif frame is not None:
-        answers.append(
-            localized(
-                scene if isinstance(scene, Localizer) else Localizer(scene_map),
-                Query(frame.name, (View(frame, SE3.identity()),)),
-            )
-        )
-    path = None if trajectory is None else shown_trajectory(Path(trajectory), scene_map.unit, scene_map.origin)
-    return MapView(shown_map(scene_map), tuple(answers), title, trajectory=path)
+        localizer = scene if isinstance(scene, Localizer) else Localizer(scene_map)
+        answers.append(answer_query(localizer, Query(frame.name, (View(frame, SE3.identity()),))))
+    path = None if trajectory is None else trajectory_json(Path(trajectory), scene_map.unit, scene_map.origin)
+    return MapView(map_json(scene_map), tuple(answers), title, trajectory=path)
 
 
-def map_of(scene: object) -> Map:
+def require_map(scene: object) -> Map:
     """Return the given map, or the map of a localizer. Raises ``InputError`` for anything else."""
-    found = scene.scene if isinstance(scene, Localizer) else scene
-    if not isinstance(found, Map):
-        raise InputError(f"scene is a {type(found).__name__}", where="view", expected="a Map, such as load_map returns")
-    return found
+    scene = scene.scene if isinstance(scene, Localizer) else scene
+    if not isinstance(scene, Map):
+        raise InputError(f"scene is a {type(scene).__name__}", where="view", expected="a Map, such as load_map returns")
+    return scene
 
 
-def localized(
+def answer_query(
     localizer: Localizer,
     query: Query,
     start: SE3 | None = None,
@@ -154,35 +151,26 @@ def localized(
     ``follow`` is called twice: before the search with its record, and before the field is rendered with the record
     and an answer whose pictures show the surface.
     """
+    scene, frame = localizer.scene, query.frame
     with recorded() as record:
         if follow is not None:
             follow(record, None)
-        found = localizer(query.views, start, query.depth_rays, seed)
-    known = (localizer.scene, query.name, found, query.frame, record, query.truth)
+        localization = localizer(query.views, start, query.depth_rays, seed)
+    answer = answer_json(scene, query.name, localization, frame, record, query.truth)
     if follow is not None:
-        follow(record, shown_answer(*known, quick=True))
-    return shown_answer(*known)
+        follow(record, add_renderings(answer, scene, localization, frame, quick=True))
+    return add_renderings(answer, scene, localization, frame)
 
 
-def read_and_localized(localizer: Localizer, source: QuerySource, place: int) -> Json:
-    """Localize the query at index ``place`` of a source; if the query cannot be used, the answer states why."""
+def answer_image(localizer: Localizer, source: QuerySource, index: int) -> Json:
+    """Localize the query at an index of a source; if the query cannot be used, the answer states why."""
     try:
-        return localized(localizer, source.read(place))
+        return answer_query(localizer, source.read(index))
     except InputError as error:
-        return no_answer(source.names[place], BAD_INPUT, str(error))
+        return no_answer(source.names[index], BAD_INPUT, str(error))
 
 
-def page_of(
-    scene: Map,
-    answers: Iterable[Json],
-    trajectory: Json | None = None,
-    results: Iterable[Json] = (),
-) -> MapView:
-    """Build the viewer page of a map with answers, a trajectory and rows of results."""
-    return MapView(shown_map(scene), tuple(answers), trajectory=trajectory, results=tuple(results))
-
-
-def shown_row(row: Any) -> Json:
+def row_json(row: Any) -> Json:
     """Return the JSON values of a row in the page's table, from a result of an evaluation.
 
     In ``row``, the pose and the covariance are lists of matrix rows. In the result, ``error`` holds the position

@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -18,10 +18,10 @@ from bidnerf.results import pose_entries, standard_deviations
 from bidnerf.viewer.pictures import (
     Json,
     jpeg,
-    packed,
-    packed_colours,
-    packed_points,
-    photograph,
+    jpeg_json,
+    pack,
+    pack_colours,
+    pack_points,
     quick_image,
 )
 from bidnerf_core.camera import Intrinsics
@@ -40,7 +40,7 @@ MOST_POINTS = 120_000
 """Maximum number of surfels or splats in a page; larger sets are subsampled at random."""
 
 
-def shown_map(scene: Map, thumbnails: int = 60) -> Json:
+def map_json(scene: Map, thumbnails: int = 60) -> Json:
     """Return the JSON values of a map; ``thumbnails`` is the maximum number of cameras with a rendered thumbnail.
 
     ``unit`` is the symbol of the unit of length, ``up_source`` states how the upward direction ``up`` was found, and
@@ -65,7 +65,7 @@ def shown_map(scene: Map, thumbnails: int = 60) -> Json:
                 "name": camera.name,
                 "pose": rows_of(camera.pose),
                 "shape": frustum(camera.intrinsics),
-                "thumbnail": photograph(_small_image(scene, camera)) if thumbnails and number % every == 0 else None,
+                "thumbnail": jpeg_json(_small_image(scene, camera)) if thumbnails and number % every == 0 else None,
             }
             for number, camera in enumerate(scene.info.cameras)
         ],
@@ -126,10 +126,10 @@ def _points(
     """Return the JSON values of a subset of a map's points; ``count`` is the number of all points.
 
     The radius of each point is ``radius``, in the map's unit, times the point's entry in ``sizes``, float32 (n), if
-    given. The ``normals``, int8 (n, 3) scaled by 127, point towards the cameras, since back faces are culled.
+    given. The ``normals``, int8 (n, 3) scaled by 127, point turn_towards the cameras, since back faces are culled.
     """
     return {
-        "points": packed_points(points),
+        "points": pack_points(points),
         "count": count,
         "radius": radius,
         "colours": colours,
@@ -145,20 +145,20 @@ def _surface(scene: Map) -> Json | None:
     some = _subset(len(surfels), MOST_POINTS)  # in random order, so that the first ones show the whole
     radius = scene.surface.cell * max(1.0, (len(surfels) / max(len(some), 1)) ** 0.5) / 2
     positions, keyframes = surfels.positions[some].cpu(), scene.surface.keyframes[:, :3, 3].cpu()
-    normals = towards(positions, surfels.normals[some].cpu(), keyframes)
+    normals = turn_towards(positions, surfels.normals[some].cpu(), keyframes)
     return _points(
         positions,
         len(surfels),
         radius,
-        packed_colours(surfels.rgb[some]),
-        normals=packed((127 * normals).round().to(torch.int8).numpy()),
+        pack_colours(surfels.rgb[some]),
+        normals=pack((127 * normals).round().to(torch.int8).numpy()),
     )
 
 
-def towards(
+def turn_towards(
     positions: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], cameras: Float[Tensor, "k 3"]
 ) -> Float[Tensor, "n 3"]:
-    """Return normals flipped towards the nearest camera, so that back-face culling lets one see into a room from outside."""
+    """Return normals flipped turn_towards the nearest camera, so that back-face culling lets one see into a room from outside."""
     if not len(cameras):
         return normals
     _, nearest = cKDTree(cameras.numpy()).query(positions.numpy())
@@ -184,8 +184,8 @@ def _splats(scene: Map) -> Json | None:
         splats.positions[some],
         len(splats.positions),
         1.0,
-        packed_colours(splats.rgb[some]),
-        packed(splats.radius[some].float().numpy()),
+        pack_colours(splats.rgb[some]),
+        pack(splats.radius[some].float().numpy()),
     )
 
 
@@ -215,7 +215,7 @@ def _framing(scene: Map) -> tuple[tuple[float, float, float], float]:
 # Trajectories.
 
 
-def shown_trajectory(path: Path, unit: LengthUnit | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> Json:
+def trajectory_json(path: Path, unit: LengthUnit | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> Json:
     """Read a trajectory: a JSON file of 'bidnerf track' or 'localize', which has uncertainties, or a TUM, EuRoC or KITTI file.
 
     The poses are shown relative to ``origin``, the origin of the map. A remark is logged if the file states a unit
@@ -227,25 +227,27 @@ def shown_trajectory(path: Path, unit: LengthUnit | None = None, origin: Sequenc
     """
     content = read_file(path, "a trajectory")
     if path.suffix.lower() in (".json", ".jsonl"):
-        found = [_posed(entry, path) for entry in pose_entries(path, content) if isinstance(entry, dict)]
-        found = [each for each in found if each[0] is not None]
+        entries = [
+            each for each in pose_entries(path, content) if isinstance(each, dict) and each.get("T_world_camera")
+        ]
+        poses = [_read_pose(entry, path) for entry in entries]
     else:
         rows = read_trajectory(path)
         stated = re.search(rb"^#.*lengths in (metres|units)", content.partition(b"\n")[0])  # by bidnerf
         of = None if stated is None else stated[1].decode()
-        poses = zip(rows.times.tolist(), rows.rotations, rows.translations, strict=True)
-        found = [(SE3(rotation, translation), "", time, None, "", of) for time, rotation, translation in poses]
-    if not found:
+        columns = zip(rows.times.tolist(), rows.rotations, rows.translations, strict=True)
+        poses = [(SE3(rotation, translation), "", time, None, "", of) for time, rotation, translation in columns]
+    if not poses:
         raise InputError("holds no pose", where=path, expected="those of a trajectory")
-    some = found[:: max(1, math.ceil(len(found) / 20_000))]  # longer ones are subsampled at a regular stride
+    some = poses[:: max(1, math.ceil(len(poses) / 20_000))]  # longer ones are subsampled at a regular stride
     T, frames, times, sigmas, outcomes, _ = zip(*some, strict=True)
-    other = {each[-1] for each in found} - {unit, None}
+    other = {each[-1] for each in poses} - {unit, None}
     if unit is not None and other:
         log.info("%s: is in %s, but the map is in %s; its poses are shown as they are", path, other.pop(), unit)
-    shown = SE3.stack(list(T)).translated(-torch.tensor(origin).double()).matrix()[:, :3]
+    local = SE3.stack(list(T)).translated(-torch.tensor(origin).double()).matrix()[:, :3]
     return {
         "name": path.name,
-        "poses": packed(shown.flatten(1).numpy()),
+        "poses": pack(local.flatten(1).numpy()),
         "frames": frames,
         "times": times,
         "sigmas": sigmas,
@@ -253,25 +255,18 @@ def shown_trajectory(path: Path, unit: LengthUnit | None = None, origin: Sequenc
     }
 
 
-_Posed: TypeAlias = tuple[SE3 | None, str, float | None, float | None, str, str | None]
-"""A pose, the name and time (seconds) of its frame, the position's standard deviation, the outcome, and the unit of length."""
-
-
-def _posed(entry: dict[str, Any], path: Path) -> _Posed:
+def _read_pose(entry: dict[str, Any], path: Path) -> tuple[SE3, str, float | None, float | None, str, str | None]:
+    """Return a pose, the name and time (seconds) of its frame, the position's standard deviation, the outcome, and the unit of length."""
+    covariance, time, unit, sigma = entry.get("covariance"), entry.get("time"), entry.get("unit"), math.nan
     try:
-        rows, covariance = entry.get("T_world_camera"), entry.get("covariance")
-        T = pose_from_matrix(torch.tensor(rows, dtype=torch.float64), "T_world_camera", path) if rows else None
-        sigma = math.nan
+        rows = torch.tensor(entry["T_world_camera"], dtype=torch.float64)
         if covariance is not None:
             sigma = standard_deviations(torch.tensor(covariance, dtype=torch.float64).reshape(6, 6))[0]
-        time = None if entry.get("time") is None else float(entry["time"])
-    except InputError:
-        raise
+        time = None if time is None else float(time)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise InputError(f"{entry.get('frame')!r} has no matrices of numbers", where=path, expected="poses") from error
-    unit = entry.get("unit")
     return (
-        T,
+        pose_from_matrix(rows, "T_world_camera", path),
         str(entry.get("frame", "")),
         time,
         sigma if math.isfinite(sigma) else None,

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from bidnerf.service import ServiceLimits, run_app, token_for
+from bidnerf.service import ServiceLimits, choose_token, require_server, run_app
 
 if TYPE_CHECKING:
     from bidnerf.viewer.app import LiveView
@@ -15,8 +15,13 @@ PORT = 8010
 NEEDS = "the live viewer needs the extra 'viewer' (pip install 'bidnerf[viewer]'); --save writes a page without it"
 
 
+def require_viewer() -> None:
+    """Raise ``InputError`` if the extra ``viewer`` is not installed; callers need not load a map before they know."""
+    require_server(NEEDS)
+
+
 def serve_view(
-    shown: LiveView,
+    live: LiveView,
     *,
     host: str | None = None,
     port: int = PORT,
@@ -31,11 +36,13 @@ def serve_view(
     ``ready`` then contains a ``token``, which is generated if none is given. ``limits`` apply to uploads. Raises
     ``InputError`` if the extra ``viewer`` is not installed, and if the port is taken.
     """
-    token = token_for(host, token, NEEDS)
+    require_viewer()
     from bidnerf.viewer.app import viewer_app
+
+    token = choose_token(host, token)
 
     def announce(address: str) -> None:
         if ready is not None:
             ready(address if token is None else f"{address}/?token={token}")
 
-    run_app(viewer_app(shown, token, limits), host, port, announce, stop, grace=1)
+    run_app(viewer_app(live, token, limits), host, port, announce, stop, grace=1)

@@ -9,6 +9,7 @@ from .accept import Support as Support
 from .accept import features as features
 from .accept import judge as judge
 from .accept import odds as odds
+from .accept import same_pose as same_pose
 from .adam import AdamSteps as AdamSteps
 from .auto import localize_by_landmarks as localize_by_landmarks
 from .by_surface import is_blank as is_blank

@@ -17,7 +17,7 @@ import bidnerf as bn
 import bidnerf_core.maps.collection as collections_module
 from bidnerf.scenes import orbit
 from bidnerf.service import Upload
-from bidnerf.service.worker import Worker
+from bidnerf.service.worker import LoadedMaps
 from bidnerf.testing import BOUNDS, CAMERA, POSES, ground, view
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.captures import stored_cameras
@@ -103,10 +103,10 @@ def test_a_map_without_a_field_is_found_by_its_landmarks(grounds: list[Map]) -> 
 def test_the_service_finds_the_map_of_a_photo(grounds: list[Map], tmp_path: Path) -> None:
     """Under the names by which the maps are served, and with the localizers that serve them."""
     localizers = {name: bn.Localizer(scene, warm_up=False) for name, scene in zip("ab", grounds, strict=False)}
-    worker = Worker(localizers, 1e6)
+    worker = LoadedMaps(localizers, 1e6)
     assert worker.together is not None
     assert worker.together.localizer("b") is localizers["b"]
-    assert Worker({"a": localizers["a"]}, 1e6).together is None
+    assert LoadedMaps({"a": localizers["a"]}, 1e6).together is None
     png = iio.imwrite("<bytes>", (255 * photo(SEEDS[1]).frame.rgb).byte().numpy(), extension=".png")
     task = {"map": None, "upload": Upload({"name": "<i>", "focal": CAMERA.fx}, {"photo": png})}
     reply = worker.answer(task, tmp_path)

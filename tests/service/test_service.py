@@ -19,11 +19,16 @@ import threading
 import time
 import warnings
 from base64 import b64encode
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from dataclasses import dataclass, field, replace
+from email.utils import formatdate
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
+from urllib.error import HTTPError
 from urllib.parse import urlsplit
+from urllib.request import urlopen
 
 import imageio.v3 as iio
 import numpy as np
@@ -34,7 +39,7 @@ pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
 pytest.importorskip("uvicorn", reason="the extra 'serve' is not installed")
 
 from bidnerf import InputError, ServiceClient, open_dataset, serve
-from bidnerf.service import ServiceError, ServiceLimits, public_message, service_app
+from bidnerf.service import Application, ServiceError, ServiceLimits, public_message, run_app, service_app
 
 # Inside: workers are killed, and the description is compared with the parameters that are read
 from bidnerf.service.models import Localization, MapFacts, PhotoForm
@@ -42,6 +47,7 @@ from bidnerf.service.pool import Pool
 from bidnerf.service.server import maps_by_name
 from bidnerf.service.web import SAFE, Gate
 from bidnerf.service.worker import main as hold_maps
+from bidnerf.viewer import require_viewer
 from bidnerf_core.camera import WAYS, WAYS_OF_PHOTO
 from bidnerf_core.localization import settings_of
 from bidnerf_core.registry import _declared
@@ -406,8 +412,8 @@ def test_messages_name_the_parameters_of_requests(tmp_path: Path) -> None:
 
 def test_requests_beyond_the_bound_are_turned_away(service: Service, place: Place) -> None:
     with contextlib.ExitStack() as taken:
-        for _ in range(service.pool.places):
-            taken.enter_context(service.pool.place())
+        for _ in range(service.pool.queue.slots):
+            taken.enter_context(service.pool.queue.slot())
         reply = service.post("/localize?map=map", place.photo)
         assert reply.status == 429
         assert int(reply.headers["retry-after"]) >= 1
@@ -540,7 +546,7 @@ def test_only_programs_on_this_machine_or_with_the_token_are_answered() -> None:
 
     refused: list[tuple[str, int]] = []
 
-    def report(scope: Any, status: int, seconds: float) -> None:
+    def report(scope: Any, status: int, seconds: float, error: Exception | None) -> None:
         if status != 200:
             refused.append((scope["path"], status))
 
@@ -620,6 +626,69 @@ def test_the_client_asks_a_server(place: Place, address: tuple[str, int]) -> Non
     assert refused.value.status == 404
 
 
+class Answering(BaseHTTPRequestHandler):
+    """Answers each request with the next of the server's ``replies``: a status, headers and a body."""
+
+    def do_GET(self) -> None:
+        replies: list[tuple[int, dict[str, str], bytes]] = self.server.replies  # type: ignore[attr-defined]
+        status, headers, body = replies.pop(0) if len(replies) > 1 else replies[0]
+        self.send_response(status)
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_: Any) -> None: ...
+
+
+@pytest.fixture
+def answering() -> Iterator[ThreadingHTTPServer]:
+    with ThreadingHTTPServer(("127.0.0.1", 0), Answering) as server:
+        thread = threading.Thread(target=server.serve_forever, args=[0.01])
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+PROBLEM = {"Content-Type": "application/problem+json"}
+
+
+@pytest.mark.parametrize(
+    ("status", "headers", "body", "expected"),
+    [
+        (200, {}, b"<html>login", r"^the answer is '<html>login', expected a JSON object"),
+        (200, {}, b"[1]", "expected a JSON object"),
+        (200, {"Content-Length": "100"}, b"{}", r"IncompleteRead\(2 bytes"),
+        (500, {"Content-Length": "100"}, b"{}", r"IncompleteRead\(2 bytes"),
+        (500, PROBLEM, b'{"title": "internal error"}', "^internal error$"),
+        (500, PROBLEM, b"{", "^{$"),
+        (404, {}, b"", "^the answer has the status 404$"),
+        (503, {}, b"busy", "^busy$"),
+    ],
+)
+def test_the_client_raises_the_same_error_for_every_bad_answer(
+    answering: ThreadingHTTPServer, status: int, headers: dict[str, str], body: bytes, expected: str
+) -> None:
+    answering.replies = [(status, headers, body)]  # type: ignore[attr-defined]
+    with pytest.raises(ServiceError, match=expected) as error:
+        ServiceClient(f"http://127.0.0.1:{answering.server_port}", timeout=0.5).maps()
+    assert error.value.status in (status, 0)
+
+
+def test_the_client_pauses_before_it_asks_a_busy_service_again(
+    answering: ThreadingHTTPServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pauses = list[float]()
+    monkeypatch.setattr(time, "sleep", pauses.append)
+    stated = [formatdate(time.time() + 20, usegmt=True), formatdate(0, usegmt=True), "7", "0", "soon", "nan"]
+    busy = [(503, {"Retry-After": value}, b"") for value in stated]
+    answering.replies = [(429, {}, b""), *busy, (200, {}, b"{}")]  # type: ignore[attr-defined]
+    assert ServiceClient(f"http://127.0.0.1:{answering.server_port}").health() == {}
+    assert pauses == pytest.approx([1, 20, 1, 7, 1, 1, 1], abs=2.5)
+    assert min(pauses) >= 1
+
+
 def spoken(address: tuple[str, int], content: bytes) -> bytes:
     """Send bytes over a connection, and return what comes back until it ends."""
     with socket.create_connection(address, timeout=20) as connection:
@@ -652,6 +721,9 @@ def test_bytes_that_are_not_http_are_refused(place: Place, address: tuple[str, i
     for path in ("/../../etc/passwd", "//etc/passwd", "/maps/%2e%2e%2fmap.json", "/maps/%00"):
         asked = f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
         assert spoken(address, asked.encode()).startswith(b"HTTP/1.1 404"), path
+    head = spoken(address, b"HEAD /health HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 200")
+    assert head.endswith(b"\r\n\r\n")  # without a body
     assert spoken(address, b"GET /maps HTTP/1.1\r\nHost: example.org\r\n\r\n").startswith(b"HTTP/1.1 403")
 
 
@@ -717,8 +789,7 @@ def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidne
     for maps, part in (
         ([], "no MAP"),
         ({"a/b": "x"}, "its name is 'a/b'"),
-        (["x/a", "y/a"], "its name is 'x/a'"),
-        (["a=x", "a=y"], "its name is 'a'"),
+        (["x/a", "y/a"], "its name is 'a'"),
     ):
         with pytest.raises(InputError, match=part):
             maps_by_name(maps)
@@ -730,6 +801,59 @@ def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidne
     with pytest.raises(InputError, match="timeout is 0"):
         ServiceLimits(timeout=0)
     assert bidnerf("serve", place.folder / "map", "--port", 99999).status == 2
+
+
+def test_an_internal_error_is_one_line_of_the_log(
+    service: Service, place: Place, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def fail(*given: Any) -> Any:
+        raise RuntimeError("/home/user/secret")
+
+    monkeypatch.setattr(service.pool, "answer", fail)
+    reply = service.post("/localize?map=map", place.photo)
+    assert (reply.status, reply.json["detail"]) == (500, "internal error")
+    (line,) = (json.loads(record.message) for record in caplog.records if record.name == "bidnerf.service")
+    assert (line["status"], line["path"], line["fault"]) == (500, "/localize", "RuntimeError: /home/user/secret")
+    assert "in fail" in line["traceback"]
+
+
+def test_a_request_that_waits_while_the_server_is_stopped_may_be_repeated() -> None:
+    """It is answered with 503, and reported, once the time that is left to it is over."""
+    stop, addresses, reports = threading.Event(), SimpleQueue[str](), list[tuple[str, int]]()
+    app = Application(
+        "slow", None, report=lambda scope, status, *_: reports.append((scope["path"], status)), lifespan=unmanaged
+    )
+
+    @app.get("/slow")
+    async def slow() -> None:
+        stop.set()
+        await asyncio.sleep(60)
+
+    server = threading.Thread(target=run_app, args=[app, None, 0, addresses.put, stop, 1])
+    server.start()
+    with pytest.raises(HTTPError) as refused, urlopen(f"{addresses.get(timeout=30)}/slow", timeout=30):
+        pass
+    server.join(30)
+    assert (refused.value.status, refused.value.headers["Retry-After"]) == (503, "5")
+    assert "is being stopped" in json.load(refused.value)["detail"]
+    assert reports == [("/slow", 503)]
+
+
+@contextlib.asynccontextmanager
+async def unmanaged(app: Any) -> AsyncIterator[None]:
+    yield
+
+
+def test_the_listening_process_does_not_load_torch() -> None:
+    program = "import sys; from bidnerf.service import service_app; service_app('MAP').openapi(); print('torch' in sys.modules)"
+    assert subprocess.check_output([sys.executable, "-c", program], text=True) == "False\n"
+
+
+@pytest.mark.parametrize(("server", "needed"), [(service_app, "serve"), (require_viewer, "viewer")])
+def test_a_server_that_is_not_installed_is_named(server: Any, needed: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    with pytest.raises(InputError, match=rf"bidnerf\[{needed}\]"):
+        server(*["MAP"] if needed == "serve" else [])
 
 
 def test_startup_of_another_server_starts_the_pool(monkeypatch: pytest.MonkeyPatch) -> None:

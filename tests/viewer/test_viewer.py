@@ -18,14 +18,14 @@ import viewed
 from bidnerf import SE3, InputError, Intrinsics, Localization, Localizer, Map, View, view
 from bidnerf.results import PosedImage, write_poses
 from bidnerf.scenes import closed_form_map, orbit
-from bidnerf.viewer import shown_trajectory
+from bidnerf.viewer import trajectory_json
 
 # Inside: what a page states of one answer is read from its parts, without a browser
-from bidnerf.viewer.answer import MOST_STEPS, depth_difference, ellipsoid, shown_answer
+from bidnerf.viewer.answer import MOST_STEPS, answer_json, depth_difference, ellipsoid
 from bidnerf.viewer.evidence import EARLIER, HERE, MEASURES, acceptance_figures, bar, contests
-from bidnerf.viewer.pages import MODULES, MapView, localized
-from bidnerf.viewer.pictures import field_image, packed_points, quick_image
-from bidnerf.viewer.scene import shown_map, towards
+from bidnerf.viewer.pages import MODULES, MapView, answer_query
+from bidnerf.viewer.pictures import field_image, pack_points, quick_image
+from bidnerf.viewer.scene import map_json, turn_towards
 from bidnerf_core.datasets import Query
 from bidnerf_core.errors import Cancelled
 from bidnerf_core.fields import render_image
@@ -86,12 +86,12 @@ def largest_error(shown: dict[str, Any]) -> float:
 
 @pytest.fixture(scope="module")
 def found(localizer: Localizer, query: Query) -> dict[str, Any]:
-    return localized(localizer, query)
+    return answer_query(localizer, query)
 
 
 @pytest.fixture(scope="module")
 def refused(localizer: Localizer) -> dict[str, Any]:
-    return localized(localizer, viewed.query(viewed.HOSTILE, seed=5))
+    return answer_query(localizer, viewed.query(viewed.HOSTILE, seed=5))
 
 
 def test_a_trajectory_in_another_unit_than_the_map_is_remarked(
@@ -102,9 +102,9 @@ def test_a_trajectory_in_another_unit_than_the_map_is_remarked(
     for ending in ("json", "tum"):
         write_poses(tmp_path / f"path.{ending}", [image])
         for unit in ("units", None):
-            shown_trajectory(tmp_path / f"path.{ending}", unit)
+            trajectory_json(tmp_path / f"path.{ending}", unit)
         assert not caplog.text
-        shown_trajectory(tmp_path / f"path.{ending}", "metres")
+        trajectory_json(tmp_path / f"path.{ending}", "metres")
         assert f"path.{ending}: is in units, but the map is in metres" in caplog.text
         caplog.clear()
 
@@ -152,7 +152,7 @@ def test_each_bound_that_is_not_kept_is_the_first_figure(answer: Localization, b
 def test_a_mirrored_photo_is_compared_with_its_mirror_image(localizer: Localizer, query: Query) -> None:
     """Its matches are drawn where the photo shows them."""
     mirrored = query.frame.replace(rgb=query.frame.rgb.flip(1), depth=None)
-    shown = localized(localizer, Query("mirrored", (View(mirrored, SE3.identity()),)))
+    shown = answer_query(localizer, Query("mirrored", (View(mirrored, SE3.identity()),)))
     assert shown["outcome"] == Outcome.MIRRORED
     assert "mirror image" in shown["contests"][0]["question"]
     assert shown["contests"][0]["answers"][0]["name"] == "the mirror image"
@@ -173,7 +173,7 @@ def test_another_place_is_a_contest_a_step_and_the_runner_up(
     both = replace(posterior, states=states, probability=probability, update=update)
     modes = [*found.modes, replace(found.modes[0], name="another place")]
     doubtful = SearchRecord(record.steps, [replace(found, modes=modes, posterior=both)])
-    shown = shown_answer(room, "a", answer, record=doubtful)
+    shown = answer_json(room, "a", answer, record=doubtful)
     here, there = shown["contests"][0]["answers"]
     assert (here["name"], there["name"]) == (HERE, "a pose 2 m away")
     assert (here["probability"], there["probability"]) == (pytest.approx(0.75), pytest.approx(0.25))
@@ -211,13 +211,13 @@ def test_poses_are_shown_relative_to_the_origin_of_the_map(
     origin = (500_000.0, 4_000_000.0, 100.0)
     offset = torch.tensor(origin, dtype=torch.float64)
     surveyed, far = replace(room, info=replace(room.info, origin=origin)), answer.translated(offset)
-    shown = shown_answer(surveyed, query.name, far, truth=far.T_world_camera)
+    shown = answer_json(surveyed, query.name, far, truth=far.T_world_camera)
     local = answer.T_world_camera.matrix().flatten().tolist()
     assert shown["pose"] == pytest.approx(local, abs=1e-6)
     assert shown["truth"] == pytest.approx(local, abs=1e-6)
-    assert "500,000" in dict(shown_map(surveyed, 0)["facts"])["origin"]
+    assert "500,000" in dict(map_json(surveyed, 0)["facts"])["origin"]
     write_poses(tmp_path / "path.txt", [PosedImage("a", 0, query.frame.intrinsics, far.T_world_camera)])
-    drawn = shown_trajectory(tmp_path / "path.txt", origin=origin)["poses"]
+    drawn = trajectory_json(tmp_path / "path.txt", origin=origin)["poses"]
     rows = np.frombuffer(b64decode(drawn["base64"]), np.float32).reshape(-1)
     assert rows == pytest.approx(local[:12], abs=1e-3)
 
@@ -232,7 +232,7 @@ def test_the_loss_of_a_descent_is_the_first_figure(answer: Localization) -> None
 
 def test_a_descent_is_shown_step_by_step_with_its_loss(room: Map, answer: Localization) -> None:
     T, losses = SE3.stack([*viewed.walk(500), answer.T_world_camera]), torch.linspace(0.5, 0.1, 500)
-    steps = shown_answer(room, "descent", replace(answer, poses=T, losses=losses))["steps"]
+    steps = answer_json(room, "descent", replace(answer, poses=T, losses=losses))["steps"]
     assert len(steps) <= MOST_STEPS + 1
     assert [steps[0]["caption"], steps[-1]["caption"]] == ["step 0 of 500", HERE]
     assert [step["loss"] for step in steps] == sorted((step["loss"] for step in steps if step["loss"]), reverse=True)
@@ -242,11 +242,11 @@ def test_a_descent_is_shown_step_by_step_with_its_loss(room: Map, answer: Locali
 def test_an_earlier_pose_by_landmarks_is_told_from_the_pose_found(
     room: Map, query: Query, answer: Localization, record: SearchRecord
 ) -> None:
-    here = shown_answer(room, "here", answer, query.frame, record)
+    here = answer_json(room, "here", answer, query.frame, record)
     assert {figure.pose for figure in here["figures"]} == {here["matches"]["pose"] if here["matches"] else None} == {""}
     away = replace(answer.T_world_camera, translation=answer.T_world_camera.translation + 1.0)
     given_up = replace(answer, T_world_camera=away, diagnostics=None, confidence=None)
-    there = shown_answer(room, "there", given_up, query.frame, record)
+    there = answer_json(room, "there", given_up, query.frame, record)
     assert (
         {figure.pose for figure in there["figures"]}
         == {there["matches"]["pose"] if there["matches"] else None}
@@ -293,24 +293,24 @@ def test_normals_point_to_the_side_of_the_cameras(generator: torch.Generator) ->
         torch.zeros((1, 3)),
         5 * torch.eye(3).repeat(2, 1) * torch.tensor([[1.0]] * 3 + [[-1.0]] * 3),
     )
-    torch.testing.assert_close(towards(places, signs * places, inside), -places)
-    torch.testing.assert_close(towards(places, signs * places, outside), places)
-    torch.testing.assert_close(towards(places, places, places[:0]), places)
+    torch.testing.assert_close(turn_towards(places, signs * places, inside), -places)
+    torch.testing.assert_close(turn_towards(places, signs * places, outside), places)
+    torch.testing.assert_close(turn_towards(places, places, places[:0]), places)
 
 
 def test_packed_points_are_exact_to_a_part_in_65535(generator: torch.Generator) -> None:
     points = 1000 + 7 * torch.randn((50, 3), generator=generator, dtype=torch.float64)
-    found = packed_points(points)
+    found = pack_points(points)
     places = np.frombuffer(b64decode(found["places"]["base64"]), "<u2").reshape(-1, 3)
     back = np.array(found["lower"]) + places / 65535 * found["size"]
     assert np.abs(back - points.numpy()).max() <= found["size"] / 65535
-    assert packed_points(points[:0])["places"]["shape"] == (0, 3)
+    assert pack_points(points[:0])["places"]["shape"] == (0, 3)
 
 
 def test_the_page_holds_its_state_and_hostile_names_stay_text(
     room: Map, found: dict[str, Any], refused: dict[str, Any]
 ) -> None:
-    page = MapView(shown_map(room, 2), (found, refused), title=viewed.HOSTILE).html()
+    page = MapView(map_json(room, 2), (found, refused), title=viewed.HOSTILE).html()
     assert viewed.HOSTILE not in page
     assert page.count("</script>") == 3  # of the state, of three.js and of the modules
     held = viewed.state_of(page)
@@ -320,7 +320,7 @@ def test_the_page_holds_its_state_and_hostile_names_stay_text(
 
 
 def test_the_page_asks_nobody_for_anything(room: Map, found: dict[str, Any]) -> None:
-    page = MapView(shown_map(room, 0), (found,)).html()
+    page = MapView(map_json(room, 0), (found,)).html()
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)
     assert policy is not None
     assert "default-src 'none'" in policy[1]
@@ -350,7 +350,7 @@ def test_a_localization_of_an_earlier_run_is_shown_without_its_frame(
     room: Map, answer: Localization, tmp_path: Path
 ) -> None:
     answer.save(tmp_path / "pose.json")
-    shown = shown_answer(room, "earlier", Localization.load(tmp_path / "pose.json"))
+    shown = answer_json(room, "earlier", Localization.load(tmp_path / "pose.json"))
     assert shown["accepted"]
     assert shown["rendered"] is None
     assert shown["figures"][0].name == "confidence"

@@ -23,11 +23,11 @@ from playwright.sync_api import sync_playwright
 
 import viewed
 from bidnerf import SE3, Localizer, Map
-from bidnerf.viewer import page_of, shown_trajectory
+from bidnerf.viewer import MapView, map_json, trajectory_json
 
 # Inside: an answer whose descent is given, and the page as a saved file
-from bidnerf.viewer.answer import shown_answer
-from bidnerf.viewer.pages import localized
+from bidnerf.viewer.answer import answer_json
+from bidnerf.viewer.pages import answer_query
 from bidnerf_core.camera import CameraSource
 from viewer_client import serving
 
@@ -85,8 +85,8 @@ def saved(room: Map, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("page")
     localizer = Localizer(room)
     answers = [
-        localized(localizer, viewed.query()),
-        localized(localizer, viewed.query(viewed.HOSTILE, seed=5)),
+        answer_query(localizer, viewed.query()),
+        answer_query(localizer, viewed.query(viewed.HOSTILE, seed=5)),
     ]
     entries = [
         {
@@ -118,7 +118,9 @@ def saved(room: Map, tmp_path_factory: pytest.TempPathFactory) -> Path:
             ("elsewhere", "imprecise"),
         )
     ]
-    page = page_of(room, answers, shown_trajectory(folder / "track.json"), rows)
+    page = MapView(
+        map_json(room), tuple(answers), trajectory=trajectory_json(folder / "track.json"), results=tuple(rows)
+    )
     (folder / "notebook.html").write_text(f"<!doctype html><title>notebook</title>{page._repr_html_()}")
     return page.save(folder / "page.html")
 
@@ -260,8 +262,8 @@ def test_a_refused_photo_tells_why_and_names_stay_text(browser: Any, saved: Path
 def test_a_descent_can_be_replayed(browser: Any, room: Map, tmp_path: Path) -> None:
     found = Localizer(room)(viewed.query().views)
     poses, losses = SE3.stack([*viewed.walk(30), found.T_world_camera]), torch.linspace(0.5, 0.1, 30)
-    answer = shown_answer(room, "descent", replace(found, poses=poses, losses=losses))
-    file = page_of(room, [answer]).save(tmp_path / "page.html")
+    answer = answer_json(room, "descent", replace(found, poses=poses, losses=losses))
+    file = MapView(map_json(room), (answer,)).save(tmp_path / "page.html")
     with opened(browser, file.as_uri(), LAPTOP, offline=True) as page:
         page.locator("#step").fill("10")
         assert page.text_content("#caption") == "step 10 of 30: loss 0.362"

@@ -16,7 +16,7 @@ from PIL import Image
 
 from bidnerf import SE3, InputError, Intrinsics, Localization, Outcome
 from bidnerf.results import Answer
-from bidnerf.service import Refused, checked, service_app
+from bidnerf.service import Refused, service_app, validate
 from bidnerf_core.maps import Anchor
 from bidnerf_core.registry import registered
 from bidnerf_geopose import answers
@@ -53,7 +53,7 @@ def asked(anchor: Anchor | None, found: Localization, **more: Any) -> tuple[dict
         uploads.append(upload)
         return Answer("camera", 0, Intrinsics(30, 30, 16, 12, 32, 24), found), {"outcome": str(found.outcome)}
 
-    request = checked(GeoPoseRequest, body)
+    request = validate(GeoPoseRequest, body)
     return answers.answer(anchor, request, localize), uploads[0]
 
 
