@@ -84,7 +84,7 @@ def run_view(
     view can be changed there. With --save, QUERY is localized immediately, and the saved page shows the same without a server.
     """
     from bidnerf.evaluation import read_results
-    from bidnerf.viewer import LiveView, MapView, map_json, row_json, serve_view, trajectory_json
+    from bidnerf.viewer import LiveView, MapView, map_json, require_viewer, row_json, serve_view, trajectory_json
     from bidnerf_core.camera import CameraSource
     from bidnerf_core.datasets import DatasetFrames, in_other_split
     from bidnerf_core.localization import Localizer
@@ -94,6 +94,8 @@ def run_view(
         raise UsageError("--frame names frames of a dataset", expected="the dataset as QUERY")
     if page.save is not None:
         check_output(page.save, (*query, *queries.depth, page.results, page.trajectory))
+    else:
+        require_viewer()
     info = load_info(map)
     path = None if page.trajectory is None else trajectory_json(page.trajectory, info.unit, info.origin)
     rows = () if page.results is None else tuple(row_json(row) for row in read_results([page.results]))

@@ -721,7 +721,7 @@ def test_bytes_that_are_not_http_are_refused(place: Place, address: tuple[str, i
     for path in ("/../../etc/passwd", "//etc/passwd", "/maps/%2e%2e%2fmap.json", "/maps/%00"):
         asked = f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
         assert spoken(address, asked.encode()).startswith(b"HTTP/1.1 404"), path
-    head = spoken(address, b"HEAD /health HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+    head = spoken(address, b"HEAD / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
     assert head.startswith(b"HTTP/1.1 200")
     assert head.endswith(b"\r\n\r\n")  # without a body
     assert spoken(address, b"GET /maps HTTP/1.1\r\nHost: example.org\r\n\r\n").startswith(b"HTTP/1.1 403")
