@@ -8,16 +8,19 @@ is unique within a method, whichever dataclass declares it.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from numbers import Real
-from typing import Annotated, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast
 
 from bidnerf_core.errors import InputError, spelling_hint
-from bidnerf_core.io import LARGEST_NUMBER, from_plain, to_plain
+from bidnerf_core.io import LARGEST_NUMBER, check_fields, expected_kinds, from_plain, to_plain
+
+if TYPE_CHECKING:
+    from pydantic import GetCoreSchemaHandler
+    from pydantic_core import CoreSchema
 
 S = TypeVar("S")
 
@@ -25,35 +28,64 @@ LARGEST_SEED = 2**31 - 1
 """Largest seed that commands and requests accept; every language represents it exactly. Python functions accept larger ones."""
 
 
+class Allowed:
+    """An annotation that limits a setting to the values in it; ``str()`` describes them for messages and help pages."""
+
+    def __contains__(self, value: object) -> bool:
+        raise NotImplementedError
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Return pydantic's validator of the annotated type, followed by the check that the value is allowed."""
+        from pydantic import ValidationError
+        from pydantic_core import PydanticCustomError, core_schema
+
+        def validate(value: Any, validate_type: Callable[[Any], Any]) -> Any:
+            kind = ""
+            try:
+                if (valid := validate_type(value)) in self:
+                    return valid
+            except ValidationError as error:
+                kind = f"{expected_kinds(error.errors(include_url=False))}, "
+            raise PydanticCustomError("not_allowed", "{expected}", {"expected": f"{kind}{self}"})
+
+        return core_schema.no_info_wrap_validator_function(validate, handler(source))
+
+
 @dataclass(frozen=True)
-class Range:
+class Range(Allowed):
     """The range of a setting, from ``least`` to ``most`` inclusive."""
 
     least: float
     most: float = math.inf
 
     def __contains__(self, value: object) -> bool:
-        if not isinstance(value, Real):
-            return False
-        number = cast(float, value)
-        return abs(number) <= LARGEST_NUMBER and self.least <= number <= self.most
+        return (
+            isinstance(value, Real)
+            and abs(number := cast(float, value)) <= LARGEST_NUMBER
+            and self.least <= number <= self.most
+        )
 
     def __str__(self) -> str:
-        if self.most == math.inf:
-            return f"a number from {_written(self.least)} up"
-        return f"{_written(self.least)} to {_written(self.most)}"
+        # The same for 1 and 1.0, since ``Annotated`` does not distinguish equal ranges.
+        least, most = (
+            f"{int(x) if x.is_integer() else x:,}" if math.isfinite(x) else ""
+            for x in map(float, (self.least, self.most))
+        )
+        return self._in_words(least, most)
+
+    def _in_words(self, least: str, most: str) -> str:
+        """Describe the range from its limits as text; ``most`` is empty if there is no upper limit."""
+        return f"{least} to {most}" if most else f"a number from {least} up"
 
 
-@dataclass(frozen=True)
 class Above(Range):
     """The range of a setting that excludes its lower limit ``least`` and includes its upper limit ``most``."""
 
     def __contains__(self, value: object) -> bool:
         return super().__contains__(value) and value != self.least
 
-    def __str__(self) -> str:
-        least = f"more than {_written(self.least)}"
-        return least if self.most == math.inf else f"{least}, at most {_written(self.most)}"
+    def _in_words(self, least: str, most: str) -> str:
+        return f"more than {least}" + (f", at most {most}" if most else "")
 
 
 class WholeNumbers(Range):
@@ -62,29 +94,19 @@ class WholeNumbers(Range):
     def __contains__(self, value: object) -> bool:
         return super().__contains__(value) and float(cast(float, value)).is_integer()
 
-    def __str__(self) -> str:
-        return f"a whole number, {super().__str__().removeprefix('a number ')}"
-
-
-def _written(limit: float) -> str:
-    """Format a limit for messages. The result is the same for 1 and 1.0, since ``Annotated`` does not distinguish equal ranges."""
-    return f"{int(limit) if float(limit).is_integer() else limit:,}"
+    def _in_words(self, least: str, most: str) -> str:
+        return "a whole number, " + (f"{least} to {most}" if most else f"from {least} up")
 
 
 # Compared and hashed by identity, since the command-line parser hashes annotations and a table is not hashable.
 @dataclass(frozen=True, eq=False)
-class OneOf:
+class OneOf(Allowed):
     """The names or numbers that a setting accepts: the keys of a table, which users may extend."""
 
     table: Mapping[Any, Any]
 
     def __contains__(self, value: object) -> bool:
-        return any(
-            isinstance(value, type(known))
-            and value == known
-            and isinstance(value, bool) == isinstance(known, bool)  # True is 1, but not where a number is expected
-            for known in self.table
-        )
+        return value in self.table
 
     def __str__(self) -> str:
         return f"one of {', '.join(map(str, self.table))}"
@@ -105,32 +127,14 @@ Positive = Annotated[float, Above(0.0, 1e6)]
 
 
 class Settings:
-    """Base class of frozen dataclasses whose fields are checked against the ranges or names in their annotations.
+    """Base class of frozen dataclasses whose fields pydantic checks against their annotations, however they are made.
 
-    Creating an instance with an invalid value raises ``InputError`` with the setting's name, its value and
-    what was expected.
+    Types are strict (text is not a number, nor True an integer), and numbers are finite. Creating an instance with an invalid
+    value raises ``InputError`` with the setting's name, its value and what was expected.
     """
 
     def __post_init__(self) -> None:
-        for name, (allowed, optional) in _allowed(type(self)).items():  # type: ignore[arg-type]
-            value = getattr(self, name)
-            if value not in allowed and not (optional and value is None):
-                raise InputError(f"{name} is {value!r}", expected=allowed)
-
-
-@functools.cache
-def _allowed(kind: Any) -> dict[str, tuple[Range | OneOf, bool]]:
-    """Return the allowed values of each field of ``kind`` that has limits, and whether None is allowed as well."""
-    found: dict[str, tuple[Range | OneOf, bool]] = {}
-    for name, hint in typing.get_type_hints(kind, include_extras=True).items():
-        optional = type(None) in typing.get_args(hint)
-        for part in (hint, *typing.get_args(hint)):
-            if typing.get_origin(part) is typing.Literal:
-                found[name] = OneOf(dict.fromkeys(typing.get_args(part))), optional
-            for note in getattr(part, "__metadata__", ()):
-                if isinstance(note, Range | OneOf):
-                    found[name] = note, optional
-    return found
+        check_fields(self)
 
 
 def to_flat(settings: Any) -> dict[str, Any]:

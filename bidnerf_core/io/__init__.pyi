@@ -37,6 +37,8 @@ from .images import to_numpy as to_numpy
 from .json import LARGEST_INTEGER as LARGEST_INTEGER
 from .json import LARGEST_NUMBER as LARGEST_NUMBER
 from .json import Record as Record
+from .json import check_fields as check_fields
+from .json import expected_kinds as expected_kinds
 from .json import from_plain as from_plain
 from .json import parse_json as parse_json
 from .json import parse_record as parse_record

@@ -6,12 +6,14 @@ All code that reads JSON uses ``parse_json``, so that damaged text of any origin
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import json
 import math
 import re
 import sys
+import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +23,7 @@ from bidnerf_core.errors import InputError, spelling_hint
 from bidnerf_core.io.files import read_file
 
 if TYPE_CHECKING:
-    from pydantic_core import SchemaValidator
+    from pydantic import TypeAdapter
     from torch import Tensor
 
 _T = TypeVar("_T")
@@ -39,19 +41,9 @@ EXPECTED = {
     "list_type": "a list",
     "tuple_type": "a list",
     "missing": "a longer list",
-    "greater_than_equal": "an integer of at most 64 bits",
-    "less_than_equal": "an integer of at most 64 bits",
+    "sequence_str": "a list",
 }
 """What messages state as expected, by pydantic's error type; other types use pydantic's own text."""
-STRICT: dict[str, dict[str, Any]] = {
-    "bool": {"strict": True},
-    "str": {"strict": True},
-    "float": {"strict": True, "allow_inf_nan": False},
-    "list": {"fail_fast": True},
-    "int": {"strict": True, "ge": -LARGEST_INTEGER, "le": LARGEST_INTEGER},
-    "tuple": {"fail_fast": True},
-}
-"""Settings added to the parts of pydantic's schemas, by type: text is not accepted as a number, but a list is as a tuple."""
 
 
 def read_json(path: Path, expected: str) -> Any:
@@ -231,58 +223,93 @@ def from_plain(kind: type[_T], value: Any, where: str) -> _T:
 
     Missing keys take their defaults, and lists become tuples where ``kind`` has tuples. Raises ``InputError``, whose message begins with
     ``where``, for an unknown key, a missing required key, a value of the wrong type, and values that ``kind`` itself
-    rejects.
+    rejects. A value that also holds tensors (see ``with_tensors``) is checked less strictly: text may stand for a number.
     """
     from pydantic import ValidationError  # imported here, since many commands read no JSON
 
+    def check_size(digits: str) -> None:
+        if abs(int(digits)) > LARGEST_INTEGER:
+            raise InputError(f"holds {digits[:30]}", where=where, expected="integers of at most 64 bits")
+
     try:
-        found: _T = _validator(cast(Any, kind)).validate_python([value])[0]
+        text = json.dumps([value])
+        json.loads(text, parse_int=check_size)
+    except TypeError:
+        text = ""
+    adapter = _adapter(cast(Any, kind))
+    try:
+        # Strict pydantic takes lists for tuples, and dicts for dataclasses, only in JSON.
+        rows = adapter.validate_json(text) if text else adapter.validate_python([value], strict=False)
     except ValidationError as error:
-        raise _first_error(error.errors(include_url=False), where, kind) from None
+        raise _first_error(error.errors(include_url=False), where, kind, value) from None
     except (TypeError, OverflowError) as error:  # raised by a dataclass itself
         raise InputError(error, where=where) from error
+    found: _T = rows[0]
     return found
 
 
+def check_fields(instance: Any) -> None:
+    """Check the fields of a dataclass against their annotations. Raises ``InputError`` for the first invalid value."""
+    from pydantic import ValidationError
+
+    values = {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)}
+    try:
+        _adapter(_fields_type(cast(Any, type(instance)))).validate_python([values])
+    except ValidationError as error:
+        errors = error.errors(include_url=False)
+        name = errors[0]["loc"][1]
+        expected = expected_kinds([e for e in errors if e["loc"][1] == name])
+        raise InputError(f"{name} is {_shown(values[str(name)])}", expected=expected) from None
+
+
 @functools.cache
-def _validator(kind: Any) -> SchemaValidator:
+def _fields_type(kind: Any) -> Any:
+    """Return the type of a dict of the fields of a dataclass."""
+    from typing_extensions import TypedDict
+
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return cast(Any, TypedDict)(kind.__name__, {field.name: hints[field.name] for field in dataclasses.fields(kind)})
+
+
+@functools.cache
+def _adapter(kind: Any) -> TypeAdapter[list[Any]]:
     """Return a validator of lists of ``kind``: pydantic accepts a configuration only for dataclasses nested in other types."""
     from pydantic import ConfigDict, TypeAdapter
-    from pydantic_core import SchemaValidator
 
-    config = ConfigDict(arbitrary_types_allowed=True, extra="forbid", allow_inf_nan=False)
-    return SchemaValidator(_strict(TypeAdapter(list[kind], config=config).core_schema))
-
-
-def _strict(node: Any) -> Any:
-    """Return a pydantic schema with the additions of ``STRICT``."""
-    if isinstance(node, list):
-        return [_strict(part) for part in node]
-    if not isinstance(node, dict):
-        return node
-    given = ("default", "expected", "metadata", "config")  # values of ours rather than parts of the schema
-    found = {key: part if key in given else _strict(part) for key, part in node.items()}
-    if found.get("type") == "union":  # the part of an error's path that stands for a member is not a key
-        found["choices"] = [(choice, "") for choice in found["choices"]]
-    return found | STRICT.get(str(found.get("type")), {})
+    strict = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
+    return TypeAdapter(list[kind], config=strict)
 
 
-def _first_error(errors: Sequence[Any], where: str, of: Any) -> InputError:
-    """Convert the first of pydantic's ``errors`` about a value of type ``of``; for a union, the error lists all expected types."""
-    first = errors[0]
-    kind, path = first["type"], [where, *(p for p in first["loc"] if p and isinstance(p, str))]
+def _first_error(errors: Sequence[Any], where: str, of: Any, value: Any) -> InputError:
+    """Convert the first of pydantic's ``errors`` about ``value``, which was to become an ``of``."""
+    first, path = errors[0], _path(errors[0], value)
+    kind, keys = first["type"], [where, *(key for key in path if isinstance(key, str))]
     if "error" in first.get("ctx", {}):  # what a dataclass raised
-        return InputError(first["ctx"]["error"], where=": ".join(path))
+        return InputError(first["ctx"]["error"], where=": ".join(keys))
     if kind == "unexpected_keyword_argument":
-        known = [f.name for f in dataclasses.fields(of) if f.init] if len(first["loc"]) == 2 else []
-        hint = spelling_hint(path[-1], known)
+        known = [f.name for f in dataclasses.fields(of) if f.init] if len(path) == 2 else []
+        hint = spelling_hint(keys[-1], known)
         expected = f"any of {', '.join(known)}" if known and not hint else None
-        return InputError(f"no field {path[-1]!r}{hint}", where=": ".join(path[:-1]), expected=expected)
-    if kind == "missing" and isinstance(first["loc"][-1], str):
-        return InputError("missing", where=": ".join(path))
-    texts = {e["type"]: e["msg"].removeprefix("Input should be ") for e in errors if e["loc"] == first["loc"]}
-    kinds = dict.fromkeys(EXPECTED.get(kind, text) for kind, text in texts.items())
-    return InputError(f"found {_shown(first['input'])}", where=": ".join(path), expected=" or ".join(kinds))
+        return InputError(f"no field {keys[-1]!r}{hint}", where=": ".join(keys[:-1]), expected=expected)
+    if kind == "missing" and isinstance(path[-1], str):
+        return InputError("missing", where=": ".join(keys))
+    expected = expected_kinds([error for error in errors if _path(error, value) == path])
+    return InputError(f"found {_shown(first['input'])}", where=": ".join(keys), expected=expected)
+
+
+def _path(error: Any, value: Any) -> list[str | int]:
+    """Return the keys and indices by which an error of pydantic is reached in ``[value]``, without the members of unions."""
+    path, part = list[str | int](), cast(Any, [value])
+    for key in error["loc"]:
+        with contextlib.suppress(LookupError, TypeError):
+            path, part = [*path, key], part[key]
+    return [*path, error["loc"][-1]] if error["type"] == "missing" else path
+
+
+def expected_kinds(errors: Sequence[Any]) -> str:
+    """Return the types or values that pydantic expected, given its errors about one value: one for each member of a union."""
+    texts = (EXPECTED.get(error["type"], error["msg"].removeprefix("Input should be ")) for error in errors)
+    return " or ".join(dict.fromkeys(texts))
 
 
 def parse_yaml(content: bytes, where: str, expected: str) -> Any:

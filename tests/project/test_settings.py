@@ -41,10 +41,10 @@ class Outer(Settings):
 OUT_OF_RANGE: list[tuple[type[Settings], str, str, list[Any]]] = [
     (Inner, "share", "0 to 1", [-1e-12, 1.0 + 1e-12, math.nan, math.inf, -math.inf]),
     (Inner, "scale", "more than 0, at most 10", [0.0, -0.0, 10.1, math.nan]),
-    (Inner, "any_size", "a number from 0 up", [math.inf, math.nan, -1.0, 10**400]),
+    (Inner, "any_size", "a number from 0 up", [math.inf, math.nan, -1.0]),
     (Outer, "rays", "1 to 10,000,000", [0, "8", None]),
     (Outer, "some", "0 to 9", [10, "3"]),
-    (Outer, "name", "one of a, b", ["c", {}]),
+    (Outer, "name", "'a' or 'b'", ["c", {}]),
     (Outer, "entry", "one of first", ["second", None, ["first"]]),
 ]
 
@@ -84,13 +84,12 @@ class Numbers(Settings):
 
 def test_literals_may_be_numbers_or_mixed() -> None:
     assert Numbers(degree="auto", shift=-1) == from_flat(Numbers, {"degree": "auto", "shift": -1}, "here")
-    for wrong in (3, "1", True, [1], 1.0):
-        with refused(found=f"degree is {wrong!r}", expected="one of 0, 1, 2, auto"):
+    for wrong in (3, "1", [1]):
+        with refused(found=f"degree is {wrong!r}", expected="0, 1, 2 or 'auto'"):
             Numbers(degree=wrong)  # type: ignore[arg-type]
-    for wrong in (3, "1", [1]):  # in a file, True and 1.0 are 1
         with refused(where="here: degree", found=repr(wrong), expected="0, 1, 2 or 'auto'"):
             from_flat(Numbers, {"degree": wrong}, "here")
-    with refused(found="shift is 0", expected="one of -1, 1"):
+    with refused(found="shift is 0", expected="-1 or 1"):
         Numbers(shift=0)  # type: ignore[arg-type]
 
 
