@@ -16,7 +16,7 @@ from numbers import Real
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast
 
 from bidnerf_core.errors import InputError, spelling_hint
-from bidnerf_core.io import LARGEST_NUMBER, check_fields, expected_kinds, from_plain, to_plain
+from bidnerf_core.io import LARGEST_NUMBER, NOT_ALLOWED, check_fields, expected_kinds, from_plain, to_plain
 
 if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler
@@ -46,7 +46,7 @@ class Allowed:
                     return valid
             except ValidationError as error:
                 kind = f"{expected_kinds(error.errors(include_url=False))}, "
-            raise PydanticCustomError("not_allowed", "{expected}", {"expected": f"{kind}{self}"})
+            raise PydanticCustomError(NOT_ALLOWED, "{expected}", {"expected": f"{kind}{self}"})
 
         return core_schema.no_info_wrap_validator_function(validate, handler(source))
 
@@ -59,32 +59,25 @@ class Range(Allowed):
     most: float = math.inf
 
     def __contains__(self, value: object) -> bool:
-        return (
-            isinstance(value, Real)
-            and abs(number := cast(float, value)) <= LARGEST_NUMBER
-            and self.least <= number <= self.most
-        )
+        if not isinstance(value, Real):
+            return False
+        number = cast(float, value)
+        return abs(number) <= LARGEST_NUMBER and self.least <= number <= self.most
 
     def __str__(self) -> str:
-        # The same for 1 and 1.0, since ``Annotated`` does not distinguish equal ranges.
-        least, most = (
-            f"{int(x) if x.is_integer() else x:,}" if math.isfinite(x) else ""
-            for x in map(float, (self.least, self.most))
-        )
-        return self._in_words(least, most)
-
-    def _in_words(self, least: str, most: str) -> str:
-        """Describe the range from its limits as text; ``most`` is empty if there is no upper limit."""
+        least, most = _limits(self)
         return f"{least} to {most}" if most else f"a number from {least} up"
 
 
+@dataclass(frozen=True)
 class Above(Range):
     """The range of a setting that excludes its lower limit ``least`` and includes its upper limit ``most``."""
 
     def __contains__(self, value: object) -> bool:
         return super().__contains__(value) and value != self.least
 
-    def _in_words(self, least: str, most: str) -> str:
+    def __str__(self) -> str:
+        least, most = _limits(self)
         return f"more than {least}" + (f", at most {most}" if most else "")
 
 
@@ -94,8 +87,14 @@ class WholeNumbers(Range):
     def __contains__(self, value: object) -> bool:
         return super().__contains__(value) and float(cast(float, value)).is_integer()
 
-    def _in_words(self, least: str, most: str) -> str:
-        return "a whole number, " + (f"{least} to {most}" if most else f"from {least} up")
+    def __str__(self) -> str:
+        return f"a whole number, {super().__str__().removeprefix('a number ')}"
+
+
+def _limits(allowed: Range) -> list[str]:
+    """Format both limits; an infinite one is empty. The text is the same for 1 and 1.0: ``Annotated`` takes such ranges for equal."""
+    limits = (float(allowed.least), float(allowed.most))
+    return ["" if math.isinf(x) else f"{int(x) if x.is_integer() else x:,}" for x in limits]
 
 
 # Compared and hashed by identity, since the command-line parser hashes annotations and a table is not hashable.
@@ -165,13 +164,14 @@ def from_flat(base: S | type[S], values: dict[str, Any], where: str) -> S:
 def _with_values(default: S, flat: dict[str, Any], where: str) -> S:
     """Return the settings ``default`` with the values of ``flat`` put into whichever groups declare their names."""
     kind: Any = type(default)
-    hints, values = typing.get_type_hints(kind), dict[str, Any]()
+    hints, values = typing.get_type_hints(kind, include_extras=True), dict[str, Any]()
     for field in dataclasses.fields(kind):
         value = getattr(default, field.name)
         if dataclasses.is_dataclass(value):
             values[field.name] = _with_values(value, flat, where)
         elif field.name in flat:
-            values[field.name] = from_plain(hints[field.name], flat[field.name], f"{where}: {field.name}")
+            one = cast(Any, dict)[str, hints[field.name]]
+            values |= from_plain(one, {field.name: flat[field.name]}, where)
         else:
             values[field.name] = value
     try:

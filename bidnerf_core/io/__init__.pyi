@@ -36,6 +36,7 @@ from .images import split_alpha as split_alpha
 from .images import to_numpy as to_numpy
 from .json import LARGEST_INTEGER as LARGEST_INTEGER
 from .json import LARGEST_NUMBER as LARGEST_NUMBER
+from .json import NOT_ALLOWED as NOT_ALLOWED
 from .json import Record as Record
 from .json import check_fields as check_fields
 from .json import expected_kinds as expected_kinds

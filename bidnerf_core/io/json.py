@@ -41,9 +41,11 @@ EXPECTED = {
     "list_type": "a list",
     "tuple_type": "a list",
     "missing": "a longer list",
-    "sequence_str": "a list",
+    "sequence_str": "a list, such as [{input!r}]",
 }
 """What messages state as expected, by pydantic's error type; other types use pydantic's own text."""
+NOT_ALLOWED = "not_allowed"
+"""The error type of values that an annotation of ``settings.Allowed`` refuses."""
 
 
 def read_json(path: Path, expected: str) -> Any:
@@ -223,7 +225,8 @@ def from_plain(kind: type[_T], value: Any, where: str) -> _T:
 
     Missing keys take their defaults, and lists become tuples where ``kind`` has tuples. Raises ``InputError``, whose message begins with
     ``where``, for an unknown key, a missing required key, a value of the wrong type, and values that ``kind`` itself
-    rejects. A value that also holds tensors (see ``with_tensors``) is checked less strictly: text may stand for a number.
+    rejects. A value with parts that JSON cannot hold (tensors, see ``with_tensors``) is checked less strictly:
+    text may stand for a number.
     """
     from pydantic import ValidationError  # imported here, since many commands read no JSON
 
@@ -232,10 +235,10 @@ def from_plain(kind: type[_T], value: Any, where: str) -> _T:
             raise InputError(f"holds {digits[:30]}", where=where, expected="integers of at most 64 bits")
 
     try:
-        text = json.dumps([value])
+        text = json.dumps([value], ensure_ascii=False).encode()
         json.loads(text, parse_int=check_size)
-    except TypeError:
-        text = ""
+    except (TypeError, UnicodeEncodeError):  # tensors, and file names of bytes that are not UTF-8
+        text = b""
     adapter = _adapter(cast(Any, kind))
     try:
         # Strict pydantic takes lists for tuples, and dicts for dataclasses, only in JSON.
@@ -250,9 +253,12 @@ def from_plain(kind: type[_T], value: Any, where: str) -> _T:
 
 def check_fields(instance: Any) -> None:
     """Check the fields of a dataclass against their annotations. Raises ``InputError`` for the first invalid value."""
+    fields = dataclasses.fields(instance)
+    values = {field.name: getattr(instance, field.name) for field in fields}
+    if all(values[field.name] is field.default for field in fields):
+        return  # most settings are the defaults, and the next line takes a tenth of a second
     from pydantic import ValidationError
 
-    values = {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)}
     try:
         _adapter(_fields_type(cast(Any, type(instance)))).validate_python([values])
     except ValidationError as error:
@@ -264,11 +270,16 @@ def check_fields(instance: Any) -> None:
 
 @functools.cache
 def _fields_type(kind: Any) -> Any:
-    """Return the type of a dict of the fields of a dataclass."""
+    """Return the type of a dict of the fields of a dataclass; dataclasses in it have checked their own fields."""
+    from pydantic import InstanceOf
     from typing_extensions import TypedDict
 
     hints = typing.get_type_hints(kind, include_extras=True)
-    return cast(Any, TypedDict)(kind.__name__, {field.name: hints[field.name] for field in dataclasses.fields(kind)})
+    fields = {field.name: hints[field.name] for field in dataclasses.fields(kind)}
+    own = {
+        name: cast(Any, InstanceOf)[hint] if dataclasses.is_dataclass(hint) else hint for name, hint in fields.items()
+    }
+    return cast(Any, TypedDict)(kind.__name__, own)
 
 
 @functools.cache
@@ -294,6 +305,8 @@ def _first_error(errors: Sequence[Any], where: str, of: Any, value: Any) -> Inpu
     if kind == "missing" and isinstance(path[-1], str):
         return InputError("missing", where=": ".join(keys))
     expected = expected_kinds([error for error in errors if _path(error, value) == path])
+    if kind == NOT_ALLOWED and isinstance(path[-1], str):
+        return InputError(f"{path[-1]} is {_shown(first['input'])}", where=": ".join(keys[:-1]), expected=expected)
     return InputError(f"found {_shown(first['input'])}", where=": ".join(keys), expected=expected)
 
 
@@ -308,7 +321,8 @@ def _path(error: Any, value: Any) -> list[str | int]:
 
 def expected_kinds(errors: Sequence[Any]) -> str:
     """Return the types or values that pydantic expected, given its errors about one value: one for each member of a union."""
-    texts = (EXPECTED.get(error["type"], error["msg"].removeprefix("Input should be ")) for error in errors)
+    own = ((error, EXPECTED.get(error["type"])) for error in errors)
+    texts = (text.format(**error) if text else error["msg"].removeprefix("Input should be ") for error, text in own)
     return " or ".join(dict.fromkeys(texts))
 
 

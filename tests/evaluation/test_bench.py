@@ -380,7 +380,7 @@ def test_results_that_are_removed_meanwhile_are_missed(tmp_path: Path, replaced:
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ('"steps": 2', '"steps": 1' + "0" * 400, "steps: found 10000000"),
+        ('"steps": 2', '"steps": 1' + "0" * 400, "holds 10000000"),
         (
             '"errors": {"translation": [',
             '"errors": {"translation": [1.0, ',

@@ -312,7 +312,7 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
         ({"faults": ["blurr:1"]}, "no fault 'blurr'", None),
         ({"faults": "blur:1"}, "faults is 'blur:1'", "a list, such as ['blur:1']"),
         ({"frames": "0001"}, "frames is '0001'", "a list, such as ['0001']"),
-        ({"sizes": ["far"]}, "sizes is ['far']", "a list of numbers"),
+        ({"sizes": ["far"]}, "sizes is ['far']", "float or a list"),
         ({"data": 3}, "data is a int", "a folder, a dataset or a list of views"),
         ({"data": [1]}, "data is a list", "a folder, a dataset or a list of views"),
         ({"data": [view, view]}, "data holds 2 frames named '0000'", "different names"),

@@ -121,9 +121,9 @@ def test_settings_come_back_from_flat_names_and_from_json(settings: Outer) -> No
         ({"zzz": 0.1}, "here", "Outer has no setting 'zzz'", "any of share, scale"),
         ({"inner": {}}, "here", "Outer has no setting 'inner'", None),
         ({"share": 2.0}, "here", "share is 2.0", "0 to 1"),
-        ({"share": "much"}, "here: share", "found 'much'", "float"),
-        ({"rays": 1.5}, "here: rays", "found 1.5", "int"),
-        ({"rays": None}, "here: rays", "found None", "int"),
+        ({"share": "much"}, "here", "share is 'much'", "float, 0 to 1"),
+        ({"rays": 1.5}, "here", "rays is 1.5", "int, 1 to 10,000,000"),
+        ({"rays": None}, "here", "rays is None", "int"),
         ({"rays": 0}, "here", "rays is 0", "1 to 10,000,000"),
         ({"free": 1}, "here: free", "found 1", "bool"),
         ({"name": "c"}, "here: name", "found 'c'", "'a' or 'b'"),
@@ -137,7 +137,7 @@ def test_what_is_wrong_is_named(values: dict[str, Any], where: str, found: str, 
 def test_messages_name_settings_as_users_do_and_not_the_groups_that_hold_them() -> None:
     with refused(where="here", found="fine_rays is 1", expected="7 to 10,000,000"):
         settings_of("auto", {"fine_rays": 1}, "here")
-    with refused(where="here: fine_rays", found="found 'x'", expected="int"):
+    with refused(where="here", found="fine_rays is 'x'", expected="int"):
         settings_of("auto", {"fine_rays": "x"}, "here")
 
 
