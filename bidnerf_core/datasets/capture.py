@@ -267,15 +267,24 @@ class Capture:
         shot = self.shots[index]
         return TimedFrame(shot.time, self._read(shot), shot.T_world_camera, next(iter(shot.splits), None))
 
+    @cached_property
+    def _by_split(self) -> dict[str, Capture]:
+        return {}  # filled by ``split``, since naming the frames of a large split takes long
+
+    @cached_property
+    def _by_name(self) -> dict[str, Shot]:
+        return {shot.name: shot for shot in self.shots}
+
     def split(self, name: str) -> Capture:
         """Return the frames of a split; "all" has every frame that is in a split. Raises ``InputError`` for an unknown split."""
-        if name == "all" and name not in self.splits:
-            return replace(self, shots=_named([shot for shot in self.shots if shot.splits]))
-        if name not in self.splits:
-            known = ", ".join(self.splits) or "none, since only images with poses are in a split"
-            raise InputError(f"no split {name!r}", where=self.path, expected=f"one of {known}")
-        own = [shot for shot in self.shots if name in shot.splits]
-        return replace(self, shots=_named(own, one_split=True))
+        if name not in self._by_split:
+            every = name == "all" and name not in self.splits
+            if not every and name not in self.splits:
+                known = ", ".join(self.splits) or "none, since only images with poses are in a split"
+                raise InputError(f"no split {name!r}", where=self.path, expected=f"one of {known}")
+            own = [shot for shot in self.shots if (shot.splits if every else name in shot.splits)]
+            self._by_split[name] = replace(self, shots=_named(own, one_split=not every))
+        return self._by_split[name]
 
     def in_time_order(self) -> Capture:
         """Return all frames in chronological order, or, if any frame lacks a time, in natural name order and without times."""
@@ -314,11 +323,11 @@ class Capture:
 
     def select(self, split: str, names: Sequence[str] | None = None) -> list[Shot]:
         """Return the frames ``names`` of a split, in that order, or the whole split. Raises ``InputError`` for an unknown split or name."""
-        chosen, where = list(self.split(split).shots), f"{self.path}: split {split!r}"
+        part, where = self.split(split), f"{self.path}: split {split!r}"
+        chosen, by_name = list(part.shots), part._by_name
         if names is None:
             return chosen
         refuse_text(f"{where}: names", names)
-        by_name = {shot.name: shot for shot in chosen}
         unknown = next((name for name in names if name not in by_name), None)
         if unknown is None:
             return [by_name[name] for name in names]

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+import bidnerf_core.datasets.capture as capture_module  # inside: how often frames are named
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames import Frame
@@ -52,6 +53,16 @@ def nerfstudio(tmp_path: Path) -> Path:
 
 def first(folder: Path, **options: Any) -> Frame:
     return open_dataset(folder, **options).views("test")[0].frame
+
+
+def test_the_frames_of_a_split_are_named_once(blender: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Naming takes time for each frame of the split, so that reading all of them would take its square."""
+    named = list[int]()
+    capture, usual = open_dataset(blender), capture_module.unique_names
+    monkeypatch.setattr(capture_module, "unique_names", lambda paths: named.append(len(paths)) or usual(paths))
+    for name in capture.frame_names("train"):
+        assert capture.views("train", [name])[0].frame.name == name
+    assert named == [3]
 
 
 # Axes and poses
