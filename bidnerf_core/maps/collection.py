@@ -48,7 +48,7 @@ class Placement:
     runner_up: tuple[str, Localization] | None  # the second best answer; None if only one map was tried
     # all maps, most similar first: the cosine between pooled descriptors, -1 if a map has none
     ranking: Mapping[str, float]
-    asked: tuple[str, ...]  # maps in which the image was localized, in order
+    tried: tuple[str, ...]  # maps in which the image was localized, in order
     backend: str  # backend of the map's field
 
     @property
@@ -74,8 +74,8 @@ class MapCollection:
     """Finds the map that an image shows, and the pose of the image in that map.
 
     Maps are ranked by the similarity of pooled descriptors, and only the most similar are tried. Maps without
-    landmarks cannot be ranked and are tried last. Recently used maps stay in memory. A collection must be used
-    from one thread only.
+    landmarks cannot be ranked; all of them are tried last. Recently used maps stay in memory. A collection must be
+    used from one thread only.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class MapCollection:
         scenes: str | Path | Sequence[Map | str | Path] | Mapping[str, Map],
         method: str = USUAL_METHOD,
         config: Any = None,
-        asked: int = 5,
+        limit: int = 5,
         progress: ProgressCallback | None = None,
         cancel: Cancel | None = None,
         localizers: Mapping[str, Localizer] | None = None,
@@ -91,14 +91,14 @@ class MapCollection:
         """Read the landmarks of all maps.
 
         ``scenes`` is a folder whose subfolders are maps, a list of maps and of folders of maps, or maps by name.
-        ``method`` and ``config`` select how images are localized, see ``Localizer``. ``asked`` is the largest
-        number of maps that are tried, the most similar ones first. ``localizers`` holds existing localizers by
+        ``method`` and ``config`` select how images are localized, see ``Localizer``. ``limit`` is the
+        largest number of ranked maps that are tried, the most similar ones first. ``localizers`` holds existing localizers by
         the names of their maps. Raises ``InputError`` if there is no map or the same one twice, and
         ``Cancelled`` once ``cancel`` returns True.
         """
-        if asked < 1:
-            raise InputError(f"asked is {asked}", expected="1 or more")
-        self.method, self.config, self.asked = method, config, asked
+        if limit < 1:
+            raise InputError(f"limit is {limit}", expected="1 or more")
+        self.method, self.config, self.limit = method, config, limit
         self._maps = _maps_by_name(scenes)
         self._given_localizers = localizers or {}
         self._localizer = functools.lru_cache(maxsize=6)(self._loaded)  # this many maps stay in memory after use
@@ -160,7 +160,8 @@ class MapCollection:
         """
         ranking = self.ranked(frame)
         quick: dict[str, Localization] = {}
-        for name in list(ranking)[: self.asked]:
+        compared = [name for name, similarity in ranking.items() if similarity > -1.0]
+        for name in [*compared[: self.limit], *(name for name in ranking if name not in compared)]:
             recognised = any(found.converged for found in quick.values())
             quick[name] = self._by_landmarks(name, frame, seed)
             if recognised:

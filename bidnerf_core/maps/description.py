@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import warnings
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -12,7 +13,7 @@ import torch
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import PoseRefinement, StoredCamera, cameras_with_invalid_pose
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, InputWarning, enumeration
 from bidnerf_core.fields import RadianceField, SceneBounds, scale_field
 from bidnerf_core.geometry import SE3, LengthUnit, pose_from_matrix, scale_point
 from bidnerf_core.io import from_plain, read_json
@@ -174,6 +175,10 @@ def load_info(folder: Path) -> MapInfo:
         name = found.get(part)
         if isinstance(name, str) and (not name or Path(name).name != name):
             raise InputError(f"names {name!r}", where=path, expected="the name of a file next to it")
+    if unknown := sorted(found.keys() - {part.name for part in fields(MapInfo)}):
+        text = f"{path}: ignored {enumeration(unknown)}, which this bidnerf does not know"
+        warnings.warn(f"{text}; the map was written by bidnerf {found.get('bidnerf')}", InputWarning, stacklevel=2)
+        found = {key: value for key, value in found.items() if key not in unknown}
     info = from_plain(MapInfo, found, str(path))
     if (folder / ANCHOR).exists():
         anchor = from_plain(Anchor, read_json(folder / ANCHOR, "the anchor of a map"), str(folder / ANCHOR))

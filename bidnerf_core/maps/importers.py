@@ -95,6 +95,14 @@ def _defects(importer: Any) -> Iterator[str]:
 IMPORTERS: Plugins[Importer] = Plugins("importers", _defects)
 """The installed importers, by name."""
 
+OFFERED = {
+    "gaussians": "splats",
+    "scan": "meshes and scanned points",
+    "nerfstudio": "checkpoints of nerfstudio",
+    "nerf-pytorch": "those of nerf-pytorch",
+}
+"""What the importers of bidnerf's own plugins read, by their names."""
+
 
 def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
     """Return the name and importer for a file: the importer called ``name`` or, without a name, the one that recognizes the file.
@@ -116,11 +124,9 @@ def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
         names = enumeration([each for each, _ in able])
         raise InputError(f"{names} can each read it; choose one of them (--as)", where=path)
     known = "; ".join(f"{each} reads {importer.summary}" for each, importer in found)
-    raise InputError(
-        "no installed importer recognizes it"
-        + (f" ({known})" if known else ", since none is installed (pip install bidnerf-gaussians adds one for splats)"),
-        where=path,
-    )
+    absent = [f"bidnerf-{each} for {what}" for each, what in OFFERED.items() if each not in IMPORTERS]
+    hint = f"; pip install {enumeration(absent)}" if absent else ""
+    raise InputError(f"no installed importer recognizes it ({known}){hint}", where=path)
 
 
 def robust_box(

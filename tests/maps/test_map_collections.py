@@ -53,13 +53,13 @@ def grounds() -> list[Map]:
 
 @pytest.mark.slow
 def test_the_map_that_an_image_shows_is_found(grounds: list[Map]) -> None:
-    maps = bn.MapCollection(grounds, asked=2)
+    maps = bn.MapCollection(grounds, limit=2)
     assert maps.names == ("ground0", "ground4", "bare")
     image = photo(SEEDS[1])
     found = maps(image.frame)
     assert (found.map, found.converged) == ("ground4", True)
     assert next(iter(found.ranking)) == found.map
-    assert len(found.asked) == 2
+    assert len(found.tried) == 2
     assert found.runner_up is not None
     assert found.runner_up[0] == list(found.ranking)[1]
     assert not found.runner_up[1].converged
@@ -133,6 +133,17 @@ def test_maps_without_landmarks_come_last(grounds: list[Map]) -> None:
     assert list(maps.ranked(view(POSES[1]).frame)) == ["ground0", "bare"]
     dark = bn.Frame.from_numpy(np.zeros((96, 128, 3), np.uint8), CAMERA)
     assert set(maps.ranked(dark).values()) == {-1.0}
+
+
+def test_the_limit_counts_only_maps_that_can_be_compared(grounds: list[Map], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Maps without landmarks cannot be ranked, so that any of them may be the one that the image shows."""
+    bare = {f"bare{n}": grounds[2] for n in range(7)}
+    maps = bn.MapCollection({**bare, "ground0": grounds[0], "ground4": grounds[1]}, limit=1)
+    none = collections_module._unrecognised("nothing matches", "auto")
+    monkeypatch.setattr(maps, "_by_landmarks", lambda *_: none)
+    monkeypatch.setattr(maps, "localizer", lambda name: lambda frame, seed: none)
+    assert maps(photo(SEEDS[1]).frame).tried == ("ground4", *bare)
+    assert set(maps(bn.Frame.from_numpy(np.zeros((96, 128, 3), np.uint8), CAMERA)).tried) == set(maps.names)
 
 
 def test_what_is_no_map_is_refused(grounds: list[Map], tmp_path: Path) -> None:

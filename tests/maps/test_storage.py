@@ -24,7 +24,7 @@ import tiny
 from bidnerf.scenes import HomogeneousBall
 from bidnerf_core.backend import load_backend
 from bidnerf_core.captures import CaptureReport, CoverageRecord, PoseRefinement, StoredCamera, stored_cameras
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import to_plain, write_file
@@ -546,6 +546,12 @@ def test_descriptions_of_what_cannot_be_are_refused(
     assert str(told.value).startswith(f"{tmp_path / 'map.json'}: ")
     assert culprit in str(told.value)
     assert value in str(told.value)
+
+
+def test_keys_of_a_newer_version_are_ignored_with_a_warning(tmp_path: Path) -> None:
+    described(tmp_path, mirrored=True, bidnerf="99.1")
+    with pytest.warns(InputWarning, match=r"map\.json: ignored mirrored, .* written by bidnerf 99\.1$"):
+        assert load_info(tmp_path).bidnerf == "99.1"
 
 
 def test_a_training_of_any_length_is_described(bidnerf: Run, tmp_path: Path) -> None:
