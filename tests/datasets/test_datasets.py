@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-import bidnerf_core.datasets.capture as capture_module  # inside: how often frames are named
+# Inside: how often the frames of a split are named
+import bidnerf_core.datasets.capture as capture_module
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames import Frame
