@@ -11,7 +11,6 @@ the upper left pixel, so half a pixel is added.
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from bidnerf_core.camera import CameraSource
@@ -29,9 +28,10 @@ from bidnerf_core.datasets import (
 )
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import is_file, read_file
+from bidnerf_core.io import is_file, parse_yaml, read_file
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0", "gt0")
+EXPECTED = "EuRoC's sensor.yaml"
 
 
 def _read(path: Path, root: Path, options: DatasetOptions) -> Capture:
@@ -56,27 +56,24 @@ def _find(path: Path) -> Path | None:
 
 def _sensor(file: Path, options: DatasetOptions) -> tuple[CameraSource, SE3]:
     """Return the camera (given or calibrated) and T_body_camera. Raises ``InputError`` for an invalid file."""
-    text = read_file(file, "EuRoC's sensor.yaml").decode("utf-8", "replace")
-    T_body_camera = pose_of_matrix(file, _numbers(file, text, "T_BS", 16), "the rotation of T_BS")
+    values = parse_yaml(read_file(file, EXPECTED), str(file), EXPECTED)
+    if not isinstance(values, dict):
+        raise InputError("has no entries", where=file, expected=EXPECTED)
+
+    def numbers(key: str, count: int) -> list[float]:
+        """Return the numbers of a list, which may be the ``data`` of a matrix."""
+        listed = values.get(key)
+        listed = listed.get("data") if isinstance(listed, dict) else listed
+        return numbers_in(f"{file}: {key}", " ".join(map(str, listed)) if isinstance(listed, list) else "", count)
+
+    T_body_camera = pose_of_matrix(file, numbers("T_BS", 16), "the rotation of T_BS")
     if options.given_camera is not None:
         return CameraSource(options.given_camera), T_body_camera
-    width, height = _numbers(file, text, "resolution", 2)
-    lens = _numbers(file, text, "distortion_coefficients", 4)
-    model = re.search(r"distortion_model\s*:\s*([\w-]+)", text)
-    if any(lens) and (model is None or model[1] not in ("radial-tangential", "radtan", "plumb_bob")):
-        found = "unknown" if model is None else model[1]
-        raise InputError(f"distortion_model is {found}", where=file, expected="radial-tangential; undistort the images")
-    numbers = _numbers(file, text, "intrinsics", 4)
-    return CameraSource(camera_of(file, numbers, (int(width), int(height)), lens)), T_body_camera
-
-
-def _numbers(file: Path, text: str, key: str, count: int) -> list[float]:
-    """Return the ``count`` numbers of a bracketed YAML list, on one or several lines, for ``key``.
-
-    The list may also be the ``data:`` entry of a matrix.
-    """
-    found = re.search(rf"^\s*{key}\s*:[^\[]*\[([^\]]*)\]", text, re.MULTILINE)
-    return numbers_in(f"{file}: {key}", found[1] if found else "", count)
+    width, height = numbers("resolution", 2)
+    lens, model = numbers("distortion_coefficients", 4), values.get("distortion_model", "unknown")
+    if any(lens) and model not in ("radial-tangential", "radtan", "plumb_bob"):
+        raise InputError(f"distortion_model is {model}", where=file, expected="radial-tangential; undistort the images")
+    return CameraSource(camera_of(file, numbers("intrinsics", 4), (int(width), int(height)), lens)), T_body_camera
 
 
 reader = Format(

@@ -160,7 +160,12 @@ FAULTS: dict[str, list[tuple[str, Edit, str | tuple[str, ...]]]] = {
         ),
     ],
     "kitti": [("../../poses/07.txt", Path.unlink, "poses.txt")],
-    "euroc": [("mav0/cam0/sensor.yaml", fisheye, ("equidistant", "radial-tangential"))],
+    "euroc": [
+        ("mav0/cam0/sensor.yaml", fisheye, ("equidistant", "radial-tangential")),
+        ("mav0/cam0/sensor.yaml", replaced("resolution", "size"), ("resolution: has 0 numbers", "expected 2")),
+        ("mav0/cam0/sensor.yaml", content("sensor_type: [camera"), "not YAML"),
+        ("mav0/cam0/sensor.yaml", content("camera"), "has no entries"),
+    ],
     "colmap": [
         ("sparse/0/cameras.txt", replaced("OPENCV", "THIN_PRISM_FISHEYE"), ("line 2", "THIN_PRISM_FISHEYE")),
         ("sparse/0/cameras.txt", replaced("OPENCV", "PINHOLE"), ("line 2", "PINHOLE", "8 parameters", "4")),
