@@ -43,7 +43,7 @@ Pairs: TypeAlias = list[tuple[int, int]]
 """Pairs (i, j) of photos with i < j."""
 
 
-def pycolmap_for(what: str) -> Any:
+def import_pycolmap(what: str) -> Any:
     """Import pycolmap and silence its log.
 
     Raises ``InputError`` if pycolmap is missing or too old; the message begins with ``what``.
@@ -77,7 +77,7 @@ class ListedPhoto:
 
 
 @dataclass(frozen=True)
-class Described:
+class PhotoSet:
     """The readable photos, and the reasons why the others cannot be read."""
 
     photos: list[ListedPhoto]
@@ -86,12 +86,12 @@ class Described:
     unusable: dict[str, str]  # reasons by name
 
 
-def described(images: Sequence[SourceImage], given: Intrinsics | str | Path | None) -> Described:
+def list_photos(images: Sequence[SourceImage], given: Intrinsics | str | Path | None) -> PhotoSet:
     """Read the headers of photos, and group the photos by camera.
 
     Raises ``InputError`` for a ``given`` camera that does not fit the photos.
     """
-    found, numbers = Described([], {}, {}, {}), dict[Any, int]()
+    found, numbers = PhotoSet([], {}, {}, {}), dict[Any, int]()
     for number, image in enumerate(images, start=1):
         try:
             header, exif = read_header(image.file), read_exif(image.file)
@@ -118,7 +118,7 @@ def _first_guess(photo: ListedPhoto, given: Intrinsics | str | Path | None) -> t
     return Intrinsics.from_focal(1.2 * max(photo.size), *photo.size), False  # as COLMAP assumes
 
 
-def key(number: int) -> str:
+def stored_name(number: int) -> str:
     """Return the name of a photo in the database, made from its number.
 
     The file name of a photo may contain spaces, which COLMAP's pair lists do not allow.
@@ -137,7 +137,7 @@ def to_colmap(intrinsics: Intrinsics, number: int, pycolmap: Any) -> Any:
     )
 
 
-def write_cameras(database: Any, found: Described, fixed: bool, pycolmap: Any) -> None:
+def write_cameras(database: Any, found: PhotoSet, fixed: bool, pycolmap: Any) -> None:
     """Write cameras and photos to an empty database. Cameras get one radial distortion coefficient unless ``fixed``."""
     with pycolmap.DatabaseTransaction(database):
         for number, intrinsics in found.cameras.items():
@@ -153,14 +153,14 @@ def write_cameras(database: Any, found: Described, fixed: bool, pycolmap: Any) -
             rig.add_ref_sensor(camera.sensor_id)
             database.write_rig(rig, use_rig_id=True)
         for photo in found.photos:
-            image = pycolmap.Image(name=key(photo.number), camera_id=photo.camera, image_id=photo.number)
+            image = pycolmap.Image(name=stored_name(photo.number), camera_id=photo.camera, image_id=photo.number)
             database.write_image(image, use_image_id=True)
             frame = pycolmap.Frame(frame_id=photo.number, rig_id=photo.camera)
             frame.add_data_id(image.data_id)
             database.write_frame(frame, use_frame_id=True)
 
 
-def write_keypoints(database: Any, found: Described, pycolmap: Any) -> None:
+def write_keypoints(database: Any, found: PhotoSet, pycolmap: Any) -> None:
     """Detect the keypoints that the database lacks; photos that cannot be decoded are moved to ``found.unusable``.
 
     If the job is cancelled, the keypoints detected so far stay in the database.
@@ -238,7 +238,7 @@ def match(database: Path, pairs: Pairs, threads: int, pycolmap: Any) -> None:
     count(len(pairs) - len(todo), len(pairs))
     for start in range(0, len(todo), size):
         batch = todo[start : start + size]
-        listed.write_text("".join(f"{key(i)} {key(j)}\n" for i, j in batch))
+        listed.write_text("".join(f"{stored_name(i)} {stored_name(j)}\n" for i, j in batch))
         pycolmap.match_image_pairs(
             database,
             matching,

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf.structure.colmap import Described, ListedPhoto
+from bidnerf.structure.colmap import ListedPhoto, PhotoSet
 from bidnerf.structure.record import MODEL, TRANSFORMS
 from bidnerf_core.camera import Intrinsics, colmap_camera
 from bidnerf_core.captures import up_direction
@@ -28,9 +28,7 @@ LEAST_PHOTOS = 3
 """Smallest number of photos in a model: two photos have a single baseline, which allows no check."""
 
 
-def reconstructed(
-    database: Path, folder: Path, found: Described, fixed: bool, threads: int, pycolmap: Any
-) -> list[Any]:
+def reconstruct(database: Path, folder: Path, found: PhotoSet, fixed: bool, threads: int, pycolmap: Any) -> list[Any]:
     """Reconstruct models from the photos in a database, with constant cameras if ``fixed``; models are written to ``folder``.
 
     Returns the models, largest first; photos without overlap form separate models. The list may be empty.
@@ -86,7 +84,7 @@ def _upright_axes(photo: ListedPhoto) -> tuple[np.ndarray, np.ndarray]:
     return np.array([x, 0.0, 0.0]), np.array([0.0, -y, 0.0])
 
 
-def full_size(model: Any, photos: Mapping[int, ListedPhoto]) -> None:
+def restore_size(model: Any, photos: Mapping[int, ListedPhoto]) -> None:
     """Scale the cameras and keypoints of a model from the downscaled photos to the photos as stored."""
     sizes = {photo.camera: photo for photo in photos.values()}
     for number, photo in sizes.items():
@@ -100,7 +98,7 @@ def full_size(model: Any, photos: Mapping[int, ListedPhoto]) -> None:
                 point.xy = point.xy * scale
 
 
-def agreement(model: Any, database: Any, pycolmap: Any) -> tuple[int, int]:
+def count_contradictions(model: Any, database: Any, pycolmap: Any) -> tuple[int, int]:
     """Count the verified pairs of photos, and those that contradict the poses and cameras of a model.
 
     Places that look alike, such as the doors of a corridor, can be taken for one place. The model is then folded, although its points
@@ -133,7 +131,7 @@ def agreement(model: Any, database: Any, pycolmap: Any) -> tuple[int, int]:
 
 
 def left_out(
-    found: Described, models: list[Any], partners: Counter[int], keypoints: Mapping[int, int]
+    found: PhotoSet, models: list[Any], partners: Counter[int], keypoints: Mapping[int, int]
 ) -> dict[str, str]:
     """Return, by name, the reason why each photo that is not in the largest model was left out.
 
@@ -159,11 +157,11 @@ def write_dataset(folder: Path, photos: Mapping[int, ListedPhoto], model: Any, b
     entries = []
     for number in sorted(model.reg_image_ids()):
         photo, image = photos[number], model.image(number)
-        image.name = relative(photo.image.file, base)
+        image.name = relative_path(photo.image.file, base)
         camera = from_colmap(model.camera(image.camera_id))
         matrix = torch.from_numpy(image.cam_from_world().matrix()).double()
         T_world_camera = SE3(matrix[:, :3].clone(), matrix[:, 3].clone()).inverse()
-        place = relative(photo.image.file, folder)
+        place = relative_path(photo.image.file, folder)
         entries.append(frame_entry(place, photo.image.name, camera, T_world_camera, photo.image.time))
     (folder / MODEL).mkdir(parents=True, exist_ok=True)
     model.write_binary(folder / MODEL)
@@ -178,7 +176,7 @@ def from_colmap(camera: Any) -> Intrinsics:
     return found
 
 
-def relative(file: Path, folder: Path) -> str:
+def relative_path(file: Path, folder: Path) -> str:
     """Return the path of a file relative to a folder, or its absolute path if they are on different drives."""
     try:
         return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()

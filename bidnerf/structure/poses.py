@@ -15,21 +15,21 @@ from typing import Any
 import torch
 
 from bidnerf.structure.colmap import (
-    Described,
-    described,
+    PhotoSet,
+    import_pycolmap,
+    list_photos,
     match,
-    pycolmap_for,
     similar_pairs,
     write_cameras,
     write_keypoints,
 )
 from bidnerf.structure.model import (
     LEAST_PHOTOS,
-    agreement,
-    full_size,
+    count_contradictions,
     left_out,
-    reconstructed,
-    relative,
+    reconstruct,
+    relative_path,
+    restore_size,
     turn_upright,
     write_dataset,
 )
@@ -38,17 +38,17 @@ from bidnerf.structure.record import (
     RECORD,
     FoundPoses,
     LeftOut,
-    begin,
-    begun,
-    clear,
     digest,
-    is_ours,
-    read_found,
+    interrupted_work,
+    is_output,
+    open_work,
+    read_record,
+    remove_output,
 )
 from bidnerf.structure.sources import (
     SourceImage,
-    chosen,
-    measured,
+    choose_frames,
+    measure_frames,
     photos_of,
     refuse_panoramas,
     write_frames,
@@ -89,7 +89,7 @@ def find_poses(
     holds something else and ``overwrite`` is not set, and if pycolmap is missing.
     """
     source, folder = Path(photos), Path(out)
-    pycolmap = pycolmap_for(str(source))
+    pycolmap = import_pycolmap(str(source))
     images = [] if is_video(source) else photos_of(source, folder)
     if not images and not source.is_file():
         raise InputError("no such file", where=source, expected="a video or a folder of photos")
@@ -97,7 +97,7 @@ def find_poses(
     known = None
     if reuse or not overwrite:
         try:
-            known = read_found(folder)
+            known = read_record(folder)
         except InputError:  # a damaged record
             if not overwrite:
                 raise
@@ -105,26 +105,26 @@ def find_poses(
         log.info(f"{folder}: already has the poses of these photos")
         return known
     refuse_panoramas(images)
-    goes_on = begun(folder).get("inputs") == inputs
+    resumes = interrupted_work(folder).get("inputs") == inputs
 
-    def described_folder(place: Path) -> str | None:
+    def describe_content(place: Path) -> str | None:
         if (place / RECORD).exists():
             return "holds the poses of other photos"
-        return "holds interrupted work on other photos" if begun(place) else None
+        return "holds interrupted work on other photos" if interrupted_work(place) else None
 
     with (
         job_context(progress, cancel),
-        output_folder(folder, overwrite, lambda file: goes_on and is_ours(file), described_folder),
+        output_folder(folder, overwrite, lambda file: resumes and is_output(file), describe_content),
     ):
         if overwrite and not reuse:
-            clear(folder)
-        work = begin(folder, inputs, video=not images)
+            remove_output(folder)
+        work = open_work(folder, inputs, video=not images)
         try:
             found = _search(source, images, work, inputs, camera, pycolmap)
         except Cancelled as stopped:
             raise Cancelled(f"{folder}: {stopped}; the same command resumes from there") from stopped
         except InputError:
-            clear(folder)
+            remove_output(folder)
             raise
         write_file(folder / RECORD, json.dumps(to_plain(found), indent=1, allow_nan=False).encode())
         shutil.rmtree(work, ignore_errors=True)
@@ -147,8 +147,8 @@ def _search(
     began, folder, database, video = time.monotonic(), work.parent, work / "database.db", not images
     fixed, threads = camera is not None, max(1, torch.get_num_threads())
     if video:
-        images = write_frames(source, folder / FRAMES, chosen(measured(source)))
-    found = described(images, camera)
+        images = write_frames(source, folder / FRAMES, choose_frames(measure_frames(source)))
+    found = list_photos(images, camera)
     try:
         stored = pycolmap.Database.open(database)
     except RuntimeError as damage:
@@ -168,7 +168,7 @@ def _search(
             similar = similar_pairs([opened.read_descriptors(number).data for number in numbers])
             pairs = [(numbers[i], numbers[j]) for i, j in similar]
     match(database, pairs, threads, pycolmap)
-    models = reconstructed(database, work / "models", found, fixed, threads, pycolmap)
+    models = reconstruct(database, work / "models", found, fixed, threads, pycolmap)
     with pycolmap.Database.open(database) as opened:
         matched = zip(*opened.read_two_view_geometries(), strict=True)
         overlapping = [pycolmap.pair_id_to_image_pair(pair) for pair, seen in matched if len(seen.inlier_matches)]
@@ -182,14 +182,14 @@ def _search(
                 expected="photos that overlap by two thirds, taken while moving sideways",
             )
         model, photos = models[0], {photo.number: photo for photo in found.photos}
-        sure, contradicting = agreement(model, opened, pycolmap)
+        sure, contradicting = count_contradictions(model, opened, pycolmap)
     error = model.compute_mean_reprojection_error()
     turn_upright(model, photos, pycolmap)
-    full_size(model, photos)
+    restore_size(model, photos)
     write_dataset(folder, photos, model, folder / FRAMES if video else source)
     reasons = left_out(found, models, Counter(itertools.chain(*overlapping)), keypoints)
     left = [
-        LeftOut(image.name, relative(image.file, folder), reasons[image.name])
+        LeftOut(image.name, relative_path(image.file, folder), reasons[image.name])
         for image in images
         if image.name in reasons
     ]
@@ -212,7 +212,7 @@ def _search(
     )
 
 
-def _require_enough(found: Described, source: Path) -> None:
+def _require_enough(found: PhotoSet, source: Path) -> None:
     if len(found.photos) < LEAST_PHOTOS:
         why = "".join(f" that can be read ({name}: {reason})" for name, reason in [*found.unusable.items()][:1])
         raise InputError(

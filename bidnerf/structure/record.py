@@ -98,14 +98,14 @@ def digest(files: Sequence[Path], camera: Intrinsics | str | Path | None) -> str
     return hashlib.blake2b(json.dumps([facts, given]).encode(), digest_size=16).hexdigest()
 
 
-def read_found(folder: Path) -> FoundPoses | None:
+def read_record(folder: Path) -> FoundPoses | None:
     """Load the record in a pose folder, or None if there is none. Raises ``InputError`` for a damaged one."""
     if not (folder / RECORD).is_file() or not (folder / TRANSFORMS).is_file():
         return None
     return from_plain(FoundPoses, read_json(folder / RECORD, "the record of found poses"), str(folder / RECORD))
 
 
-def begun(folder: Path) -> dict[str, Any]:
+def interrupted_work(folder: Path) -> dict[str, Any]:
     """Return the state of interrupted work: the digest ``inputs`` and whether they are a ``video``; empty if there is none."""
     with contextlib.suppress(InputError):
         found = read_json(folder / WORK / "begun.json", "the state of interrupted work")
@@ -113,14 +113,14 @@ def begun(folder: Path) -> dict[str, Any]:
     return {}
 
 
-def begin(folder: Path, inputs: str, video: bool) -> Path:
+def open_work(folder: Path, inputs: str, video: bool) -> Path:
     """Return the work folder, which is emptied unless the work in it has the same inputs.
 
     Raises ``InputError`` if the frames of a video would be written among other images.
     """
     work = folder / WORK
-    if begun(folder).get("inputs") != inputs:
-        clear(folder)
+    if interrupted_work(folder).get("inputs") != inputs:
+        remove_output(folder)
         if video and (folder / FRAMES).exists():
             raise InputError(
                 "exists already, and the video's frames would be written into it; name another folder",
@@ -131,14 +131,14 @@ def begin(folder: Path, inputs: str, video: bool) -> Path:
     return work
 
 
-def is_ours(file: Path) -> bool:
+def is_output(file: Path) -> bool:
     """Return whether a file or folder in a pose folder was written by this module."""
     if file.name == FRAMES:
         return file.is_dir() and all(re.fullmatch(r"\d{6,}\.jpg", each.name) for each in file.iterdir())
     return file.name in (RECORD, TRANSFORMS, WORK, MODEL.partition("/")[0])
 
 
-def clear(folder: Path) -> None:
+def remove_output(folder: Path) -> None:
     """Remove everything that this module wrote.
 
     Other files are kept, such as photos in a folder with the same name as the frames folder.
@@ -147,8 +147,8 @@ def clear(folder: Path) -> None:
     record: Any = {}
     with contextlib.suppress(InputError):
         record = read_json(folder / RECORD, "the record of found poses")
-    of_video = any(isinstance(part, dict) and part.get("video") is True for part in (record, begun(folder)))
-    if of_video and (folder / FRAMES).is_dir() and is_ours(folder / FRAMES):
+    of_video = any(isinstance(part, dict) and part.get("video") is True for part in (record, interrupted_work(folder)))
+    if of_video and (folder / FRAMES).is_dir() and is_output(folder / FRAMES):
         shutil.rmtree(folder / FRAMES)
     (folder / RECORD).unlink(missing_ok=True)
     shutil.rmtree(folder / WORK, ignore_errors=True)

@@ -88,7 +88,7 @@ def refuse_panoramas(photos: Sequence[SourceImage]) -> None:
             raise InputError("is a panorama (equirectangular)", where=photo.file, expected=expected)
 
 
-def measured(video: Path) -> list[Measure]:
+def measure_frames(video: Path) -> list[Measure]:
     """Measure the image motion and sharpness of each frame of a video.
 
     Up to 200 corners (Shi and Tomasi 1994) are tracked in images of at most 320 pixels a side, from an anchor frame until they have
@@ -126,7 +126,7 @@ def measured(video: Path) -> list[Measure]:
     return found
 
 
-def chosen(frames: Sequence[Measure]) -> list[int]:
+def choose_frames(frames: Sequence[Measure]) -> list[int]:
     """Return the indices of the frames to find poses for: for each step of motion, the sharpest frame near it."""
     motion, sharp = np.array(frames).T
     step = max(STEP, float(motion[-1]) / (MOST - 1))

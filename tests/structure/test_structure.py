@@ -23,15 +23,15 @@ import bidnerf as bn
 import tiny
 from bidnerf.results import pose_error
 from bidnerf.structure import FoundPoses
-from bidnerf.structure.colmap import NEIGHBOURS, described, similar_pairs, to_colmap
-from bidnerf.structure.model import agreement, from_colmap
-from bidnerf.structure.record import begin, clear, digest
+from bidnerf.structure.colmap import NEIGHBOURS, list_photos, similar_pairs, to_colmap
+from bidnerf.structure.model import count_contradictions, from_colmap
+from bidnerf.structure.record import digest, open_work, remove_output
 from bidnerf.structure.sources import (
     MOST,
     STEP,
     SourceImage,
-    chosen,
-    measured,
+    choose_frames,
+    measure_frames,
     photos_of,
     write_frames,
 )
@@ -194,11 +194,11 @@ def test_photos_inside_the_folder_of_the_poses_are_never_removed(tmp_path: Path)
     with refused(where=photos, found="2 photos", expected="at least 3"):
         bn.find_poses(photos, tmp_path / "capture", overwrite=True)
     with refused(where=photos, found="exists already, and the video's frames"):
-        begin(tmp_path / "capture", "a video", video=True)
+        open_work(tmp_path / "capture", "a video", video=True)
     assert len(list(photos.iterdir())) == 2
-    begin(tmp_path / "other", "a video", video=True)
+    open_work(tmp_path / "other", "a video", video=True)
     photos.rename(tmp_path / "other" / "images")
-    clear(tmp_path / "other")
+    remove_output(tmp_path / "other")
     assert list((tmp_path / "other").iterdir()) == []
 
 
@@ -250,7 +250,7 @@ def test_a_damaged_database_is_refused_and_removed(tmp_path: Path) -> None:
     photos, out = tmp_path / "photos", tmp_path / "out"
     write_photos(photos, walk(3))
     files = [image.file for image in photos_of(photos)]
-    (begin(out, digest(files, None), video=False) / "database.db").write_bytes(b"no database" * 100)
+    (open_work(out, digest(files, None), video=False) / "database.db").write_bytes(b"no database" * 100)
     with refused(where=out / "work" / "database.db", found="cannot be read", expected="begins anew"):
         bn.find_poses(photos, out)
     assert not (out / "work").exists()
@@ -311,7 +311,7 @@ def test_photos_of_one_lens_share_a_camera_however_they_are_turned(tmp_path: Pat
         write_photo(tmp_path / "c.jpg", pixels, FocalLengthIn35mmFilm=52),
         write_photo(tmp_path / "d.jpg", pixels[:100]),
     ]
-    found = described([SourceImage(file.stem, file) for file in files], None)
+    found = list_photos([SourceImage(file.stem, file) for file in files], None)
     assert [photo.camera for photo in found.photos] == [1, 1, 2, 3]
     assert found.known_focal == {1: True, 2: True, 3: False}
     assert found.cameras[2].fx == pytest.approx(2 * found.cameras[1].fx)
@@ -351,7 +351,7 @@ def test_upright_axes_are_those_of_the_turned_image(tmp_path: Path) -> None:
 
 def bn_photo(folder: Path, code: int):  # type: ignore[no-untyped-def]
     file = write_photo(folder / f"{code}.jpg", np.zeros((4, 6, 3), np.uint8), code)
-    return described([SourceImage("a", file)], None).photos[0]
+    return list_photos([SourceImage("a", file)], None).photos[0]
 
 
 def test_many_photos_are_matched_with_neighbours_and_those_that_look_alike() -> None:
@@ -373,11 +373,11 @@ def test_many_photos_are_matched_with_neighbours_and_those_that_look_alike() -> 
 
 def test_frames_are_chosen_at_equal_steps_of_motion_the_sharpest_near_each() -> None:
     still = [(0.0, 0.0)] * 20
-    assert chosen(still) == [0]
+    assert choose_frames(still) == [0]
     moving = [(0.1 * STEP * n, -float(n % 10 != 1)) for n in range(101)]
-    assert chosen(moving) == [1, 11, 21, 31, 41, 51, 61, 71, 81, 91, 98]
+    assert choose_frames(moving) == [1, 11, 21, 31, 41, 51, 61, 71, 81, 91, 98]
     long = [(STEP * n, 0.0) for n in range(3 * MOST)]
-    assert MOST / 2 < len(chosen(long)) <= MOST
+    assert MOST / 2 < len(choose_frames(long)) <= MOST
 
 
 def test_a_video_is_thinned_by_its_motion_and_not_by_its_shaking(tmp_path: Path) -> None:
@@ -396,11 +396,11 @@ def test_a_video_is_thinned_by_its_motion_and_not_by_its_shaking(tmp_path: Path)
                 image = cv2.blur(image, (9, 1))
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode())
-    measures = measured(tmp_path / "clip.mp4")
+    measures = measure_frames(tmp_path / "clip.mp4")
     assert len(measures) == len(poses)
     rest = measures[35][0] - measures[16][0]
     assert rest < 0.2 * measures[-1][0]
-    frames = chosen(measures)
+    frames = choose_frames(measures)
     assert sum(16 <= number < 36 for number in frames) <= 2
     assert sum(number % 3 == 1 for number in frames) <= len(frames) / 6
     written = write_frames(tmp_path / "clip.mp4", tmp_path / "images", frames)
@@ -454,10 +454,10 @@ def test_pairs_with_many_matches_tell_a_folded_model() -> None:
             camera=lambda number: camera,
         )
 
-    assert agreement(model(true), database, pycolmap) == (2, 0)
+    assert count_contradictions(model(true), database, pycolmap) == (2, 0)
     folded = true | {3: pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, 0.6, 0])), [-1.5, 0.5, 0])}
-    assert agreement(model(folded), database, pycolmap) == (2, 1)
-    assert agreement(model({1: true[1], 3: folded[3]}), database, pycolmap) == (0, 0)
+    assert count_contradictions(model(folded), database, pycolmap) == (2, 1)
+    assert count_contradictions(model({1: true[1], 3: folded[3]}), database, pycolmap) == (0, 0)
 
 
 def test_poses_that_many_pairs_contradict_are_doubted(search: Search) -> None:
