@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -28,14 +28,16 @@ from bidnerf_core.camera import (
     read_exif,
     reduced_size,
 )
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.io import read_header, read_image
 from bidnerf_core.mapping import Keypoints, Sift, Vocabulary
 from bidnerf_core.progress import counter
 
 LARGEST = 1600
-"""Pixels along the longer side of downscaled photos: more give slightly more accurate poses, but take far longer."""
+"""Longer side of downscaled photos (pixels). Larger ones give slightly more accurate poses, but take far longer."""
 DETECTOR = Sift(count=4096, largest=LARGEST)
+LEAST_PHOTOS = 3
+"""Smallest number of photos in a model: two photos have a single baseline, which allows no check."""
 NEIGHBOURS = 10
 """Number of photos before and after each photo, in order of name or time, with which it is matched."""
 
@@ -76,14 +78,24 @@ class ListedPhoto:
     camera: int  # in the database, from 1
 
 
-@dataclass(frozen=True)
+@dataclass
 class PhotoSet:
-    """The readable photos, and the reasons why the others cannot be read."""
+    """The readable photos and their cameras, and the reasons why other photos cannot be read."""
 
-    photos: list[ListedPhoto]
-    cameras: dict[int, Intrinsics]  # of reduced photos, by number
-    known_focal: dict[int, bool]  # whether EXIF or the user states the focal length
-    unusable: dict[str, str]  # reasons by name
+    photos: list[ListedPhoto] = field(default_factory=list)
+    cameras: dict[int, Intrinsics] = field(default_factory=dict)  # of reduced photos, by number
+    known_focal: dict[int, bool] = field(default_factory=dict)  # whether EXIF or the user states the focal length
+    unusable: dict[str, str] = field(default_factory=dict)  # reasons by name
+
+    def require_enough(self, source: Path) -> None:
+        """Raise ``InputError``, whose message begins with ``source``, if too few photos are readable."""
+        if len(self.photos) < LEAST_PHOTOS:
+            why = "".join(f" that can be read ({name}: {reason})" for name, reason in [*self.unusable.items()][:1])
+            raise InputError(
+                f"{amount(len(self.photos), 'photo')}{why}",
+                where=source,
+                expected=f"at least {LEAST_PHOTOS} of one scene, taken from different places",
+            )
 
 
 def list_photos(images: Sequence[SourceImage], given: Intrinsics | str | Path | None) -> PhotoSet:
@@ -91,24 +103,24 @@ def list_photos(images: Sequence[SourceImage], given: Intrinsics | str | Path | 
 
     Raises ``InputError`` for a ``given`` camera that does not fit the photos.
     """
-    found, numbers = PhotoSet([], {}, {}, {}), dict[Any, int]()
+    listed, numbers = PhotoSet(), dict[Any, int]()
     for number, image in enumerate(images, start=1):
         try:
             header, exif = read_header(image.file), read_exif(image.file)
         except InputError as error:
-            found.unusable[image.name] = _without_file(error, image)
+            listed.unusable[image.name] = _without_file(error, image)
             continue
         size = (header.width, header.height)
         camera = numbers.setdefault((size, replace(exif, orientation=UPRIGHT)), len(numbers) + 1)
         photo = ListedPhoto(image, number, size, reduced_size(*size, LARGEST), exif, camera)
-        found.photos.append(photo)
-        if camera not in found.cameras:
-            first, found.known_focal[camera] = _first_guess(photo, given)
-            found.cameras[camera] = first.resized(*photo.reduced)
-    return found
+        listed.photos.append(photo)
+        if camera not in listed.cameras:
+            first, listed.known_focal[camera] = _initial_camera(photo, given)
+            listed.cameras[camera] = first.resized(*photo.reduced)
+    return listed
 
 
-def _first_guess(photo: ListedPhoto, given: Intrinsics | str | Path | None) -> tuple[Intrinsics, bool]:
+def _initial_camera(photo: ListedPhoto, given: Intrinsics | str | Path | None) -> tuple[Intrinsics, bool]:
     raster, exif = Raster(*photo.size), replace(photo.exif, orientation=UPRIGHT)
     if given is not None:
         return CameraSource(given).find(photo.image.file, raster).intrinsics, True
@@ -137,22 +149,22 @@ def to_colmap(intrinsics: Intrinsics, number: int, pycolmap: Any) -> Any:
     )
 
 
-def write_cameras(database: Any, found: PhotoSet, fixed: bool, pycolmap: Any) -> None:
+def write_cameras(database: Any, photos: PhotoSet, fixed: bool, pycolmap: Any) -> None:
     """Write cameras and photos to an empty database. Cameras get one radial distortion coefficient unless ``fixed``."""
     with pycolmap.DatabaseTransaction(database):
-        for number, intrinsics in found.cameras.items():
+        for number, intrinsics in photos.cameras.items():
             size = intrinsics.width, intrinsics.height
             camera = (
                 to_colmap(intrinsics, number, pycolmap)
                 if fixed
                 else pycolmap.Camera.create_from_model_name(number, "SIMPLE_RADIAL", intrinsics.fx, *size)
             )
-            camera.has_prior_focal_length = found.known_focal[number]
+            camera.has_prior_focal_length = photos.known_focal[number]
             database.write_camera(camera, use_camera_id=True)
             rig = pycolmap.Rig(rig_id=number)
             rig.add_ref_sensor(camera.sensor_id)
             database.write_rig(rig, use_rig_id=True)
-        for photo in found.photos:
+        for photo in photos.photos:
             image = pycolmap.Image(name=stored_name(photo.number), camera_id=photo.camera, image_id=photo.number)
             database.write_image(image, use_image_id=True)
             frame = pycolmap.Frame(frame_id=photo.number, rig_id=photo.camera)
@@ -160,26 +172,26 @@ def write_cameras(database: Any, found: PhotoSet, fixed: bool, pycolmap: Any) ->
             database.write_frame(frame, use_frame_id=True)
 
 
-def write_keypoints(database: Any, found: PhotoSet, pycolmap: Any) -> None:
-    """Detect the keypoints that the database lacks; photos that cannot be decoded are moved to ``found.unusable``.
+def write_keypoints(database: Any, photos: PhotoSet, pycolmap: Any) -> None:
+    """Detect the keypoints that the database lacks; photos that cannot be decoded are moved to ``photos.unusable``.
 
     If the job is cancelled, the keypoints detected so far stay in the database.
     """
-    count, total = counter("finding keypoints", "photos"), len(found.photos)
-    missing = [photo for photo in found.photos if not database.exists_keypoints(photo.number)]
+    count, total = counter("finding keypoints", "photos"), len(photos.photos)
+    missing = [photo for photo in photos.photos if not database.exists_keypoints(photo.number)]
     with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
         try:
             for done, (photo, keypoints) in enumerate(zip(missing, pool.map(_keypoints, missing), strict=True)):
                 if isinstance(keypoints, InputError):
-                    found.unusable[photo.image.name] = _without_file(keypoints, photo.image)
-                    found.photos.remove(photo)
+                    photos.unusable[photo.image.name] = _without_file(keypoints, photo.image)
+                    photos.photos.remove(photo)
                 else:
-                    described = pycolmap.FeatureDescriptors(
+                    descriptors = pycolmap.FeatureDescriptors(
                         pycolmap.FeatureExtractorType.SIFT, keypoints.descriptors.numpy()
                     )
                     with pycolmap.DatabaseTransaction(database):
                         database.write_keypoints(photo.number, keypoints.pixels.float().numpy())
-                        database.write_descriptors(photo.number, described)
+                        database.write_descriptors(photo.number, descriptors)
                 count(total - len(missing) + done + 1, total)
         finally:
             pool.shutdown(cancel_futures=True)
@@ -191,12 +203,12 @@ def _keypoints(photo: ListedPhoto) -> Keypoints | InputError:
         rgb, alpha = read_image(photo.image.file, size=photo.reduced)
     except InputError as error:
         return error
-    found = DETECTOR(rgb)
+    keypoints = DETECTOR(rgb)
     if alpha is None:
-        return found
-    columns, rows = found.pixels.long().unbind(-1)
+        return keypoints
+    columns, rows = keypoints.pixels.long().unbind(-1)
     inside = alpha[rows.clamp(0, alpha.shape[0] - 1), columns.clamp(0, alpha.shape[1] - 1)] > 0.5
-    return found[inside]
+    return keypoints[inside]
 
 
 def _without_file(error: InputError, image: SourceImage) -> str:
@@ -211,14 +223,14 @@ def similar_pairs(descriptors: Sequence[np.ndarray]) -> Pairs:
     photos that are in arbitrary order. The similarity of two photos is the scalar product of their vectors of locally aggregated
     descriptors (VLAD, Jégou et al. 2010), whose words are found in the photos themselves.
     """
-    count, known = len(descriptors), [torch.from_numpy(own) for own in descriptors]
+    count, tensors = len(descriptors), [torch.from_numpy(own) for own in descriptors]
     pairs = {(i, j) for i in range(count) for j in range(i + 1, min(count, i + NEIGHBOURS + 1))}
-    vocabulary = Vocabulary.of(known)
-    vectors = torch.stack([vocabulary.pooled(own) for own in known])
+    vocabulary = Vocabulary.of(tensors)
+    vectors = torch.stack([vocabulary.pooled(own) for own in tensors])
     for i, vector in enumerate(vectors):
-        likeness = vectors @ vector
-        likeness[i] = -torch.inf
-        pairs |= {(min(i, j), max(i, j)) for j in likeness.topk(min(20, count - 1)).indices.tolist()}
+        similarity = vectors @ vector
+        similarity[i] = -torch.inf
+        pairs |= {(min(i, j), max(i, j)) for j in similarity.topk(min(20, count - 1)).indices.tolist()}
     return sorted(pairs)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf.structure.colmap import ListedPhoto, PhotoSet
+from bidnerf.structure.colmap import LEAST_PHOTOS, ListedPhoto, PhotoSet
 from bidnerf.structure.record import MODEL, TRANSFORMS
 from bidnerf_core.camera import Intrinsics, colmap_camera
 from bidnerf_core.captures import up_direction
@@ -24,14 +24,11 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import write_file
 from bidnerf_core.progress import counter
 
-LEAST_PHOTOS = 3
-"""Smallest number of photos in a model: two photos have a single baseline, which allows no check."""
 
+def reconstruct(database: Path, folder: Path, photos: PhotoSet, fixed: bool, threads: int, pycolmap: Any) -> list[Any]:
+    """Reconstruct models from the photos in a database, write them to ``folder``, and return them, the largest first.
 
-def reconstruct(database: Path, folder: Path, found: PhotoSet, fixed: bool, threads: int, pycolmap: Any) -> list[Any]:
-    """Reconstruct models from the photos in a database, with constant cameras if ``fixed``; models are written to ``folder``.
-
-    Returns the models, largest first; photos without overlap form separate models. The list may be empty.
+    If ``fixed``, the cameras are constant. Photos without overlap form separate models; there may be none.
     """
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=threads,
@@ -41,10 +38,10 @@ def reconstruct(database: Path, folder: Path, found: PhotoSet, fixed: bool, thre
         max_num_models=20,
     )
     if fixed:
-        options.constant_cameras = set(found.cameras)
+        options.constant_cameras = set(photos.cameras)
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
-    total, count, placed = len(found.photos), counter("placing photos", "photos"), itertools.count(1)
+    total, count, placed = len(photos.photos), counter("placing photos", "photos"), itertools.count(1)
     folder.mkdir(parents=True, exist_ok=True)
     models = pycolmap.incremental_mapping(
         database, folder, folder, options, next_image_callback=lambda: count(min(next(placed), total), total)
@@ -108,11 +105,11 @@ def count_contradictions(model: Any, database: Any, pycolmap: Any) -> tuple[int,
     repeated details have up to 80), and how many of these pairs contradict the model: fewer than half of their matches are within
     four pixels of the epipolar lines, measured in the downscaled photos.
     """
-    placed, keypoints = set(model.reg_image_ids()), dict[int, np.ndarray]()
+    registered, keypoints = set(model.reg_image_ids()), dict[int, np.ndarray]()
     pairs = contradicting = 0
     for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
         i, j = pycolmap.pair_id_to_image_pair(pair)
-        if i not in placed or j not in placed or len(geometry.inlier_matches) < 100:
+        if not {i, j} <= registered or len(geometry.inlier_matches) < 100:
             continue
         rays = []
         for number, column in ((i, 0), (j, 1)):
@@ -130,8 +127,8 @@ def count_contradictions(model: Any, database: Any, pycolmap: Any) -> tuple[int,
     return pairs, contradicting
 
 
-def left_out(
-    found: PhotoSet, models: list[Any], partners: Counter[int], keypoints: Mapping[int, int]
+def reasons_left_out(
+    photos: PhotoSet, models: list[Any], partners: Counter[int], keypoints: Mapping[int, int]
 ) -> dict[str, str]:
     """Return, by name, the reason why each photo that is not in the largest model was left out.
 
@@ -139,8 +136,8 @@ def left_out(
     photo number.
     """
     of_model = {number: model for model in reversed(models) for number in model.reg_image_ids()}
-    reasons = dict(found.unusable)
-    for photo in found.photos:
+    reasons = dict(photos.unusable)
+    for photo in photos.photos:
         model, other = of_model.get(photo.number), amount(partners[photo.number], "other photo")
         if model is models[0]:
             continue
@@ -161,8 +158,8 @@ def write_dataset(folder: Path, photos: Mapping[int, ListedPhoto], model: Any, b
         camera = from_colmap(model.camera(image.camera_id))
         matrix = torch.from_numpy(image.cam_from_world().matrix()).double()
         T_world_camera = SE3(matrix[:, :3].clone(), matrix[:, 3].clone()).inverse()
-        place = relative_path(photo.image.file, folder)
-        entries.append(frame_entry(place, photo.image.name, camera, T_world_camera, photo.image.time))
+        path = relative_path(photo.image.file, folder)
+        entries.append(frame_entry(path, photo.image.name, camera, T_world_camera, photo.image.time))
     (folder / MODEL).mkdir(parents=True, exist_ok=True)
     model.write_binary(folder / MODEL)
     content = {"camera_model": "OPENCV", "unit": "units", "frames": entries}
@@ -171,14 +168,11 @@ def write_dataset(folder: Path, photos: Mapping[int, ListedPhoto], model: Any, b
 
 def from_colmap(camera: Any) -> Intrinsics:
     """Return the intrinsics of a pycolmap camera with a perspective lens."""
-    found = colmap_camera("COLMAP", camera.model.name, camera.width, camera.height, list(camera.params))
-    assert isinstance(found, Intrinsics)
-    return found
+    intrinsics = colmap_camera("COLMAP", camera.model.name, camera.width, camera.height, list(camera.params))
+    assert isinstance(intrinsics, Intrinsics)
+    return intrinsics
 
 
 def relative_path(file: Path, folder: Path) -> str:
-    """Return the path of a file relative to a folder, or its absolute path if they are on different drives."""
-    try:
-        return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
-    except ValueError:
-        return file.resolve().as_posix()
+    """Return the path of a file relative to a folder."""
+    return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()

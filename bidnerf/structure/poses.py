@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import logging
@@ -15,7 +16,6 @@ from typing import Any
 import torch
 
 from bidnerf.structure.colmap import (
-    PhotoSet,
     import_pycolmap,
     list_photos,
     match,
@@ -24,9 +24,8 @@ from bidnerf.structure.colmap import (
     write_keypoints,
 )
 from bidnerf.structure.model import (
-    LEAST_PHOTOS,
     count_contradictions,
-    left_out,
+    reasons_left_out,
     reconstruct,
     relative_path,
     restore_size,
@@ -94,23 +93,19 @@ def find_poses(
     if not images and not source.is_file():
         raise InputError("no such file", where=source, expected="a video or a folder of photos")
     inputs = digest([image.file for image in images] or [source], camera)
-    known = None
     if reuse or not overwrite:
-        try:
-            known = read_record(folder)
-        except InputError:  # a damaged record
-            if not overwrite:
-                raise
-    if known is not None and known.inputs == inputs:
-        log.info(f"{folder}: already has the poses of these photos")
-        return known
+        with contextlib.suppress(*([InputError] if overwrite else [])):  # a damaged record is replaced
+            record = read_record(folder)
+            if record is not None and record.inputs == inputs:
+                log.info(f"{folder}: already has the poses of these photos")
+                return record
     refuse_panoramas(images)
     resumes = interrupted_work(folder).get("inputs") == inputs
 
-    def describe_content(place: Path) -> str | None:
-        if (place / RECORD).exists():
+    def describe_content(folder: Path) -> str | None:
+        if (folder / RECORD).exists():
             return "holds the poses of other photos"
-        return "holds interrupted work on other photos" if interrupted_work(place) else None
+        return "holds interrupted work on other photos" if interrupted_work(folder) else None
 
     with (
         job_context(progress, cancel),
@@ -120,19 +115,19 @@ def find_poses(
             remove_output(folder)
         work = open_work(folder, inputs, video=not images)
         try:
-            found = _search(source, images, work, inputs, camera, pycolmap)
+            record = _search(source, images, work, inputs, camera, pycolmap)
         except Cancelled as stopped:
             raise Cancelled(f"{folder}: {stopped}; the same command resumes from there") from stopped
         except InputError:
             remove_output(folder)
             raise
-        write_file(folder / RECORD, json.dumps(to_plain(found), indent=1, allow_nan=False).encode())
+        write_file(folder / RECORD, json.dumps(to_plain(record), indent=1, allow_nan=False).encode())
         shutil.rmtree(work, ignore_errors=True)
-    for line in str(found).splitlines():
+    for line in str(record).splitlines():
         log.info(f"{source}: {line}")
-    if found.doubt is not None:
-        warnings.warn(f"{source}: {found.doubt}", InputWarning, stacklevel=2)
-    return found
+    if record.doubt is not None:
+        warnings.warn(f"{source}: {record.doubt}", InputWarning, stacklevel=2)
+    return record
 
 
 def _search(
@@ -144,23 +139,23 @@ def _search(
     pycolmap: Any,
 ) -> FoundPoses:
     """Find the poses of ``images`` or, if there are none, of frames of the video ``source``; write the dataset next to ``work``."""
-    began, folder, database, video = time.monotonic(), work.parent, work / "database.db", not images
+    start, folder, database, video = time.monotonic(), work.parent, work / "database.db", not images
     fixed, threads = camera is not None, max(1, torch.get_num_threads())
     if video:
         images = write_frames(source, folder / FRAMES, choose_frames(measure_frames(source)))
-    found = list_photos(images, camera)
+    photos = list_photos(images, camera)
     try:
         stored = pycolmap.Database.open(database)
     except RuntimeError as damage:
         expected = "the same command once more, which begins anew"
         raise InputError("cannot be read, perhaps damaged;", where=database, expected=expected) from damage
     with stored as opened:
-        _require_enough(found, source)
+        photos.require_enough(source)
         if not opened.num_images():
-            write_cameras(opened, found, fixed, pycolmap)
-        write_keypoints(opened, found, pycolmap)
-        _require_enough(found, source)
-        keypoints = {photo.number: opened.num_keypoints_for_image(photo.number) for photo in found.photos}
+            write_cameras(opened, photos, fixed, pycolmap)
+        write_keypoints(opened, photos, pycolmap)
+        photos.require_enough(source)
+        keypoints = {photo.number: opened.num_keypoints_for_image(photo.number) for photo in photos.photos}
         numbers = [number for number, count in keypoints.items() if count]
         pairs = list(itertools.combinations(numbers, 2))
         # For more photos than this, matching all pairs would take hours.
@@ -168,7 +163,7 @@ def _search(
             similar = similar_pairs([opened.read_descriptors(number).data for number in numbers])
             pairs = [(numbers[i], numbers[j]) for i, j in similar]
     match(database, pairs, threads, pycolmap)
-    models = reconstruct(database, work / "models", found, fixed, threads, pycolmap)
+    models = reconstruct(database, work / "models", photos, fixed, threads, pycolmap)
     with pycolmap.Database.open(database) as opened:
         matched = zip(*opened.read_two_view_geometries(), strict=True)
         overlapping = [pycolmap.pair_id_to_image_pair(pair) for pair, seen in matched if len(seen.inlier_matches)]
@@ -177,32 +172,32 @@ def _search(
             if overlapping:
                 why = f"although {amount(len(overlapping), 'pair')} overlap; from one place, they do not determine distances"
             raise InputError(
-                f"no three of {amount(len(found.photos), 'photo')} could be placed: {why};",
+                f"no three of {amount(len(photos.photos), 'photo')} could be placed: {why};",
                 where=source,
                 expected="photos that overlap by two thirds, taken while moving sideways",
             )
-        model, photos = models[0], {photo.number: photo for photo in found.photos}
+        model, by_number = models[0], {photo.number: photo for photo in photos.photos}
         sure, contradicting = count_contradictions(model, opened, pycolmap)
     error = model.compute_mean_reprojection_error()
-    turn_upright(model, photos, pycolmap)
-    restore_size(model, photos)
-    write_dataset(folder, photos, model, folder / FRAMES if video else source)
-    reasons = left_out(found, models, Counter(itertools.chain(*overlapping)), keypoints)
-    left = [
+    turn_upright(model, by_number, pycolmap)
+    restore_size(model, by_number)
+    write_dataset(folder, by_number, model, folder / FRAMES if video else source)
+    reasons = reasons_left_out(photos, models, Counter(itertools.chain(*overlapping)), keypoints)
+    left_out = [
         LeftOut(image.name, relative_path(image.file, folder), reasons[image.name])
         for image in images
         if image.name in reasons
     ]
-    turned = sum(photos[number].exif.orientation != UPRIGHT for number in model.reg_image_ids())
+    turned = sum(by_number[number].exif.orientation != UPRIGHT for number in model.reg_image_ids())
     return FoundPoses(
         source=source.name,
         photos=len(images),
         placed=model.num_reg_images(),
         models=tuple(each.num_reg_images() for each in models),
-        left_out=tuple(left),
+        left_out=tuple(left_out),
         points=model.num_points3D(),
         reprojection_error=error,
-        seconds=round(time.monotonic() - began, 1),
+        seconds=round(time.monotonic() - start, 1),
         inputs=inputs,
         pycolmap=pycolmap.__version__,
         video=video,
@@ -210,13 +205,3 @@ def _search(
         contradicting=contradicting,
         turned=turned,
     )
-
-
-def _require_enough(found: PhotoSet, source: Path) -> None:
-    if len(found.photos) < LEAST_PHOTOS:
-        why = "".join(f" that can be read ({name}: {reason})" for name, reason in [*found.unusable.items()][:1])
-        raise InputError(
-            f"{amount(len(found.photos), 'photo')}{why}",
-            where=source,
-            expected=f"at least {LEAST_PHOTOS} of one scene, taken from different places",
-        )

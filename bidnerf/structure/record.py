@@ -48,11 +48,9 @@ class FoundPoses:
     inputs: str  # digest of the names, sizes and times of the files, and of the camera
     pycolmap: str  # its version
     video: bool = False  # whether the photos are frames of a video, which were written next to this record
-    # pairs of registered photos with so many matches that they certainly show the same place
-    sure_pairs: int = 0
+    sure_pairs: int = 0  # pairs of registered photos with too many matches to show different places
     contradicting: int = 0  # of these, pairs whose matches contradict the poses
-    # registered photos with an EXIF orientation; their cameras are those of the images as stored
-    turned: int = 0
+    turned: int = 0  # registered photos with an EXIF orientation; their cameras are those of the images as stored
 
     @property
     def doubt(self) -> str | None:
@@ -93,9 +91,9 @@ class FoundPoses:
 
 def digest(files: Sequence[Path], camera: Intrinsics | str | Path | None) -> str:
     """Return a digest of the photos and of the settings with which their poses are estimated."""
-    facts = [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
-    given = [repr(camera) if isinstance(camera, Intrinsics) else str(camera), repr(DETECTOR)]
-    return hashlib.blake2b(json.dumps([facts, given]).encode(), digest_size=16).hexdigest()
+    identities = [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
+    settings = [repr(camera) if isinstance(camera, Intrinsics) else str(camera), repr(DETECTOR)]
+    return hashlib.blake2b(json.dumps([identities, settings]).encode(), digest_size=16).hexdigest()
 
 
 def read_record(folder: Path) -> FoundPoses | None:
@@ -106,10 +104,13 @@ def read_record(folder: Path) -> FoundPoses | None:
 
 
 def interrupted_work(folder: Path) -> dict[str, Any]:
-    """Return the state of interrupted work: the digest ``inputs`` and whether they are a ``video``; empty if there is none."""
+    """Return the state of interrupted work, which is empty if there is none.
+
+    It has the digest ``inputs``, and whether they are a ``video``.
+    """
     with contextlib.suppress(InputError):
-        found = read_json(folder / WORK / "begun.json", "the state of interrupted work")
-        return found if isinstance(found, dict) else {}
+        state = read_json(folder / WORK / "begun.json", "the state of interrupted work")
+        return state if isinstance(state, dict) else {}
     return {}
 
 

@@ -8,7 +8,7 @@ camera rests, many while it turns.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -95,7 +95,7 @@ def measure_frames(video: Path) -> list[Measure]:
     moved by two percent of the diagonal or half of them are lost.
     """
     count = counter("measuring frames", "frames")
-    frames, found = Video(video), list[Measure]()
+    frames, measures = Video(video), list[Measure]()
     total = len(frames)
     before: np.ndarray | None = None
     points = start = np.zeros((0, 1, 2), np.float32)
@@ -108,8 +108,8 @@ def measure_frames(video: Path) -> list[Measure]:
         if before is not None and is_anchor:  # nothing to track: unknown motion, assumed to be one step
             motion += STEP
         elif before is not None:
-            moved, kept, _ = cv2.calcOpticalFlowPyrLK(before, grey, points, np.empty_like(points))
-            ok = kept.reshape(-1) == 1
+            moved, status, _ = cv2.calcOpticalFlowPyrLK(before, grey, points, np.empty_like(points))
+            ok = status.reshape(-1) == 1
             points, start = moved[ok], start[ok]
             if len(points):
                 away = float(np.median(np.linalg.norm(points - start, axis=-1))) / float(np.hypot(*grey.shape))
@@ -121,33 +121,33 @@ def measure_frames(video: Path) -> list[Measure]:
             points = start = np.zeros((0, 1, 2), np.float32) if detected is None else np.asarray(detected)
             corners = len(points)
         before = grey
-        found.append((motion, sharpness(whole.astype(np.float32) / 255)))
-        count(min(len(found), total), total)
-    return found
+        measures.append((motion, sharpness(whole.astype(np.float32) / 255)))
+        count(min(len(measures), total), total)
+    return measures
 
 
 def choose_frames(frames: Sequence[Measure]) -> list[int]:
-    """Return the indices of the frames to find poses for: for each step of motion, the sharpest frame near it."""
+    """Return the indices of the frames whose poses are searched: at each step of motion, the sharpest one near it."""
     motion, sharp = np.array(frames).T
     step = max(STEP, float(motion[-1]) / (MOST - 1))
-    found = set[int]()
-    for place in np.arange(round(float(motion[-1]) / step) + 1) * step:
-        away = np.abs(motion - place)
+    chosen = set[int]()
+    for target in np.arange(round(float(motion[-1]) / step) + 1) * step:
+        away = np.abs(motion - target)
         near = np.flatnonzero(away <= 0.3 * step)
-        found.add(int(near[sharp[near].argmax()]) if len(near) else int(away.argmin()))
-    return sorted(found)
+        chosen.add(int(near[sharp[near].argmax()]) if len(near) else int(away.argmin()))
+    return sorted(chosen)
 
 
-def write_frames(video: Path, folder: Path, wanted: Sequence[int]) -> list[SourceImage]:
+def write_frames(video: Path, folder: Path, wanted: Collection[int]) -> list[SourceImage]:
     """Write the frames with indices ``wanted`` to ``folder`` as NUMBER.jpg, and return them with their times."""
     folder.mkdir(parents=True, exist_ok=True)
-    asked, found, count = set(wanted), list[SourceImage](), counter("writing frames", "frames")
+    written, count = list[SourceImage](), counter("writing frames", "frames")
     for number, (time, pixels) in enumerate(Video(video)):
-        if number in asked:
+        if number in wanted:
             image = SourceImage(f"{number:06d}", folder / f"{number:06d}.jpg", time)
             Image.fromarray(pixels).save(image.file, quality=95, subsampling=0)
-            found.append(image)
-            count(len(found), len(asked))
-        if len(found) == len(asked):
+            written.append(image)
+            count(len(written), len(wanted))
+        if len(written) == len(wanted):
             break
-    return found
+    return written

@@ -7,7 +7,7 @@ A complete test of a backend is::
     class TestMine(BackendContract):
         backend = my_package.backend
 
-Contracts for readers, methods, detectors and faults refer to a plugin by its registered name::
+Contracts for readers, posers, methods, detectors and faults refer to a plugin by its registered name::
 
     class TestMyReader(ReaderContract):
         name, folder = "mine", "a/small/capture"

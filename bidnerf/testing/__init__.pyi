@@ -15,6 +15,7 @@ from .field_checks import check_ranges as check_ranges
 from .field_checks import check_rays_alone as check_rays_alone
 from .field_checks import check_repeatable as check_repeatable
 from .field_checks import check_shapes as check_shapes
+from .poser_contract import PoserContract as PoserContract
 from .reader_contract import ReaderContract as ReaderContract
 from .recipes import Recorder as Recorder
 from .recipes import colour_error as colour_error

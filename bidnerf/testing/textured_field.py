@@ -38,10 +38,13 @@ class TexturedGround:
         self.phases = 6.3 * torch.rand(24, generator=generator)
         self.weights = 0.3 * torch.randn((24, 3), generator=generator)
 
+    def height(self, positions: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p"]:
+        """Return the height (metres) of the ground above or below positions."""
+        return 0.12 * (3 * positions[..., 0]).sin() * (2.5 * positions[..., 1] + 1).sin()
+
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        x, y, z = positions.unbind(-1)
-        height = 0.12 * (3 * x).sin() * (2.5 * y + 1).sin()
-        density = 120 * torch.sigmoid((height - z) / 0.01)  # per metre; it rises over about a centimetre
+        # The density, per metre, rises over about a centimetre.
+        density = 120 * torch.sigmoid((self.height(positions) - positions[..., 2]) / 0.01)
         signal = (positions[..., :2] @ self.waves.to(positions) + self.phases.to(positions)).sin()
         return FieldValues(density, torch.sigmoid(2 * signal @ self.weights.to(positions)))
 
@@ -72,6 +75,16 @@ def seen(T: SE3, camera: Intrinsics, name: str = "", seed: int = 0) -> View:
     """Return an image of the ground from any camera, with its depth."""
     image = render_image(ground(seed), camera, T, BOUNDS, chunk=512)  # whose waves stay in the cache
     return View(Frame(name, image.rgb, camera, torch.where(image.opacity > 0.95, image.depth, 0)), T)
+
+
+def photograph(T: SE3, camera: Intrinsics) -> Float[Tensor, "h w 3"]:
+    """Return the colours of the ground from a camera above it, by the intersections of its rays; fast, and without depth."""
+    directions = T.rotate(camera.unproject(camera.pixel_centres(torch.float64)))
+    positions = T.translation.expand_as(directions)
+    for _ in range(10):  # a fixed point: the rays are steeper than the ground
+        ahead = (ground().height(positions) - T.translation[2]) / directions[..., 2]
+        positions = T.translation + ahead[..., None] * directions
+    return ground().query(positions, directions).rgb.float()
 
 
 @functools.cache

@@ -35,6 +35,7 @@ from bidnerf.structure.sources import (
     photos_of,
     write_frames,
 )
+from bidnerf.testing import PoserContract
 from bidnerf_core.datasets import lacks_poses, write_transforms
 from bidnerf_core.geometry import fit_similarity
 
@@ -49,6 +50,11 @@ pytestmark = pytest.mark.slow
 
 
 pytest.importorskip("pycolmap")
+
+
+class TestColmap(PoserContract):
+    name = "colmap"
+
 
 PLACED, OTHERS = 6, 3
 

@@ -14,6 +14,7 @@ import pytest
 import torch
 from torch import Generator, Tensor, nn
 
+import bidnerf.testing
 import bidnerf_core
 import tiny
 from bidnerf.testing import BackendContract
@@ -613,5 +614,7 @@ def test_a_backend_may_be_given_by_the_name_of_its_entry_point() -> None:
 
 
 def test_the_contract_does_not_need_pytest() -> None:
-    files = Path(bidnerf_core.__file__).parent.rglob("*.py")
+    packages = (Path(package.__file__).parent for package in (bidnerf.testing, bidnerf_core))
+    files = [file for package in packages for file in package.rglob("*.py")]
+    assert any(file.name == "reader_contract.py" for file in files)
     assert not [file for file in files if re.search(r"^\s*(import|from) pytest", file.read_text(), re.MULTILINE)]

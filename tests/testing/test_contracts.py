@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,10 +19,20 @@ from bidnerf.testing import (
     FaultContract,
     FeaturesContract,
     MethodContract,
+    PoserContract,
     ReaderContract,
     training_views,
 )
-from bidnerf_core.datasets import READERS, Capture, DatasetOptions, Reader, of_views, write_transforms
+from bidnerf_core.datasets import (
+    READERS,
+    Capture,
+    DatasetOptions,
+    Poser,
+    Reader,
+    of_views,
+    photos_below,
+    write_transforms,
+)
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import AutoConfig, Localization, Outcome, Problem, find_method, settings_of
@@ -99,9 +111,11 @@ class Converting(Reader):
         return replace(mistaken, background=capture.background)
 
 
+OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+
+
 def reversed_axes(view: View) -> View:
-    turned = SE3(torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)), torch.zeros(3).double())
-    return replace(view, T_ref_camera=view.T_ref_camera @ turned)
+    return replace(view, T_ref_camera=SE3(view.T_ref_camera.rotation @ OPENGL, view.T_ref_camera.translation))
 
 
 def millimetres(view: View) -> View:
@@ -140,6 +154,40 @@ def test_a_reader_that_ignores_its_options_is_named(capture: Path, monkeypatch: 
     monkeypatch.setitem(registered, ("readers", "mistaken"), Deaf(lambda view: view))
     test = "test_background_is_the_one_that_is_asked_for"
     assert "the background is" in fault_of(ReaderContract, test, name="mistaken", folder=capture)
+
+
+def poser_by(change: Callable[[SE3], SE3]) -> Poser:
+    """Return a poser that knows the true poses, and writes them changed."""
+
+    def find_poses(
+        photos: Any, out: Any, camera: Any = None, overwrite: bool = False, *, reuse: bool = False
+    ) -> SimpleNamespace:
+        files = photos_below(Path(photos))
+        posed = zip(files, PoserContract.poses, strict=True)
+        views = [View(Frame.open(file, camera=camera), change(T)) for file, T in posed]
+        write_transforms(Path(out), {"train": views})
+        return SimpleNamespace(placed=len(files))
+
+    return find_poses
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda T: SE3(T.rotation, 3 * T.translation), None),  # the unit is arbitrary
+        (lambda T: T.inverse(), "is off by"),
+        (lambda T: SE3(T.rotation @ OPENGL, T.translation), "x right, y down and z forward"),
+    ],
+)
+def test_posers_are_held_to_the_true_poses(
+    monkeypatch: pytest.MonkeyPatch, change: Callable[[SE3], SE3], says: str | None
+) -> None:
+    monkeypatch.setitem(registered, ("posers", "known"), poser_by(change))
+    test = "test_dataset_has_the_poses_of_the_photos"
+    if says is None:
+        assert_fulfilled(PoserContract, name="known")
+    else:
+        assert says in fault_of(PoserContract, test, name="known")
 
 
 def shifted(rgb: Float[Tensor, "h w 3"]) -> Keypoints:
