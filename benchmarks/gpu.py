@@ -39,7 +39,7 @@ from _lab import RowStore
 from paper_tables import test_frames
 
 from bidnerf import Localizer, View
-from bidnerf.evaluation import opened
+from bidnerf.evaluation import open_scene
 from bidnerf_core.backend import SceneBounds, load_backend
 from bidnerf_core.devices import captured, moved, without_waiting
 from bidnerf_core.fields import RadianceField, derivatives_of, levels, render_image, trained_field
@@ -83,7 +83,7 @@ def made_steps(
     generator: torch.Generator | None = None,
 ) -> AdamSteps:
     """Return the steps of ``bid`` that start 0.1 units from the first test frame's pose."""
-    stored, dataset = opened(folder, data)
+    stored, dataset = open_scene(folder, data)
     there = None if device.type == "cpu" else device
     scene = Localizer(stored, "bid", device=there, warm_up=False).scene
     view = dataset.views("test", test_frames(folder, data, tuning=False)[:1])[0]
@@ -166,7 +166,7 @@ def operations(steps: AdamSteps) -> dict[str, Any]:
 def step_rows(folder: str, data: str, device: torch.device) -> dict[str, Any]:
     """Return the times of a step at each level of a map."""
     found = {}
-    for level in range(len(levels(opened(folder, data)[0].field))):
+    for level in range(len(levels(open_scene(folder, data)[0].field))):
         generator = torch.Generator(device).manual_seed(0)
         steps = made_steps(folder, data, level, device, generator=generator)
         found[f"level {level}"] = timed_steps(steps, device, generator)
@@ -175,7 +175,7 @@ def step_rows(folder: str, data: str, device: torch.device) -> dict[str, Any]:
 
 def kernel_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
     """Return the time of the field with its derivatives at many points, and what its accesses and products take alone."""
-    stored = opened(folder, data)[0].to(device)
+    stored = open_scene(folder, data)[0].to(device)
     lower, upper = (torch.tensor(corner, device=device) for corner in (stored.bounds.lower, stored.bounds.upper))
     at = lower + (upper - lower) * torch.rand(POINTS, 3, device=device)
     along = torch.nn.functional.normalize(torch.randn(POINTS, 3, device=device), dim=-1)
@@ -198,7 +198,7 @@ def kernel_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
 
 def search_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
     """Return the time of Gauss-Newton steps on rendered rays as a CUDA graph, and the memory that they take."""
-    stored, dataset = opened(folder, data)
+    stored, dataset = open_scene(folder, data)
     view, found = dataset.views("test", test_frames(folder, data, tuning=False)[:1])[0], {}
     problem = rig(stored.to(device), [view], None)
     pivot_of_scene = torch.tensor([0.0, 0.0, 3.5], dtype=torch.float64, device=device)
@@ -223,7 +223,7 @@ def search_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
 
 def query_rows(folder: str, data: str, device: torch.device) -> dict[str, Any]:
     """Return the times of ``auto`` on frames with and without depth, and how the answers compare with the CPU's."""
-    stored, dataset = opened(folder, data)
+    stored, dataset = open_scene(folder, data)
     views = dataset.views("test", test_frames(folder, data, tuning=False)[:FRAMES])
     here, there, found = Localizer(stored), Localizer(stored, device=device), {}
     for name, shown in _lab.modes(views).items():
@@ -284,7 +284,7 @@ class UntilSharp(Silent):
 
 def training_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
     """Return how long a field like the map's takes to train until unseen images reach ``ENOUGH`` decibels."""
-    stored, dataset = opened(folder, data)
+    stored, dataset = open_scene(folder, data)
     backend, bounds = load_backend(stored.info.backend), stored.bounds
     config = from_plain(backend.config_type, stored.info.config, "the map's settings")
     train = [view.over(bounds.background) for view in dataset.views("train", dataset.frame_names("train"))]

@@ -1,17 +1,18 @@
-"""The tables of BID-NeRF (Csehi and Jozsa 2023) and the protocol of iNeRF, on given maps, with the paper's settings.
+"""The tables of BID-NeRF (Csehi and Jozsa 2023) and the starts of other papers, on given maps, with the paper's settings.
 
-    python benchmarks/paper_tables.py DATA --map MAP [--map MAP ...] --out FOLDER [--part table1 depth_weight table2 inerf]
+    python benchmarks/paper_tables.py DATA --map MAP [--map MAP ...] --out FOLDER [--part table1 ...]
 
 - ``table1``: fine or coarse x RGB or RGB-D, one image, e_t 0.5, 0.8 and 1.2 together;
 - ``depth_weight``: the cells of ``table1`` that have depth, with a tenth of its weight;
 - ``table2``: 1 image, 8 images 15 degrees apart, 8 and wide sampling, at e_t 0.9, 1.7 and 3.4;
-- ``inerf``: ``bid`` and ``inerf`` from iNeRF's starts.
+- ``inerf``: ``bid`` and ``inerf`` from iNeRF's starts;
+- ``parallel``: ``bid`` and ``inerf`` from the 25 starts of Parallel Inversion.
 
 All cells of a part share the frames, the starts, the numbers of rays and steps, and all settings but those compared. The
 settings are those of ``--preset``: ``paper``, with updates in the camera's frame as in the paper's Alg. 1, or ``paper-scene``,
 with ours. In ``table1``, the frames of cells without depth have none, so that nothing can use it: ``bid`` then turns about the
 middle of the map instead of the middle of the measured points. Frames whose index in the test split is 1 modulo 5 are left
-out, since settings were tuned on them.
+out, since settings were tuned on them, except in ``parallel``, which draws its frames from the whole split.
 
 Each part and map has a file of results in FOLDER, which survives a kill at any moment: the same command resumes where it
 stopped. When a part is complete, its record is written next to it; ``bidnerf report FOLDER/table1_*.jsonl`` draws it.
@@ -21,6 +22,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -30,25 +32,33 @@ from pathlib import Path
 from typing import Any
 
 import _lab
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 from scipy.stats import fisher_exact, mannwhitneyu
 
 from bidnerf.cli import displayed
 from bidnerf.evaluation import (
     NEVER,
+    PROTOCOLS,
     Group,
     Plan,
+    Protocol,
     ResultsFile,
+    Size,
     Trial,
     changed_settings,
-    grouped,
+    group_results,
+    list_trials,
     median,
-    opened,
-    planned,
+    open_scene,
     run_trials,
     steps_of,
-    summarize,
 )
-from bidnerf_core.errors import Cancelled
+from bidnerf.scenes import ClosedFormData
+from bidnerf_core.errors import Cancelled, InputError
+from bidnerf_core.geometry import SE3, rotate_about
 from bidnerf_core.localization import METHODS
 from bidnerf_core.progress import job_context
 
@@ -70,52 +80,163 @@ PAPER = {
 """Percentages as printed in the paper."""
 
 
-def table1(base: Plan, common: Common, trials: int | None, scene: Scene) -> list[Plan]:
+# The starts of other papers.
+
+PARALLEL_SEED, PARALLEL_TRIALS = 1234, 25
+
+
+def draw_starts(frames: int) -> tuple[Int[np.ndarray, "5"], Float[np.ndarray, "5 5 3"], Float[np.ndarray, "5 5 3"]]:
+    """Return the frame indices, angles (degrees) and translations of Parallel Inversion, bit for bit.
+
+    The 25 starts are those of Lin et al. 2023, "Parallel Inversion of Neural Radiance Fields for Robust Pose Estimation",
+    from the description of its published bulk experiment. The program seeds NumPy's legacy generator once and draws 5 frames
+    of the test file *with* replacement, 5x5x3 Euler angles uniform in +-15 degrees, and 5x5x3 translations uniform in +-0.25.
+    The numbers depend on the number of frames in the split, since the choice of frames consumes random numbers. Ranges and
+    seed are options of the program that its repository sets for each experiment; 1234, 15 and 0.25 are assumed here. The
+    published scenes may be scaled; here lengths are those of the data.
+    """
+    generator = np.random.RandomState(PARALLEL_SEED)
+    chosen, shape = generator.choice(frames, 5), (5, 5, 3)
+    angles = generator.uniform(-15.0, 15.0, size=shape)
+    return chosen, angles, generator.uniform(-0.25, 0.25, size=shape)
+
+
+def parallel_cases(frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
+    """Return the frame index and seed of the first ``trials`` of the 25 trials, whose seeds are 1234 to 1258."""
+    if seed != PARALLEL_SEED or trials > PARALLEL_TRIALS:
+        expected = f"at most {PARALLEL_TRIALS} from seed {PARALLEL_SEED}, since the list is fixed"
+        raise InputError(f"{trials} trials from seed {seed}", where="parallel", expected=expected)
+    chosen = draw_starts(frames)[0]
+    return [(int(chosen[i // 5]), PARALLEL_SEED + i) for i in range(trials)]
+
+
+def parallel_start(T_true: SE3, size: Size, seed: int) -> SE3:
+    """Return the start of the trial with ``seed`` (1234 to 1258); ``size`` holds the number of frames in the split.
+
+    The angles (phi, theta, psi) turn the camera about its own centre and the *world's* axes, R' = Rz(phi) Ry(-theta) Rx(psi) R,
+    and the centre moves along the world's axes.
+    """
+    _, angles, moves = draw_starts(int(size[0]))
+    start = divmod(seed - PARALLEL_SEED, 5)
+    phi, theta, psi = angles[start]
+    turn = torch.from_numpy(Rotation.from_euler("xyz", (psi, -theta, phi), degrees=True).as_matrix())
+    true = T_true.to(dtype=torch.float64)
+    return SE3(turn @ true.rotation, true.translation + torch.from_numpy(moves[start]))
+
+
+# Processes that run trials import this file, too.
+PROTOCOLS["parallel"] = Protocol(
+    "Parallel Inversion: its 25 starts, up to 15 degrees and 0.25 along each axis",
+    parallel_start,
+    ((200.0,),),
+    ("frames in the split",),
+    PARALLEL_TRIALS,
+    PARALLEL_SEED,
+    parallel_cases,
+)
+
+
+def arc(poses: Sequence[SE3], last: int, count: int, angle_deg: float) -> tuple[int, ...] | None:
+    """Return the indices of ``count`` frames ending with ``last``, ``angle_deg`` apart about a common centre (BID-NeRF, Table 2).
+
+    The centre is the point at which the cameras look: the least-squares intersection of their optical axes. At each step
+    about the vertical axis, the frame nearest in direction from the centre is chosen. Both senses of rotation are tried,
+    and the better fit is returned; None if at some step no unused frame lies within half a step.
+    """
+    rotations, positions = torch.stack([T.rotation for T in poses]), torch.stack([T.translation for T in poses])
+    eye, axes = torch.eye(3, dtype=torch.float64), rotations[:, :, 2]
+    across = eye - axes[:, :, None] * axes[:, None]
+    normal = across.sum(0) + 1e-9 * eye  # for parallel axes, any point will do
+    middle = torch.linalg.solve(normal, (across @ positions[..., None]).sum(0)[:, 0])
+    mean = -rotations[:, :, 1].mean(0)
+    up = torch.nn.functional.normalize(mean if mean.norm() > 1e-3 else -rotations[0, :, 1], dim=0)
+    directions = torch.nn.functional.normalize(positions - middle, dim=-1)
+    fitting = []
+    for step in (angle_deg, -angle_deg):
+        turns = [rotate_about(poses[last], middle, up, number * step) for number in range(count)]
+        ideal = torch.nn.functional.normalize(torch.stack([T.translation for T in turns]) - middle, dim=-1)
+        cosines = directions @ ideal.mT  # (frames, steps)
+        taken, missed = [last], [0.0]
+        for number in range(1, count):
+            cosines[taken, number] = -1
+            taken.append(int(cosines[:, number].argmax()))
+            missed.append(math.acos(min(1.0, float(cosines[taken[-1], number]))))
+        if max(missed) <= math.radians(abs(angle_deg)) / 2:
+            fitting.append((sum(missed), tuple(reversed(taken))))
+    return min(fitting)[1] if fitting else None
+
+
+def rigs_on_arcs(plan: Plan, scene: Scene, count: int, angle_deg: float) -> dict[str, tuple[str, ...]]:
+    """Return ``count`` frames on an arc that end with each frame of the plan with which such an arc can end."""
+    dataset = open_scene(*scene, plan)[1]
+    poses = {view.frame.name: view.T_ref_camera for view in dataset.views(plan.images.split)}
+    ending, names = plan.frames or tuple(poses), list(poses)
+    if isinstance(dataset, ClosedFormData):
+        return {name: dataset.sequence(name, count, angle_deg) for name in ending}
+    arcs = {name: arc([*poses.values()], names.index(name), count, angle_deg) for name in ending}
+    if not any(arcs.values()):
+        raise InputError(f"no frame ends {count} frames {angle_deg:g} degrees apart about a centre", where=scene[1])
+    return {name: tuple(names[index] for index in indices) for name, indices in arcs.items() if indices is not None}
+
+
+# The parts. Each returns the trials of its cells.
+
+
+def table1(base: Plan, common: Common, trials: int | None, scene: Scene) -> list[list[Trial]]:
     """Return the cells of table 1; ``trials`` is the number over all three sizes."""
     each = -(-(trials or 24) // 3)
     plan = replace(base, protocol="bid", sizes=(0.5, 0.8, 1.2), trials=each)
     return [
-        replace(plan, depth=depth, config=_json(common("bid") | {"level": level}))
+        trials_of(replace(plan, depth=depth, config=_json(common("bid") | {"level": level})), scene)
         for level in (0, None)
         for depth in (True, False)
     ]
 
 
-def depth_weight(base: Plan, common: Common, trials: int | None, scene: Scene) -> list[Plan]:
+def depth_weight(base: Plan, common: Common, trials: int | None, scene: Scene) -> list[list[Trial]]:
     """Return the cells of ``table1`` that have depth, from the same starts, with a tenth of its weight."""
     return [
-        replace(plan, config=_json(json.loads(plan.config) | {"depth_weight": 0.1}))
-        for plan in table1(base, common, trials, scene)
-        if plan.depth
+        [replace(trial, config=_json(json.loads(trial.config) | {"depth_weight": 0.1})) for trial in cell]
+        for cell in table1(base, common, trials, scene)
+        if cell[0].depth
     ]
 
 
-def table2(base: Plan, common: Common, trials: int | None, scene: Scene) -> list[Plan]:
+def table2(base: Plan, common: Common, trials: int | None, scene: Scene) -> list[list[Trial]]:
     """Return the cells of table 2."""
-    plan = replace(base, protocol="bid", sizes=(0.9, 1.7, 3.4), trials=trials or 16)
-    ending = sequence_ends(plan, scene)  # one image is the last of the eight: the same frames for all
-    return [
-        replace(plan, config=_json(common("bid")), frames=ending),
-        replace(plan, config=_json(common("bid")), images=8),
-        replace(plan, config=_json(common("bid") | {"wide": 2.0}), images=8),
-    ]
+    rigs = rigs_on_arcs(base, scene, 8, 15.0)
+    # One image is the last of the eight: the same frames for all.
+    plan = replace(base, protocol="bid", sizes=(0.9, 1.7, 3.4), trials=trials or 16, frames=tuple(rigs))
+    single, wide = (
+        trials_of(replace(plan, config=_json(common("bid") | settings)), scene) for settings in ({}, {"wide": 2.0})
+    )
+    return [single, *([replace(trial, frames=rigs[trial.frame]) for trial in cell] for cell in (single, wide))]
 
 
-def inerf(base: Plan, common: Common, trials: int | None, scene: Scene) -> list[Plan]:
+def inerf(base: Plan, common: Common, trials: int | None, scene: Scene) -> list[list[Trial]]:
     """Return ``bid`` and ``inerf`` from the starts of iNeRF, both with its learning rate, as in the paper."""
     plan = replace(base, protocol="inerf", trials=trials or 25)
     return [
-        replace(plan, method=method, config=_json(common(method) | {"learning_rate": 0.01}))
+        trials_of(replace(plan, method=method, config=_json(common(method) | {"learning_rate": 0.01})), scene)
         for method in ("bid", "inerf")
     ]
 
 
-PARTS: dict[str, Callable[[Plan, Common, int | None, Scene], list[Plan]]] = {
+def parallel(base: Plan, common: Common, trials: int | None, scene: Scene) -> list[list[Trial]]:
+    """Return ``bid`` and ``inerf`` from the starts of Parallel Inversion."""
+    frames = len(open_scene(*scene, base)[1].frame_names(base.images.split))
+    plan = replace(base, protocol="parallel", sizes=[frames], trials=trials, seed=None, frames=None)
+    return [trials_of(replace(plan, method=method, config=_json(common(method))), scene) for method in ("bid", "inerf")]
+
+
+PARTS: dict[str, Callable[[Plan, Common, int | None, Scene], list[list[Trial]]]] = {
     "table1": table1,
     "depth_weight": depth_weight,
     "table2": table2,
     "inerf": inerf,
+    "parallel": parallel,
 }
+"""Functions of a plan, the shared settings, the number of trials of a cell and the scene; each returns the trials of its cells."""
 
 
 def preset_settings(preset: str, others: Settings, method: str) -> Settings:
@@ -127,19 +248,13 @@ def preset_settings(preset: str, others: Settings, method: str) -> Settings:
 
 def test_frames(map_folder: str, data: str, tuning: bool) -> tuple[str, ...]:
     """Return the test frames on which settings are tuned, or all others."""
-    _, dataset = opened(map_folder, data)
+    _, dataset = open_scene(map_folder, data)
     return tuple(_lab.held_out(dataset.frame_names("test"), tuning))
 
 
 def trials_of(plan: Plan, scene: Scene) -> list[Trial]:
     """Return the trials of a plan."""
-    return planned(plan, *scene, opened(*scene, plan)[1])
-
-
-def sequence_ends(plan: Plan, scene: Scene) -> tuple[str, ...]:
-    """Return the frames with which a sequence of eight can end."""
-    every = trials_of(replace(plan, images=8, trials=10_000, sizes=(0.9,)), scene)
-    return tuple(dict.fromkeys(trial.frame for trial in every))
+    return list_trials(plan, *scene, open_scene(*scene, plan)[1])
 
 
 def run_part(trials: Sequence[Trial], path: Path, workers: int, minutes: float | None = None) -> list[Group]:
@@ -159,7 +274,7 @@ def run_part(trials: Sequence[Trial], path: Path, workers: int, minutes: float |
         if not done or (len(done) < len(trials) and minutes is None):
             raise SystemExit(f"stopped; {path} is kept, the same command goes on")
         file.put_in_order(trials)
-        return grouped([file[trial] for trial in done])
+        return group_results([file[trial] for trial in done])
 
 
 @dataclass(frozen=True)
@@ -179,7 +294,7 @@ class PairTest:
 
 def pairwise_tests(groups: Sequence[Group], criterion: str) -> list[PairTest]:
     """Return the tests of every pair of groups that share a situation and to which the criterion applies."""
-    fitting = [group for group in groups if summarize(group.results).success[criterion] is not None]
+    fitting = [group for group in groups if group.summary.success[criterion] is not None]
     pairs = itertools.combinations(fitting, 2)
     return [compare_pair(a, b, criterion) for a, b in pairs if a.situation == b.situation]
 
@@ -215,7 +330,7 @@ def as_record(groups: Sequence[Group]) -> dict[str, Any]:
             "map": group.situation.map,
             "start": group.situation.start,
             "condition": group.label,
-            **asdict(summarize(group.results)),
+            **asdict(group.summary),
         }
         for group in groups
     ]
@@ -245,8 +360,7 @@ def main() -> None:
         for folder in given.map:
             scene = folder, given.data
             base = Plan(method="bid", seed=given.seed, device=given.device, frames=test_frames(*scene, tuning=False))
-            plans = PARTS[part](base, common, given.trials, scene)
-            trials = [trial for plan in plans for trial in trials_of(plan, scene)]
+            trials = [trial for cell in PARTS[part](base, common, given.trials, scene) for trial in cell]
             name = f"{part}_{trials[0].portable.map.replace(':', '_')}"
             groups = run_part(trials, given.out / f"{name}.jsonl", given.workers, given.stop_after)
             results = {"paper_percent": PAPER.get(part), "preset": given.preset, **as_record(groups)}

@@ -153,7 +153,7 @@ def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     # Inside: what a process of a comparison does is done in this one
     from bidnerf.evaluation.run import InThisProcess
 
-    monkeypatch.setattr("bidnerf.evaluation.comparison.own_processes", lambda count: InThisProcess())
+    monkeypatch.setattr("bidnerf.evaluation.comparison.local_processes", lambda count: InThisProcess())
 
 
 @pytest.fixture

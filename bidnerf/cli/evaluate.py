@@ -29,7 +29,7 @@ class TrialOptions:
         str | None,
         Option(
             "NAME",
-            "how starts are chosen: bid, bid-hard, inerf, parallel, perturb or none",
+            "how starts are chosen: bid, bid-hard, inerf, perturb or none",
             "none; bid for methods that need a start",
         ),
     ] = None
@@ -44,13 +44,12 @@ class TrialOptions:
     seed: Annotated[int | None, Option("N", "seed of every random choice", "the protocol's")] = None
     frame: Annotated[Names, Option("NAME...", "try only these frames", "all of the split")] = ()
 
-    def plan(self, method: MethodOptions, dataset: DatasetOptions, **more: Any) -> Plan:
+    def plan(self, method: MethodOptions, images: DatasetOptions, **more: Any) -> Plan:
         """Return the plan of the trials; ``more`` holds the fields of the plan that these options do not set."""
         from bidnerf.evaluation import Plan
         from bidnerf_core.localization import find_method
 
-        registration = dataset.registration
-        _ = dataset.mask_folder  # raises for anything but a folder of masks
+        _ = images.mask_folder  # raises for anything but a folder of masks
         try:
             numbers = [[float(number) for number in size.split(":")] for size in self.size]
         except ValueError as error:
@@ -65,12 +64,7 @@ class TrialOptions:
                 trials=self.trials,
                 seed=self.seed,
                 frames=self.frame or None,
-                split=dataset.split,
-                camera=None if dataset.camera is None else str(dataset.camera),
-                register_depth=registration if registration in (None, False) else str(registration),
-                depth_unit=dataset.depth_unit,
-                masks=None if dataset.masks is None else str(dataset.masks),
-                mask_hides=dataset.mask_hides,
+                images=replace(images, register_depth=images.registration),
                 **more,
             )
 
@@ -79,13 +73,7 @@ class TrialOptions:
 class InputOptions:
     """What the method receives."""
 
-    images: Annotated[int, Option("K", "localize a sequence of K images around the object at once")] = 1
-    angle: Annotated[float, Option("DEGREES", "angle between neighbours of a sequence")] = 15.0
     depth: Annotated[bool, Option(None, "use measured depth if available")] = True
-    depth_points: Annotated[
-        Path | None,
-        Option("MODEL", "COLMAP sparse model whose points, where frames observe them, are used as depth"),
-    ] = None
     fault: Annotated[
         Names,
         Option(
@@ -123,7 +111,7 @@ def run_evaluate(
     starts: TrialOptions,
     input: InputOptions,
     work: WorkOptions,
-    dataset: Annotated[DatasetOptions, Without("largest", "background")] = TEST_IMAGES,
+    images: Annotated[DatasetOptions, Without("largest", "background")] = TEST_IMAGES,
     method: MethodOptions,
 ) -> None:
     """Localize many frames of a dataset, and write one JSON line a trial.
@@ -139,20 +127,17 @@ def run_evaluate(
         raise UsageError("--workers and --dask contradict each other: a cluster has its own workers")
     plan = starts.plan(
         method,
-        dataset,
-        images=input.images,
-        angle=input.angle,
+        images,
         device=work.device,
         depth=input.depth,
-        depth_points=None if input.depth_points is None else str(input.depth_points),
         faults=input.fault,
         shard=work.shard,
         shards=work.shards,
     )
     require_outside_maps(out.parent, out)
     with working("waiting for the trials under way (Ctrl-C again: at once)"):
-        found = evaluate(map, data or map, plan, out=out, workers=work.dask or work.workers)
-    show(f"{amount(len(found.rows), 'trial')} in {out}; 'bidnerf report {out}' shows them")
+        table = evaluate(map, data or map, plan, out=out, workers=work.dask or work.workers)
+    show(f"{amount(len(table.rows), 'trial')} in {out}; 'bidnerf report {out}' shows them")
 
 
 def run_compare(
@@ -193,17 +178,17 @@ def run_compare(
     if out is not None:
         check_folder(out, folders)
     with nullcontext() if out is None else output_folder(out, overwrite), displayed():
-        found = compare(maps, data, plan)
+        comparison = compare(maps, data, plan)
         if out is not None:
-            found.save(out / "compare.json")
+            comparison.save(out / "compare.json")
             try:
-                say(f"look at {comparison_figure(out, found).with_suffix('.png')}")
+                say(f"look at {comparison_figure(out, comparison).with_suffix('.png')}")
             except InputError as error:  # matplotlib is optional
                 say(str(error))
     if json:
-        print_json(to_plain(replace(found, results=())))
+        print_json(to_plain(replace(comparison, results=())))
         return
-    for line in str(found).split("\n"):
+    for line in str(comparison).split("\n"):
         show(line)
 
 

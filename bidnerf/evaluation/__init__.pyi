@@ -11,13 +11,14 @@ from .faults.changes import texture as texture
 from .faults.changes import warped as warped
 from .plan import PROTOCOLS as PROTOCOLS
 from .plan import Plan as Plan
+from .plan import Protocol as Protocol
 from .plan import Size as Size
 from .plan import Trial as Trial
 from .plan import bid_start as bid_start
 from .plan import changed_settings as changed_settings
 from .plan import find_protocol as find_protocol
+from .plan import list_trials as list_trials
 from .plan import parse_settings as parse_settings
-from .plan import planned as planned
 from .plots import comparison_figure as comparison_figure
 from .report import chosen_criterion as chosen_criterion
 from .report import write_report as write_report
@@ -36,7 +37,7 @@ from .run import run_trials as run_trials
 from .summary import NEVER as NEVER
 from .summary import Group as Group
 from .summary import Summary as Summary
-from .summary import grouped as grouped
+from .summary import group_results as group_results
 from .summary import median as median
 from .summary import steps_of as steps_of
 from .summary import summarize as summarize
@@ -44,7 +45,7 @@ from .trial import ScalarPoseError as ScalarPoseError
 from .trial import Trace as Trace
 from .trial import TrialResult as TrialResult
 from .trial import forget_peak_memory as forget_peak_memory
-from .trial import opened as opened
+from .trial import open_scene as open_scene
 from .trial import peak_memory_bytes as peak_memory_bytes
 from .trial import run_trial as run_trial
 from .trial import views_digest as views_digest

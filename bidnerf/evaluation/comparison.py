@@ -14,24 +14,23 @@ from typing import Any
 import torch
 from torch import nn
 
-from bidnerf.evaluation.plan import Plan, Trial, parse_settings, planned
+from bidnerf.evaluation.plan import Plan, Trial, list_trials
 from bidnerf.evaluation.results import aligned, as_line
 from bidnerf.evaluation.run import (
     InThisProcess,
-    Scene,
+    data_name,
     device_name,
     ended_on_failure,
-    name_of,
-    open_both,
-    own_processes,
+    local_processes,
 )
 from bidnerf.evaluation.summary import ABSOLUTE, RELATIVE, Summary, summarize
 from bidnerf.evaluation.trial import (
-    Data,
-    Opened,
+    DataSource,
+    MapSource,
+    Scene,
     TrialResult,
     open_data,
-    opened,
+    open_scene,
     registered_for,
     run_trial,
 )
@@ -51,7 +50,6 @@ from bidnerf_core.progress import (
     job_context,
     report_progress,
 )
-from bidnerf_core.settings import to_flat
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,12 +142,13 @@ class Comparison:
 
     def save(self, path: str | Path) -> None:
         """Write the comparison with all results as JSON."""
-        write_file(Path(path), as_line(to_plain(self)))
+        results = [[result.plain() for result in column] for column in self.results]
+        write_file(Path(path), as_line(to_plain(replace(self, results=())) | {"results": results}))
 
 
 def compare(
-    scenes: Sequence[Scene] | Mapping[str, Scene],
-    data: Data,
+    scenes: Sequence[MapSource] | Mapping[str, MapSource],
+    data: DataSource,
     plan: Plan | None = None,
     *,
     progress: ProgressCallback | None = None,
@@ -159,43 +158,44 @@ def compare(
 
     The plan must have a single size of starts, by default the first of its protocol. ``scenes`` may be a dictionary, whose keys
     then name the maps. Each map in a folder runs in its own process, so that its peak memory can be measured; this requires an
-    importable main module. Maps in memory, and all maps if the data is in memory, run in this process. One trial runs at a time, so that a change
-    in the machine's load affects all maps alike. Raises ``InputError`` and ``Cancelled`` as ``evaluate`` does.
+    importable main module. Maps in memory, and all maps if the data is in memory, run in this process. One trial runs at a time,
+    so that a change in the machine's load affects all maps alike. Raises ``InputError`` and ``Cancelled`` as ``evaluate`` does,
+    and ``InputError`` for a map that is given twice.
     """
     if isinstance(scenes, str | Path | Map):
-        raise InputError(f"scenes is the one map {name_of(scenes)}", expected="a list of maps, or a dictionary of them")
+        name = scenes.info.backend if isinstance(scenes, Map) else scenes
+        raise InputError(f"scenes is the one map {name}", expected="a list of maps, or a dictionary of them")
     if not scenes:
         raise InputError("no maps to compare", expected="at least one")
-    named = scenes if isinstance(scenes, Mapping) else name_maps(scenes)
+    sources = scenes if isinstance(scenes, Mapping) else name_maps(scenes)
     plan = plan or Plan()
-    if plan.sizes is None:
-        plan = replace(plan, sizes=plan.starts()[:1])
-    if len(plan.starts()) > 1 or len(plan.faults) > 1:
+    if len(plan.sizes or ()) > 1 or len(plan.faults) > 1:
         raise InputError("maps are compared from one kind of start", expected="one size and one fault")
     with job_context(progress, cancel), ExitStack() as stack:
-        for scene in named.values():
-            if not isinstance(scene, Map) and not is_closed_form(str(scene)):
-                load_info(Path(scene))  # raises before any work for what is not a map
+        for source in sources.values():
+            if not isinstance(source, Map) and not is_closed_form(str(source)):
+                load_info(Path(source))  # raises before any work for what is not a map
         here = {
-            name: open_both(scene, data, plan)
-            for name, scene in named.items()
-            if isinstance(scene, Map) or not isinstance(data, str | Path)
+            name: open_scene(source, data, plan)
+            for name, source in sources.items()
+            if isinstance(source, Map) or not isinstance(data, str | Path)
         }
-        dataset = next((capture for _, capture in here.values()), None) or open_data(data, plan.reading)
-        starts = planned(plan, "", name_of(data), dataset)
+        dataset = next((capture for _, capture in here.values()), None) or open_data(data, plan.images)
+        trials = list_trials(plan, "", data_name(data, dataset), dataset)
+        starts = [trial for trial in trials if trial.size == trials[0].size]
         executors = {
-            name: stack.enter_context(ended_on_failure(InThisProcess() if name in here else own_processes(1)))
-            for name in named
+            name: stack.enter_context(ended_on_failure(InThisProcess() if name in here else local_processes(1)))
+            for name in sources
         }
-        turns = list(product(starts, named))
-        found: dict[str, list[tuple[TrialResult, float]]] = {name: [] for name in named}
+        turns = list(product(starts, sources))
+        pairs: dict[str, list[tuple[TrialResult, float]]] = {name: [] for name in sources}
         for number, (start, name) in enumerate(turns, start=1):
             check_cancelled("comparison")
-            device = device_name(named[name], plan.device)
-            trial = replace(start, map=name if name in here else str(named[name]), device=device)
+            device = device_name(sources[name], plan.device)
+            trial = replace(start, map=name if name in here else str(sources[name]), device=device)
             try:
-                running = executors[name].submit(measured, trial, here.get(name), registered_for(trial))
-                found[name].append(running.result())
+                running = executors[name].submit(run_and_sample, trial, here.get(name), registered_for(trial))
+                pairs[name].append(running.result())
             except BrokenProcessPool as error:
                 raise InputError(
                     f"the process that localized frame {trial.frame} ended",
@@ -203,21 +203,20 @@ def compare(
                     expected="a result; was memory short, or does the main module begin work outside of"
                     " 'if __name__ == \"__main__\"'?",
                 ) from error
-            text = f"{trial.frame} in {name}"
-            report_progress(Progress("comparison", number, len(turns), "trials", text))
-    results = {name: tuple(result for result, _ in pairs) for name, pairs in found.items()}
+            report_progress(Progress("comparison", number, len(turns), "trials", f"{trial.frame} in {name}"))
+    results = {name: tuple(result for result, _ in own) for name, own in pairs.items()}
     rows = tuple(
-        MapRow.of(name, map_bytes(scene), results[name], [samples for _, samples in found[name]])
-        for name, scene in named.items()
+        MapRow.of(name, map_bytes(source), results[name], [samples for _, samples in pairs[name]])
+        for name, source in sources.items()
     )
-    first, run = starts[0], next(iter(results.values()))[0]
+    first = next(iter(results.values()))[0]
     return Comparison(
-        run.trial.data,
-        first.split,
-        first.protocol,
-        first.size,
-        run.method,
-        run.settings,
+        first.trial.data,
+        first.trial.images.split,
+        first.trial.protocol,
+        first.trial.size,
+        first.method,
+        first.settings,
         first.seed,
         len(starts),
         rows,
@@ -225,8 +224,8 @@ def compare(
     )
 
 
-def measured(
-    trial: Trial, scene: Opened | None = None, registered: Sequence[tuple[str, str]] = ()
+def run_and_sample(
+    trial: Trial, scene: Scene | None = None, registered: Sequence[tuple[str, str]] = ()
 ) -> tuple[TrialResult, float]:
     """Run a trial as ``run_trial`` does, and also return the samples per ray in its last frame at the true pose.
 
@@ -234,9 +233,9 @@ def measured(
     that the method uses or, if it uses none, for the field itself.
     """
     result = run_trial(trial, scene, registered)
-    stored, dataset = scene or opened(trial.map, trial.data, trial)
-    (view,) = dataset.views(trial.split, trial.frames[-1:])
-    number = to_flat(parse_settings(trial.method, trial.config)).get("level")
+    stored, dataset = scene or open_scene(trial.map, trial.data, trial)
+    (view,) = dataset.views(trial.images.split, trial.frames[-1:])
+    number = result.settings.get("level")
     level = stored.field if number is None else levels(stored.field)[number]
     own, rays = (View(view.frame, SE3.identity()),), 2048  # on which samples are counted
     device = device_of(stored.field)
@@ -246,12 +245,12 @@ def measured(
     return result, float(samples.valid.sum()) / rays
 
 
-def map_bytes(stored: Scene) -> int:
+def map_bytes(source: MapSource) -> int:
     """Return the size of a map: its description and weights in a folder, or its field's tensors; 0 in closed form."""
-    if isinstance(stored, Map):
-        state = stored.field.state_dict() if isinstance(stored.field, nn.Module) else {}
+    if isinstance(source, Map):
+        state = source.field.state_dict() if isinstance(source.field, nn.Module) else {}
         return sum(tensor.numel() * tensor.element_size() for tensor in state.values())
-    if is_closed_form(str(stored)):
+    if is_closed_form(str(source)):
         return 0
-    folder = Path(stored)
+    folder = Path(source)
     return sum((folder / name).stat().st_size for name in (DESCRIPTION, load_info(folder).weights))

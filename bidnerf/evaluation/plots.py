@@ -24,10 +24,9 @@ from bidnerf.evaluation.summary import (
     Situation,
     applies,
     are_stepwise,
-    situation_titles,
+    is_right,
     situations,
     steps_of,
-    succeeded,
     unit_of,
 )
 from bidnerf.evaluation.trial import TrialResult
@@ -71,7 +70,7 @@ QUANTITIES = {
     "rotation_deg": Quantity(
         "rotation error (degrees)", "trials (%)", 5.0, lambda r, _: r.error.rotation_deg if r.error else NEVER
     ),
-    "seconds": Quantity("time (s)", "right trials (%)", None, lambda r, _: r.seconds if succeeded(r) else NEVER),
+    "seconds": Quantity("time (s)", "right trials (%)", None, lambda r, _: r.seconds if is_right(r) else NEVER),
     "steps": Quantity(
         "step",
         "successful trials (%)",
@@ -101,8 +100,7 @@ class Figures:
         self.folder, self.criterion = folder, criterion
         self.groups = [g for g in groups if g.situation.fault == NO_FAULT] or list(groups)
         labels = dict.fromkeys(group.label for group in groups)
-        self.looks = {label: line_look(place) for place, label in enumerate(labels)}
-        self.titles = situation_titles(situations(groups))
+        self.looks = {label: line_look(number) for number, label in enumerate(labels)}
 
     def all(self) -> list[Figure]:
         """Draw every figure for which the results have data."""
@@ -154,7 +152,7 @@ class Figures:
             if bound is not None:  # errors below bound / 500 are drawn as equal on the logarithmic axis
                 known = np.maximum(known, bound / 500).tolist()
             if known:
-                shares = [100 * place / len(values) for place in range(len(known) + 1)]
+                shares = [100 * count / len(values) for count in range(len(known) + 1)]
                 axes.step([known[0], *known], shares, where="post", **self.looks[group.label])
         axes.set(xlabel=label.format(unit=unit_of(groups[0].results)), ylabel=share, ylim=(-2, 102))
         if bound is not None:
@@ -191,7 +189,7 @@ class Figures:
         panels: list[Panel] = []
         for situation in situations(groups)[:MOST_SITUATIONS]:
             own = [group for group in groups if group.situation == situation]
-            panels += [(self.titles[situation], partial(each, groups=own)) for each in draw]
+            panels += [(own[0].title, partial(each, groups=own)) for each in draw]
         shown = {group.label for group in groups}
         looks = {label: look for label, look in self.looks.items() if label in shown}
         return self._figure(name, panels, looks, caption)
@@ -252,9 +250,9 @@ def comparison_figure(folder: Path, comparison: Comparison) -> Path:
     Raises ``InputError`` if matplotlib, which is optional, is missing.
     """
     first = comparison.results[0][0].trial
-    place = Situation("", "", first.data, first.split, first.protocol, first.fault, first.size)
+    situation = Situation("", "", first.data, first.images.split, first.protocol, first.fault, first.size)
     pairs = zip(comparison.rows, comparison.results, strict=True)
-    groups = [Group(place, row.map, results) for row, results in pairs]
+    groups = [Group(situation, "", row.map, results) for row, results in pairs]
     figures = Figures(groups, folder, "")
 
     def bars(axes: Any, values: Sequence[float]) -> None:

@@ -24,8 +24,8 @@ from bidnerf.evaluation.summary import (
     Group,
     applies,
     are_stepwise,
+    is_right,
     situations,
-    succeeded,
 )
 from bidnerf.evaluation.trial import TrialResult, open_data, trial_views
 from bidnerf.results import CRITERIA, CRITERION_NAMES, as_picture, require_matplotlib
@@ -64,7 +64,7 @@ def write_report(
     is_ours = path.is_file() and MARK.encode() in path.read_bytes()[:4096]  # the head of the page
     if folder.is_dir() and not is_ours and not all(is_temporary(file.name) for file in folder.iterdir()):
         raise InputError("holds something other than a bidnerf report; name another --out or remove it", where=folder)
-    frames = pictured(worst(table.rows)[:24], data)
+    frames = add_images(worst(table.rows)[:24], data)
     with output_folder(folder, overwrite=True):
         if not path.exists():  # so that an interrupted report is recognized as one
             text = "This report was interrupted; the same command rewrites it."
@@ -99,7 +99,7 @@ def page(
     view: str | None = None,
     frames: Sequence[tuple[TrialResult, str | None]] = (),
 ) -> str:
-    """Return a report as HTML; ``frames`` lists trials with their images, see ``pictured``."""
+    """Return a report as HTML; ``frames`` lists trials with their images, see ``add_images``."""
     environment = Environment(autoescape=True, finalize=_printed, undefined=StrictUndefined, keep_trailing_newline=True)
     environment.filters["number"] = _number
     source = files(__package__).joinpath("report.html.jinja").read_text(encoding="utf-8")
@@ -112,7 +112,7 @@ def page(
         trials=len(table.rows),
         maps=list(dict.fromkeys(maps)),
         criteria={n: CRITERION_NAMES[n] for n in CRITERIA if any(applies(n, g.results) for g in groups)},
-        sections=[(start, list(rows)) for start, rows in groupby(table.summary, attrgetter("start"))],
+        sections=[(title, list(own)) for title, own in groupby(groups, attrgetter("title"))],
         pooled=any(g.situation.size is None for g in groups),
         stepwise=any(are_stepwise(group.results) for group in groups),
         figures=[(caption, base64.b64encode(file.read_bytes()).decode()) for file, caption in figures],
@@ -120,8 +120,8 @@ def page(
         absolute=ABSOLUTE,
         view=view,
         frames=frames,
-        succeeded=succeeded,
-        wrong=sum(row.converged and not succeeded(row) for row in table.rows),
+        is_right=is_right,
+        wrong=sum(row.converged and not is_right(row) for row in table.rows),
         refused=sum(not row.converged for row in table.rows),
         runs=[(name, _facts(name, known), list(dict.fromkeys(r.command for r in known))) for name, known in runs],
     )
@@ -136,31 +136,33 @@ def worst(rows: Sequence[TrialResult]) -> list[TrialResult]:
 
     def rank(row: TrialResult) -> tuple[bool, bool, float]:
         error = float("inf") if row.error is None else row.error.translation
-        return row.converged and succeeded(row), not row.converged, -error
+        return row.converged and is_right(row), not row.converged, -error
 
     return sorted(rows, key=rank)
 
 
-def pictured(rows: Sequence[TrialResult], data: Sequence[str | Path]) -> list[tuple[TrialResult, str | None]]:
+def add_images(rows: Sequence[TrialResult], data: Sequence[str | Path]) -> list[tuple[TrialResult, str | None]]:
     """Return each trial with its image (with faults) as a base64-encoded JPEG, or with None if its dataset is not in ``data``."""
     folders = {Path(os.path.realpath(folder)).name: str(folder) for folder in data}
-    opened: dict[tuple[str, str], Capture] = {}
-    found: list[tuple[TrialResult, str | None]] = []
+    datasets: dict[tuple[str, DatasetOptions], Capture] = {}
+    pairs: list[tuple[TrialResult, str | None]] = []
     for row in rows:
         trial = row.trial
         name = trial.data if is_closed_form(trial.data) else folders.get(trial.data)
         if name is None:
-            found.append((row, None))
+            pairs.append((row, None))
             continue
-        if (name, trial.split) not in opened:  # results hold names of other files, not paths
-            options = DatasetOptions(split=trial.split, depth_unit=trial.depth_unit)
-            opened[name, trial.split] = open_data(name, options)
-        view, content = trial_views(trial, opened[name, trial.split])[-1], io.BytesIO()
+        # Results hold names of the files of masks, cameras and sensors, not their paths.
+        own = {key: value for key, value in vars(trial.images).items() if key == "split" or not isinstance(value, str)}
+        key = name, DatasetOptions(**own)
+        if key not in datasets:
+            datasets[key] = open_data(*key)
+        view, content = trial_views(trial, datasets[key])[-1], io.BytesIO()
         image = Image.fromarray(as_picture(view.frame.rgb))
         image.thumbnail((240, 240))
         image.save(content, "JPEG", quality=80)
-        found.append((row, base64.b64encode(content.getvalue()).decode()))
-    return found
+        pairs.append((row, base64.b64encode(content.getvalue()).decode()))
+    return pairs
 
 
 def _printed(value: Any) -> Any:

@@ -17,23 +17,18 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from importlib.metadata import version
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, Self
+from typing import Any, BinaryIO, Self
 
 import psutil
 import torch
 
 import bidnerf_core
 from bidnerf.evaluation.plan import Trial
-from bidnerf.evaluation.summary import (
-    Group,
-    Situation,
-    Summary,
-    grouped,
-    situation_titles,
-    summarize,
-)
-from bidnerf.evaluation.trial import TrialResult
+from bidnerf.evaluation.summary import Group, group_results
+from bidnerf.evaluation.trial import TrialResult, read_result
 from bidnerf.results import CRITERIA
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.geometry import symbol
@@ -49,21 +44,13 @@ from bidnerf_core.io import (
     to_plain,
     write_file,
 )
+from bidnerf_core.settings import to_flat
 
 LARGEST_FILE = 512 * 2**20
 """Largest size of a file of results in bytes. A trial takes a few kilobytes, so that a hundred thousand trials fit."""
 EXPECTED = "lines as written by 'bidnerf evaluate'"
 BEGINNING = b'{"T_world_camera": '
 """The beginning of each line of a file of results."""
-
-
-class SummaryRow(NamedTuple):
-    """The statistics of the trials of one condition in one situation, with the titles of both in reports."""
-
-    start: str  # title of the situation
-    label: str  # of the condition
-    situation: Situation
-    statistics: Summary
 
 
 @dataclass(frozen=True)
@@ -75,35 +62,26 @@ class ResultTable:
     @cached_property
     def groups(self) -> list[Group]:
         """The results, grouped by situation (what was to be localized) and condition (what localized it)."""
-        return grouped(self.rows)
-
-    @cached_property
-    def summary(self) -> tuple[SummaryRow, ...]:
-        """Success rates with Wilson's 95 % intervals, errors and cost of each group."""
-        titles = situation_titles([group.situation for group in self.groups])
-        return tuple(SummaryRow(titles[g.situation], g.label, g.situation, summarize(g.results)) for g in self.groups)
+        return group_results(self.rows)
 
     def __str__(self) -> str:
         lines = [["success by", "n", "frames", *CRITERIA, "median error"]]
-        start = None
-        for row in self.summary:
-            if row.start != start:
-                lines.append([row.start])
-                start = row.start
-            known = row.statistics
-            rates = [
-                f"{100 * s.rate.rate:.0f} % ({100 * s.rate.low:.0f}-{100 * s.rate.high:.0f})" if s else "-"
-                for s in known.success.values()
-            ]
-            error = "-"
-            if known.translation is not None and known.rotation_deg is not None:
-                error = f"{known.translation:.3f} {symbol(known.unit)} {known.rotation_deg:6.2f} deg"
-            lines.append([f"  {row.label}", str(known.trials), str(known.frames), *rates, error])
+        for title, groups in groupby(self.groups, attrgetter("title")):
+            lines.append([title])
+            for group in groups:
+                summary, error = group.summary, "-"
+                rates = [
+                    f"{100 * s.rate.rate:.0f} % ({100 * s.rate.low:.0f}-{100 * s.rate.high:.0f})" if s else "-"
+                    for s in summary.success.values()
+                ]
+                if summary.translation is not None and summary.rotation_deg is not None:
+                    error = f"{summary.translation:.3f} {symbol(summary.unit)} {summary.rotation_deg:6.2f} deg"
+                lines.append([f"  {group.label}", str(summary.trials), str(summary.frames), *rates, error])
         return aligned(lines)
 
     def save(self, path: str | Path) -> None:
         """Write the results as JSON lines, which ``bidnerf report`` reads; an existing file is replaced as a whole."""
-        write_file(Path(path), b"".join(as_line(to_plain(row)) for row in self.rows))
+        write_file(Path(path), b"".join(as_line(row.plain()) for row in self.rows))
 
     @classmethod
     def load(cls, *paths: str | Path) -> ResultTable:
@@ -134,7 +112,7 @@ def aligned(lines: Sequence[Sequence[str]]) -> str:
 
 def key_of(trial: Trial) -> str:
     """Return a key that is equal for two trials if and only if they are the same trial, wherever their folders are."""
-    return json.dumps(to_plain(trial.portable), sort_keys=True)
+    return json.dumps(to_flat(trial.portable), sort_keys=True)
 
 
 def read_results(paths: Iterable[Path]) -> list[TrialResult]:
@@ -143,16 +121,16 @@ def read_results(paths: Iterable[Path]) -> list[TrialResult]:
     An incomplete last line is ignored. Raises ``InputError`` for a file that cannot be read or contains
     anything but results.
     """
-    found: dict[Any, TrialResult] = {}
+    results: dict[Any, TrialResult] = {}
     for path in paths:
-        for result in _parsed(path, read_file(path, EXPECTED, LARGEST_FILE))[0]:
-            found.setdefault((key_of(result.trial), result.weights, result.inputs), result)
-    return list(found.values())
+        for result in _parse(path, read_file(path, EXPECTED, LARGEST_FILE))[0]:
+            results.setdefault((key_of(result.trial), result.weights, result.inputs), result)
+    return list(results.values())
 
 
-def _parsed(path: Path, content: bytes) -> tuple[list[TrialResult], int]:
+def _parse(path: Path, content: bytes) -> tuple[list[TrialResult], int]:
     """Return the result of each complete line, and the number of bytes in these lines."""
-    lines, found, length = content.split(b"\n"), [], 0
+    lines, results, length = content.split(b"\n"), list[TrialResult](), 0
     for number, line in enumerate(lines, start=1):
         where = f"{path}: line {number}"
         try:
@@ -163,9 +141,9 @@ def _parsed(path: Path, content: bytes) -> tuple[list[TrialResult], int]:
                 break
             raise
         if plain is not None:
-            found.append(from_plain(TrialResult, plain, where))
+            results.append(read_result(plain, where))
         length += len(line) + (number < len(lines))
-    return found, length
+    return results, length
 
 
 class ResultsFile:
@@ -187,7 +165,7 @@ class ResultsFile:
         file = self._open(self.path)
         try:
             content = read_open_file(file, self.path, EXPECTED, LARGEST_FILE)
-            results, whole = _parsed(self.path, content)
+            results, whole = _parse(self.path, content)
             for result in results:
                 self.values.setdefault(key_of(result.trial), result)
             if whole < len(content):
@@ -215,15 +193,15 @@ class ResultsFile:
         """Append a result and write it to disk before returning. Raises ``InputError`` if the file was removed."""
         if self.path is not None:
             file = self._unmoved(self.path)
-            file.write(as_line(to_plain(result)))
+            file.write(as_line(result.plain()))
             file.flush()
             os.fsync(file.fileno())
         self.values[key_of(result.trial)] = result
 
     def put_in_order(self, trials: Sequence[Trial]) -> None:
         """Move the results of ``trials`` to the end of the file, in their order, in one atomic step."""
-        last = [key for key in map(key_of, trials) if key in self.values]
-        order = [key for key in self.values if key not in set(last)] + last
+        last = dict.fromkeys(key for key in map(key_of, trials) if key in self.values)
+        order = [*(key for key in self.values if key not in last), *last]
         if self.path is not None:
             self._unmoved(self.path)
             if order != list(self.values):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import signal
@@ -18,27 +19,26 @@ from typing import Any, TypeAlias
 import torch
 
 from bidnerf.evaluation.faults import NO_FAULT
-from bidnerf.evaluation.plan import Plan, Trial, listed, parse_settings, planned
+from bidnerf.evaluation.plan import Plan, Trial, list_trials
 from bidnerf.evaluation.results import ResultsFile, ResultTable, note_run, provenance, script_command
-from bidnerf.evaluation.summary import succeeded
+from bidnerf.evaluation.summary import is_right
 from bidnerf.evaluation.trial import (
-    Data,
-    Opened,
+    DataSource,
+    InputDigests,
+    MapSource,
+    Scene,
     TrialResult,
-    input_digests,
-    open_data,
-    open_map,
-    opened,
-    opened_points,
+    open_scene,
     registered_for,
     run_trial,
     trial_views,
+    views_digest,
 )
 from bidnerf_core.datasets import Capture
 from bidnerf_core.errors import Cancelled, InputError, amount
 from bidnerf_core.fields import device_of
-from bidnerf_core.io import to_plain, usable_cores
-from bidnerf_core.localization import find_method, require_use_of_depth
+from bidnerf_core.io import usable_cores
+from bidnerf_core.localization import find_method
 from bidnerf_core.maps import Map
 from bidnerf_core.progress import (
     Cancel,
@@ -52,23 +52,20 @@ from bidnerf_core.settings import to_flat
 
 log = logging.getLogger("bidnerf")
 
-Scene: TypeAlias = Map | str | Path
-"""A map in memory, the folder of a map, or demo:NAME."""
 Workers: TypeAlias = int | str | None
 """A number of processes, None for one per core, or the address of a dask scheduler such as ``tcp://host:8786``."""
 PATIENCE = "20s"
 """Time to wait for the scheduler of a cluster to respond."""
 CHANGED = {
     "views": "images, depth, masks or cameras than {trial.data} has now",
-    "points": "depth points than {trial.depth_points} has now",
     "surface": "surface than map {trial.map} has now, which was rebaked",
 }
 """The meaning of a change in a digest of a trial's input, by the name of the digest."""
 
 
 def evaluate(
-    scene: Scene,
-    data: Data,
+    scene: MapSource,
+    data: DataSource,
     plan: Plan | None = None,
     *,
     out: str | Path | None = None,
@@ -86,8 +83,7 @@ def evaluate(
     run time are found only if importing that module registers them. With one process, everything runs in the
     calling thread.
 
-    Raises ``InputError`` for an evaluation that cannot be carried out, including a method that does not use the
-    plan's depth points and a trial whose views observe none. Raises ``Cancelled`` once ``cancel`` returns True
+    Raises ``InputError`` for an evaluation that cannot be carried out, and ``Cancelled`` once ``cancel`` returns True
     and the running trials have ended.
     """
     in_memory = isinstance(scene, Map) or not isinstance(data, str | Path)
@@ -97,29 +93,31 @@ def evaluate(
             expected="1: other processes read the map and the data from folders, and these are in memory",
         )
     plan = plan or Plan()
-    plan = replace(plan, device=device_name(scene, plan.device))
     with job_context(progress, cancel):
-        here = open_both(scene, data, plan)
-        trials = planned(plan, name_of(scene), name_of(data), here[1])
-        if plan.depth_points is not None:
-            require_use_of_depth(plan.method)
-            points, rigs = opened_points(plan.depth_points, here[0]), dict.fromkeys(t.frames for t in trials)
-            blind = [rig[-1] for rig in rigs if not any(len(points.seen(name, plan.split)) for name in rig)]
-            if blind:
-                raise InputError(
-                    f"has no points for {len(blind)} of {len(rigs)} frames ({listed(blind)}); choose others with --frame",
-                    where=plan.depth_points,
-                )
+        here = open_scene(scene, data, plan)
+        names = scene.info.backend if isinstance(scene, Map) else str(scene), data_name(data, here[1])
+        device = device_name(scene, plan.device)
+        trials = [replace(trial, device=device) for trial in list_trials(plan, *names, here[1])]
         with ResultsFile(None if out is None else Path(out)) as file:
             run_trials(trials, file, here, 1 if in_memory else workers)
             file.put_in_order(trials)
             return ResultTable(tuple(file[trial] for trial in trials))
 
 
+def data_name(data: DataSource, dataset: Capture) -> str:
+    """Return the name of a dataset in results: its folder as given, or the path of a dataset in memory."""
+    return str(data if isinstance(data, str | Path) else dataset.path)
+
+
+def device_name(source: MapSource, usual: str) -> str:
+    """Return the device of a map in memory, or ``usual`` for any other map."""
+    return str(device_of(source.field)) if isinstance(source, Map) else usual
+
+
 def run_trials(
     trials: Sequence[Trial],
     file: ResultsFile,
-    scene: Opened | None = None,
+    scene: Scene | None = None,
     workers: Workers = 1,
 ) -> None:
     """Run the trials that have no result in ``file``, and store each result as soon as it is available.
@@ -160,7 +158,7 @@ def run_trials(
             raise Cancelled(f"stopped; {amount(left, 'trial')} {are} left{where}, {kept}") from error
 
 
-def _run(todo: Sequence[Trial], file: ResultsFile, executor: Executor, at_once: int, scene: Opened | None) -> None:
+def _run(todo: Sequence[Trial], file: ResultsFile, executor: Executor, at_once: int, scene: Scene | None) -> None:
     """Run trials, ``at_once`` at a time, and store their results; raise the first error once the running ones have ended."""
     running = set[Future[TrialResult]]()
     count = right = 0
@@ -170,7 +168,7 @@ def _run(todo: Sequence[Trial], file: ResultsFile, executor: Executor, at_once: 
         for future in wait(running, return_when=FIRST_COMPLETED).done:
             running.remove(future)
             file.add(future.result())
-            count, right = count + 1, right + succeeded(future.result())
+            count, right = count + 1, right + is_right(future.result())
             text = f"{right} within 5 deg and 0.05"
             report_progress(Progress("trials", count, len(todo), "trials", text))
 
@@ -189,18 +187,18 @@ def _run(todo: Sequence[Trial], file: ResultsFile, executor: Executor, at_once: 
         raise
 
 
-def left_to_do(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None = None) -> list[Trial]:
+def left_to_do(trials: Sequence[Trial], file: ResultsFile, scene: Scene | None = None) -> list[Trial]:
     """Return the trials that have no result in the file.
 
     ``scene`` is the map and data of the trials, by default those that the trials name. Raises ``InputError`` if
     the file holds a result from another training run or surface of the map, other images or other settings.
     Settings unknown to the version that made a result are assumed to have had their defaults.
     """
-    digests: dict[Any, dict[str, Any]] = {}
+    digests = dict[Any, InputDigests]()
     advice = "name another --out, or remove the file to start again"
     for trial in (trial for trial in trials if trial in file):
         known = file[trial]
-        stored, dataset = scene or opened(trial.map, trial.data, trial)
+        stored, dataset = scene or open_scene(trial.map, trial.data, trial)
         if known.weights != stored.training:
             raise InputError(
                 f"holds results of another training run of map {trial.map} ({known.weights}, expected"
@@ -208,20 +206,20 @@ def left_to_do(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None 
                 where=file.path,
             )
         usual = to_flat(find_method(trial.method).config_type())
-        for name, value in to_flat(parse_settings(trial.method, trial.config)).items():
-            before = known.settings.get(name, usual[name])
+        for name, value in (usual | json.loads(trial.config)).items():
+            before = known.settings.get(name, usual.get(name))
             if before != value:
                 raise InputError(f"was made with {name} {before}, expected {value}; {advice}", where=file.path)
         if known.inputs is None:  # not recorded by an earlier version
             continue
         # The images depend on the seed only if they have faults.
         seed = None if trial.fault == NO_FAULT else trial.seed
-        read = trial.frames, trial.depth, trial.depth_points, trial.fault, seed
+        read = trial.frames, trial.depth, trial.fault, seed
         if read not in digests:
-            digests[read] = to_plain(input_digests(trial, stored, trial_views(trial, dataset)))
-        for name, digest in to_plain(known.inputs).items():
-            if digest != digests[read][name]:
-                what = CHANGED[name].format(trial=trial)
+            digests[read] = InputDigests(views_digest(trial_views(trial, dataset)), stored.info.surface)
+        for name, meaning in CHANGED.items():
+            if getattr(known.inputs, name) != getattr(digests[read], name):
+                what = meaning.format(trial=trial)
                 raise InputError(
                     f"holds results of frame {trial.frame} made with other {what}; {advice}", where=file.path
                 )
@@ -248,16 +246,8 @@ class InThisProcess(Executor):
         return future
 
 
-def local_processes(count: int) -> Executor:
-    """Return an executor of ``count`` single-threaded processes, which end when this process ends, for whatever reason.
-
-    With a count of 1, everything runs in this process.
-    """
-    return InThisProcess() if count == 1 else own_processes(count)
-
-
-def own_processes(count: int) -> ProcessPoolExecutor:
-    """Return an executor like that of ``local_processes``, but with separate processes even for a count of 1."""
+def local_processes(count: int) -> ProcessPoolExecutor:
+    """Return an executor of ``count`` single-threaded processes, which end when this process ends, for whatever reason."""
     return ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_prepare_worker)
 
 
@@ -305,7 +295,7 @@ def executor_of(workers: Workers, trials: int, on_cpu: bool) -> Iterator[tuple[E
     if workers is not None and workers < 1:
         raise InputError(f"workers is {workers}", expected="1 or more, or None for one per core")
     count = min(workers or (usable_cores() if on_cpu else 1), trials)
-    with ended_on_failure(local_processes(count)) as executor:
+    with ended_on_failure(InThisProcess() if count == 1 else local_processes(count)) as executor:
         yield executor, count, f"{count} local process{'es' if count > 1 else ''} of one thread"
 
 
@@ -320,28 +310,3 @@ def ended_on_failure(executor: Executor) -> Iterator[Executor]:
         raise
     finally:
         executor.shutdown(cancel_futures=True)
-
-
-# Maps and data, in memory or in folders.
-
-
-def open_both(scene: Scene, data: Data, plan: Plan) -> Opened:
-    """Return the map and the dataset, each read from its folder unless it is in memory."""
-    if isinstance(scene, str | Path) and isinstance(data, str | Path):
-        return opened(str(scene), str(data), plan)
-    stored = scene if isinstance(scene, Map) else open_map(str(scene), plan.device)
-    return stored, open_data(data, plan.reading, stored)
-
-
-def device_name(scene: Scene, given: str) -> str:
-    """Return the device of a map in memory, or ``given`` for any other map."""
-    return str(device_of(scene.field)) if isinstance(scene, Map) else given
-
-
-def name_of(value: Scene | Data) -> str:
-    """Return the name of a map or dataset in results: its folder, or the backend of a map in memory."""
-    if isinstance(value, Map):
-        return value.info.backend
-    if isinstance(value, str | Path):
-        return str(value)
-    return str(value.path) if isinstance(value, Capture) else "views"

@@ -7,10 +7,11 @@ import math
 import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 from bidnerf.evaluation.faults import NO_FAULT
-from bidnerf.evaluation.trial import TrialResult
+from bidnerf.evaluation.trial import Trace, TrialResult
 from bidnerf.results import CRITERIA, Rate, Reduced, steps_to_success, success_rate_by_frame
 from bidnerf_core.errors import amount
 from bidnerf_core.geometry import LengthUnit
@@ -53,33 +54,40 @@ class Group:
     """The trials of one condition (a method with its settings, input and hardware) in one situation."""
 
     situation: Situation
-    label: str  # of the condition, among the others
+    title: str  # of the situation in reports
+    label: str  # of the condition in reports
     results: tuple[TrialResult, ...]
 
+    @cached_property
+    def summary(self) -> Summary:
+        """Success rates with Wilson's 95 % intervals, errors and cost."""
+        return summarize(self.results)
 
-def grouped(results: Sequence[TrialResult]) -> list[Group]:
+
+def group_results(results: Sequence[TrialResult]) -> list[Group]:
     """Group trial results by situation and condition, and add a pooled group for each condition tried at several sizes.
 
     Groups are sorted by map, data, protocol and fault in order of appearance, then by size, with the pooled sizes last.
     """
     conditions = [_condition(result) for result in results]
     labels = _labels(conditions)
-    found: dict[tuple[Situation, str], list[TrialResult]] = {}
-    sizes: dict[tuple[Situation, str], set[Any]] = {}
+    rows = dict[tuple[Situation, str], list[TrialResult]]()
+    sizes = dict[tuple[Situation, str], set[Any]]()
     for result, condition in zip(results, conditions, strict=True):
         t, label = result.trial, labels[json.dumps(condition, sort_keys=True)]
-        pooled = Situation(t.map, result.weights, t.data, t.split, t.protocol, t.fault, None)
-        found.setdefault((replace(pooled, size=t.size), label), []).append(result)
-        found.setdefault((pooled, label), []).append(result)
+        pooled = Situation(t.map, result.weights, t.data, t.images.split, t.protocol, t.fault, None)
+        rows.setdefault((replace(pooled, size=t.size), label), []).append(result)
+        rows.setdefault((pooled, label), []).append(result)
         sizes.setdefault((pooled, label), set()).add(t.size)
-    order = {situation: place for place, (situation, _) in reversed(list(enumerate(sizes)))}
-    groups = [Group(*key, tuple(rows)) for key, rows in found.items() if key not in sizes or len(sizes[key]) > 1]
+    order = {situation: number for number, (situation, _) in reversed(list(enumerate(sizes)))}
 
-    def rank(group: Group) -> tuple[Any, ...]:
-        pooled, size = replace(group.situation, size=None), group.situation.size
-        return order[pooled], size is None, size or ()
+    def rank(key: tuple[Situation, str]) -> tuple[Any, ...]:
+        size = key[0].size
+        return order[replace(key[0], size=None)], size is None, size or ()
 
-    return sorted(groups, key=rank)
+    keys = sorted((key for key in rows if key not in sizes or len(sizes[key]) > 1), key=rank)
+    titles = situation_titles([situation for situation, _ in keys])
+    return [Group(situation, titles[situation], label, tuple(rows[situation, label])) for situation, label in keys]
 
 
 def situations(groups: Sequence[Group]) -> list[Situation]:
@@ -105,13 +113,16 @@ def situation_titles(every: Sequence[Situation]) -> dict[Situation, str]:
 def _condition(result: TrialResult) -> dict[str, Any]:
     """Return the properties that define the condition of a trial, by name: method, input, hardware and settings."""
     trial = result.trial
-    own = {name: getattr(trial, name) for name in ("depth", "depth_points", "camera", "register_depth", "depth_unit")}
-    hidden = None if trial.masks is None else f"{trial.mask_hides} of {trial.masks}"
+    options = {
+        name: value for name, value in vars(trial.images).items() if name not in ("split", "masks", "mask_hides")
+    }
+    masks = trial.images.masks
     return {
         "method": result.method,
         "images": len(trial.frames),
-        "hidden": hidden,
-        **own,
+        "hidden": None if masks is None else f"{trial.images.mask_hides} of {masks}",
+        "depth": trial.depth,
+        **options,
         "backend": result.backend,
         "device": trial.device,
         **result.settings,
@@ -121,7 +132,6 @@ def _condition(result: TrialResult) -> dict[str, Any]:
 WORDS: dict[str, Callable[[Any], str]] = {
     "images": lambda count: amount(count, "image"),
     "depth": lambda used: "RGB-D" if used else "RGB",
-    "depth_points": lambda folder: "no points" if folder is None else f"points of {folder}",
     "hidden": lambda masks: "nothing hidden" if masks is None else f"{masks} hidden",
     "backend": str,
     "device": str,
@@ -176,7 +186,7 @@ class Summary:
 
 def summarize(results: Sequence[TrialResult]) -> Summary:
     """Return the statistics of at least one trial."""
-    pairs = [(result.converged, succeeded(result)) for result in results]
+    pairs = [(result.converged, is_right(result)) for result in results]
     errors = [result.error for result in results]
     return Summary(
         trials=len(results),
@@ -197,7 +207,7 @@ def summarize(results: Sequence[TrialResult]) -> Summary:
 
 def frame_of(result: TrialResult) -> tuple[str, str, tuple[str, ...]]:
     """Return the identity of a trial's images: trials of the same images are not independent."""
-    return result.trial.data, result.trial.split, result.trial.frames
+    return result.trial.data, result.trial.images.split, result.trial.frames
 
 
 def unit_of(results: Sequence[TrialResult]) -> LengthUnit:
@@ -218,14 +228,16 @@ def are_stepwise(results: Sequence[TrialResult]) -> bool:
 
 def steps_of(results: Sequence[TrialResult], criterion: str) -> list[float]:
     """Return the steps to success of each trial, ``NEVER`` for those without success."""
-    found = (steps_to_success(result.errors.as_error(), CRITERIA[criterion]) for result in results)
-    return [NEVER if steps is None else float(steps) for steps in found]
+    every = (steps_to_success(result.errors.as_error(), CRITERIA[criterion]) for result in results)
+    return [NEVER if steps is None else float(steps) for steps in every]
 
 
-def succeeded(result: TrialResult) -> bool:
-    """Return whether the final pose is within 5 degrees and 0.05 (in the unit of the map) of the true one."""
-    error = result.error
-    return error is not None and error.rotation_deg < 5.0 and error.translation < 0.05
+def is_right(result: TrialResult) -> bool:
+    """Return whether the final pose meets the ``ABSOLUTE`` criterion."""
+    if result.error is None:
+        return False
+    error = Trace((result.error.translation,), (result.error.rotation_deg,)).as_error()
+    return bool(CRITERIA[ABSOLUTE](error, error))
 
 
 def rate_of(results: Sequence[TrialResult], outcomes: Sequence[bool]) -> Rate:

@@ -20,29 +20,30 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import torch
-from torch import Tensor
 
 from bidnerf.evaluation.faults import faulty, parse_faults
-from bidnerf.evaluation.plan import Setup, Trial, find_protocol, parse_settings
+from bidnerf.evaluation.plan import USUAL, Setup, Trial, find_protocol, parse_settings
 from bidnerf.results import PoseError, plain_localization, pose_error
 from bidnerf.scenes import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets import Capture, DatasetOptions, SparseChoice, SparsePoints, of_views
+from bidnerf_core.datasets import Capture, DatasetOptions, of_views
 from bidnerf_core.devices import threads_at_most, working_device
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.localization import Localizer
-from bidnerf_core.maps import DESCRIPTION, Map, load_map, named_poses
+from bidnerf_core.maps import DESCRIPTION, Map, load_map
 from bidnerf_core.registry import registered_names, require_registered
 from bidnerf_core.settings import to_flat
 
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
-Opened: TypeAlias = tuple[Map, Capture]
-"""A map, and a dataset of the same scene."""
-Data: TypeAlias = Capture | Sequence[View] | str | Path
+MapSource: TypeAlias = Map | str | Path
+"""A map in memory, the folder of a map, or demo:NAME."""
+DataSource: TypeAlias = Capture | Sequence[View] | str | Path
 """A dataset in memory, posed images (T_world_camera), the folder of a dataset, or demo:NAME."""
+Scene: TypeAlias = tuple[Map, Capture]
+"""A map, and a dataset of the same scene."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,6 @@ class InputDigests:
     """Digests of the content of a trial's input: folders may move and machines may differ, but the content must not."""
 
     views: str  # images, depth, intrinsics and true poses of the frames, in hexadecimal
-    points: str | None = None  # files of the COLMAP model that depth points were taken from
     surface: str | None = None  # file name of the map's baked surface, which changes with every baking
 
 
@@ -121,8 +121,21 @@ class TrialResult:
             if abs(getattr(self, name)) >= 2**63:  # JSON can hold integers that no tensor or float can
                 raise ValueError(f"{name} is larger than any measurement")
 
+    def plain(self) -> dict[str, Any]:
+        """Return the result as an object of strict JSON, in which the trial has flat names; ``read_result`` reads it."""
+        return to_plain(self) | {"trial": to_flat(self.trial)}
 
-def run_trial(trial: Trial, scene: Opened | None = None, registered: Sequence[tuple[str, str]] = ()) -> TrialResult:
+
+def read_result(plain: Any, where: str) -> TrialResult:
+    """Return the result stored as ``plain``. Raises ``InputError``, whose message begins with ``where``, for anything else."""
+    for part, name in (("trial", "depth_points"), ("inputs", "points")):  # of earlier versions, usually null
+        values = plain.get(part) if isinstance(plain, dict) else None
+        if isinstance(values, dict) and values.get(name, "") is None:
+            plain = plain | {part: {key: value for key, value in values.items() if key != name}}
+    return from_plain(TrialResult, plain, where)
+
+
+def run_trial(trial: Trial, scene: Scene | None = None, registered: Sequence[tuple[str, str]] = ()) -> TrialResult:
     """Run a trial on the map and dataset ``scene``, by default those named by the trial.
 
     ``registered`` has the group and name of everything that the planning process registered for it. Raises
@@ -131,32 +144,33 @@ def run_trial(trial: Trial, scene: Opened | None = None, registered: Sequence[tu
     """
     require_registered(registered)
     with threads_at_most(1):
-        stored, dataset = scene or opened(trial.map, trial.data, trial)
+        stored, dataset = scene or open_scene(trial.map, trial.data, trial)
         views = trial_views(trial, dataset)
         truth, protocol = views[-1].T_ref_camera, find_protocol(trial.protocol)
         protocol.check_size(trial.size)
-        start = protocol.start(truth, trial.size, trial.seed, len(dataset.frame_names(trial.split)))
+        start = protocol.start(truth, trial.size, trial.seed)
         settings = parse_settings(trial.method, trial.config)
-        points = None if trial.depth_points is None else opened_points(trial.depth_points, stored)
-        rays = None if points is None else points.rays(views, trial.split)
         localizer = Localizer(stored, trial.method, settings, warm_up=False)
-        digests = input_digests(trial, stored, views)
+        inputs = InputDigests(views_digest(views), stored.info.surface)
         forget_peak_memory()
-        found = localizer(views, start, rays, trial.seed)
-    trace = pose_error(found.poses, truth)
-    plain = plain_localization(found, stored.info.backend, pose_error(found.T_world_camera, truth))
+        answer = localizer(views, start, seed=trial.seed)
+    trace = pose_error(answer.poses, truth)
+    plain = plain_localization(answer, stored.info.backend, pose_error(answer.T_world_camera, truth))
     more = {
         "frame": trial.frame,
         "seed": trial.seed,
         "start_error": None if start is None else pose_error(start, truth).plain(),
-        "errors": {"translation": _finite(trace.translation), "rotation_deg": _finite(trace.rotation_deg)},
+        "errors": {
+            name: [x if math.isfinite(x) else None for x in getattr(trace, name).tolist()]
+            for name in ("translation", "rotation_deg")
+        },
         "peak_memory_bytes": peak_memory_bytes(),
         "settings": to_flat(settings),
         "weights": stored.training,
-        "trial": to_plain(trial.portable),
-        "inputs": to_plain(digests),
+        "trial": to_flat(trial.portable),
+        "inputs": to_plain(inputs),
     }
-    return from_plain(TrialResult, plain | more, "result")
+    return read_result(plain | more, "result")
 
 
 def registered_for(trial: Trial) -> list[tuple[str, str]]:
@@ -166,7 +180,7 @@ def registered_for(trial: Trial) -> list[tuple[str, str]]:
     """
     named = {("methods", trial.method), *(("faults", fault.name) for fault in parse_faults(trial.fault))}
     needed = ("backends", "features", "readers")
-    return [found for found in registered_names() if found in named or found[0] in needed]
+    return [key for key in registered_names() if key in named or key[0] in needed]
 
 
 def trial_views(trial: Trial, dataset: Capture) -> list[View]:
@@ -174,16 +188,10 @@ def trial_views(trial: Trial, dataset: Capture) -> list[View]:
 
     The trial's faults are applied to the views, and their depth is removed if the trial withholds depth.
     """
-    views = [faulty(view, trial.fault, trial.seed) for view in dataset.views(trial.split, trial.frames)]
+    views = [faulty(view, trial.fault, trial.seed) for view in dataset.views(trial.images.split, trial.frames)]
     if trial.depth:
         return views
     return [View(view.frame.replace(depth=None), view.T_ref_camera) for view in views]
-
-
-def input_digests(trial: Trial, stored: Map, views: list[View]) -> InputDigests:
-    """Return digests of everything that the trial reads apart from the map's weights."""
-    points = None if trial.depth_points is None else folder_digest(trial.depth_points)
-    return InputDigests(views_digest(views), points, stored.info.surface)
 
 
 def open_map(name: str, device: str = "cpu") -> Map:
@@ -192,10 +200,10 @@ def open_map(name: str, device: str = "cpu") -> Map:
     return closed_form_map(name) if is_closed_form(name) else load_map(Path(name), where)
 
 
-def open_data(data: Data, options: DatasetOptions, stored: Map | None = None) -> Capture:
+def open_data(data: DataSource, options: DatasetOptions, stored: Map | None = None) -> Capture:
     """Return a dataset, read from its folder unless it is in memory; ``stored`` gives the background colour.
 
-    Raises ``InputError`` for ``data`` of another type, and for file options with data that has no files.
+    Raises ``InputError`` for ``data`` of another type, and for options about files with data that has no files.
     """
     if isinstance(data, str | Path) and not is_closed_form(str(data)):
         return replace(options, background=None if stored is None else stored.bounds.background).open(data)
@@ -211,38 +219,36 @@ def open_data(data: Data, options: DatasetOptions, stored: Map | None = None) ->
         if count > 1:  # trials identify their frames by name
             raise InputError(f"data holds {count} frames named {name!r}", expected="different names")
         capture = of_views(views, Path("views"))
-    if not options.camera is options.register_depth is options.depth_unit is None:
-        raise InputError(
-            "has its own cameras and depth; leave out camera, register_depth and depth_unit",
-            where=capture.path,
-        )
+    usual, taken = DatasetOptions(), ("split", "masks", "mask_hides", "background")
+    given = [name for name, value in vars(options).items() if name not in taken and value != getattr(usual, name)]
+    if given:
+        raise InputError(f"has its own cameras and depth; leave out {enumeration(given)}", where=capture.path)
     return capture if options.mask_folder is None else capture.masked(options.mask_folder)
 
 
-def opened(map_name: str, data_name: str, setup: Setup | None = None) -> Opened:
-    """Return the map and dataset with these names, which are read once per process unless the map has changed since."""
+def open_scene(source: MapSource, data: DataSource, setup: Setup = USUAL) -> Scene:
+    """Return a map and a dataset, each read from its folder unless it is in memory.
+
+    If both are in folders, they are read once per process unless the map has changed since.
+    """
+    if not isinstance(source, str | Path):
+        return source, open_data(data, setup.images, source)
+    if not isinstance(data, str | Path):
+        stored = open_map(str(source), setup.device)
+        return stored, open_data(data, setup.images, stored)
     version: tuple[int, int] | None = None
     with contextlib.suppress(OSError):  # a closed-form scene, or not a map, which is detected on reading
-        file = os.stat(Path(map_name) / DESCRIPTION)
+        file = os.stat(Path(source) / DESCRIPTION)
         version = file.st_ino, file.st_mtime_ns
-    setup = setup or Setup()
-    return _opened(map_name, data_name, setup.device, setup.reading, version)
+    return _read_scene(str(source), str(data), setup.device, setup.images, version)
 
 
 @lru_cache(maxsize=4)
-def _opened(
+def _read_scene(
     map_name: str, data_name: str, device: str, options: DatasetOptions, version: tuple[int, int] | None
-) -> Opened:
+) -> Scene:
     stored = open_map(map_name, device)
     return stored, open_data(data_name, options, stored)
-
-
-@lru_cache(maxsize=4)
-def opened_points(folder: str, stored: Map) -> SparsePoints:
-    """Return the points of the COLMAP model in ``folder``, scaled to the map by means of the poses of the map's training images."""
-    if not stored.info.cameras:
-        raise InputError("the map has no training cameras to determine the scale from", where=folder)
-    return SparsePoints(Path(folder), named_poses(stored.info), SparseChoice())
 
 
 def views_digest(views: Sequence[View]) -> str:
@@ -260,23 +266,6 @@ def views_digest(views: Sequence[View]) -> str:
             array = image.detach().cpu().contiguous().numpy()
             hashed.update(f"{array.dtype} {array.shape}\n".encode())
             hashed.update(array.tobytes())
-    return hashed.hexdigest()
-
-
-@lru_cache(maxsize=4)
-def folder_digest(folder: str) -> str:
-    """Return the digest of the names and contents of the files directly in ``folder``.
-
-    Raises ``InputError`` if one of them cannot be read.
-    """
-    hashed = hashlib.blake2b(digest_size=16)
-    try:
-        for path in sorted(path for path in Path(folder).iterdir() if path.is_file()):
-            with path.open("rb") as file:
-                content = hashlib.file_digest(file, "blake2b").digest()
-            hashed.update(path.name.encode(errors="surrogateescape") + b"\n" + content)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=error.filename or folder) from error
     return hashed.hexdigest()
 
 
@@ -305,7 +294,3 @@ def peak_memory_bytes() -> int:
     except ImportError:  # Windows
         return 0
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-
-
-def _finite(values: Tensor) -> list[float | None]:
-    return [value if math.isfinite(value) else None for value in values.tolist()]

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import sparse_model
 import tiny
-from bidnerf.evaluation import grouped, read_results
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.maps import load_info
 from commands import Run, assert_refused
@@ -90,48 +88,10 @@ def test_with_a_surface_the_points_take_the_place_of_a_start(
 
 
 @pytest.mark.parametrize("method", ["inerf", "inerf-lm"])
-def test_methods_of_colour_alone_refuse_them(
-    method: str, bidnerf: Run, shared: Path, given: Path, tmp_path: Path
-) -> None:
-    options = ["--method", method, "--depth-points", given / "sparse"]
-    place = [shared / "map", given / "data"]
-    for words in (
-        ["localize", *place, "--frame", "t_0001", "--perturb", 0.1, 5],
-        ["evaluate", *place, "--out", tmp_path / "r.jsonl", "--trials", 1],
-    ):
-        assert_refused(bidnerf(*words, *options), 1, f"'{method}'", "colour alone", after_remarks=True)
-
-
-def test_a_bench_takes_them_too(bidnerf: Run, shared: Path, given: Path, tmp_path: Path) -> None:
-    out, points = tmp_path / "r.jsonl", ["--depth-points", given / "sparse"]
-    bench: list[Any] = [
-        "evaluate",
-        shared / "map",
-        given / "data",
-        "--out",
-        out,
-        "--trials",
-        2,
-        "--size",
-        0.5,
-    ]
-    bench += ["--workers", 1, "--method", "bid", "--max-steps", 2, "--rays", 32]
-    assert bidnerf(*bench).status == 0
-    assert bidnerf(*bench, *points).status == 0
-    again = bidnerf(*bench, *points)
-    assert "2 of 2 trials are already there" in again.err
-    found = read_results([out])
-    assert [result.trial.depth_points for result in found[:2]] == [None, None]
-    assert all(str(result.trial.depth_points).endswith("/sparse") for result in found[2:])
-    assert found[0].loss != found[2].loss
-    assert found[0].start_error == found[2].start_error
-    labels = {group.label for group in grouped(found)}
-    assert any("no points" in label for label in labels)
-    assert any("points of" in label for label in labels)
-    refused = bidnerf(*bench, "--depth-points", given / "training")
-    assert_refused(refused, 1, "2 of 2 frames (t_0002,", "--frame")
-    demo = bidnerf("evaluate", "demo:blobs", "--out", tmp_path / "x", *points)
-    assert_refused(demo, 1, "no training cameras")
+def test_methods_of_colour_alone_refuse_them(method: str, bidnerf: Run, shared: Path, given: Path) -> None:
+    words = ["localize", shared / "map", given / "data", "--frame", "t_0001", "--perturb", 0.1, 5]
+    refused = bidnerf(*words, "--method", method, "--depth-points", given / "sparse")
+    assert_refused(refused, 1, f"'{method}'", "colour alone", after_remarks=True)
 
 
 def test_a_model_that_is_of_no_use_is_told_in_a_line(bidnerf: Run, shared: Path, given: Path, tmp_path: Path) -> None:

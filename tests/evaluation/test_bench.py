@@ -12,13 +12,13 @@ import shutil
 import signal
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import imageio.v3 as iio
 import pytest
-import torch
 
 import bidnerf as bn
 from bidnerf.cli import main
@@ -28,20 +28,18 @@ from bidnerf.evaluation import (
     ResultTable,
     Trial,
     TrialResult,
-    planned,
+    list_trials,
     read_results,
     read_runs,
     run_trial,
     run_trials,
 )
 
-# Inside: lines of results, and the middle of a sequence
-from bidnerf.evaluation.plan import arc
+# Inside: lines of results
 from bidnerf.evaluation.results import as_line
 from bidnerf.results import pose_error
-from bidnerf.scenes import closed_form_data, orbit
-from bidnerf_core.geometry import look_at
-from bidnerf_core.io import to_plain
+from bidnerf.scenes import closed_form_data
+from bidnerf_core.datasets import DatasetOptions
 from refusals import refused
 
 QUICK = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--workers", "1"]
@@ -81,7 +79,7 @@ def ran(seed: int) -> TrialResult:
 
 
 def trials_of(**options: Any) -> list[Trial]:
-    return planned(Plan(**{"protocol": "bid"} | options), BLOBS, BLOBS, closed_form_data(BLOBS))
+    return list_trials(Plan(**{"protocol": "bid"} | options), BLOBS, BLOBS, closed_form_data(BLOBS))
 
 
 # Plans.
@@ -98,9 +96,6 @@ def test_a_plan_is_its_protocol_for_each_size() -> None:
     assert sorted({t.frame for t in few}) == ["0003", "0007"]
     (odd,) = trials_of(sizes=[[0.1]], trials=1, device="cpu:0", depth=False)
     assert (odd.device, odd.depth) == ("cpu:0", False)
-    parallel = trials_of(protocol="parallel")
-    assert [t.seed for t in parallel] == list(range(1234, 1259))
-    assert len({t.frame for t in parallel[:5]}) == 1
 
 
 @pytest.mark.parametrize("shards", [1, 3, 13])
@@ -122,9 +117,7 @@ def test_shards_share_all_trials_between_them(shards: int) -> None:
             "none, since this protocol has no sizes, as bid and others have",
         ),
         ({"frames": ["nope"]}, "split 'test': no frame 'nope'", None),
-        ({"split": "train"}, "no split 'train'", "test"),
-        ({"protocol": "parallel", "frames": ["0000"]}, "'parallel' defines its own frames", "all frames"),
-        ({"protocol": "parallel", "seed": 3}, "25 trials from seed 3", "at most 25 from seed 1234"),
+        ({"images": DatasetOptions()}, "no split 'train'", "test"),
         ({"scene": "demo:object"}, "'demo:object'", "'bidnerf demo' trains maps"),
         ({"scene": "demo:blops"}, "'demo:blops'", "demo:blobs"),
         ({"data": "demo:rom"}, "'demo:rom'", "demo:room"),
@@ -139,28 +132,7 @@ def test_what_cannot_be_planned_is_refused(change: dict[str, Any], found: str, e
         bn.evaluate(scene, data, Plan(**change))
 
 
-# Sequences.
-
-
-def test_a_sequence_goes_round_the_object_in_equal_steps() -> None:
-    poses = [look_at((4 * c, 4 * s, 2.0), (0.0, 0.0, 0.0)) for c, s in _circle(24)]
-    places = arc(poses, 5, 4, 15.0)
-    assert places in ((2, 3, 4, 5), (8, 7, 6, 5))
-    assert arc(poses, 5, 3, 30.0) in ((1, 3, 5), (9, 7, 5))
-    assert arc(poses, 5, 4, 7.0) is None
-    assert arc(poses, 5, 24, 15.0) is not None
-    assert arc(poses, 5, 25, 15.0) is None
-
-
-def test_a_sequence_follows_a_moved_and_turned_world() -> None:
-    poses = orbit(3.0, 60, elevation=(10, 40), seed=2)
-    move = look_at((1.0, -2.0, 0.5), (3.0, 1.0, 4.0))
-    found = [arc(poses, last, 4, 15.0) for last in range(60)]
-    assert any(found)
-    assert found == [arc([move @ T for T in poses], last, 4, 15.0) for last in range(60)]
-
-
-def test_closed_form_sequences_are_rendered_at_the_angle_asked_for() -> None:
+def test_closed_form_sequences_are_rendered_at_the_given_angle() -> None:
     data = closed_form_data("demo:object")
     names = data.sequence("0002", 3, 15.0)
     assert names == ("0002@30", "0002@15", "0002")
@@ -168,8 +140,8 @@ def test_closed_form_sequences_are_rendered_at_the_angle_asked_for() -> None:
     for first, second in itertools.pairwise(views):
         assert float(pose_error(first.T_ref_camera, second.T_ref_camera).rotation_deg) == pytest.approx(15)
     assert all(view.frame.has_depth for view in views)
-    trials = trials_of(sizes=[0.9], method="bid", config=blob_trial().config, trials=2, images=3)
-    assert len(run_trial(trials[0]).trial.frames) == 3
+    rig = replace(blob_trial(2), frames=names)
+    assert run_trial(rig).trial.frames == names
     with refused(found="no frame '0024'"):
         data.views("test", ["0024"])
 
@@ -238,8 +210,8 @@ def _written(path: Path, *seeds: int) -> list[TrialResult]:
 def test_a_half_written_last_line_is_dropped_and_nothing_else(tmp_path: Path, kept: float) -> None:
     path = tmp_path / "r.jsonl"
     first, second = _written(path, 0, 1)
-    whole, half = path.read_bytes(), as_line(to_plain(second))[:-1]
-    path.write_bytes(as_line(to_plain(first)) + half[: math.ceil(kept * len(half))])
+    whole, half = path.read_bytes(), as_line(second.plain())[:-1]
+    path.write_bytes(as_line(first.plain()) + half[: math.ceil(kept * len(half))])
     known = [first, second] if kept == 1 else [first]  # the line of 1 lacks only its end
     assert read_results([path, path]) == known
     with ResultsFile(path) as file:
@@ -282,6 +254,28 @@ def test_results_come_in_the_order_of_the_plan(tmp_path: Path) -> None:
         file.put_in_order(trials)
         file.add(ran(4))  # still the same file
     assert [r.seed for r in read_results([tmp_path / "r.jsonl"])] == [9, 0, 1, 2, 4]
+
+
+def test_many_results_are_put_in_order_in_linear_time() -> None:
+    """Each key is looked up a bounded number of times."""
+    lookups = 0
+
+    class Key(str):
+        __slots__ = ()
+
+        def __hash__(self) -> int:
+            nonlocal lookups
+            lookups += 1
+            return super().__hash__()
+
+    trials = [blob_trial(seed) for seed in range(300)]
+    with pytest.MonkeyPatch.context() as patch, ResultsFile(None) as file:
+        patch.setattr("bidnerf.evaluation.results.key_of", lambda trial: Key(trial.seed))
+        file.values = {Key(trial.seed): ran(0) for trial in reversed(trials)}
+        lookups = 0
+        file.put_in_order(trials)
+    assert list(file.values) == [str(trial.seed) for trial in trials]
+    assert lookups <= 10 * len(trials)
 
 
 def test_more_trials_and_other_methods_go_into_the_same_file(
@@ -392,7 +386,7 @@ def test_results_that_are_removed_meanwhile_are_missed(tmp_path: Path, replaced:
 def test_numbers_and_text_that_nothing_can_hold_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, said: str
 ) -> None:
-    line = as_line(to_plain(ran(0))).decode()
+    line = as_line(ran(0).plain()).decode()
     assert old in line
     path = tmp_path / "r.jsonl"
     path.write_text(line.replace(old, new))
@@ -410,8 +404,3 @@ def test_a_trial_that_fails_ends_the_run_and_keeps_the_others(tmp_path: Path) ->
     with ResultsFile(tmp_path / "r.jsonl") as file, refused(found="method 'bid' needs a start"):
         run_trials([good, bad, blob_trial(1)], file)
     assert [r.seed for r in read_results([tmp_path / "r.jsonl"])] == [0]
-
-
-def _circle(count: int) -> list[tuple[float, float]]:
-    angles = torch.arange(count, dtype=torch.float64) * (2 * torch.pi / count)
-    return list(zip(angles.cos().tolist(), angles.sin().tolist(), strict=True))

@@ -25,12 +25,12 @@ from bidnerf.evaluation import (
     TrialResult,
     compare,
     comparison_figure,
-    planned,
+    list_trials,
     run_trial,
     trial,
 )
-from bidnerf.evaluation.comparison import MapRow, map_bytes, measured
-from bidnerf.evaluation.run import InThisProcess, ended_on_failure, own_processes
+from bidnerf.evaluation.comparison import MapRow, map_bytes, run_and_sample
+from bidnerf.evaluation.run import InThisProcess, ended_on_failure, local_processes
 from bidnerf.evaluation.summary import success_of
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.io import from_plain
@@ -75,8 +75,8 @@ def compared(maps: list[Path], data: Path, plan: Plan, tmp_path_factory: pytest.
     (folder / "statistics.py").write_text("raise SystemExit('a file of the user was run')")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        process = own_processes(1)
-        patch.setattr("bidnerf.evaluation.comparison.own_processes", lambda count: process)
+        process = local_processes(1)
+        patch.setattr("bidnerf.evaluation.comparison.local_processes", lambda count: process)
         return compare(maps, data, plan)
 
 
@@ -97,7 +97,7 @@ def test_a_process_elsewhere_finds_what_this_one_finds(
 ) -> None:
     for place in (0, 1):
         trials, found = (
-            planned(plan, str(maps[place]), str(data), open_dataset(data)),
+            list_trials(plan, str(maps[place]), str(data), open_dataset(data)),
             compared.results[place],
         )
         again, found = run_trial(trials[place]), found[place]
@@ -109,10 +109,10 @@ def test_a_process_elsewhere_takes_no_file_of_the_folder_for_a_module(compared: 
 
 
 def test_a_process_keeps_one_map(usual: Trial) -> None:
-    """Its memory is measured as that of one."""
-    trial._opened.cache_clear()
-    measured(usual)
-    assert trial._opened.cache_info().currsize == 1
+    """Its memory is run_and_sample as that of one."""
+    trial._read_scene.cache_clear()
+    run_and_sample(usual)
+    assert trial._read_scene.cache_info().currsize == 1
 
 
 def test_a_row_says_what_the_map_costs(compared: Comparison, maps: list[Path]) -> None:
@@ -129,8 +129,8 @@ def test_samples_are_those_of_the_level_that_the_method_uses(maps: list[Path], u
     trial = replace(usual, map=str(maps[1]), frames=("t_0000",))
     fine = replace(trial, config=json.dumps(json.loads(QUICK) | {"level": None}))
     coarse = replace(trial, config=json.dumps(json.loads(QUICK) | {"level": 0}))
-    assert measured(trial)[1] == measured(coarse)[1]
-    assert measured(fine)[1] > 0
+    assert run_and_sample(trial)[1] == run_and_sample(coarse)[1]
+    assert run_and_sample(fine)[1] > 0
 
 
 def test_speed_is_that_of_the_trials_that_succeeded() -> None:
@@ -187,7 +187,7 @@ class Ending(InThisProcess):
 def test_a_process_that_ends_is_told_in_one_line(
     maps: list[Path], data: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bidnerf.evaluation.comparison.own_processes", lambda count: Ending())
+    monkeypatch.setattr("bidnerf.evaluation.comparison.local_processes", lambda count: Ending())
     with refused(where=maps[0], found="frame t_0002 ended", expected="memory"):
         compare([maps[0]], data, plan)
 

@@ -29,7 +29,7 @@ from bidnerf.evaluation import (
     Trial,
     TrialResult,
     forget_peak_memory,
-    opened,
+    open_scene,
     peak_memory_bytes,
     read_results,
     run_trial,
@@ -39,9 +39,9 @@ from bidnerf.evaluation import (
 from bidnerf.evaluation.run import InThisProcess
 from bidnerf.results import pose_error
 from bidnerf.scenes import closed_form_data, closed_form_map
-from bidnerf_core.datasets import open_dataset
+from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import from_plain, to_plain
+from bidnerf_core.io import from_plain
 from bidnerf_core.localization import find_method
 from bidnerf_core.progress import Progress
 from refusals import refused
@@ -111,10 +111,10 @@ def test_a_table_has_what_the_command_writes(shared: Path, tmp_path: Path, capsy
 @pytest.mark.usefixtures("undrawn")
 def test_a_table_is_summed_up_saved_and_loaded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = bn.evaluate(BLOBS, BLOBS, quick(trials=4))
-    (row,) = table.summary
-    found = row.statistics.success["5deg 0.05"]
+    (group,) = table.groups
+    found = group.summary.success["5deg 0.05"]
     assert found is not None
-    assert (row.start, row.label, found.rate.trials) == ("bid 0.3", "bid", 4)
+    assert (group.title, group.label, found.rate.trials) == ("bid 0.3", "bid", 4)
     assert 0 <= found.rate.low <= found.rate.rate <= found.rate.high <= 1
     assert "5deg 0.05" in str(table)
     assert "bid 0.3" in str(table)
@@ -131,7 +131,7 @@ def test_a_map_is_read_once_until_it_changes(shared: Path, tmp_path: Path) -> No
     for steps in (4, 8):
         words = ["train", str(data), "--out", str(scene), "--overwrite", *tiny.options(steps)]
         assert main(words) == 0
-        found += [opened(str(scene), str(data), plan)[0] for plan in (None, quick(trials=1))]
+        found += [open_scene(scene, data, plan)[0] for plan in (Plan(), quick(trials=1))]
         (row,) = bn.evaluate(scene, data, quick(trials=1)).rows
         assert row.weights == found[-1].training == bn.load_map(scene).info.weights
     assert found[0] is found[1] is not found[2] is found[3]
@@ -166,7 +166,7 @@ def test_what_this_process_alone_has_registered_is_not_mistaken_for_what_is_inst
                 return super().submit(*pickle.loads(pickle.dumps((fn, *args))), **kwargs)
 
     monkeypatch.setattr("bidnerf.evaluation.run.local_processes", lambda count: Elsewhere())
-    monkeypatch.setattr("bidnerf.evaluation.comparison.own_processes", lambda count: Elsewhere())
+    monkeypatch.setattr("bidnerf.evaluation.comparison.local_processes", lambda count: Elsewhere())
     said = "method 'bid' was registered in one process but is unknown in another"
     with refused(found=said):
         bn.evaluate(BLOBS, BLOBS, quick(trials=2), workers=2)
@@ -186,7 +186,7 @@ def test_results_say_where_a_map_in_memory_computed(monkeypatch: pytest.MonkeyPa
         seen.append(trial.device)
         raise LookupError("no trial is run")
 
-    for module, name in (("run", "run_trial"), ("comparison", "measured")):
+    for module, name in (("run", "run_trial"), ("comparison", "run_and_sample")):
         monkeypatch.setattr(import_module(f"bidnerf.evaluation.{module}"), name, stop)
     for begin in (
         lambda: bn.evaluate(elsewhere, tiny.views(2), quick(trials=1)),
@@ -206,15 +206,18 @@ def test_masks_hide_parts_of_the_images_in_every_trial(shared: Path, masks: Mask
         assert main(["evaluate", *words, *more, "--out", str(tmp_path / f"{number}.jsonl")]) == 0
     whole, black, white = (read_results([tmp_path / f"{number}.jsonl"]) for number in range(3))
     assert len({result[0].loss for result in (whole, black, white)}) == 3
-    given = bn.load_map(scene), open_dataset(data, masks=hiding[1])
+    given, hidden = (
+        (bn.load_map(scene), open_dataset(data, masks=hiding[1])),
+        DatasetOptions(None, "test", masks=hiding[1]),
+    )
     in_memory = bn.evaluate(*given, quick(trials=2, seed=5))
-    again = bn.evaluate(scene, data, quick(trials=2, seed=5, masks=hiding[1]))
+    again = bn.evaluate(scene, data, quick(trials=2, seed=5, images=hidden))
     assert [r.T_world_camera for r in in_memory.rows] == [r.T_world_camera for r in black]
     assert timeless(again.rows) == timeless(black)
-    assert black[0].trial.masks == "masks"
+    assert black[0].trial.images.masks == "masks"
     labels = {group.label for group in ResultTable((*whole, *black, *white)).groups}
     assert labels == {"bid, nothing hidden", "bid, black of masks hidden", "bid, white of masks hidden"}
-    compared = bn.compare([bn.load_map(scene)], data, quick(trials=2, seed=5, masks=hiding[1]))
+    compared = bn.compare([bn.load_map(scene)], data, quick(trials=2, seed=5, images=hidden))
     assert placeless(compared.results[0]) == placeless(black)
 
 
@@ -228,11 +231,12 @@ def test_frames_that_masks_hide_wholly_are_named_and_left_out(
     told = f"masks hide 1 whole frame of {len(names)}, not tried: {names[0]}\n"
     assert capsys.readouterr().err.count(told) == 1
     assert {row.frame for row in read_results([tmp_path / "r.jsonl"])} == set(names[1:])
+    images = DatasetOptions(split="test", masks=place)
     with pytest.warns(bn.InputWarning, match="1 whole frame"):
-        found = bn.compare([bn.load_map(scene)], data, quick(trials=6, masks=str(place)))
+        found = bn.compare([bn.load_map(scene)], data, quick(trials=6, images=images))
     assert {row.frame for row in found.results[0]} == set(names[1:])
     with refused(where=place, found=f"1 whole frame of 1, not tried: {names[0]};") as caught:
-        bn.evaluate(scene, data, quick(frames=names[:1], masks=str(place)))
+        bn.evaluate(scene, data, quick(frames=names[:1], images=images))
     assert "--mask-hides" in caught.error.found
 
 
@@ -303,7 +307,12 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
         ({"trials": 0}, "trials is 0", "a whole number, 1 to 100,000"),
         ({"trials": 2.5}, "trials is 2.5", "a whole number, 1 to 100,000"),
         ({"trials": 2.0}, "trials is 2.0", "a whole number"),
-        ({"images": True}, "images is True", "a whole number"),
+        (
+            {"images": DatasetOptions(camera=tiny.CAMERA)},
+            "camera is a Intrinsics",
+            "text, a number or the path of a file",
+        ),
+        ({"images": DatasetOptions("cam.json", "test")}, "leave out camera", None),
         ({"scene": BLOBS, "workers": 0}, "workers is 0", "1 or more"),
         ({"scene": BLOBS, "workers": -1}, "workers is -1", "1 or more"),
         ({"seed": -1}, "seed is -1", "a whole number, 0 to 2,147,483,647"),
@@ -359,7 +368,7 @@ def trial(shared: Path) -> Trial:
 def test_a_line_has_what_localize_prints_and_more(
     trial: Trial, shared: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    line = to_plain(run_trial(trial))
+    line = run_trial(trial).plain()
     capsys.readouterr()
     assert (
         main(

@@ -24,7 +24,7 @@ from bidnerf.evaluation import (
     faulty,
     key_of,
     left_to_do,
-    planned,
+    list_trials,
 )
 
 # Inside: the images of a trial
@@ -44,7 +44,7 @@ def trial(fault: str = NO_FAULT, seed: int = 0) -> Trial:
 
 
 def trials_of(**options: Any) -> list[Trial]:
-    return planned(Plan(**options), "demo:blobs", "demo:blobs", closed_form_data("demo:blobs"))
+    return list_trials(Plan(**options), "demo:blobs", "demo:blobs", closed_form_data("demo:blobs"))
 
 
 def test_a_plan_tries_each_fault_on_the_same_frames() -> None:

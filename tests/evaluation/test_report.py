@@ -24,7 +24,7 @@ from bidnerf.evaluation import (
     Trace,
     Trial,
     TrialResult,
-    grouped,
+    group_results,
     median,
     note_run,
     provenance,
@@ -37,9 +37,8 @@ from bidnerf.evaluation.plots import Figures
 from bidnerf.evaluation.report import page
 from bidnerf.evaluation.summary import situation_titles, situations
 from bidnerf.results import success_rate_by_frame
-from bidnerf_core.datasets import write_transforms
+from bidnerf_core.datasets import DatasetOptions, write_transforms
 from bidnerf_core.errors import InputError
-from bidnerf_core.io import to_plain
 from trial_results import trial_result
 
 STEPS = 10
@@ -72,7 +71,7 @@ def results() -> list[TrialResult]:
 
 
 def test_groups_are_named_by_what_differs(results: list[TrialResult]) -> None:
-    groups = grouped(results)
+    groups = group_results(results)
     assert [g.situation.start for g in groups] == [
         "bid 0.5",
         "bid 0.5",
@@ -83,18 +82,18 @@ def test_groups_are_named_by_what_differs(results: list[TrialResult]) -> None:
     ]
     assert {g.label for g in groups} == {"bid, level 0", "bid, level none"}
     assert [len(g.results) for g in groups] == [6, 6, 6, 6, 12, 12]
-    assert [g.label for g in grouped(results[:6])] == ["bid"]
-    rigs = grouped([result(0, 1), result(0, 1, images=8)])
+    assert [g.label for g in group_results(results[:6])] == ["bid"]
+    rigs = group_results([result(0, 1), result(0, 1, images=8)])
     assert [g.label for g in rigs] == ["bid, 1 image", "bid, 8 images"]
     blind = result(0, 1)
     blind = dataclasses.replace(blind, trial=dataclasses.replace(blind.trial, depth=False))
-    assert [g.label for g in grouped([result(0, 1), blind])] == ["bid, RGB-D", "bid, RGB"]
+    assert [g.label for g in group_results([result(0, 1), blind])] == ["bid, RGB-D", "bid, RGB"]
     other = dataclasses.replace(result(0, 1), weights="weights-2")
-    assert len(situations(grouped([result(0, 1), other]))) == 2
+    assert len(situations(group_results([result(0, 1), other]))) == 2
 
 
 def test_a_summary_counts(results: list[TrialResult]) -> None:
-    by_name = {(g.situation.start, g.label): summarize(g.results) for g in grouped(results)}
+    by_name = {(g.situation.start, g.label): summarize(g.results) for g in group_results(results)}
     slow = by_name["bid, all sizes", "bid, level none"]
     judged = slow.success["10%"]
     assert judged is not None
@@ -186,7 +185,7 @@ def test_without_matplotlib_a_report_tells_what_to_install(
 
 
 def test_figures_are_the_same_each_time(tmp_path: Path, results: list[TrialResult]) -> None:
-    first, second = (Figures(grouped(results[:2]), tmp_path / name, "10%").errors() for name in ("a", "b"))
+    first, second = (Figures(group_results(results[:2]), tmp_path / name, "10%").errors() for name in ("a", "b"))
     assert first[0].read_bytes() == second[0].read_bytes()
 
 
@@ -252,12 +251,14 @@ def test_an_interrupted_report_is_written_again(
 
 def test_datasets_and_maps_are_named_where_they_differ() -> None:
     first = result(0, 2, protocol="none")
-    other = dataclasses.replace(first, trial=dataclasses.replace(first.trial, data="scans", split="val"))
+    other = dataclasses.replace(
+        first, trial=dataclasses.replace(first.trial, data="scans", images=DatasetOptions(split="val"))
+    )
     retrained = dataclasses.replace(first, weights="weights-2.safetensors")
     moved = dataclasses.replace(first, trial=dataclasses.replace(first.trial, map="garden"))
 
     def titles(*found: TrialResult) -> list[str]:
-        return list(situation_titles(situations(grouped(found))).values())
+        return list(situation_titles(situations(group_results(found))).values())
 
     assert titles(first) == ["no start"]
     assert titles(first, other) == ["photos/test: no start", "scans/val: no start"]
@@ -352,7 +353,8 @@ def hostile_result(place: int) -> TrialResult:
     """Return a result that holds every second hostile text wherever a file may hold any text."""
     texts, usual = HOSTILE[place::2], result(place, 2 + place, protocol="none")
     text, name = "".join(texts), "".join(texts).replace("\0", "")
-    trial = dataclasses.replace(usual.trial, map=name, data=name, split=text, device=text, depth_points=name)
+    images = DatasetOptions(name, text, masks=name)
+    trial = dataclasses.replace(usual.trial, map=name, data=name, images=images, device=text)
     return dataclasses.replace(
         usual, settings={each: each for each in texts}, backend=text, weights=text, reason=text, trial=trial
     )
@@ -399,8 +401,8 @@ def test_hostile_names_are_harmless_everywhere(tmp_path: Path, capfd: pytest.Cap
 
 
 def test_a_name_that_no_folder_can_have_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line = json.dumps(to_plain(result(0, 2)))
-    for name in ("map", "data", "depth_points"):
+    line = json.dumps(result(0, 2).plain())
+    for name in ("map", "data", "camera"):
         plain = json.loads(line)
         plain["trial"][name] = "a\0b"
         (tmp_path / "r.jsonl").write_text(json.dumps(plain))

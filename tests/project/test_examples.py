@@ -18,7 +18,11 @@ pytestmark = pytest.mark.slow
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
 QUICK = {"--steps": ["4"], "--descent": ["3"], "--trials": ["2"], "--backends": ["hashgrid", "vanilla"]}
-SHORTENED = {"steps: int = 80": "steps: int = 4", '"max_steps": 100': '"max_steps": 3'}
+SHORTENED = {
+    "steps: int = 80": "steps: int = 4",
+    '"max_steps": 100': '"max_steps": 3',
+    "processes=True": "processes=False",
+}
 """Replacements of text that shorten an example without options."""
 
 

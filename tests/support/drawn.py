@@ -14,6 +14,7 @@ from hypothesis.strategies import SearchStrategy
 
 from bidnerf.evaluation import Trace
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import SE3
 
@@ -70,7 +71,18 @@ def traces() -> SearchStrategy[Trace]:
     return rows.map(lambda pairs: Trace(*zip(*pairs, strict=True)))
 
 
+def dataset_options() -> SearchStrategy[DatasetOptions]:
+    """Options of which JSON can hold every value."""
+    text = st.none() | words
+    units = st.none() | st.floats(1e-6, 1e-2)
+    masked = st.builds(DatasetOptions, text, words, text, units, words, st.sampled_from(["black", "white"]))
+    return masked | st.builds(
+        DatasetOptions, text, words, text | st.booleans(), units, largest=st.none() | st.integers(1, 9)
+    )
+
+
 SPECIAL: dict[type, Callable[[], SearchStrategy[Any]]] = {
+    DatasetOptions: dataset_options,
     Intrinsics: cameras,
     SceneBounds: bounds,
     Trace: traces,
