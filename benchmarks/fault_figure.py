@@ -13,7 +13,7 @@ from typing import Any
 import _lab
 import numpy as np
 
-from bidnerf.results import COLOURS, new_figure, styled, success_rate
+from bidnerf.results import COLOURS, common_style, new_figure, success_rate
 
 DRAWN = {
     "right": ("right", COLOURS[2]),
@@ -67,7 +67,7 @@ def main() -> None:
     given = parser.parse_args()
     modes = pooled(given.records)
     rows = max(len(cells) for cells in modes.values())
-    with styled():
+    with common_style():
         figure = new_figure(len(modes) * WIDTH, rows * ROW * 1.6 + 1.1)
         axes = figure.subplots(1, len(modes), squeeze=False).flatten()
         for panel, (mode, cells) in zip(axes, modes.items(), strict=True):

@@ -18,7 +18,7 @@ from typing import Any
 from _lab import BOUND, parser, record, within
 from confidence import assessed
 
-from bidnerf.results import COLOURS, new_figure, styled
+from bidnerf.results import COLOURS, common_style, new_figure
 
 CRITERIA = {
     "right": lambda row: within(row),
@@ -69,7 +69,7 @@ def main() -> None:
     arguments.add_argument("--out", type=Path, required=True, help="of the figure, a PNG")
     given = arguments.parse_args()
     results = {path.name.split(".")[0]: reliability(rows_of(path)) for path in given.rows}
-    with styled():
+    with common_style():
         figure = new_figure(4.6 * len(results), 4.0)
         axes = figure.subplots(1, len(results), squeeze=False).flatten()
         for panel, (name, found) in zip(axes, results.items(), strict=True):

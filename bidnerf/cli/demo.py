@@ -123,7 +123,7 @@ def _draw(stored: Map, trials: list[Trial], out: Path) -> None:
         rows = (
             painter.row(painter.observed, "observed", auto.T_world_camera, "found by auto, no start"),
             painter.row(
-                painter.rendered(start),
+                painter.render(start),
                 "rendered at the start",
                 bid.T_world_camera,
                 "found by bid from there",
@@ -135,6 +135,6 @@ def _draw(stored: Map, trials: list[Trial], out: Path) -> None:
     # Denser at the beginning, where most of the motion happens.
     moments = sorted({round(steps * (i / (ANIMATED - 1)) ** 2) for i in range(ANIMATED)})
     with console.status("drawing the animation"):
-        save_gif(out / "localization.gif", [painter.blended(path[i]) for i in moments])
+        save_gif(out / "localization.gif", [painter.blend(path[i]) for i in moments])
     show(f"look at {out / 'overlay-*.png'}, {out / 'localization.gif'}")
     show(f"see why a pose was found: bidnerf view {out / 'map'} {out / 'data'}")

@@ -233,7 +233,7 @@ class Run:
             scene = self.answers.scene
             assert scene is not None
             assert not isinstance(scene, MapCollection)
-            picture = overlay(scene, query.frame, answer.found, self.start(query))
+            picture = overlay(scene, query.frame, answer.localization, self.start(query))
             write_file(self.output.picture(query.name), png_bytes(picture))
 
     @contextlib.contextmanager
@@ -257,8 +257,8 @@ class Run:
                     scene = answers.scene
                     more = f" in {len(scene)} maps" if isinstance(scene, MapCollection) else ""
                     say(f"{len(answers.accepted)} of {total} converged{more}")
-                if is_whole and answers.remark is not None:
-                    say(answers.remark)
+                if is_whole and answers.world_mismatch is not None:
+                    say(answers.world_mismatch)
                 is_written = out is not None and bool(answers.given if takes_all else answers.accepted)
                 if out is not None and is_written:
                     answers.save(out)
@@ -275,7 +275,7 @@ def answer_lines(answer: Answer, full: bool) -> list[str]:
     from bidnerf.results import OPENCV_AXES, standard_deviations
     from bidnerf_core.geometry import symbol
 
-    found, error, placement = answer.found, answer.error, answer.placement
+    found, error, placement = answer.localization, answer.error, answer.placement
     verdict = "converged" if found.converged else f"NOT converged: {found.outcome.value}"
     verdict = f"{verdict} ({found.reason})"
     world, runner_up = "", []

@@ -32,11 +32,11 @@ from bidnerf.evaluation.summary import (
 from bidnerf.evaluation.trial import TrialResult
 from bidnerf.results import (
     CRITERION_NAMES,
-    line_look,
+    common_style,
+    line_style,
     new_figure,
     require_matplotlib,
     save_figure,
-    styled,
 )
 
 WIDTH, COLUMNS = 10.8, 3
@@ -100,7 +100,7 @@ class Figures:
         self.folder, self.criterion = folder, criterion
         self.groups = [g for g in groups if g.situation.fault == NO_FAULT] or list(groups)
         labels = dict.fromkeys(group.label for group in groups)
-        self.looks = {label: line_look(number) for number, label in enumerate(labels)}
+        self.looks = {label: line_style(number) for number, label in enumerate(labels)}
 
     def all(self) -> list[Figure]:
         """Draw every figure for which the results have data."""
@@ -208,7 +208,7 @@ class Figures:
         beside = 2 if len(looks) > 2 and max(map(len, looks)) < WIDTH / 2 * PER_INCH else 1
         labels = [_wrapped(label, WIDTH / beside - 0.5) for label in looks]
         legend = 0.35 + 0.2 * sum(label.count("\n") + 1 for label in labels) / beside
-        with styled():
+        with common_style():
             figure = new_figure(WIDTH, rows * (2.7 + 0.15 * max(t.count("\n") for t in titles)) + legend)
             axes = figure.subplots(rows, columns, squeeze=False).flatten()
             for panel, title, (_, draw) in zip(axes, titles, panels, strict=False):

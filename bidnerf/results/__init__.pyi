@@ -30,12 +30,12 @@ from .overlays import save_gif as save_gif
 from .overlays import tile as tile
 from .plots import COLOURS as COLOURS
 from .plots import CRITERION_NAMES as CRITERION_NAMES
+from .plots import common_style as common_style
 from .plots import draw_capture as draw_capture
-from .plots import line_look as line_look
+from .plots import line_style as line_style
 from .plots import new_figure as new_figure
 from .plots import require_matplotlib as require_matplotlib
 from .plots import save_figure as save_figure
-from .plots import styled as styled
 from .plots import write_figure as write_figure
 from .pose_files import OPENCV_AXES as OPENCV_AXES
 from .pose_files import PosedImage as PosedImage

@@ -50,55 +50,57 @@ BAD_INPUT = "bad input"
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The pose found for an image, and what is known about the image. The image itself is not kept."""
+    """The localization of an image, and what is known about the image, which is not stored."""
 
     name: str
     number: int  # index in the run or sequence, from 0
     intrinsics: Intrinsics  # of the upright image; corrected if the localization corrected them
-    found: Localization
+    localization: Localization
     truth: SE3 | None = None  # T_world_camera
     time: float | None = None  # seconds
     file: Path | None = None
     placement: Placement | None = None  # in one of several maps
 
     @staticmethod
-    def of(frame: Frame, number: int, found: Localization, **about: Any) -> Answer:
+    def of(frame: Frame, number: int, localization: Localization, **about: Any) -> Answer:
         """Build the answer for a frame; ``about`` holds further attributes of the answer.
 
-        Only the final pose is kept: intermediate ones take up a lot of memory in long sequences.
+        Only the final pose is stored: intermediate ones take up a lot of memory in long sequences.
         """
-        intrinsics = found.frame_as_taken(frame).intrinsics
-        return Answer(frame.name, number, intrinsics, replace(found, poses=found.poses[-1:], shown=None), **about)
+        intrinsics = localization.frame_as_taken(frame).intrinsics
+        return Answer(
+            frame.name, number, intrinsics, replace(localization, poses=localization.poses[-1:], shown=None), **about
+        )
 
     @property
     def accepted(self) -> bool:
         """Whether the localization converged to a finite pose."""
-        return self.found.converged and self.is_finite
+        return self.localization.converged and self.is_finite
 
     @property
     def is_finite(self) -> bool:
         """Whether the pose consists of finite numbers."""
-        return bool(self.found.T_world_camera.matrix().isfinite().all())
+        return bool(self.localization.T_world_camera.matrix().isfinite().all())
 
     @property
     def error(self) -> PoseError | None:
-        """The error of the pose found, or None if the true pose is unknown."""
-        found = self.found
-        return None if self.truth is None else pose_error(found.T_world_camera, self.truth, found.unit)
+        """The error of the pose, or None if the true pose is unknown."""
+        localization = self.localization
+        return None if self.truth is None else pose_error(localization.T_world_camera, self.truth, localization.unit)
 
     @property
-    def posed(self) -> PosedImage:
-        """The image as listed in pose files."""
-        found = self.found
+    def posed_image(self) -> PosedImage:
+        """The image with its pose, for pose files."""
+        localization = self.localization
         return PosedImage(
             self.name,
             self.number,
             self.intrinsics,
-            found.T_world_camera,
+            localization.T_world_camera,
             self.file,
             self.time,
-            found.covariance,
-            found.unit,
+            localization.covariance,
+            localization.unit,
         )
 
 
@@ -143,7 +145,7 @@ class Answers:
     def add(
         self,
         frame: Frame,
-        found: Localization,
+        localization: Localization,
         time: float | None = None,
         truth: SE3 | None = None,
         number: int | None = None,
@@ -157,12 +159,12 @@ class Answers:
         if frame.camera_source and frame.camera_source not in self._camera_sources:
             self._camera_sources.add(frame.camera_source)
             log.info("%s: %s", frame.name, frame.camera_source)
-        answer = Answer.of(frame, number, found, truth=truth, time=time)
+        answer = Answer.of(frame, number, localization, truth=truth, time=time)
         self.append(answer)
-        if not found.converged and self._lost_at is None:
+        if not localization.converged and self._lost_at is None:
             self._lost_at = len(self)
-            log.info("frame %d (%s): %s: %s", number + 1, frame.name, found.outcome, found.reason)
-        elif found.converged and self._lost_at is not None:
+            log.info("frame %d (%s): %s: %s", number + 1, frame.name, localization.outcome, localization.reason)
+        elif localization.converged and self._lost_at is not None:
             missed = amount(len(self) - self._lost_at, "frame")
             log.info("frame %d (%s): tracking again after %s", number + 1, frame.name, missed)
             self._lost_at = None
@@ -182,7 +184,7 @@ class Answers:
         if isinstance(answer, Answer):
             placement = answer.placement
             backend = backend if placement is None else placement.backend
-            values |= plain_localization(answer.found, backend, answer.error)
+            values |= plain_localization(answer.localization, backend, answer.error)
         else:
             values |= {
                 "T_world_camera": None,
@@ -218,23 +220,23 @@ class Answers:
         return [answer for answer in self.given if isinstance(answer, Answer)]
 
     @property
-    def remark(self) -> str | None:
+    def world_mismatch(self) -> str | None:
         """A remark if one similarity transform explains all pose errors, as for true poses in another world frame; else None."""
-        known = self._known
-        if known is None or len(known[0].translation) < 4:  # a similarity fits nearly any three pairs of positions
+        poses = self._compared_poses
+        if poses is None or len(poses[0].translation) < 4:  # a similarity fits nearly any three pairs of positions
             return None
-        found, true = known[0].translation.double(), known[1].translation.double()
+        estimated, true = (T.translation.double() for T in poses)
         try:
-            worlds = fit_similarity(true, found)
+            worlds = fit_similarity(true, estimated)
         except InputError:
             return None
-        left, error = (torch.linalg.vector_norm(found - of, dim=-1) for of in (worlds.apply(true), true))
+        left, error = (torch.linalg.vector_norm(estimated - of, dim=-1) for of in (worlds.apply(true), true))
         if not bool(left.max() < 0.1 * error.median()):  # it must explain the errors of all poses
             return None
         T = worlds.T_target_source
         turn, shift = float(rotation_angle(T.rotation)), float(torch.linalg.vector_norm(T.translation))
         return (
-            f"all {len(found)} accepted poses differ from the dataset's by one transformation (a rotation by"
+            f"all {len(estimated)} accepted poses differ from the dataset's by one transformation (a rotation by"
             f" {math.degrees(turn):.3g}°, a scale of {worlds.scale:.4g} and a shift of {shift:.3g} {symbol(self.unit)}): the"
             " dataset's world is not that of the map"
         )
@@ -252,7 +254,7 @@ class Answers:
             write_file(path, f"[\n{rows}\n]\n".encode())
             return
         accepted = self.accepted
-        write_poses(path, [answer.posed for answer in accepted])
+        write_poses(path, [answer.posed_image for answer in accepted])
         if left_out := len(self) - len(accepted):
             poses = amount(len(accepted), "pose")
             log.info("%s: %s; %d without an accepted pose are left out", path, poses, left_out)
@@ -274,11 +276,11 @@ class Answers:
             rows.append(row)
             if isinstance(each, Failure):
                 continue
-            T, found = each.found.T_world_camera.to("cpu", torch.float64), each.found
+            T, localization = each.localization.T_world_camera.to("cpu", torch.float64), each.localization
             row |= zip(("x", "y", "z"), T.translation.tolist(), strict=True)
             row |= zip(("qx", "qy", "qz", "qw"), T.quaternion("xyzw").tolist(), strict=True)
-            if found.covariance is not None:
-                position, rotation = standard_deviations(found.covariance)
+            if localization.covariance is not None:
+                position, rotation = standard_deviations(localization.covariance)
                 row |= {"sigma_translation": position, "sigma_rotation_deg": math.degrees(rotation)}
             if (off := each.error) is not None:
                 row |= {
@@ -294,17 +296,17 @@ class Answers:
 
     def errors(self) -> TrajectoryErrors | None:
         """Return the errors of the accepted poses whose truth is known, or None if there are none."""
-        known = self._known
+        known = self._compared_poses
         return None if known is None else TrajectoryErrors.of(*known, self.unit)
 
     @property
-    def _known(self) -> tuple[SE3, SE3] | None:
+    def _compared_poses(self) -> tuple[SE3, SE3] | None:
         """The accepted poses whose true poses are known, and the true poses; None if there are none."""
-        known = [(answer.found.T_world_camera, answer.truth) for answer in self.accepted if answer.truth]
+        known = [(answer.localization.T_world_camera, answer.truth) for answer in self.accepted if answer.truth]
         if not known:
             return None
-        found, true = (SE3.stack(list(poses)) for poses in zip(*known, strict=True))
-        return found, true
+        estimated, true = (SE3.stack(list(poses)) for poses in zip(*known, strict=True))
+        return estimated, true
 
     def plot(self, file: str | Path, surface: SurfaceMap | None = None, up: UpDirection | None = None) -> None:
         """Plot the trajectory over the surface of its map, as PNG or SVG by file extension.
@@ -315,10 +317,10 @@ class Answers:
         drawn, origin = [answer for answer in self.answers if answer.is_finite], origin_of(self.scene)
         if not drawn:
             raise InputError("not drawn, since no frame was tracked", where=file)
-        covariances = [answer.found.covariance for answer in drawn]
+        covariances = [answer.localization.covariance for answer in drawn]
         deviations = [math.nan if c is None else standard_deviations(c)[0] for c in covariances]
         draw_path(
-            SE3.stack([answer.found.T_world_camera for answer in drawn]).translated(-origin),
+            SE3.stack([answer.localization.T_world_camera for answer in drawn]).translated(-origin),
             torch.tensor([answer.accepted for answer in drawn]),
             torch.tensor(deviations, dtype=torch.float64),
             [None if answer.truth is None else answer.truth.translated(-origin) for answer in drawn],
@@ -347,9 +349,9 @@ class Answers:
             if errors.rpe is not None:
                 rows.append(("RPE per frame", str(errors.rpe)))
         inside = [
-            bool(within(answer.found.T_world_camera, answer.truth, answer.found.covariance))
+            bool(within(answer.localization.T_world_camera, answer.truth, answer.localization.covariance))
             for answer in self.accepted
-            if answer.truth is not None and answer.found.covariance is not None
+            if answer.truth is not None and answer.localization.covariance is not None
         ]
         if inside:
             share = sum(inside) / len(inside)
@@ -370,9 +372,9 @@ class Answers:
         return [(name, text) for name, text in rows if text]
 
 
-def plain_localization(found: Localization, backend: str, error: PoseError | None) -> dict[str, Any]:
+def plain_localization(localization: Localization, backend: str, error: PoseError | None) -> dict[str, Any]:
     """Return the JSON values of a localization, the backend of its map, and its error if known."""
-    return found.plain() | {"backend": backend, "error": None if error is None else error.plain()}
+    return localization.plain() | {"backend": backend, "error": None if error is None else error.plain()}
 
 
 def localize_each(
@@ -413,17 +415,17 @@ def localize_each(
                         )
                         raise InputError(rig, where=name, expected=expected)
                     placement = localizer(query.views[0].frame, seed)
-                    found, truth = placement.found, None
+                    localization, truth = placement.found, None
                 else:
                     if number == 0:
                         _log_depth(query, localizer.shared.depth_sensor)
                     begin = None if start is None else start(query)
-                    found = localizer(query.views, begin, query.depth_rays, seed)
+                    localization = localizer(query.views, begin, query.depth_rays, seed)
                 frame = query.frame.replace(name=query.name)
-                answer = Answer.of(frame, number, found, truth=truth, file=query.file, placement=placement)
+                answer = Answer.of(frame, number, localization, truth=truth, file=query.file, placement=placement)
                 if placement is None and not answer.is_finite:
                     raise InputError(
-                        f"{found.method} diverged to a pose that is not finite; is the map valid?", where=name
+                        f"{localization.method} diverged to a pose that is not finite; is the map valid?", where=name
                     )
             except UsageError:
                 raise

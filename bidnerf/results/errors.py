@@ -46,25 +46,25 @@ class PoseError:
         return values if all(map(math.isfinite, values.values())) else None
 
 
-def pose_error(found: SE3, true: SE3, unit: LengthUnit = "units") -> PoseError:
-    """Return the error of ``found`` relative to ``true`` in float64, with broadcasting over batches.
+def pose_error(estimated: SE3, true: SE3, unit: LengthUnit = "units") -> PoseError:
+    """Return the error of ``estimated`` relative to ``true`` in float64, with broadcasting over batches.
 
     The error is not finite if a pose is not finite. ``unit`` is the length unit of the poses, used to print the
     error.
     """
-    found, true = found.to(dtype=torch.float64), true.to(dtype=torch.float64)
-    distance = torch.linalg.vector_norm(found.translation - true.translation, dim=-1)
-    return PoseError(distance, torch.rad2deg(rotation_angle(true.rotation.mT @ found.rotation)), unit)
+    estimated, true = estimated.to(dtype=torch.float64), true.to(dtype=torch.float64)
+    distance = torch.linalg.vector_norm(estimated.translation - true.translation, dim=-1)
+    return PoseError(distance, torch.rad2deg(rotation_angle(true.rotation.mT @ estimated.rotation)), unit)
 
 
-def normalized_error_squared(found: SE3, true: SE3, covariance: Float[Tensor, "*c 6 6"]) -> Float[Tensor, "*b"]:
-    """Return the squared error normalized by its covariance C: ``xi^T C^-1 xi`` with ``true = found exp(xi)``.
+def normalized_error_squared(estimated: SE3, true: SE3, covariance: Float[Tensor, "*c 6 6"]) -> Float[Tensor, "*b"]:
+    """Return the squared error normalized by its covariance C: ``xi^T C^-1 xi`` with ``true = estimated exp(xi)``.
 
     xi and C hold the translation (unit of the poses), then the rotation (radians). If C is consistent, the
     result follows a chi-squared distribution with 6 degrees of freedom (Bar-Shalom et al. 2001, "Estimation
     with applications to tracking and navigation", 5.4.2). It is infinite or NaN if C has no inverse.
     """
-    xi = (found.to(dtype=torch.float64).inverse() @ true.to(dtype=torch.float64)).log()
+    xi = (estimated.to(dtype=torch.float64).inverse() @ true.to(dtype=torch.float64)).log()
     solved, _ = torch.linalg.solve_ex(covariance.double(), xi[..., None])
     return (xi * solved[..., 0]).sum(-1)
 
@@ -75,14 +75,16 @@ def standard_deviations(covariance: Float[Tensor, "6 6"]) -> tuple[float, float]
     return position, rotation
 
 
-def within(found: SE3, true: SE3, covariance: Float[Tensor, "*c 6 6"], probability: float = 0.95) -> Bool[Tensor, "*b"]:
-    """Return whether the error of ``found`` lies within the confidence bound that its covariance implies.
+def within(
+    estimated: SE3, true: SE3, covariance: Float[Tensor, "*c 6 6"], probability: float = 0.95
+) -> Bool[Tensor, "*b"]:
+    """Return whether the error of ``estimated`` lies within the confidence bound that its covariance implies.
 
     The bound is the quantile of the chi-squared distribution with 6 degrees of freedom, 12.59 for 0.95. If
     the covariances are consistent, that fraction of errors lies within the bound. The result is False if the
     covariance has no inverse.
     """
-    return normalized_error_squared(found, true, covariance) <= chi_squared_quantile(probability, 6)
+    return normalized_error_squared(estimated, true, covariance) <= chi_squared_quantile(probability, 6)
 
 
 def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
@@ -192,8 +194,8 @@ def success_rate_by_frame(outcomes: Sequence[bool], frames: Sequence[Hashable]) 
         variance = count / (count - 1) * squares / trials**2
         quantiles = t.ppf(0.975, [trials - 1, count - 1])
         correction = float(quantiles[0] / quantiles[1]) ** 2
-        found = correction * share * (1 - share) / variance if variance > 0 else math.inf
-        effective = min(max(found, 1.0), float(trials))
+        size = correction * share * (1 - share) / variance if variance > 0 else math.inf
+        effective = min(max(size, 1.0), float(trials))
     return _with_interval(successes, trials, effective, count)
 
 
@@ -247,29 +249,29 @@ class TrajectoryErrors:
     rpe: ErrorSummary | None  # of the motion between consecutive poses
 
     @staticmethod
-    def of(found: SE3, true: SE3, unit: LengthUnit = "units") -> TrajectoryErrors:
+    def of(estimated: SE3, true: SE3, unit: LengthUnit = "units") -> TrajectoryErrors:
         """Compare estimated with true poses ``T_world_camera`` (n, in ``unit``), in chronological order.
 
         Raises ``InputError`` if there are no poses.
         """
-        count = len(found.translation)
+        count = len(estimated.translation)
         # Fewer than three poses do not determine an alignment.
-        distances = alignment_errors(found, true) if count >= 3 else None
+        distances = alignment_errors(estimated, true) if count >= 3 else None
         return TrajectoryErrors(
             count,
-            ErrorSummary.of(pose_error(found, true, unit)),
+            ErrorSummary.of(pose_error(estimated, true, unit)),
             None if distances is None else float(distances.square().mean().sqrt()),
-            ErrorSummary.of(replace(relative_errors(found, true), unit=unit)) if count > 1 else None,
+            ErrorSummary.of(replace(relative_errors(estimated, true), unit=unit)) if count > 1 else None,
         )
 
 
-def alignment_errors(found: SE3, true: SE3) -> Float[Tensor, "n"] | None:
+def alignment_errors(estimated: SE3, true: SE3) -> Float[Tensor, "n"] | None:
     """Return the absolute trajectory error of each pose: its distance from the true position after a rigid alignment.
 
     The alignment minimizes the squared distances between the estimated and the true camera centres, without scaling. The
     errors are in the unit of the poses. Returns None if the camera did not move, since the rotation is then undetermined.
     """
-    source, target = found.translation.double(), true.translation.double()
+    source, target = estimated.translation.double(), true.translation.double()
     try:
         rotation = fit_similarity(source, target).T_target_source.rotation
     except InputError:
@@ -277,19 +279,19 @@ def alignment_errors(found: SE3, true: SE3) -> Float[Tensor, "n"] | None:
     return torch.linalg.vector_norm((source - source.mean(0)) @ rotation.mT - (target - target.mean(0)), dim=-1)
 
 
-def relative_errors(found: SE3, true: SE3) -> PoseError:
+def relative_errors(estimated: SE3, true: SE3) -> PoseError:
     """Return the relative pose errors (n - 1) of the motion between consecutive poses (Sturm et al. 2012, eq. 2)."""
-    found, true = found.to(torch.float64), true.to(torch.float64)
-    moved = [T[:-1].inverse() @ T[1:] for T in (found, true)]
+    estimated, true = estimated.to(torch.float64), true.to(torch.float64)
+    moved = [T[:-1].inverse() @ T[1:] for T in (estimated, true)]
     return pose_error(moved[0], moved[1])
 
 
 def spans(flags: Sequence[bool]) -> list[tuple[int, int]]:
     """Return each run of true flags as its first and last index, both inclusive."""
-    found: list[tuple[int, int]] = []
-    for place, flag in enumerate(flags):
-        if flag and found and found[-1][1] == place - 1:
-            found[-1] = (found[-1][0], place)
+    runs: list[tuple[int, int]] = []
+    for index, flag in enumerate(flags):
+        if flag and runs and runs[-1][1] == index - 1:
+            runs[-1] = (runs[-1][0], index)
         elif flag:
-            found.append((place, place))
-    return found
+            runs.append((index, index))
+    return runs

@@ -28,12 +28,12 @@ to which smaller images are enlarged, so that captions fit."""
 
 
 def overlay(
-    scene: SceneMap, frame: Frame, found: Localization | Start, start: Start | None = None
+    scene: SceneMap, frame: Frame, pose: Localization | Start, start: Start | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return one picture of a photo, the map rendered from a pose, and both blended with the edges of each.
 
-    ``found`` is the localization of the photo, whose corrected intrinsics are used if it has any, or a pose
-    ``T_world_camera``. If ``start`` is given, a second row shows the map rendered from that pose. The photo is
+    ``pose`` is a pose ``T_world_camera``, or the localization of the photo, whose corrected intrinsics are used if
+    it has any. If ``start`` is given, a second row shows the map rendered from that pose. The photo is
     downscaled to at most 640 pixels a side, since each rendered pixel takes time. Raises ``InputError`` for arguments
     that are not a map, a frame or a pose.
     """
@@ -43,10 +43,10 @@ def overlay(
             f"frame is a {type(frame).__name__}", where="overlay", expected="a Frame, such as that of a View"
         )
     frame = frame.over(scene.bounds.background)
-    if isinstance(found, Localization):
-        frame, found = found.frame_as_taken(frame), found.T_world_camera
-    painter, pose = Painter(scene, frame, 640), start_pose(found, "found")
-    rows = [painter.row(painter.observed, "observed", pose, "rendered at the pose found")]
+    if isinstance(pose, Localization):
+        frame, pose = pose.frame_as_taken(frame), pose.T_world_camera
+    painter = Painter(scene, frame, 640)
+    rows = [painter.row(painter.observed, "observed", start_pose(pose, "pose"), "rendered at the pose found")]
     if start is not None:
         rows.append(painter.row(painter.observed, "observed", start_pose(start), "rendered at the start"))
     return np.concatenate(rows, axis=0)
@@ -62,20 +62,20 @@ class Painter:
         size = (self._camera.width, self._camera.height)
         self.observed: Float[Tensor, "h w 3"] = frame.rgb if scale >= 1 else reduced(frame.rgb, *size)
 
-    def rendered(self, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
+    def render(self, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
         """Render the map with the photo's camera at a pose."""
         T = T_world_camera.translated(-origin_of(self._map))
         return render_picture(self._map.field, self._camera, T, self._map.bounds).rgb
 
-    def blended(self, T_world_camera: SE3) -> UInt8[np.ndarray, "h w 3"]:
+    def blend(self, T_world_camera: SE3) -> UInt8[np.ndarray, "h w 3"]:
         """Return the photo blended with the rendering, with the edges of each."""
-        return blend(self.observed, self.rendered(T_world_camera))
+        return blend(self.observed, self.render(T_world_camera))
 
     def row(
-        self, left: Float[Tensor, "h w 3"], left_caption: str, found: SE3, caption: str
+        self, left: Float[Tensor, "h w 3"], left_caption: str, T_world_camera: SE3, caption: str
     ) -> UInt8[np.ndarray, "H W 3"]:
-        """Return ``left``, the rendering at the pose ``found``, and the blend of photo and rendering, side by side."""
-        rendered = self.rendered(found)
+        """Return ``left``, the rendering at a pose, and the blend of photo and rendering, side by side."""
+        rendered = self.render(T_world_camera)
         blended = blend(self.observed, rendered)
         tiles = ((left, left_caption), (rendered, caption), (blended, "edges: photo green, map pink"))
         return np.concatenate([tile(*each) for each in tiles], axis=1)
@@ -159,7 +159,7 @@ class TrackingVideo:
         self._partial = file.with_name(f".{file.stem}.partial{file.suffix}")
         self._output: Any = None
         self._stream: Any = None
-        self._began, self._latest = 0.0, -1
+        self._start, self._latest = 0.0, -1
 
     def __enter__(self) -> TrackingVideo:
         return self
@@ -175,23 +175,23 @@ class TrackingVideo:
         """Add a frame next to the rendered map; a frame without colour is shown by its depth, as grey values up to 5 m."""
         import av
 
-        found = answer.found
-        painter = Painter(self._scene, found.frame_as_taken(frame))
+        localization = answer.localization
+        painter = Painter(self._scene, localization.frame_as_taken(frame))
         observed = painter.observed
         if frame.depth is not None and not frame.has_colour:
             grey = (frame.depth.cpu() / 5.0).clamp(0, 1)[None, None]
             size = (observed.shape[0], observed.shape[1])
             observed = torch.nn.functional.interpolate(grey, size)[0].permute(1, 2, 0).expand(-1, -1, 3)
-        caption = "rendered at the pose found" if found.converged else f"not accepted: {found.outcome}"
+        caption = "rendered at the pose found" if localization.converged else f"not accepted: {localization.outcome}"
         tiles = (
             tile(observed, f"observed: {frame.name}"),
-            tile(painter.rendered(found.T_world_camera), caption),
+            tile(painter.render(localization.T_world_camera), caption),
         )
         picture = Image.fromarray(np.concatenate(tiles, axis=1))
         # Frames without timestamps are shown at 30 frames per second.
         time = answer.number / 30 if answer.time is None else answer.time
         if self._stream is None:
-            self._output, self._began = av.open(str(self._partial), "w"), time
+            self._output, self._start = av.open(str(self._partial), "w"), time
             # At this quality, hardly any loss is visible.
             codec = CODECS[self._file.suffix.lower()]
             self._stream = self._output.add_stream(codec, rate=1000, options={"crf": "20"})  # times in ms
@@ -199,6 +199,6 @@ class TrackingVideo:
             self._stream.pix_fmt = "yuv420p"
         picture = picture.resize((self._stream.width, self._stream.height))
         shown = av.VideoFrame.from_image(picture)
-        self._latest = max(self._latest + 1, round(1000 * (time - self._began)))
+        self._latest = max(self._latest + 1, round(1000 * (time - self._start)))
         shown.pts, shown.time_base = self._latest, Fraction(1, 1000)
         self._output.mux(self._stream.encode(shown))

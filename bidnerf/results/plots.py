@@ -45,7 +45,7 @@ def require_matplotlib() -> Any:
     return matplotlib
 
 
-def styled() -> Any:
+def common_style() -> Any:
     """Return a context in which figures are drawn and saved in the common style."""
     style = {
         "font.family": "DejaVu Sans",
@@ -102,7 +102,7 @@ def write_figure(figure: Any, *paths: Path, dpi: int = 150) -> None:
         text.set_text(_drawable(text.get_text()))
     for formatter in (axis.get_major_formatter() for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
         if isinstance(formatter, FuncFormatter):  # its labels are set again whenever a figure is drawn
-            formatter.func = lambda *place, labels=formatter.func: _drawable(str(labels(*place)))
+            formatter.func = lambda *given, labels=formatter.func: _drawable(str(labels(*given)))
     for path in paths:
         file, suffix = io.BytesIO(), path.suffix.lstrip(".") or "png"
         figure.savefig(file, format=suffix, dpi=dpi, metadata={"Date": None} if suffix == "svg" else {})
@@ -116,9 +116,9 @@ def _drawable(text: str) -> str:
     return "\n".join(line if len(line) <= 200 else line[:197] + "..." for line in lines)
 
 
-def line_look(place: int) -> dict[str, Any]:
-    """Return the colour, dash pattern and width of line number ``place``."""
-    turn, colour = divmod(place, len(COLOURS))
+def line_style(number: int) -> dict[str, Any]:
+    """Return the colour, dash pattern and width of a line, given its number."""
+    turn, colour = divmod(number, len(COLOURS))
     return {"color": COLOURS[colour], "linestyle": ("-", "--", ":", "-.")[turn % 4], "linewidth": 1.6}
 
 
@@ -141,7 +141,7 @@ def draw_capture(
         for name in ("position", "direction")
     )
     cameras, directions = ((position - centre) @ axes).numpy(), (ahead @ axes).numpy()
-    with styled():
+    with common_style():
         figure = new_figure(7.6, 7.0)
         panel = figure.add_subplot()
         # The plot shows the cameras and the centre with a margin; landmarks farther away are left out.
@@ -155,12 +155,12 @@ def draw_capture(
             figure.colorbar(drawn, ax=panel, label="photos that show a landmark", shrink=0.7, pad=0.02)
         panel.quiver(*cameras.T, *directions.T, color="#555", scale=25, width=0.002, headwidth=1, zorder=2)
         worst = [photo.problems[0] if photo.problems else "without a finding" for photo in report.photos]
-        for place, problem in enumerate(("without a finding", *get_args(PhotoProblem))):
+        for rank, problem in enumerate(("without a finding", *get_args(PhotoProblem))):
             here = [number for number, each in enumerate(worst) if each == problem]
-            look = {"color": COLOURS[(place + 2) % len(COLOURS)], "marker": "oPvXsDh*"[place % 8]}
+            style = {"color": COLOURS[(rank + 2) % len(COLOURS)], "marker": "oPvXsDh*"[rank % 8]}
             if here:
-                label, size = f"{problem} ({len(here)})", 55 if place else 18
-                panel.scatter(*cameras[here].T, s=size, label=label, edgecolors="white", zorder=3, **look)
+                label, size = f"{problem} ({len(here)})", 55 if rank else 18
+                panel.scatter(*cameras[here].T, s=size, label=label, edgecolors="white", zorder=3, **style)
         for photo, camera in zip(report.photos, cameras, strict=True):
             if photo.problems:
                 panel.annotate(photo.name, camera, (4, 4), textcoords="offset points", fontsize=6)
@@ -193,7 +193,7 @@ def draw_path(
     right, back = horizontal_axes(up.tensor())
     scale, fine = (1000.0, "mm") if unit == "metres" else (1.0, "units")
     known = [T.translation.double().numpy() for T in truth if T is not None]
-    with styled():
+    with common_style():
         figure = new_figure(9.6, 4.9)
         panels = figure.subplots(1, 2)
         for panel, upward, title in zip(panels, (back, up.tensor()), ("from above", "from the side"), strict=True):
@@ -211,10 +211,10 @@ def draw_path(
                 panel.scatter(*points[some].T, s=2, c=paint, linewidths=0, rasterized=True)
             if known:
                 panel.plot(*(np.array(known) @ projection).T, color="#000", linewidth=0.8, label="ground truth")
-            found, colours = accepted.numpy(), scale * deviations.double().numpy()
-            if not found.all():
-                panel.scatter(*places[~found].T, s=14, marker="x", color=COLOURS[1], label="lost")
-            marks = panel.scatter(*places[found].T, c=colours[found], s=9, label="tracked", zorder=3)
+            is_accepted, colours = accepted.numpy(), scale * deviations.double().numpy()
+            if not is_accepted.all():
+                panel.scatter(*places[~is_accepted].T, s=14, marker="x", color=COLOURS[1], label="lost")
+            marks = panel.scatter(*places[is_accepted].T, c=colours[is_accepted], s=9, label="tracked", zorder=3)
             panel.set(title=title, xlabel=unit, aspect="equal")
         label = f"standard deviation of the position ({fine})"
         figure.colorbar(marks, ax=list(panels), label=label, shrink=0.85)

@@ -47,10 +47,10 @@ class PosedImage:
     @property
     def pose(self) -> SE3:
         """T_world_camera in float64, on the CPU. Raises ``InputError`` if it is not finite."""
-        found = self.T_world_camera.to("cpu", torch.float64)
-        if not bool(found.matrix().isfinite().all()):
+        pose = self.T_world_camera.to("cpu", torch.float64)
+        if not bool(pose.matrix().isfinite().all()):
             raise InputError(f"the pose of {self.name} is not finite", expected="to leave it out, or a .json file")
-        return found
+        return pose
 
     @property
     def as_stored(self) -> PosedImage:
@@ -59,20 +59,20 @@ class PosedImage:
         Without a file and an orientation, the image is returned as it is. Raises ``InputError`` for a photo
         stored mirrored, for which no rigid pose exists.
         """
-        turned = self.orientation
-        if turned is None:
-            turned = UPRIGHT if self.file is None else read_exif(self.file).orientation
-        if turned == UPRIGHT:
+        orientation = self.orientation
+        if orientation is None:
+            orientation = UPRIGHT if self.file is None else read_exif(self.file).orientation
+        if orientation == UPRIGHT:
             return self
         # The columns are the stored image's axes in the upright camera's frame.
-        x, y = (-1.0 if flips else 1.0 for flips in (turned.mirrors_columns, turned.mirrors_rows))
-        axes = [[0.0, y, 0.0], [x, 0.0, 0.0]] if turned.transposes else [[x, 0.0, 0.0], [0.0, y, 0.0]]
+        x, y = (-1.0 if flips else 1.0 for flips in (orientation.mirrors_columns, orientation.mirrors_rows))
+        axes = [[0.0, y, 0.0], [x, 0.0, 0.0]] if orientation.transposes else [[x, 0.0, 0.0], [0.0, y, 0.0]]
         turn = torch.tensor([*axes, [0.0, 0.0, 1.0]], dtype=torch.float64)
         if float(torch.linalg.det(turn)) < 0:
             raise InputError("is stored mirrored, which this format cannot describe", where=self.file)
-        inverse = Orientation(turned.mirrors_columns, turned.mirrors_rows)
-        if turned.transposes:
-            inverse = Orientation(turned.mirrors_rows, turned.mirrors_columns, True)
+        inverse = Orientation(orientation.mirrors_columns, orientation.mirrors_rows)
+        if orientation.transposes:
+            inverse = Orientation(orientation.mirrors_rows, orientation.mirrors_columns, True)
         pose = self.pose @ SE3(turn, torch.zeros(3, dtype=torch.float64))
         return replace(self, intrinsics=self.intrinsics.upright(inverse), T_world_camera=pose)
 
@@ -153,10 +153,10 @@ def write_pose_transforms(path: Path, images: Sequence[PosedImage], **more: Any)
     """
     frames = []
     for image in images:
-        stored, place = image.as_stored, image.name
+        stored, file = image.as_stored, image.name
         if image.file is not None:
-            place = os.path.relpath(image.file.resolve(), path.parent.resolve())
-        entry = frame_entry(Path(place).as_posix(), image.name, stored.intrinsics, stored.pose, image.time)
+            file = os.path.relpath(image.file.resolve(), path.parent.resolve())
+        entry = frame_entry(Path(file).as_posix(), image.name, stored.intrinsics, stored.pose, image.time)
         frames.append(entry)
     content = {"camera_model": "OPENCV", "unit": common_unit(images), "frames": frames, **more}
     write_file(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
@@ -182,10 +182,10 @@ def pose_format(path: Path) -> str:
 
     Raises ``UsageError`` for a name without a known ending.
     """
-    found = max((e for e in POSE_WRITERS if path.name.lower().endswith(e)), key=len, default=None)
-    if found is None:
+    ending = max((e for e in POSE_WRITERS if path.name.lower().endswith(e)), key=len, default=None)
+    if ending is None:
         raise UsageError(where=path, expected=f"a name that ends with {', '.join(POSE_WRITERS)}")
-    return found
+    return ending
 
 
 def write_poses(path: str | Path, images: Sequence[PosedImage]) -> None:
@@ -207,10 +207,10 @@ def read_pose(path: str | Path) -> SE3:
     A list with one such object is accepted as well. Raises ``InputError`` unless the file holds the rows of a
     rigid transform.
     """
-    found = read_poses(path)
-    if len(found) != 1:
-        raise InputError(f"holds {len(found)} poses", where=path, expected="one")
-    return next(iter(found.values()))
+    poses = read_poses(path)
+    if len(poses) != 1:
+        raise InputError(f"holds {len(poses)} poses", where=path, expected="one")
+    return next(iter(poses.values()))
 
 
 def read_poses(path: str | Path) -> dict[str, SE3]:
@@ -222,7 +222,7 @@ def read_poses(path: str | Path) -> dict[str, SE3]:
     """
     path = Path(path)
     entries = pose_entries(path, read_file(path, "a pose file"))
-    found = dict[str, SE3]()
+    poses = dict[str, SE3]()
     for entry in entries:
         rows = entry.get("T_world_camera") if isinstance(entry, dict) else entry
         name = entry.get("frame", "") if isinstance(entry, dict) else ""
@@ -232,12 +232,12 @@ def read_poses(path: str | Path) -> dict[str, SE3]:
             raise InputError(
                 f"holds {len(entries)} poses", where=path, expected='one, or a name under "frame" for each'
             )
-        if name in found:
+        if name in poses:
             raise InputError(f"holds two poses of frame {name!r}", where=path, expected="one")
-        found[name] = pose_from_matrix(_numbers(str(path), rows, EXPECTED_POSE), "T_world_camera", str(path))
-    if not found:
+        poses[name] = pose_from_matrix(_numbers(str(path), rows, EXPECTED_POSE), "T_world_camera", str(path))
+    if not poses:
         raise InputError("holds no pose", where=path, expected=EXPECTED_POSE)
-    return found
+    return poses
 
 
 def read_positions(path: str | Path) -> dict[str, Float[Tensor, "3"]]:
@@ -280,15 +280,15 @@ def pose_of(poses: dict[str, SE3], name: str, path: str | Path) -> SE3:
     return poses[name]
 
 
-def pose_entries(path: Path, content: bytes) -> list[Any]:
+def pose_entries(path: Path, text: bytes) -> list[Any]:
     """Return the objects in a pose file, or its single matrix, as a list."""
     try:
-        found = parse_json(content, str(path), EXPECTED_POSE)
+        content = parse_json(text, str(path), EXPECTED_POSE)
     except InputError:
-        lines = [line for line in content.splitlines() if line.strip()]
+        lines = [line for line in text.splitlines() if line.strip()]
         if len(lines) < 2 or not all(line.startswith(b"{") for line in lines):
             raise
         return [parse_json(line, f"{path}: line {n}", EXPECTED_POSE) for n, line in enumerate(lines, 1)]
-    if isinstance(found, list) and all(isinstance(entry, dict) for entry in found):
-        return found
-    return [found]
+    if isinstance(content, list) and all(isinstance(entry, dict) for entry in content):
+        return content
+    return [content]

@@ -55,9 +55,9 @@ def track(
     total = -(-len(sequence) // every)
     with job_context(progress, cancel):
         count = counter("tracking", "frames")
-        for number, place in enumerate(range(0, len(sequence), every)):
+        for number, index in enumerate(range(0, len(sequence), every)):
             try:
-                timed = sequence[place]
+                timed = sequence[index]
             except BreaksOff:
                 raise
             except InputError as error:
@@ -69,8 +69,7 @@ def track(
                 answers.unread += 1
             else:
                 frame = timed.frame if depth else timed.frame.replace(depth=None)
-                found = tracker(frame, timed.time)
-                answer = answers.add(frame, found, timed.time, timed.truth, every * number)
+                answer = answers.add(frame, tracker(frame, timed.time), timed.time, timed.truth, index)
                 if each is not None:
                     each(timed.frame, answer)
             count(number + 1, total)

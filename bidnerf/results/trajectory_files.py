@@ -16,7 +16,7 @@ def write_kitti_poses(path: Path, images: Sequence[PosedImage]) -> None:
     """Write KITTI poses: rows of the twelve numbers of 3x4 camera-to-world matrices, without times."""
     numbers = [image.number for image in images]
     if numbers != list(range(len(numbers))):
-        skipped = next(place for place, number in enumerate(numbers) if place != number)
+        skipped = next(index for index, number in enumerate(numbers) if index != number)
         warnings.warn(
             f"{path}: image {skipped} has no pose; KITTI rows do not state their image, so the following"
             " rows are shifted (.tum and .euroc.csv have times)",

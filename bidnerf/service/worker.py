@@ -60,7 +60,7 @@ class LoadedMaps:
 
         def localize(upload: Upload) -> tuple[Answer, dict[str, Any]]:
             answer, body = self.localize(task["map"], upload, folder)
-            outcomes.append(str(answer.found.outcome))
+            outcomes.append(str(answer.localization.outcome))
             return answer, body
 
         try:

@@ -136,8 +136,8 @@ def test_an_overlay_of_something_else_is_refused() -> None:
     wrong: list[tuple[tuple[Any, Any, Any], str | None, str, str]] = [
         ((7, frame, T), "overlay", "got a int", "a Map, or the folder of one"),
         ((scene(), bn.View(frame, T), T), "overlay", "frame is a View", "a Frame"),
-        ((scene(), frame, "pose.json"), None, "found is a str", "an SE3 or a 4x4 matrix"),
-        ((scene(), frame, np.eye(3)), None, "found has shape (3, 3)", "a 4x4 matrix"),
+        ((scene(), frame, "pose.json"), None, "pose is a str", "an SE3 or a 4x4 matrix"),
+        ((scene(), frame, np.eye(3)), None, "pose has shape (3, 3)", "a 4x4 matrix"),
     ]
     for arguments, where, found, expected in wrong:
         with refused(where=where, found=found, expected=expected):
@@ -320,7 +320,7 @@ def test_errors_by_another_world_are_told_from_errors_of_poses(line: bool) -> No
     there = [SE3(T.rotation @ truth.rotation, T.apply(1.7 * truth.translation)) for truth in truths]
     noise = 0.01 * torch.randn((6, 6), dtype=torch.float64, generator=generator)
     noisy = [pose.retract(step) for pose, step in zip(there, noise, strict=True)]
-    remark = answers_with(noisy, truths).remark
+    remark = answers_with(noisy, truths).world_mismatch
     assert remark is not None
     assert remark.startswith("all 6 accepted poses differ from the dataset's by one transformation")
     scale = float(remark.partition("a scale of ")[2].split()[0])
@@ -331,5 +331,5 @@ def test_errors_by_another_world_are_told_from_errors_of_poses(line: bool) -> No
         [*noisy[:5], noisy[5].retract(50 * noise[5])],
         noisy[::-1],
     ):
-        assert answers_with(others, truths).remark is None
-    assert answers_with(noisy[:2], truths[:2]).remark is None
+        assert answers_with(others, truths).world_mismatch is None
+    assert answers_with(noisy[:2], truths[:2]).world_mismatch is None
