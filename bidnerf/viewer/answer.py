@@ -201,10 +201,10 @@ def depth_difference(image: RenderedImage, frame: Frame) -> Json | None:
     known = (measured > 0) & (image.depth > 0)
     if not bool(known.any()):
         return None
-    off = (image.depth - measured)[known]
-    most = max(float(off.abs().quantile(0.95)), 1e-9)
+    difference = (image.depth - measured)[known]
+    most = max(float(difference.abs().quantile(0.95)), 1e-9)
     share = torch.zeros_like(measured)
-    share[known] = (off / most).clamp(-1, 1)
+    share[known] = (difference / most).clamp(-1, 1)
     # Pixels are red where the rendered depth is smaller than the measured one, nearly white where it is equal, and blue
     # where it is larger.
     near, middle, far = torch.tensor([(0.70, 0.09, 0.17), (0.97, 0.97, 0.96), (0.13, 0.40, 0.67)])
@@ -212,7 +212,7 @@ def depth_difference(image: RenderedImage, frame: Frame) -> Json | None:
     rgb = middle + share.abs()[..., None] * (towards - middle)
     pixels = torch.cat([rgb, known[..., None].float()], dim=-1)
     picture = png_json((pixels * 255 + 0.5).to(torch.uint8).numpy())
-    return {"picture": picture, "range": most, "median": float(off.abs().median())}
+    return {"picture": picture, "range": most, "median": float(difference.abs().median())}
 
 
 def _steps(localization: Localization, record: SearchRecord | None) -> tuple[Json, ...]:
@@ -236,11 +236,11 @@ def _steps(localization: Localization, record: SearchRecord | None) -> tuple[Jso
     return (*shown, _step(HERE, last[None], [0.0], 1, shown[-1]["loss"] if shown else None))
 
 
-def _step(caption: str, T: SE3, scores: list[float], kept: int, loss: float | None = None) -> Json:
-    """Return one step: the poses that were considered together, the best first, their scores, and the ``loss`` of a descent."""
+def _step(caption: str, T: SE3, scores: list[float], retained: int, loss: float | None = None) -> Json:
+    """Return one step: the poses that were considered together, the best first, their scores, how many were retained, and the ``loss`` of a descent."""
     poses = pack(T.matrix()[:, :3].detach().cpu().double().flatten(1).numpy())
     known = tuple(map(_finite, scores))
-    return {"caption": caption, "poses": poses, "scores": known, "kept": kept, "loss": _finite(loss)}
+    return {"caption": caption, "poses": poses, "scores": known, "retained": retained, "loss": _finite(loss)}
 
 
 def _finite(value: float | None) -> float | None:

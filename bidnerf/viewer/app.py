@@ -40,7 +40,7 @@ from bidnerf.service import (
 from bidnerf.viewer.answer import no_answer
 from bidnerf.viewer.pages import MapView, answer_query, require_map
 from bidnerf.viewer.pictures import Json, field_image, jpeg, quick_image
-from bidnerf.viewer.scene import map_json, thumbnail_jpeg
+from bidnerf.viewer.scene import map_json, thumbnail
 from bidnerf_core.camera import CameraSource, Intrinsics
 from bidnerf_core.datasets import Query, QuerySource
 from bidnerf_core.errors import Cancelled, InputError
@@ -217,10 +217,10 @@ def viewer_app(live: LiveView, token: str | None = None, limits: ServiceLimits |
         return JSONResponse({"status": "ok"})
 
     @app.get("/api/thumbnail/{number}", responses=error_responses(404), summary="A rendering from a camera of the map.")
-    async def thumbnail(number: str) -> Response:
+    async def map_image(number: str) -> Response:
         cameras = scene.info.cameras
         camera = cameras[_index(number, len(cameras), "camera of the map")]
-        content = await painter.run(lambda: thumbnail_jpeg(scene, camera))
+        content = await painter.run(lambda: jpeg(thumbnail(scene, camera)))
         return Response(content, headers={"Cache-Control": "private, max-age=3600"}, media_type="image/jpeg")
 
     @app.post(

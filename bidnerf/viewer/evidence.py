@@ -66,12 +66,12 @@ def probable_poses(answer: LandmarkAnswer) -> list[tuple[int, SE3, float]]:
 def _contest(
     question: str,
     answers: Iterable[tuple[str, float] | tuple[str, float, Sequence[float] | None]],
-    remark: str = "",
+    note: str = "",
     of_pose: bool = True,
 ) -> Json:
     """Return a comparison of poses or cameras: names, probabilities and, for other poses, the 16 numbers of T_world_camera."""
     shown = [{"pose": None} | dict(zip(("name", "probability", "pose"), each, strict=False)) for each in answers]
-    return {"question": question, "answers": shown, "remark": remark, "of_pose": of_pose}
+    return {"question": question, "answers": shown, "note": note, "of_pose": of_pose}
 
 
 def _compare_modes(localization: Localization, answer: LandmarkAnswer) -> Json:
@@ -112,8 +112,8 @@ def _compare_rivals(support: Support) -> Json:
     weights = [(HERE, 1.0), *((names[name], odds(-each)) for name, each in against.items())]
     total = sum(weight for _, weight in weights)
     moved = against["displaced"] < min([0.0, *(each for name, each in against.items() if name != "displaced")])
-    remark = "The image fits better when the pose is moved: it is not even a local optimum." if moved else ""
-    return _contest("What fits the image best?", [(name, w / total) for name, w in weights], remark)
+    note = "The image fits better when the pose is moved: it is not even a local optimum." if moved else ""
+    return _contest("What fits the image best?", [(name, w / total) for name, w in weights], note)
 
 
 MEASURES = {

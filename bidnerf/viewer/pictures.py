@@ -33,7 +33,7 @@ def pack(array: np.ndarray) -> Json:
 
 
 def pack_points(points: Float[Tensor, "n 3"]) -> Json:
-    """Return points quantized to 16-bit integers, ``places``: a coordinate is ``lower + place / 65535 * size``."""
+    """Return points quantized to 16-bit integers, ``places``: a coordinate is ``lower + value / 65535 * size``."""
     values = points.detach().cpu().double().numpy()
     lower = values.min(0) if len(values) else np.zeros(3)
     size = max(float((values - lower).max(initial=0.0)), 1e-9)
@@ -73,11 +73,11 @@ def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Flo
     If the map has no field, its landmarks are drawn as dots.
     """
     bounds = scene.bounds
-    place = T_world_camera.translation.detach().cpu().double()
+    position = T_world_camera.translation.detach().cpu().double()
     if scene.surface is not None and len(scene.surface.surfels):
-        away = (scene.surface.surfels.positions.cpu().double() - place).norm(dim=-1).min()
+        away = (scene.surface.surfels.positions.cpu().double() - position).norm(dim=-1).min()
         bounds = replace(bounds, near=min(bounds.near, float(away) / 2))  # to show the nearest surface
-    distance = float((place - torch.tensor(bounds.centre, dtype=torch.float64)).norm())
+    distance = float((position - torch.tensor(bounds.centre, dtype=torch.float64)).norm())
     # There is no matter farther from the centre than this.
     beyond = bounds.far if bounds.contracted else math.hypot(*bounds.size) / 2
     bounds = replace(bounds, far=max(bounds.far, distance + beyond))

@@ -17,7 +17,6 @@ from torch import Tensor
 from bidnerf.results import pose_entries, standard_deviations
 from bidnerf.viewer.pictures import (
     Json,
-    jpeg,
     jpeg_json,
     pack,
     pack_colours,
@@ -65,7 +64,7 @@ def map_json(scene: Map, thumbnails: int = 60) -> Json:
                 "name": camera.name,
                 "pose": rows_of(camera.pose),
                 "shape": frustum(camera.intrinsics),
-                "thumbnail": jpeg_json(_small_image(scene, camera)) if thumbnails and number % every == 0 else None,
+                "thumbnail": jpeg_json(thumbnail(scene, camera)) if thumbnails and number % every == 0 else None,
             }
             for number, camera in enumerate(scene.info.cameras)
         ],
@@ -84,12 +83,8 @@ def frustum(camera: Intrinsics) -> Json:
     }
 
 
-def thumbnail_jpeg(scene: Map, camera: StoredCamera) -> bytes:
-    """Render a small image from a camera of the map, as a JPEG file."""
-    return jpeg(_small_image(scene, camera))
-
-
-def _small_image(scene: Map, camera: StoredCamera) -> Float[Tensor, "h w 3"]:
+def thumbnail(scene: Map, camera: StoredCamera) -> Float[Tensor, "h w 3"]:
+    """Render a small image from a camera of the map."""
     return quick_image(scene, camera.intrinsics.at_most(80), camera.pose)  # pixels on the longer side
 
 

@@ -17,7 +17,6 @@ import sys
 import tempfile
 import threading
 import time
-import warnings
 from base64 import b64encode
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -26,6 +25,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
+from unittest.mock import AsyncMock
 from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import urlopen
@@ -38,6 +38,8 @@ import pytest
 pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
 pytest.importorskip("uvicorn", reason="the extra 'serve' is not installed")
 
+from starlette.responses import PlainTextResponse
+
 from bidnerf import InputError, ServiceClient, open_dataset, serve
 from bidnerf.service import Application, ServiceError, ServiceLimits, public_message, run_app, service_app
 
@@ -46,7 +48,6 @@ from bidnerf.service.models import Localization, MapFacts, PhotoForm
 from bidnerf.service.pool import Pool
 from bidnerf.service.server import maps_by_name
 from bidnerf.service.web import SAFE, Gate
-from bidnerf.service.worker import main as hold_maps
 from bidnerf.viewer import require_viewer
 from bidnerf_core.camera import WAYS, WAYS_OF_PHOTO
 from bidnerf_core.localization import settings_of
@@ -96,12 +97,12 @@ class Reply:
 
 
 class Service:
-    """An application that is served in an event loop, asked without HTTP as its server would."""
+    """An application that is served in an event loop, called without HTTP as its server would."""
 
-    def __init__(self, app: Any, loop: asyncio.AbstractEventLoop) -> None:
-        self.app, self.loop = app, loop
+    def __init__(self, app: Any, loop: asyncio.AbstractEventLoop, url: str) -> None:
+        self.app, self.loop, self.url = app, loop, url
         self.pool: Pool = app.state.pool
-        self.said = app.openapi()
+        self.description = app.openapi()
 
     def metric(self, name: str, **labels: str) -> float:
         """A number that the service tells of itself now."""
@@ -165,31 +166,31 @@ class Service:
         self._require_described(method, path, reply)
         return reply
 
-    said: dict[str, Any] | None = None  # of an application that describes itself
+    description: dict[str, Any] | None = None  # of an application that describes itself
 
     def _require_described(self, method: str, path: str, reply: Reply) -> None:
         """Every answer of every test has a status, a type and headers that the description promises."""
         template = re.sub("^/maps/[^/]+", "/maps/{map}", path)
-        operation = (self.said or {"paths": {}})["paths"].get(template, {}).get(method.lower())
+        operation = (self.description or {"paths": {}})["paths"].get(template, {}).get(method.lower())
         if operation is None or reply.status == 499:  # for which there is nobody to receive it
             return
-        said = operation["responses"][str(reply.status)]
-        kinds = {kind.partition(";")[0] for kind in said["content"]}
+        description = operation["responses"][str(reply.status)]
+        kinds = {kind.partition(";")[0] for kind in description["content"]}
         assert reply.headers["content-type"].partition(";")[0] in kinds
         usual = {"content-type", "content-length", "connection", *map(str.lower, SAFE)}
-        assert set(reply.headers) - usual == {name.lower() for name in said.get("headers", ())} - usual
+        assert set(reply.headers) - usual == {name.lower() for name in description.get("headers", ())} - usual
         assert reply.headers.keys() >= set(map(str.lower, SAFE))
 
 
 @dataclass(frozen=True)
-class Place:
+class Inputs:
     folder: Path
     photo: bytes
     start: str
 
 
 @pytest.fixture(scope="module")
-def place(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Place:
+def inputs(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Inputs:
     folder = tmp_path_factory.mktemp("service")
     (folder / "uploads").mkdir()
     (folder / "data").symlink_to(shared / "data")
@@ -200,68 +201,45 @@ def place(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Place:
     shutil.copy(folder / "data/images/t_0000.png", folder / "photo.png")
     pose = open_dataset(folder / "data").views("test")[0].T_ref_camera.matrix().tolist()
     (folder / "start.json").write_text(json.dumps({"T_world_camera": pose}))
-    return Place(folder, (folder / "photo.png").read_bytes(), json.dumps(pose).replace(" ", ""))
-
-
-@dataclass(frozen=True)
-class Served:
-    service: Service
-    address: tuple[str, int]
+    return Inputs(folder, (folder / "photo.png").read_bytes(), json.dumps(pose).replace(" ", ""))
 
 
 @pytest.fixture(scope="module")
-def served(place: Place) -> Iterator[Served]:
+def service(inputs: Inputs) -> Iterator[Service]:
     """One service for all tests, on a port of its own: its start takes seconds."""
-    ready, stop, told, made = threading.Event(), threading.Event(), [], []
-    maps, site = [place.folder / "map", place.folder / "hall"], place.folder / "site"
+    ready, stop = SimpleQueue[tuple[str, None, asyncio.AbstractEventLoop]](), threading.Event()
+    site = inputs.folder / "site"
     (site / "echo-1.0.dist-info").mkdir(parents=True)
     (site / "echo-1.0.dist-info/METADATA").write_text("Metadata-Version: 2.1\nName: echo\nVersion: 1.0\n")
-    points = "[bidnerf.services]\necho = strange_echo:echo\n"
-    (site / "echo-1.0.dist-info/entry_points.txt").write_text(points)
+    (site / "echo-1.0.dist-info/entry_points.txt").write_text("[bidnerf.services]\necho = strange_echo:echo\n")
     (site / "strange_echo.py").write_text(ECHO)
-
-    def tell(url: str, token: str | None) -> None:
-        told.extend([url, token, asyncio.get_running_loop()])
-        ready.set()
-
-    def kept(*given: Any, **more: Any) -> Any:
-        made.append(service_app(*given, **more))
-        return made[-1]
-
-    options: Any = {"port": 0, "limits": LIMITS, "method": "bid", "config": QUICK}
-    options |= {"ready": tell, "stop": stop}
-    running = threading.Thread(target=serve, args=[maps], kwargs=options)
-    lasting = pytest.MonkeyPatch()  # for the processes that take the place of those that tests kill, too
-    lasting.syspath_prepend(str(site))
-    lasting.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")])))
-    _declared.cache_clear()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tempfile, "tempdir", str(place.folder / "uploads"))
-        patch.setattr("bidnerf.service.server.service_app", kept)
-        running.start()
-        started = ready.wait(60)
-    try:
-        assert started
-        assert told[1] is None  # this machine only needs no token
-        parts = urlsplit(told[0])
-        yield Served(Service(made[0], told[2]), (str(parts.hostname), int(parts.port or 0)))
-    finally:
-        stop.set()
-        running.join(30)
-        lasting.undo()
+    with pytest.MonkeyPatch.context() as patch:  # also for the processes that replace those that tests kill
+        patch.syspath_prepend(str(site))
+        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")])))
+        patch.setattr(tempfile, "tempdir", str(inputs.folder / "uploads"))
         _declared.cache_clear()
+        maps = [inputs.folder / "map", inputs.folder / "hall"]
+        app = service_app(maps, method="bid", config=QUICK, limits=LIMITS)
+        options = {"port": 0, "stop": stop, "ready": lambda *given: ready.put((*given, asyncio.get_running_loop()))}
+        running = threading.Thread(target=serve, args=[maps], kwargs=options)
+        try:
+            with pytest.MonkeyPatch.context() as at_start:
+                at_start.setattr("bidnerf.service.server.service_app", lambda *_, **__: app)
+                running.start()
+                url, token, loop = ready.get(timeout=60)
+            assert token is None  # this machine only needs none
+            yield Service(app, loop, url)
+        finally:
+            stop.set()
+            running.join(30)
+    _declared.cache_clear()
     with pytest.raises(ServiceError, match="refused"):
-        ServiceClient(told[0]).ask("/maps")
+        ServiceClient(url).ask("/maps")
 
 
 @pytest.fixture(scope="module")
-def service(served: Served) -> Service:
-    return served.service
-
-
-@pytest.fixture(scope="module")
-def address(served: Served) -> tuple[str, int]:
-    return served.address
+def address(service: Service) -> tuple[str, int]:
+    return "127.0.0.1", int(urlsplit(service.url).port or 0)
 
 
 def form(**parts: bytes | str) -> bytes:
@@ -274,13 +252,13 @@ def form(**parts: bytes | str) -> bytes:
     return text + b"--xyz--\r\n"
 
 
-def test_answers_are_those_of_the_command_line(service: Service, place: Place, bidnerf: Run) -> None:
+def test_answers_are_those_of_the_command_line(service: Service, inputs: Inputs, bidnerf: Run) -> None:
     options = [f"--{name.replace('_', '-')}={value}" for name, value in QUICK.items()]
-    words = ["localize", place.folder / "map", place.folder / "photo.png", "--method=bid", *options]
-    depth = place.folder / "data/depth/t_0000.png"
-    words += ["--start", place.folder / "start.json", "--depth", depth, "--depth-unit=0.001"]
+    words = ["localize", inputs.folder / "map", inputs.folder / "photo.png", "--method=bid", *options]
+    depth = inputs.folder / "data/depth/t_0000.png"
+    words += ["--start", inputs.folder / "start.json", "--depth", depth, "--depth-unit=0.001"]
     expected = json.loads(bidnerf(*words, "--focal=32", "--seed=7", "--json").out)
-    parts = {"photo": place.photo, "depth": depth.read_bytes(), "start": place.start}
+    parts = {"photo": inputs.photo, "depth": depth.read_bytes(), "start": inputs.start}
     body = form(**parts, focal="32", depth_unit="0.001", seed="7")
     reply = service.post("/maps/map/localize", body, FORM)
     assert reply.status == 200
@@ -291,51 +269,51 @@ def test_answers_are_those_of_the_command_line(service: Service, place: Place, b
     assert {key: reply.json[key] for key in same} == {key: expected[key] for key in same}
 
 
-def test_a_photo_may_be_the_body(service: Service, place: Place) -> None:
-    query = f"map=map&focal=32&name=%3Cscript%3E&start={place.start}"
-    reply = service.post(f"/localize?{query}", place.photo)
+def test_a_photo_may_be_the_body(service: Service, inputs: Inputs) -> None:
+    query = f"map=map&focal=32&name=%3Cscript%3E&start={inputs.start}"
+    reply = service.post(f"/localize?{query}", inputs.photo)
     assert reply.status == 200
     assert reply.json["frame"] == "<script>"
     assert reply.headers["content-type"] == "application/json"
     assert reply.headers["x-content-type-options"] == "nosniff"
 
 
-def test_a_registered_protocol_is_answered(service: Service, place: Place) -> None:
+def test_a_registered_protocol_is_answered(service: Service, inputs: Inputs) -> None:
     """Both processes load the plugin: that which listens, and the worker."""
-    asked = {"photo": b64encode(place.photo).decode(), "start": place.start}
+    question = {"photo": b64encode(inputs.photo).decode(), "start": inputs.start}
     for path in ("/echo?map=map", "/maps/hall/echo"):
-        reply = service.post(path, json.dumps(asked).encode(), "application/json")
+        reply = service.post(path, json.dumps(question).encode(), "application/json")
         assert reply.json == {"frame": "echo", "cameras": service.get("/maps/hall").json["cameras"]}
-    assert service.post("/echo", json.dumps(asked).encode()).json["detail"].startswith("several maps")
+    assert service.post("/echo", json.dumps(question).encode()).json["detail"].startswith("several maps")
     assert "no 'photo'" in service.post("/maps/map/echo", b"{}").json["detail"]
     assert service.get("/maps/map/echo").json == {"status": "running"}
-    assert service.post("/echo?map=", json.dumps(asked).encode()).status == 404
+    assert service.post("/echo?map=", json.dumps(question).encode()).status == 404
     refused = service.get("/echo", "PUT")
     assert (refused.status, refused.headers["allow"]) == (405, "GET, POST")
 
 
-def test_names_are_text_and_never_files(service: Service, place: Place) -> None:
+def test_names_are_text_and_never_files(service: Service, inputs: Inputs) -> None:
     part = b'--xyz\r\nContent-Disposition: form-data; name="photo"; filename="../../etc/pass wd.png"\r\n\r\n'
-    body = part + place.photo + b"\r\n" + form(start=place.start, focal="32", map="map")
+    body = part + inputs.photo + b"\r\n" + form(start=inputs.start, focal="32", map="map")
     assert service.post("/localize", body, FORM).json["frame"] == "pass wd"
-    named = form(photo=place.photo, start=place.start, focal="32", map="map", name="<script>")
+    named = form(photo=inputs.photo, start=inputs.start, focal="32", map="map", name="<script>")
     assert service.post("/localize", named, FORM).json["frame"] == "<script>"
     for path in ("..%2f..%2fetc%2fpasswd", "../map.json", "map/map.json", ".", "../../etc/passwd"):
         assert service.get(f"/maps/{path}").status == 404, path
     assert service.get("/etc/passwd").status == 404
     for text in ("../map", "/etc/passwd", "map\0", "x" * 5000):
-        reply = service.post("/localize", form(photo=place.photo, map=text), FORM)
+        reply = service.post("/localize", form(photo=inputs.photo, map=text), FORM)
         assert reply.status in (400, 404), text
-    assert service.post("/localize?map=map&camera=/etc/passwd", place.photo).status == 422
+    assert service.post("/localize?map=map&camera=/etc/passwd", inputs.photo).status == 422
     assert "passwd" not in service.get("/metrics").body.decode()
-    assert list((place.folder / "uploads").iterdir()) == []
+    assert list((inputs.folder / "uploads").iterdir()) == []
 
 
-def test_limits_hold_before_anything_is_decoded(service: Service, place: Place) -> None:
+def test_limits_hold_before_anything_is_decoded(service: Service, inputs: Inputs) -> None:
     bomb = service.post("/localize?map=map&focal=32", png_of(9000, 9000))
     assert bomb.status == 422
     assert "9000x9000, expected at most 1 megapixels" in bomb.json["detail"]
-    depth = form(photo=place.photo, depth=png_of(60000, 60000))
+    depth = form(photo=inputs.photo, depth=png_of(60000, 60000))
     assert service.post("/localize?map=map", depth, FORM).status == 422
     large = service.run(service.ask("POST", "/localize", [b"x"], {"content-length": str(2 * 10**9)}))
     assert large.status == 413
@@ -347,11 +325,11 @@ def test_limits_hold_before_anything_is_decoded(service: Service, place: Place) 
     assert slow.status == 408
 
 
-def test_malformed_requests_are_refused_with_a_reason(service: Service, place: Place) -> None:
+def test_malformed_requests_are_refused_with_a_reason(service: Service, inputs: Inputs) -> None:
     drawn = random.Random(0)
     forms = [FORM, "multipart/form-data", "multipart/form-data; boundary="]
     kinds = [*forms, "image/png", "text/html", "application/json", ""]
-    seeds = [place.photo, form(photo=place.photo, focal="32"), b'{"photo": [{}]}', b"", png_of(9, 9)]
+    seeds = [inputs.photo, form(photo=inputs.photo, focal="32"), b'{"photo": [{}]}', b"", png_of(9, 9)]
     paths = ["/localize", "/maps/map/localize", "/maps/\xff/localize"]
     found = set()
     for _ in range(250):
@@ -375,9 +353,9 @@ def test_malformed_requests_are_refused_with_a_reason(service: Service, place: P
     assert service.metric("worker_restarts_total", reason="died") == 0
 
 
-def test_what_is_missing_is_named(service: Service, place: Place) -> None:
+def test_what_is_missing_is_named(service: Service, inputs: Inputs) -> None:
     for query, *parts in (
-        (f"focal=32&start={place.start}", "start was given without map", "map"),
+        (f"focal=32&start={inputs.start}", "start was given without map", "map"),
         ("focal=32", "needs a start"),
         ("map=map&fcal=3", "did you mean 'focal'?"),
         ("map=map&focal=x", 'focal is "x"', "a number"),
@@ -391,7 +369,7 @@ def test_what_is_missing_is_named(service: Service, place: Place) -> None:
         ("map=map&hfov=179.9", "expected a number up to 170"),
         ("map=map&focal=0.001", "focal is 0.001 for 24 columns, expected at least 1.05"),
     ):
-        detail = service.post(f"/localize?{query}", place.photo).json["detail"]
+        detail = service.post(f"/localize?{query}", inputs.photo).json["detail"]
         assert [part for part in parts if part not in detail] == []
     assert service.post("/localize?map=map").json["detail"].startswith("no photo, expected")
     refused = service.get("/localize")
@@ -399,7 +377,7 @@ def test_what_is_missing_is_named(service: Service, place: Place) -> None:
     for path in ("/nothing", "/maps/", "/maps/nothing", "/maps/nothing/localize/"):
         assert service.get(path).json["status"] == 404, path
     for number in ("1_0", "\u0663", " 5", "infinity", "0x10"):
-        reply = service.post(f"/localize?map=map&focal={number}", place.photo)
+        reply = service.post(f"/localize?map=map&focal={number}", inputs.photo)
         assert "expected a number" in reply.json["detail"]
 
 
@@ -410,18 +388,18 @@ def test_messages_name_the_parameters_of_requests(tmp_path: Path) -> None:
         assert shown == "photo: no focal length, expected a camera: focal, hfov or camera"
 
 
-def test_requests_beyond_the_bound_are_turned_away(service: Service, place: Place) -> None:
+def test_requests_beyond_the_bound_are_turned_away(service: Service, inputs: Inputs) -> None:
     with contextlib.ExitStack() as taken:
         for _ in range(service.pool.queue.slots):
             taken.enter_context(service.pool.queue.slot())
-        reply = service.post("/localize?map=map", place.photo)
+        reply = service.post("/localize?map=map", inputs.photo)
         assert reply.status == 429
         assert int(reply.headers["retry-after"]) >= 1
         assert service.get("/health").status == 200
-    assert service.post("/localize?map=map", place.photo).status == 422
+    assert service.post("/localize?map=map", inputs.photo).status == 422
 
 
-def quickly(condition: Callable[[], bool]) -> None:
+def wait_until(condition: Callable[[], bool]) -> None:
     until = time.monotonic() + 20
     while not condition():
         assert time.monotonic() < until
@@ -429,25 +407,25 @@ def quickly(condition: Callable[[], bool]) -> None:
 
 
 @contextlib.contextmanager
-def stopped(service: Service) -> Iterator[int]:
+def pause_worker(service: Service) -> Iterator[int]:
     """Let the only worker stand still, as one does that computes for long."""
-    quickly(lambda: len(service.pool.workers) == 1)
+    wait_until(lambda: len(service.pool.workers) == 1)
     (worker,) = service.pool.workers
     os.kill(worker.pid, signal.SIGSTOP)
     yield worker.pid
-    quickly(lambda: service.pool.workers not in ([], [worker]))
+    wait_until(lambda: service.pool.workers not in ([], [worker]))
 
 
-def request(service: Service, place: Place, leaving: asyncio.Event | None = None) -> Any:
-    path = f"/localize?map=map&focal=32&start={place.start}"
-    return asyncio.run_coroutine_threadsafe(service.ask("POST", path, [place.photo], leaving=leaving), service.loop)
+def request(service: Service, inputs: Inputs, leaving: asyncio.Event | None = None) -> Any:
+    path = f"/localize?map=map&focal=32&start={inputs.start}"
+    return asyncio.run_coroutine_threadsafe(service.ask("POST", path, [inputs.photo], leaving=leaving), service.loop)
 
 
-def test_nothing_is_lost_when_a_worker_is_killed(service: Service, place: Place) -> None:
+def test_nothing_is_lost_when_a_worker_is_killed(service: Service, inputs: Inputs) -> None:
     before = service.metric("worker_restarts_total", reason="died")
-    with stopped(service) as process:
-        waiting = [request(service, place) for _ in range(3)]
-        quickly(lambda: service.metric("queue_length") == 2)
+    with pause_worker(service) as process:
+        waiting = [request(service, inputs) for _ in range(3)]
+        wait_until(lambda: service.metric("queue_length") == 2)
         os.kill(process, signal.SIGKILL)
         assert [reply.result(60).status for reply in waiting] == [200] * 3
     assert service.metric("worker_restarts_total", reason="died") == before + 1
@@ -460,11 +438,11 @@ def holder_of_maps(service: Service) -> psutil.Process:
 
 
 @pytest.mark.slow
-def test_nothing_is_lost_when_the_process_with_the_maps_is_killed(service: Service, place: Place) -> None:
+def test_nothing_is_lost_when_the_process_with_the_maps_is_killed(service: Service, inputs: Inputs) -> None:
     maps = holder_of_maps(service)
-    with stopped(service) as process:
-        waiting = request(service, place)
-        quickly(lambda: service.metric("requests_in_progress") == 1)
+    with pause_worker(service) as process:
+        waiting = request(service, inputs)
+        wait_until(lambda: service.metric("requests_in_progress") == 1)
         maps.kill()
         os.kill(process, signal.SIGKILL)
         assert waiting.result(150).status == 200
@@ -473,17 +451,12 @@ def test_nothing_is_lost_when_the_process_with_the_maps_is_killed(service: Servi
 def test_a_process_with_the_maps_that_does_not_answer_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     pool, worker, (ours, theirs) = Pool({"maps": {}}, LIMITS), object(), socket.socketpair()
     silent = subprocess.Popen(["sleep", "60"])
-
-    async def loaded() -> None:
-        async def fork() -> Any:
-            return worker
-
-        monkeypatch.setattr(pool, "_fork", fork)
-
-    monkeypatch.setattr("bidnerf.service.pool.FORK_SECONDS", 0.05)
     monkeypatch.setattr("bidnerf.service.pool.PAUSE", 0.0)
+    monkeypatch.setattr("bidnerf.service.pool.FORK_SECONDS", 0.05)
     monkeypatch.setattr(pool, "_maps", (silent, ours))
-    monkeypatch.setattr(pool, "_load", loaded)
+    monkeypatch.setattr(
+        pool, "_load", AsyncMock(side_effect=lambda: monkeypatch.setattr(pool, "_fork", AsyncMock(return_value=worker)))
+    )
     with theirs:
         assert asyncio.run(pool._replacement()) is worker
     assert (silent.returncode, ours.fileno()) == (-signal.SIGKILL, -1)
@@ -492,34 +465,27 @@ def test_a_process_with_the_maps_that_does_not_answer_is_replaced(monkeypatch: p
 
 def test_maps_are_kept_while_a_worker_cannot_begin(monkeypatch: pytest.MonkeyPatch) -> None:
     """An accelerator whose memory is full now is no reason to load the maps again."""
-    pool, tried, held, worker = Pool({"maps": {}}, LIMITS), list[int](), object(), object()
-
-    async def fork() -> Any:
-        tried.append(len(tried))
-        if len(tried) < 3:
-            raise InputError("out of memory")
-        return worker
-
-    monkeypatch.setattr(pool, "_maps", held)
-    monkeypatch.setattr(pool, "_fork", fork)
+    pool, maps, worker, full = Pool({"maps": {}}, LIMITS), object(), object(), InputError("out of memory")
     monkeypatch.setattr("bidnerf.service.pool.PAUSE", 0.0)
+    monkeypatch.setattr(pool, "_maps", maps)
+    monkeypatch.setattr(pool, "_fork", AsyncMock(side_effect=[full, full, worker]))
     assert asyncio.run(pool._replacement()) is worker
-    assert (tried, pool._maps) == ([0, 1, 2], held)
+    assert pool._maps is maps
 
 
-def test_a_temporary_folder_that_is_removed_is_made_anew(service: Service, place: Place) -> None:
-    (place.folder / "uploads").rmdir()
+def test_a_temporary_folder_that_is_removed_is_made_anew(service: Service, inputs: Inputs) -> None:
+    (inputs.folder / "uploads").rmdir()
     assert service.get("/health").status == 200
-    assert request(service, place).result(60).status == 200
+    assert request(service, inputs).result(60).status == 200
 
 
-def test_work_that_nobody_waits_for_is_stopped(service: Service, place: Place) -> None:
+def test_work_that_nobody_waits_for_is_stopped(service: Service, inputs: Inputs) -> None:
     leaving = asyncio.Event()
-    with stopped(service):
-        waiting = request(service, place, leaving)
-        quickly(lambda: service.metric("requests_in_progress") == 1)
-        behind = request(service, place)
-        quickly(lambda: service.metric("queue_length") == 1)  # the worker has the other, all of it
+    with pause_worker(service):
+        waiting = request(service, inputs, leaving)
+        wait_until(lambda: service.metric("requests_in_progress") == 1)
+        behind = request(service, inputs)
+        wait_until(lambda: service.metric("queue_length") == 1)  # the worker has the other, all of it
         service.loop.call_soon_threadsafe(leaving.set)
         assert waiting.result(20).status == 499
         assert behind.result(60).status == 200
@@ -527,75 +493,77 @@ def test_work_that_nobody_waits_for_is_stopped(service: Service, place: Place) -
     assert service.metric("requests_in_progress") == 0
 
 
-def test_work_that_takes_too_long_is_stopped(service: Service, place: Place) -> None:
+def test_work_that_takes_too_long_is_stopped(service: Service, inputs: Inputs) -> None:
     service.app.state.limits = replace(LIMITS, timeout=0.2)
     try:
-        with stopped(service):
-            first, second = request(service, place), request(service, place)
+        with pause_worker(service):
+            first, second = request(service, inputs), request(service, inputs)
             assert (first.result(20).status, second.result(20).status) == (504, 504)
     finally:
         service.app.state.limits = LIMITS
     assert service.metric("worker_restarts_total", reason="timeout") == 1
-    assert request(service, place).result(60).status == 200
+    assert request(service, inputs).result(60).status == 200
 
 
-def test_only_programs_on_this_machine_or_with_the_token_are_answered() -> None:
-    async def app(scope: Any, receive: Any, send: Any) -> None:
-        await send({"type": "http.response.start", "status": 200, "headers": []})
-        await send({"type": "http.response.body", "body": b""})
+TOKEN = "0123456789abcdef"
 
-    refused: list[tuple[str, int]] = []
 
-    def report(scope: Any, status: int, seconds: float, error: Exception | None) -> None:
-        if status != 200:
-            refused.append((scope["path"], status))
-
-    def status(token: str | None, path: str = "/localize", **headers: str) -> int:
-        service = Service.__new__(Service)
-        service.app = Gate(app, token, "cookie", report)
-        return asyncio.run(service.ask("POST", path, [], headers)).status
-
-    for host in ("localhost:8000", "127.0.0.1", "[::1]:8000", "127.8.8.8"):
-        assert status(None, host=host) == 200, host
-    for host in ("example.org", "192.168.1.5:8000", "localhost.example.org", "", "[", "127.0.0.1.nip.io"):
-        assert status(None, host=host) == 403, host
-    for origin in ("https://example.org", "null", "http://localhost:3000"):
-        assert status(None, origin=origin, host="localhost:8000") == 403, origin
-    assert status(None, origin="http://localhost:8000", host="localhost:8000") == 200
-    token = "0123456789abcdef"
-    assert status(token, host="example.org") == 401
-    assert status(token, host="localhost") == 401
-    near = (f"Basic {token}", f"bearer{token}", f"Bearer {token}x")
-    for wrong in ("Bearer", "Bearer x", *near, "Bearer \xe9"):
-        assert status(token, authorization=wrong) == 401, wrong
-    assert status(token, host="example.org", authorization=f"Bearer {token}") == 200
-    assert status(token, "/health", host="example.org") == 200
-    assert status(token, host="example.org", cookie=f"cookie_80={token}") == 200
-    elsewhere = {"host": "localhost:8010", "origin": "http://localhost:3000"}
-    assert status(token, cookie=f"cookie_80={token}", **elsewhere) == 401
-    assert refused == [("/localize", 403)] * 9 + [("/localize", 401)] * 9
+@pytest.mark.parametrize(
+    ("token", "status", "headers"),
+    [
+        *((None, 200, {"host": host}) for host in ("localhost:8000", "127.0.0.1", "[::1]:8000", "127.8.8.8")),
+        *(
+            (None, 403, {"host": host})
+            for host in ("example.org", "192.168.1.5:8000", "localhost.example.org", "", "[")
+        ),
+        (None, 403, {"host": "127.0.0.1.nip.io"}),
+        *(
+            (None, 403, {"origin": f"http{end}", "host": "localhost:8000"})
+            for end in ("s://example.org", "://localhost:3000")
+        ),
+        (None, 403, {"origin": "null", "host": "localhost:8000"}),
+        (None, 200, {"origin": "http://localhost:8000", "host": "localhost:8000"}),
+        (TOKEN, 401, {"host": "example.org"}),
+        (TOKEN, 401, {"host": "localhost"}),
+        *((TOKEN, 401, {"authorization": wrong}) for wrong in ("Bearer", "Bearer x", "Bearer \xe9", f"Basic {TOKEN}")),
+        *((TOKEN, 401, {"authorization": wrong}) for wrong in (f"bearer{TOKEN}", f"Bearer {TOKEN}x")),
+        (TOKEN, 200, {"host": "example.org", "authorization": f"Bearer {TOKEN}"}),
+        (TOKEN, 200, {"host": "example.org", "path": "/health"}),
+        (TOKEN, 200, {"host": "example.org", "cookie": f"cookie_80={TOKEN}"}),
+        (TOKEN, 401, {"cookie": f"cookie_80={TOKEN}", "host": "localhost:8010", "origin": "http://localhost:3000"}),
+    ],
+)
+def test_only_programs_on_this_machine_or_with_the_token_are_answered(
+    token: str | None, status: int, headers: dict[str, str]
+) -> None:
+    reports, service = list[tuple[str, int]](), Service.__new__(Service)
+    path, headers = headers.get("path", "/localize"), {name: headers[name] for name in headers if name != "path"}
+    app = PlainTextResponse("let in")
+    service.app = Gate(app, token, "cookie", lambda scope, status, *_: reports.append((scope["path"], status)))
+    assert asyncio.run(service.ask("POST", path, [], headers)).status == status
+    assert reports == [(path, status)]
 
 
 def test_every_path_is_described(service: Service) -> None:
-    said = service.get("/openapi.json").json
-    assert set(said["paths"]) == {route.path for route in service.app.routes}
+    description = service.get("/openapi.json").json
+    assert set(description["paths"]) == {route.path for route in service.app.routes}
     protected = service_app(["map"], token="0123456789abcdef").openapi()
-    assert (protected["security"], said["security"]) == ([{"token": []}], [])
+    assert (protected["security"], description["security"]) == ([{"token": []}], [])
     for path, operations in protected["paths"].items():
         for method, operation in operations.items():
             assert ("401" in operation["responses"], "403" in operation["responses"]) == (
                 path != "/health",
                 False,
             )
-            assert "403" in said["paths"][path][method]["responses"]
-    queried = {p["name"] for p in said["paths"]["/localize"]["post"]["parameters"]}
+            assert "403" in description["paths"][path][method]["responses"]
+    queried = {p["name"] for p in description["paths"]["/localize"]["post"]["parameters"]}
     assert queried == PhotoForm.model_fields.keys() - {"photo", "depth"}
     page = service.get("/docs")
     assert page.headers["content-type"].startswith("text/html")
     assert "script" not in page.headers["content-security-policy"]
     for part in ("POST /maps/{map}/localize", "horizontal field of view in degrees", "T_world_camera"):
         assert part in page.body.decode()
-    assert not re.search(rb'(src|href)="(?![/#])', page.body)  # no other server is asked
+    assert not re.search(rb'(src|href)="(?![/#])', page.body)  # no other server is needed
     assert asyncio.run(service.ask("GET", "/maps", [], {"host": "example.org"})).status == 403
     text = service.get("/metrics").body.decode()
     for path, status in (("/localize", 200), ("refused", 403)):
@@ -608,12 +576,12 @@ def test_every_path_is_described(service: Service) -> None:
     assert service.get("/maps/hall").json["anchor"]["latitude"] == 47.4
 
 
-def test_the_client_asks_a_server(place: Place, address: tuple[str, int]) -> None:
-    client = ServiceClient(f"http://{address[0]}:{address[1]}", timeout=30)
-    start = json.loads(place.start)
-    found = client.localize(place.folder / "photo.png", map="map", focal=32, start=start)
+def test_the_client_asks_a_server(inputs: Inputs, service: Service) -> None:
+    client = ServiceClient(service.url, timeout=30)
+    start = json.loads(inputs.start)
+    found = client.localize(inputs.folder / "photo.png", map="map", focal=32, start=start)
     assert (found["frame"], found["method"]) == ("photo", "bid")
-    pixels, depth = iio.imread(place.folder / "photo.png"), np.full((24, 24), 2.0, np.float32)
+    pixels, depth = iio.imread(inputs.folder / "photo.png"), np.full((24, 24), 2.0, np.float32)
     again = client.localize(pixels, "map", focal=32, start=np.array(start), name="photo")
     assert again["T_world_camera"] == found["T_world_camera"]
     assert client.localize(pixels[..., 0], "map", depth=depth, focal=32, start=start)["frame"] == "photo"
@@ -622,7 +590,7 @@ def test_the_client_asks_a_server(place: Place, address: tuple[str, int]) -> Non
     assert set(client.maps()) == {"map", "hall"}
     assert client.health()["status"] == "ok"
     with pytest.raises(ServiceError, match="no map with that name") as refused:
-        client.localize(place.photo, map="other")
+        client.localize(inputs.photo, map="other")
     assert refused.value.status == 404
 
 
@@ -689,7 +657,7 @@ def test_the_client_pauses_before_it_asks_a_busy_service_again(
     assert min(pauses) >= 1
 
 
-def spoken(address: tuple[str, int], content: bytes) -> bytes:
+def exchange(address: tuple[str, int], content: bytes) -> bytes:
     """Send bytes over a connection, and return what comes back until it ends."""
     with socket.create_connection(address, timeout=20) as connection:
         found = b""
@@ -701,8 +669,8 @@ def spoken(address: tuple[str, int], content: bytes) -> bytes:
         return found
 
 
-def test_bytes_that_are_not_http_are_refused(place: Place, address: tuple[str, int]) -> None:
-    drawn, body = random.Random(1), form(photo=place.photo, focal="32", start=place.start, map="map")
+def test_bytes_that_are_not_http_are_refused(inputs: Inputs, address: tuple[str, int]) -> None:
+    drawn, body = random.Random(1), form(photo=inputs.photo, focal="32", start=inputs.start, map="map")
     head = f"POST /localize HTTP/1.1\r\nHost: localhost\r\nContent-Type: {FORM}\r\nConnection: close\r\n"
     statuses = set()
     for number in range(150):
@@ -711,23 +679,23 @@ def test_bytes_that_are_not_http_are_refused(place: Place, address: tuple[str, i
         for _ in range(drawn.randrange(1, 9)):
             at = drawn.randrange(len(head) + 20 if number % 2 else len(content))
             content[at : at + drawn.randrange(5)] = drawn.randbytes(drawn.randrange(5))
-        answer = spoken(address, bytes(content))
+        answer = exchange(address, bytes(content))
         statuses.add(answer[9:10] if answer.startswith(b"HTTP/1.1 ") else b"closed")
     assert statuses <= {b"2", b"4", b"closed"}
     endless = b"GET " + b"x" * 100_000 + b" HTTP/1.1\r\n\r\n"
     for content in (b"\x00\x01\r\n\r\n", b"GET / HTTP/9\r\n\r\n", endless):
-        head = spoken(address, content)
+        head = exchange(address, content)
         assert head.startswith(b"HTTP/1.1 400")
     for path in ("/../../etc/passwd", "//etc/passwd", "/maps/%2e%2e%2fmap.json", "/maps/%00"):
-        asked = f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
-        assert spoken(address, asked.encode()).startswith(b"HTTP/1.1 404"), path
-    head = spoken(address, b"HEAD / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+        question = f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
+        assert exchange(address, question.encode()).startswith(b"HTTP/1.1 404"), path
+    head = exchange(address, b"HEAD / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
     assert head.startswith(b"HTTP/1.1 200")
     assert head.endswith(b"\r\n\r\n")  # without a body
-    assert spoken(address, b"GET /maps HTTP/1.1\r\nHost: example.org\r\n\r\n").startswith(b"HTTP/1.1 403")
+    assert exchange(address, b"GET /maps HTTP/1.1\r\nHost: example.org\r\n\r\n").startswith(b"HTTP/1.1 403")
 
 
-def test_a_body_without_end_and_a_client_without_haste_are_cut_off(place: Place, address: tuple[str, int]) -> None:
+def test_a_body_without_end_and_a_client_without_haste_are_cut_off(inputs: Inputs, address: tuple[str, int]) -> None:
     head = b"POST /localize HTTP/1.1\r\nHost: localhost\r\n"
     for length in (b"Content-Length: 2000000000", b"Transfer-Encoding: chunked"):
         sent, block = 0, bytes(2**16)
@@ -748,23 +716,23 @@ def test_a_body_without_end_and_a_client_without_haste_are_cut_off(place: Place,
     assert time.monotonic() - began < 10
     for _ in range(5):  # clients that leave before the answer
         with socket.create_connection(address, timeout=20) as connection:
-            body = form(photo=place.photo, focal="32", start=place.start, map="map")
+            body = form(photo=inputs.photo, focal="32", start=inputs.start, map="map")
             kind = f"Content-Type: {FORM}\r\nContent-Length: {len(body)}\r\n\r\n".encode()
             connection.sendall(head + kind + body)
     client = ServiceClient(f"http://{address[0]}:{address[1]}", timeout=30)
-    assert client.localize(place.photo, map="map", focal=32, start=json.loads(place.start))["method"] == "bid"
-    quickly(lambda: client.ask("/health")["waiting"] == 0)
+    assert client.localize(inputs.photo, map="map", focal=32, start=json.loads(inputs.start))["method"] == "bid"
+    wait_until(lambda: client.ask("/health")["waiting"] == 0)
 
 
 @pytest.mark.slow
 def test_strangers_who_read_the_description_find_it_true(
-    place: Place, address: tuple[str, int], monkeypatch: pytest.MonkeyPatch
+    inputs: Inputs, address: tuple[str, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("schemathesis", reason="Schemathesis is not installed")
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
     openapi = importlib.import_module("_openapi")
     # The protocols share the code of echo.
-    found = openapi.tried(f"http://{address[0]}:{address[1]}", "map", [place.photo], 1, without="geopose")
+    found = openapi.tried(f"http://{address[0]}:{address[1]}", "map", [inputs.photo], 1, without="geopose")
     assert (found["failures"], found["errors"]) == ({}, {}), found["output"]
     assert found["operations"] >= 8
     assert found["requests"] > 100
@@ -783,7 +751,7 @@ def test_a_token_that_is_given_is_not_shown(tmp_path: Path, bidnerf: Run, monkey
     assert "Bearer made-up-0123456789" in made_up.out + made_up.err
 
 
-def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidnerf: Run) -> None:
+def test_maps_and_settings_that_cannot_be_served_are_refused(inputs: Inputs, bidnerf: Run) -> None:
     assert maps_by_name({"a": "x"}) == maps_by_name(["a=x"]) == {"a": Path("x")}
     assert list(maps_by_name(["x/a", "b=y/a"])) == ["a", "b"]
     for maps, part in (
@@ -800,17 +768,17 @@ def test_maps_and_settings_that_cannot_be_served_are_refused(place: Place, bidne
         service_app("MAP", method="bid", config=5)
     with pytest.raises(InputError, match="timeout is 0"):
         ServiceLimits(timeout=0)
-    assert bidnerf("serve", place.folder / "map", "--port", 99999).status == 2
+    assert bidnerf("serve", inputs.folder / "map", "--port", 99999).status == 2
 
 
 def test_an_internal_error_is_one_line_of_the_log(
-    service: Service, place: Place, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    service: Service, inputs: Inputs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def fail(*given: Any) -> Any:
         raise RuntimeError("/home/user/secret")
 
     monkeypatch.setattr(service.pool, "answer", fail)
-    reply = service.post("/localize?map=map", place.photo)
+    reply = service.post("/localize?map=map", inputs.photo)
     assert (reply.status, reply.json["detail"]) == (500, "internal error")
     (line,) = (json.loads(record.message) for record in caplog.records if record.name == "bidnerf.service")
     assert (line["status"], line["path"], line["fault"]) == (500, "/localize", "RuntimeError: /home/user/secret")
@@ -858,48 +826,16 @@ def test_a_server_that_is_not_installed_is_named(server: Any, needed: str, monke
 
 def test_startup_of_another_server_starts_the_pool(monkeypatch: pytest.MonkeyPatch) -> None:
     """An ASGI server starts the workers and ends them by events, which are not requests and carry no token."""
-    app, told = service_app("MAP", token="0123456789abcdef"), list[str]()
-    events = [{"type": "lifespan.startup"}, {"type": "lifespan.shutdown"}]
-
-    async def started() -> None:
-        told.append("started")
-
-    async def ended() -> None:
-        told.append("ended")
-
-    monkeypatch.setattr(app.state.pool, "start", started)
-    monkeypatch.setattr(app.state.pool, "close", ended)
-
-    async def receive() -> Any:
-        return events.pop(0)
-
-    async def send(message: Any) -> None:
-        told.append(message["type"])
-
+    app, start, close, send = service_app("MAP", token="0123456789abcdef"), AsyncMock(), AsyncMock(), AsyncMock()
+    monkeypatch.setattr(app.state.pool, "start", start)
+    monkeypatch.setattr(app.state.pool, "close", close)
+    receive = AsyncMock(side_effect=[{"type": "lifespan.startup"}, {"type": "lifespan.shutdown"}])
     asyncio.run(app({"type": "lifespan", "asgi": {"version": "3.0"}, "state": {}}, receive, send))
-    assert told == ["started", "lifespan.startup.complete", "ended", "lifespan.shutdown.complete"]
+    answers = [call.args[0]["type"] for call in send.await_args_list]
+    assert answers == ["lifespan.startup.complete", "lifespan.shutdown.complete"]
+    assert (start.await_count, close.await_count) == (1, 1)
 
 
-def test_a_folder_without_a_map_is_refused(place: Place, bidnerf: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The process that would hold the maps refuses it, which is a thread here, and the command prints its line."""
-
-    class Threaded:
-        pid = 2**30  # no process has this number
-
-        def __init__(self, words: list[str], pass_fds: list[int], **options: Any) -> None:
-            monkeypatch.setattr(sys, "argv", [words[-2], str(os.dup(pass_fds[0]))])
-            self.thread = threading.Thread(target=hold_maps)
-            self.thread.start()
-
-        def kill(self) -> None: ...
-
-        def wait(self) -> None:
-            self.thread.join()
-
-    monkeypatch.setattr("bidnerf.service.pool.subprocess.Popen", Threaded)
-    monkeypatch.setattr("bidnerf.service.worker.signal.signal", lambda *_: None)
-    monkeypatch.setattr("bidnerf.service.worker.os.getpgrp", os.getpid)
-    monkeypatch.setattr("cv2.setNumThreads", lambda _: None)
-    with warnings.catch_warnings():
-        refused = bidnerf("serve", place.folder / "data")
-    assert_refused(refused, 1, place.folder / "data", "no map.json")
+def test_a_folder_without_a_map_is_refused(inputs: Inputs, bidnerf: Run) -> None:
+    """The process that would hold the maps refuses it, and the command prints its line."""
+    assert_refused(bidnerf("serve", inputs.folder / "data"), 1, inputs.folder / "data", "no map.json")

@@ -227,7 +227,7 @@ def test_the_loss_of_a_descent_is_the_first_figure(answer: Localization) -> None
     lost = replace(answer, confidence=0.05, diagnostics=said)
     first = acceptance_figures(lost, None)[0]
     assert (first.name, first.value, first.threshold, first.passed) == ("mean loss", "0.036", "at most 0.02", False)
-    assert "not even a local optimum" in contests(lost, None)[0]["remark"]
+    assert "not even a local optimum" in contests(lost, None)[0]["note"]
 
 
 def test_a_descent_is_shown_step_by_step_with_its_loss(room: Map, answer: Localization) -> None:
@@ -252,7 +252,7 @@ def test_an_earlier_pose_by_landmarks_is_told_from_the_pose_found(
         == {there["matches"]["pose"] if there["matches"] else None}
         == {EARLIER}
     )
-    assert EARLIER in next(each["remark"] for each in there["contests"] if not each["of_pose"])
+    assert EARLIER in next(each["note"] for each in there["contests"] if not each["of_pose"])
 
 
 def test_a_localization_is_not_recorded_unless_asked_for(

@@ -67,9 +67,9 @@ export class Live {
     this.page.progress(`${name}: waiting`);
     try {
       const reply = await fetch(path, { method: "POST", body, headers: body ? { "Content-Type": "application/octet-stream" } : {} });
-      const said = await reply.json();
-      if (!reply.ok) throw new Error(said.detail);
-      await this.watch(said.job, name);
+      const accepted = await reply.json();
+      if (!reply.ok) throw new Error(accepted.detail);
+      await this.watch(accepted.job, name);
     } catch (error) {
       this.page.note(`${name}: ${error.message}`);
     }

@@ -282,11 +282,11 @@ class Page {
       onchange: (event) => { this.factor = Number(event.target.value); this.drawAnswer(); this.drawPanel(); } }, ...sizes)) : null;
     this.comparison.show(this.runner ? { ...answer, rendered: other.rendered, label: name, depth: null, matches: null } : answer);
     const compared = contests(answer, true), measured = figures(answer);
-    const said = this.runner ? compared : [...(answer.accepted ? [...measured, ...compared] : [...compared, ...measured]), ...contests(answer, false),
+    const parts = this.runner ? compared : [...(answer.accepted ? [...measured, ...compared] : [...compared, ...measured]), ...contests(answer, false),
       ...uncertainty(answer, this.factor), enlarge];
     find("verdict").replaceChildren(...outcomeOf(answer));
     find("answer").replaceChildren(...[this.runner ? runner : null, this.comparison.root, this.runner ? null : runner,
-      ...said, ...poseText(answer, this.pose)].filter(Boolean));
+      ...parts, ...poseText(answer, this.pose)].filter(Boolean));
   }
 
   get otherName() { return this.answer.runner_up?.probability > 0.5 ? "likelier pose" : "runner-up"; }

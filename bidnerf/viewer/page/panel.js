@@ -66,7 +66,7 @@ export function figures(answer) {
 }
 
 export function contests(answer, ofPose) {
-  return answer.contests.filter((each) => each.of_pose === ofPose).flatMap(({ question, answers, remark }) => {
+  return answer.contests.filter((each) => each.of_pose === ofPose).flatMap(({ question, answers, note }) => {
     const most = Math.max(...answers.map((each) => each.probability));
     const lines = answers.flatMap(({ name, probability }) => {
       const fill = element("i");
@@ -76,7 +76,7 @@ export function contests(answer, ofPose) {
         element("div", { class: "gauge plain" }, fill),
       ];
     });
-    return [element("h2", {}, question), remark && !answer.reason.includes(remark) ? element("p", { class: "small" }, remark) : null, element("div", { class: "weighed" }, ...lines)];
+    return [element("h2", {}, question), note && !answer.reason.includes(note) ? element("p", { class: "small" }, note) : null, element("div", { class: "weighed" }, ...lines)];
   });
 }
 

@@ -391,17 +391,17 @@ export class Space {
   // The poses of a step of the search, coloured by score, the best last so that they are in front.
   hypotheses(step, shape) {
     this.clear("search");
-    const rows = numbers(step.poses), count = rows.length / 12, kept = [], others = [], tints = [], grey = [];
+    const rows = numbers(step.poses), count = rows.length / 12, retained = [], others = [], tints = [], grey = [];
     const best = new THREE.Color(colourOf("--best")), worst = new THREE.Color(colourOf("--worst"));
     const known = step.scores.filter((s) => s !== null), low = Math.min(...known), high = Math.max(...known, low + 1e-9);
     for (let i = count - 1; i >= 0; i--) {
       const pose = [...rows.subarray(12 * i, 12 * i + 12), 0, 0, 0, 1];
       const places = this.moved3(pyramid(shape, this.size * (i === 0 ? 0.8 : 0.4)).lines, pose);
       const score = step.scores[i] ?? high, tint = best.clone().lerp(worst, (score - low) / (high - low)).toArray();
-      if (i < step.kept) { kept.push(...places); tints.push(...places.map(() => tint)); } else { others.push(...places); grey.push(...places.map(() => tint)); }
+      if (i < step.retained) { retained.push(...places); tints.push(...places.map(() => tint)); } else { others.push(...places); grey.push(...places.map(() => tint)); }
     }
     if (others.length) this.lines("search", others, null, { colours: grey, opacity: 0.5 });
-    if (kept.length) this.lines("search", kept, null, { colours: tints });
+    if (retained.length) this.lines("search", retained, null, { colours: tints });
     this.label("search", [rows[3], rows[7], rows[11]], count > 1 ? "best of this step" : "this step", colourOf("--best"));
   }
 

@@ -15,12 +15,12 @@ export class Track {
     this.range = element("input", { type: "range", id: "time", min: "0", max: String(this.count - 1), step: "1", value: "0", "aria-label": "Pose of the trajectory",
       oninput: (event) => { this.stop(); this.show(Number(event.target.value)); } });
     this.button = element("button", { id: "run", "aria-label": "Play the trajectory", onclick: () => this.play() }, "▶");
-    this.said = element("p", { class: "small", id: "place" });
+    this.text = element("p", { class: "small", id: "place" });
     const choice = ways.length > 1 ? element("select", { "aria-label": "Colour", onchange: (event) => { this.way = event.target.value; this.draw(); } },
       ...ways.map((way) => element("option", { value: way }, `by ${way}`))) : null;
     this.key = element("div", { class: "under" });
     find("trajectory").replaceChildren(element("h2", {}, `Trajectory ${shown.name}, ${this.count} poses`),
-      element("div", { class: "row" }, this.button, this.range, ...(choice ? [choice] : [])), this.key, this.said);
+      element("div", { class: "row" }, this.button, this.range, ...(choice ? [choice] : [])), this.key, this.text);
     this.range.style.flex = "1";
     this.draw();
     this.show(0);
@@ -59,7 +59,7 @@ export class Track {
     const { frames, times, sigmas, outcomes } = this.shown, { space } = this.page;
     const time = times[this.place] === null ? null : `${(times[this.place] - (times[0] ?? 0)).toFixed(2)} s`;
     const sigma = sigmas[this.place] === null ? null : `± ${lengthText(sigmas[this.place], this.page.map.unit)}`;
-    this.said.textContent = [`${this.place + 1} of ${this.count}`, time, frames[this.place], outcomes[this.place], sigma].filter(Boolean).join(" · ");
+    this.text.textContent = [`${this.place + 1} of ${this.count}`, time, frames[this.place], outcomes[this.place], sigma].filter(Boolean).join(" · ");
     space?.clear("runner");
     space?.frustum("runner", [...this.rows.subarray(12 * this.place, 12 * this.place + 12), 0, 0, 0, 1], this.page.map.cameras[0]?.shape, colourOf("--accent"));
   }
