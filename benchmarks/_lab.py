@@ -249,7 +249,7 @@ def record(name: str, results: dict[str, Any], seed: int = 0, folder: Path = RES
     """
     threads, path = torch.get_num_threads(), folder / f"{name}.json"
     run = provenance(script_command(), f"one process of {threads} thread{'s' if threads > 1 else ''}")
-    kept = {"benchmark": name, **to_plain(run), "seed": seed, "results": _rounded(results)}
+    kept = {"benchmark": name, **to_plain(run), "seed": seed, "results": _round(results)}
     folder.mkdir(parents=True, exist_ok=True)
     write_file(path, (_in_lines(kept) + "\n").encode())
     print(path)
@@ -272,9 +272,9 @@ def _in_lines(value: Any, indent: str = "") -> str:
     return f"{first}\n{deeper}" + f",\n{deeper}".join(parts) + f"\n{indent}{last}"
 
 
-def _rounded(value: Any) -> Any:
+def _round(value: Any) -> Any:
     if isinstance(value, float):
         return float(f"{value:.5g}")
     if isinstance(value, dict):
-        return {key: _rounded(part) for key, part in value.items()}
-    return [_rounded(part) for part in value] if isinstance(value, (list, tuple)) else value
+        return {key: _round(part) for key, part in value.items()}
+    return [_round(part) for part in value] if isinstance(value, (list, tuple)) else value

@@ -23,12 +23,12 @@ positive_data_acceptance.expected-statuses = ["2xx", "400", "404", "422", "429"]
 """
 
 
-def installed() -> bool:
+def is_installed() -> bool:
     """Return whether Schemathesis is installed."""
     return find_spec("schemathesis") is not None
 
 
-def tried(
+def run_schemathesis(
     address: str,
     scene: str,
     photos: Sequence[bytes],

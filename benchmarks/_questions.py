@@ -42,7 +42,7 @@ class Answers:
         if depth and not view.frame.has_depth:
             return {"no depth": True}
         truth = view if data == str(self._scene.data) else None
-        return timed(lambda: self._localizer(view.frame), truth)
+        return time_answer(lambda: self._localizer(view.frame), truth)
 
     def begin(self, data: str, first: int | None = None) -> dict[str, Any]:
         """Begin to track a sequence; its frames are read once."""
@@ -57,10 +57,10 @@ class Answers:
         view = View(shown.frame, SE3.identity() if shown.truth is None else shown.truth)
         frame = view.frame if depth else without_depth(view).frame
         truth = None if shown.truth is None else view
-        return timed(lambda: self._tracker(frame, shown.time), truth)
+        return time_answer(lambda: self._tracker(frame, shown.time), truth)
 
 
-def timed(ask: Callable[[], Localization], truth: View | None) -> dict[str, Any]:
+def time_answer(ask: Callable[[], Localization], truth: View | None) -> dict[str, Any]:
     """Return an answer's CPU time, its errors where the truth is known, and whether it was accepted."""
     began = time.process_time()
     found = ask()

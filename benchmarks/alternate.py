@@ -41,9 +41,7 @@ class Respondents:
 
     def __init__(self, checkouts: dict[str, Path]) -> None:
         self._turn, self._metadata = 0, TemporaryDirectory()
-        self._processes = {
-            name: _started(folder, Path(self._metadata.name, name)) for name, folder in checkouts.items()
-        }
+        self._processes = {name: _start(folder, Path(self._metadata.name, name)) for name, folder in checkouts.items()}
 
     def __enter__(self) -> Respondents:
         return self
@@ -71,7 +69,7 @@ class Respondents:
         return found
 
 
-def _started(checkout: Path, metadata: Path) -> subprocess.Popen[str]:
+def _start(checkout: Path, metadata: Path) -> subprocess.Popen[str]:
     """Start the process of a checkout, whose entry points are read from its pyproject.toml, since another one may be installed."""
     project = tomllib.loads((checkout / "pyproject.toml").read_text())["project"]
     folder = metadata / f"{project['name']}-0.dist-info"
@@ -90,7 +88,7 @@ def _started(checkout: Path, metadata: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
 
 
-def tracked(ask: Respondents, scene: str, first: int | None) -> Iterator[tuple[str, list[Pair]]]:
+def track(ask: Respondents, scene: str, first: int | None) -> Iterator[tuple[str, list[Pair]]]:
     """Yield the answers to the frames of a sequence in order of time."""
     data = str(folder_of("BIDNERF_DATA") / scene)
     for mode, depth in (("RGB-D", True), ("RGB", False)):
@@ -99,7 +97,7 @@ def tracked(ask: Respondents, scene: str, first: int | None) -> Iterator[tuple[s
         yield mode, [ask("track", number=number, depth=depth) for number in shown]
 
 
-def localized(ask: Respondents, scene: str, count: int | None) -> Iterator[tuple[str, list[Pair]]]:
+def localize(ask: Respondents, scene: str, count: int | None) -> Iterator[tuple[str, list[Pair]]]:
     """Yield the answers to test frames of a scene and of others."""
     place, data = SCENES.index(scene), folder_of("BIDNERF_DATA")
     others = [SCENES[(place + step) % len(SCENES)] for step in range(1, FOREIGN + 1)]
@@ -164,8 +162,8 @@ def overall(cells: dict[str, dict[str, Any]]) -> dict[str, Any]:
 
 
 TASKS: dict[str, tuple[Sequence[str], Callable[[Respondents, str, int | None], Iterator[tuple[str, list[Pair]]]]]] = {
-    "track": (SEQUENCES, tracked),
-    "localize": (SCENES, localized),
+    "track": (SEQUENCES, track),
+    "localize": (SCENES, localize),
 }
 
 

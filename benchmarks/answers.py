@@ -57,7 +57,7 @@ from _lab import (
     without_depth,
 )
 from answer_maps import folder_of, map_folder
-from repeated_scene import copies, doubled
+from repeated_scene import copies, double
 from scipy.stats import binomtest
 from torch import Generator, Tensor
 from torch.nn.functional import interpolate
@@ -95,7 +95,7 @@ def generator_of(frame: Frame) -> Generator:
     return Generator().manual_seed(int.from_bytes(digest, "big"))
 
 
-def resampled(frame: Frame, rgb: Tensor, depth: Tensor | None, width: int, height: int) -> Frame:
+def resample(frame: Frame, rgb: Tensor, depth: Tensor | None, width: int, height: int) -> Frame:
     """Return the frame with images resized, but with the focal lengths and the principal point that it states."""
     rgb = interpolate(rgb.permute(2, 0, 1)[None], (height, width), mode="bilinear", antialias=True)[0]
     if depth is not None:
@@ -108,7 +108,7 @@ def resampled(frame: Frame, rgb: Tensor, depth: Tensor | None, width: int, heigh
 def shrunk(frame: Frame) -> Frame:
     """Resize the images to three quarters, and state the camera of the original."""
     camera = frame.intrinsics
-    return resampled(frame, frame.rgb, frame.depth, round(0.75 * camera.width), round(0.75 * camera.height))
+    return resample(frame, frame.rgb, frame.depth, round(0.75 * camera.width), round(0.75 * camera.height))
 
 
 def corner(frame: Frame) -> Frame:
@@ -118,15 +118,15 @@ def corner(frame: Frame) -> Frame:
     right, low = (torch.rand(2, generator=generator_of(frame)) < 0.5).tolist()
     part = (slice(height * low, height * (1 + low)), slice(width * right, width * (1 + right)))
     depth = None if frame.depth is None else frame.depth[part]
-    return resampled(frame, frame.rgb[part], depth, camera.width, camera.height)
+    return resample(frame, frame.rgb[part], depth, camera.width, camera.height)
 
 
-def brightened(frame: Frame) -> Frame:
+def brighten(frame: Frame) -> Frame:
     """Change the tone curve by a gamma of a half."""
     return replace(frame, rgb=frame.rgb.clamp(0, 1).sqrt())
 
 
-def sheared(frame: Frame) -> Frame:
+def shear(frame: Frame) -> Frame:
     """Shift each row sideways by 15 % of its height above the middle."""
     pixels = frame.intrinsics.pixel_centres()
     shift = 0.15 * (pixels[..., 1] - frame.intrinsics.height / 2)
@@ -194,10 +194,10 @@ CONDITIONS = {
     "mirrored": Condition("mirror:1", 0.34),
     "blur 2 px": Condition("blur:2", 0.25),
     "blur 3 px": Condition("blur:3", 0.25),
-    "gamma 0.5": Condition(brightened),
+    "gamma 0.5": Condition(brighten),
     "covered 25 %": Condition("occluder:0.25"),
     "rolling shutter": Condition("rolling-shutter:2"),
-    "sheared 15 %": Condition(sheared, 0.34),
+    "sheared 15 %": Condition(shear, 0.34),
     "lens k1 -0.3": Condition("distortion:-0.3", 0.34),
     "lens k1 +0.3": Condition("distortion:0.3", 0.34),
     "picture tilted": Condition(lambda frame: picture(frame, "tilted"), 0.34),
@@ -314,7 +314,7 @@ class Subject:
 
     @cached_property
     def localizer_of_two(self) -> Localizer:
-        return Localizer(doubled(self.scene.map, copies(self.scene.map.bounds)[0]))
+        return Localizer(double(self.scene.map, copies(self.scene.map.bounds)[0]))
 
     def dataset(self, name: str) -> Capture:
         return open_dataset(folder_of("BIDNERF_DATA") / name, self.scene.map.bounds.background)
@@ -477,7 +477,7 @@ def mcnemar(first: Sequence[Row], second: Sequence[Row], test: Callable[[Row], b
     return *only, float(binomtest(only[0], sum(only)).pvalue) if sum(only) else 1.0
 
 
-def untimed(row: Row) -> Row:
+def without_time(row: Row) -> Row:
     return {name: value for name, value in row.items() if name != "cpu_seconds"}
 
 
@@ -485,12 +485,12 @@ def changes(first: Sequence[Row], second: Sequence[Row]) -> dict[str, int]:
     """Return how many pairs of answers differ at all, and in what."""
     pairs = list(zip(first, second, strict=True))
     parts = ("pose", "covariance", "outcome", "reason", "confidence")
-    found = {"any": sum(untimed(a) != untimed(b) for a, b in pairs)}
+    found = {"any": sum(without_time(a) != without_time(b) for a, b in pairs)}
     found |= {part: sum(a[part] != b[part] for a, b in pairs) for part in parts}
-    return found | {"pose beyond rounding": sum(moved(a["pose"], b["pose"]) for a, b in pairs)}
+    return found | {"pose beyond rounding": sum(has_moved(a["pose"], b["pose"]) for a, b in pairs)}
 
 
-def moved(first: list[list[float]] | None, second: list[list[float]] | None) -> bool:
+def has_moved(first: list[list[float]] | None, second: list[list[float]] | None) -> bool:
     """Return whether two poses differ by more than rounding does, or only one is known."""
     if first is None or second is None:
         return first is not second

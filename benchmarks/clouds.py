@@ -191,7 +191,7 @@ class Open3d:
     def _features(self, voxel: float) -> tuple[Any, Any]:
         return self._described(self.at(voxel), voxel)
 
-    def _described(self, cloud: Any, voxel: float) -> tuple[Any, Any]:
+    def _describe(self, cloud: Any, voxel: float) -> tuple[Any, Any]:
         """Return a cloud and its FPFH features, with radii as in the library's tutorial on global registration."""
         around = self.library.geometry.KDTreeSearchParamHybrid(radius=5 * voxel, max_nn=100)
         return cloud, self.library.pipelines.registration.compute_fpfh_feature(cloud, around)
@@ -297,9 +297,9 @@ def tuned_open3d(library: Open3d, tries: Sequence[Case], voxel: float) -> tuple[
 
     def search(setting: Ransac) -> tuple[Score, list[Matrix]]:
         library.features(setting.voxel)
-        found, seconds = timed(tries, lambda i, case: _searched(library, case, setting))
+        found, seconds = measure_time(tries, lambda i, case: _search(library, case, setting))
         refined = [library.refine(case.measured, T, rough) for case, T in zip(tries, found, strict=True)]
-        return scored(tries, refined, seconds), found
+        return score_poses(tries, refined, seconds), found
 
     results = {setting: search(setting) for setting in ransac_choices(voxel)}
     results |= {s: search(s) for s in ransac_neighbours(_quickest(results))}
@@ -313,7 +313,7 @@ def tuned_gicp(library: SmallGicp, tries: Sequence[Case], starts: Sequence[Matri
     return _nearest(tries, starts, library.refine, gicp_choices(voxel, near))
 
 
-def timed(tries: Sequence[Case], run: Callable[[int, Case], Matrix]) -> tuple[list[Matrix], list[float]]:
+def measure_time(tries: Sequence[Case], run: Callable[[int, Case], Matrix]) -> tuple[list[Matrix], list[float]]:
     """Return the answers, and the CPU seconds of each."""
     found, seconds = [], []
     for i, case in enumerate(tries):
@@ -323,14 +323,14 @@ def timed(tries: Sequence[Case], run: Callable[[int, Case], Matrix]) -> tuple[li
     return found, seconds
 
 
-def scored(tries: Sequence[Case], found: Sequence[Matrix], seconds: Sequence[float]) -> Score:
+def score_poses(tries: Sequence[Case], found: Sequence[Matrix], seconds: Sequence[float]) -> Score:
     errors = pose_error(SE3.stack([as_pose(T) for T in found]), SE3.stack([case.truth for case in tries]))
     good = [int(CRITERIA[name](errors, errors).sum()) for name in ("5deg 0.05", "1deg 0.02")]
     shares = errors.translation / 0.02 + errors.rotation_deg
     return Score(sum(good), float(shares.nan_to_num(torch.inf).median()), median(seconds))
 
 
-def _searched(library: Open3d, case: Case, setting: Ransac) -> Matrix:
+def _search(library: Open3d, case: Case, setting: Ransac) -> Matrix:
     library.seed(case.seed)
     return library.search(case.measured, setting)
 
@@ -349,8 +349,8 @@ def _nearest(
     """Return the settings that succeed most often and, among these, have the smallest errors."""
 
     def score(setting: Setting) -> tuple[int, float]:
-        found, seconds = timed(tries, lambda i, case: refine(case.measured, starts[i], setting))
-        result = scored(tries, found, seconds)
+        found, seconds = measure_time(tries, lambda i, case: refine(case.measured, starts[i], setting))
+        result = score_poses(tries, found, seconds)
         return result.successes, -result.error
 
     return max(choices, key=score)
@@ -363,9 +363,9 @@ def tuned_kiss(
     rough = Gicp(voxel / 2, (2 * voxel, voxel))
 
     def search(size: float) -> tuple[Score, list[Matrix]]:
-        found, seconds = timed(tries, lambda i, case: library.search(case.measured, size)[0])
+        found, seconds = measure_time(tries, lambda i, case: library.search(case.measured, size)[0])
         refined = [gicp.refine(case.measured, T, rough) for case, T in zip(tries, found, strict=True)]
-        return scored(tries, refined, seconds), found
+        return score_poses(tries, refined, seconds), found
 
     results = {size: search(size) for size in (0.6 * voxel, voxel, 1.6 * voxel)}
     best = max(results, key=lambda size: (results[size][0].successes, -results[size][0].seconds))

@@ -73,7 +73,7 @@ def example(key: Sequence[str], row: dict[str, Any]) -> Example:
     return Example(features(Evidence(**row["evidence"])), right, scene, condition)
 
 
-def fitted(given: Sequence[Example], ridge: float = RIDGE) -> LogisticModel:
+def fit_model(given: Sequence[Example], ridge: float = RIDGE) -> LogisticModel:
     """Fit a logistic regression whose weights have the right signs.
 
     Features are standardised for the ridge penalty; the weights returned are for the raw features.
@@ -111,7 +111,7 @@ def folds(given: Sequence[Example], by_fault: bool) -> list[tuple[list[Example],
     return pairs
 
 
-def assessed(said: Sequence[float], right: Sequence[bool]) -> dict[str, Any]:
+def assess(said: Sequence[float], right: Sequence[bool]) -> dict[str, Any]:
     """Return the reliability diagram and the counts at the threshold of acceptance."""
     p, y = np.array(said), np.array(right)
     number = np.minimum((p * BINS).astype(int), BINS - 1)
@@ -133,22 +133,22 @@ def assessed(said: Sequence[float], right: Sequence[bool]) -> dict[str, Any]:
     }
 
 
-def cross_validated(given: Sequence[Example], by_fault: bool) -> dict[str, Any]:
+def cross_validate(given: Sequence[Example], by_fault: bool) -> dict[str, Any]:
     """Fit and test on every fold, and pool the answers, overall and by scene."""
     said, right, scenes = [], [], []
     for fit, test in folds(given, by_fault):
-        model = fitted(fit)
+        model = fit_model(fit)
         said += [model.probability(e.features) for e in test]
         right += [e.right for e in test]
         scenes += [e.scene for e in test]
     by_scene = {
-        scene: assessed(
+        scene: assess(
             [p for p, s in zip(said, scenes, strict=True) if s == scene],
             [y for y, s in zip(right, scenes, strict=True) if s == scene],
         )
         for scene in sorted(set(scenes))
     }
-    return {"all": assessed(said, right), "by_scene": by_scene}
+    return {"all": assess(said, right), "by_scene": by_scene}
 
 
 def line(s: dict[str, Any]) -> str:
@@ -167,11 +167,11 @@ def main() -> None:
     everything = examples(given.rows)
     if min(sum(e.right for e in everything), sum(not e.right for e in everything)) < FEWEST:
         raise SystemExit(f"{len(everything)} examples, expected {FEWEST} right and {FEWEST} wrong ones")
-    model = fitted(everything)
+    model = fit_model(everything)
     results = {
-        "other scenes": cross_validated(everything, by_fault=False),
-        "other scenes and faults": cross_validated(everything, by_fault=True),
-        "the examples themselves": assessed(
+        "other scenes": cross_validate(everything, by_fault=False),
+        "other scenes and faults": cross_validate(everything, by_fault=True),
+        "the examples themselves": assess(
             [model.probability(e.features) for e in everything], [e.right for e in everything]
         ),
     }

@@ -67,7 +67,7 @@ def at_night(frame: Frame) -> Frame:
     return replace(frame, rgb=(255 * rgb).round() / 255)
 
 
-def resized(frame: Frame, factor: float) -> Frame:
+def resize(frame: Frame, factor: float) -> Frame:
     """Return the image at another resolution, with the matching camera."""
     camera = frame.intrinsics.scaled(factor)
     kind = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
@@ -77,8 +77,8 @@ def resized(frame: Frame, factor: float) -> Frame:
 
 CONDITIONS: dict[str, Callable[[Frame], Frame]] = {
     "as it is": lambda frame: frame,
-    "half resolution": partial(resized, factor=0.5),
-    "double resolution": partial(resized, factor=2.0),
+    "half resolution": partial(resize, factor=0.5),
+    "double resolution": partial(resize, factor=2.0),
     "night": at_night,
 }
 
@@ -91,7 +91,7 @@ def detector(name: str) -> Features:
     return find_features(name)
 
 
-def localized(landmarks: LandmarkMatcher, features: Features, query: View) -> Row:
+def localize(landmarks: LandmarkMatcher, features: Features, query: View) -> Row:
     """Localize one frame by landmarks alone, and return its errors, whether its pose is accepted, and the CPU time."""
     began = time.process_time()
     found = Loop([View(query.frame, SE3.identity())], landmarks, features=features)()
@@ -143,7 +143,7 @@ def answers(
                     def make(name: str = name, change: Any = change, test: str = test, maps: Maps = maps) -> Row:
                         (view,) = map(without_depth, data.views("test", [test]))
                         matcher = maps[name]
-                        return localized(matcher, detector(name), replace(view, frame=change(view.frame)))
+                        return localize(matcher, detector(name), replace(view, frame=change(view.frame)))
 
                     row = store.get([folder.name, every, first, condition, name, test], make)
                     found[condition][name].append(row)
@@ -159,7 +159,7 @@ def detection(folder: Path, names: Sequence[str], store: RowStore, count: int | 
 
             def make(name: str = name, test: str = test) -> Row:
                 frame, times = data.views("test", [test])[0].frame, list[float]()
-                rgb = resized(frame, 640 / frame.intrinsics.width).rgb[:480].contiguous()
+                rgb = resize(frame, 640 / frame.intrinsics.width).rgb[:480].contiguous()
                 features = detector(name)
                 for _ in range(ANSWERS):
                     began = time.process_time()

@@ -25,7 +25,7 @@ ROW, WIDTH = 0.26, 5.2
 """Height of a fault's row and width of a panel, inches."""
 
 
-def pooled(paths: Sequence[Path]) -> dict[str, dict[str, dict[str, int]]]:
+def pool_counts(paths: Sequence[Path]) -> dict[str, dict[str, dict[str, int]]]:
     """Return the counts by mode and fault, summed over the scenes of all records."""
     found: dict[str, dict[str, dict[str, int]]] = {}
     for path in paths:
@@ -65,7 +65,7 @@ def main() -> None:
     parser.add_argument("records", nargs="+", type=Path)
     parser.add_argument("--out", type=Path, required=True, help="of the figure, a PNG")
     given = parser.parse_args()
-    modes = pooled(given.records)
+    modes = pool_counts(given.records)
     rows = max(len(cells) for cells in modes.values())
     with common_style():
         figure = new_figure(len(modes) * WIDTH, rows * ROW * 1.6 + 1.1)

@@ -177,7 +177,7 @@ def frames_of(
         yield Query(map, data, name, depth, fault, foreign, given.config, given.seed)
 
 
-def answered(
+def answer_all(
     asked: Iterator[Query], store: RowStore, executor: Executor, jobs: int
 ) -> Iterator[tuple[Query, dict[str, Any]]]:
     """Yield all queries with their rows, in order, with ``jobs`` queries under way at a time."""
@@ -196,11 +196,11 @@ def answered(
         yield first()
 
 
-def measured(given: argparse.Namespace, store: RowStore, executor: Executor) -> dict[str, Any]:
+def measure(given: argparse.Namespace, store: RowStore, executor: Executor) -> dict[str, Any]:
     """Return the summaries of all cells by scene and mode, and print each when it is complete."""
     cells: dict[tuple[str, str, str], list[Row]] = {}
     last: tuple[str, str, str] | None = None
-    for query, row in answered(queries(given), store, executor, given.jobs):
+    for query, row in answer_all(queries(given), store, executor, given.jobs):
         if last is not None and query.cell != last:
             print(line(" ".join(last), cells[last]), flush=True)
         last = query.cell
@@ -241,7 +241,7 @@ def main() -> None:
     given = arguments()
     one_thread()
     with RowStore(RESULTS / f"{given.name}.rows.jsonl") as store, local_processes(given.jobs) as executor:
-        results = measured(given, store, executor)
+        results = measure(given, store, executor)
     record(given.name, results, given.seed)
 
 

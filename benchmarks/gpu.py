@@ -102,7 +102,7 @@ def made_steps(
     return AdamSteps(loss, pivot("scene", problem), rate, problem.start_for("bid").to(device))
 
 
-def timed(step: Callable[[], None], count: int) -> tuple[float, float]:
+def measure_time(step: Callable[[], None], count: int) -> tuple[float, float]:
     """Return the median and the maximum time of a step (ms), measured with device events."""
     torch.cuda.synchronize()
     marks = [torch.cuda.Event(enable_timing=True) for _ in range(count + 1)]
@@ -123,15 +123,15 @@ def timed_steps(steps: AdamSteps, device: torch.device, generator: torch.Generat
         torch.cuda.synchronize()
         torch.cuda.set_sync_debug_mode("error")  # a step in which the host waits raises
         try:
-            launched = timed(steps, TIMED)
+            launched = measure_time(steps, TIMED)
         finally:
             torch.cuda.set_sync_debug_mode("default")
         found = operations(steps)
         began = time.perf_counter()
         replay = captured(steps, device, generator)
         capturing = time.perf_counter() - began
-        timed(replay, WARM_UP)
-        graph = timed(replay, TIMED)
+        measure_time(replay, WARM_UP)
+        graph = measure_time(replay, TIMED)
     return {
         "graph_ms": graph[0],
         "graph_ms_most": graph[1],
@@ -180,17 +180,17 @@ def kernel_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
     at = lower + (upper - lower) * torch.rand(POINTS, 3, device=device)
     along = torch.nn.functional.normalize(torch.randn(POINTS, 3, device=device), dim=-1)
     field: Any = trained_field(stored.field)
-    own = timed(lambda: derivatives_of(stored.field, at, along), 20)[0]
+    own = measure_time(lambda: derivatives_of(stored.field, at, along), 20)[0]
     # An access reads at least a sector of 32 bytes: eight corners of each level. A sixteenth of them fits into memory.
     table = torch.cat(list(field.encoding.tables))
     index = torch.randint(len(table), (len(field.encoding.levels) * POINTS // 2,), device=device)
-    reads = 16 * timed(lambda: table.index_select(0, index), 20)[0]
+    reads = 16 * measure_time(lambda: table.index_select(0, index), 20)[0]
     # The values, three derivatives of the density network, and six of the colour network, in the precision of the kernel.
     geometry, colour = (sum(part.numel() for part in net.parameters()) for net in (field.geometry, field.colour))
     matrix = torch.randn(SIDE, SIDE, device=device)
     usual = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high")
-    product = timed(lambda: matrix @ matrix, 20)[0] / SIDE**3
+    product = measure_time(lambda: matrix @ matrix, 20)[0] / SIDE**3
     torch.set_float32_matmul_precision(usual)
     floors = {"reads": reads, "products": POINTS * (4 * geometry + 7 * colour) * product}
     return {"points": POINTS, "ms": own, "bounds_ms": floors, "share": max(floors.values()) / own}
@@ -212,7 +212,7 @@ def search_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
                 step()
             torch.cuda.reset_peak_memory_stats()
             replay = captured(step, device)
-            milliseconds = timed(replay, 50)[0]
+            milliseconds = measure_time(replay, 50)[0]
         found[f"{poses} poses, {rays} rays"] = {
             "ms": milliseconds,
             "is_graph": replay is not step,
@@ -333,7 +333,7 @@ def table_rows(folder: str, data: str, device: torch.device, out: Path, workers:
     return {"folder": tables.name, "seconds": time.perf_counter() - began}
 
 
-def attempted(what: str, make: Callable[[], Any]) -> Any:
+def attempt(what: str, make: Callable[[], Any]) -> Any:
     """Return the result of ``make``, or why it failed, so that the other rows are measured nevertheless."""
     print(what, flush=True)
     try:
@@ -371,7 +371,7 @@ def main() -> None:
             name = Path(folder).name
             for row in given.part:
                 make = partial(rows[row], folder, given.data, device)
-                found = store.get([gpu, name, row], partial(attempted, f"{name}: {row}", make))
+                found = store.get([gpu, name, row], partial(attempt, f"{name}: {row}", make))
                 print(json.dumps(found), flush=True)
                 results.setdefault(row, {})[name] = found
     _lab.record(given.name, results, folder=given.out)

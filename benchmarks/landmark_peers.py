@@ -108,7 +108,7 @@ Peer = Callable[[View, int], Answer]
 """A function from a view and a seed to an answer; the view's own pose serves only to make a start."""
 
 
-def installed() -> dict[str, str | None]:
+def installed_versions() -> dict[str, str | None]:
     """Return the versions of the libraries, and print a line for each that is missing."""
     found: dict[str, str | None] = dict.fromkeys(LIBRARIES)
     for module, distributions in LIBRARIES.items():
@@ -159,7 +159,7 @@ def depth_peers(
     points, voxel = map_points(scene.map.surface), given.voxel
     tries = cases([(measured_points(view.frame), view.T_ref_camera) for view in tuning])
 
-    def wanted(*names: str) -> bool:
+    def is_wanted(*names: str) -> bool:
         return not given.peers or any(name in given.peers for name in names)
 
     def tuned(name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -167,9 +167,9 @@ def depth_peers(
         found: dict[str, Any] = store.get([*scene.key, "tuned", name, voxel, given.off], make)
         return found
 
-    if find_spec("small_gicp") and wanted(KISS_GICP, FROM_START):
+    if find_spec("small_gicp") and is_wanted(KISS_GICP, FROM_START):
         gicp = SmallGicp(points)
-        if wanted(FROM_START):
+        if is_wanted(FROM_START):
             starts = [bid_start(case.truth, given.off, i).matrix().numpy() for i, case in enumerate(tries)]
             settings[FROM_START] = tuned(FROM_START, lambda: to_plain(tuned_gicp(gicp, tries, starts, voxel, False)))
             refine = from_plain(Gicp, settings[FROM_START], FROM_START)
@@ -181,7 +181,7 @@ def depth_peers(
                 )
             )
             peers["auto from a start"] = partial(auto, localizer, given.off)
-        if find_spec("kiss_matcher") and wanted(KISS_GICP):
+        if find_spec("kiss_matcher") and is_wanted(KISS_GICP):
             kiss = KissMatcher(points)
 
             def tune_kiss() -> dict[str, Any]:
@@ -192,7 +192,7 @@ def depth_peers(
             peers[KISS_GICP] = partial(
                 kiss_gicp, kiss, gicp, chosen["voxel"], from_plain(Gicp, chosen["gicp"], KISS_GICP)
             )
-    if find_spec("open3d") and wanted(*OPEN3D_PEERS):
+    if find_spec("open3d") and is_wanted(*OPEN3D_PEERS):
         library = Open3d(points)
         names = ("ransac", "icp", "coloured icp")
         plain = tuned(
@@ -237,7 +237,7 @@ def answer(peer: Peer, view: View, seed: int) -> Row:
     return row | (error or {})
 
 
-def compared(
+def compare(
     peers: dict[str, Peer],
     views: Sequence[View],
     warm: View,
@@ -249,7 +249,7 @@ def compared(
     rows: dict[str, list[Row]] = {name: [] for name in peers}
     warmed = set[str]()
 
-    def timed(name: str, view: View, seed: int) -> Row:
+    def time_answer(name: str, view: View, seed: int) -> Row:
         if name not in warmed:
             peers[name](warm, 0)
             warmed.add(name)
@@ -258,7 +258,7 @@ def compared(
     for place, view in enumerate(views):
         for name in in_turn(list(peers), place):
             known_by = [*key, name, settings.get(name), views_digest([view]), place]
-            rows[name].append(store.get(known_by, partial(timed, name, view, place)))
+            rows[name].append(store.get(known_by, partial(time_answer, name, view, place)))
     return rows
 
 
@@ -321,7 +321,7 @@ def scene_rows(scene: Scene, given: argparse.Namespace, store: RowStore) -> tupl
             peers, settings = depth_peers(scene, tuning, given, store)
         if given.peers:
             peers = {name: peer for name, peer in peers.items() if name == OURS or name in given.peers}
-        rows = every[mode] = compared(peers, views, modes(tuning)[mode][0], [*scene.key, mode], settings, store)
+        rows = every[mode] = compare(peers, views, modes(tuning)[mode][0], [*scene.key, mode], settings, store)
         results[mode] = {"settings": settings, "peers": summaries(rows)}
         for name, found in results[mode]["peers"].items():
             print(f"{scene.name:15} {mode:5} {name:38} {line(found)}", flush=True)
@@ -347,7 +347,7 @@ def main() -> None:
     arguments.set_defaults(modes=("RGB", "RGB-D"))
     given = arguments.parse_args()
     one_thread()
-    versions, scenes, every = installed(), {}, []
+    versions, scenes, every = installed_versions(), {}, []
     with RowStore(RESULTS / f"{given.name}.rows.jsonl") as store:
         for scene in map(Scene.open, given.scenes):
             scenes[scene.name], rows = scene_rows(scene, given, store)

@@ -147,7 +147,7 @@ def scenes() -> list[PlanarScene]:
     ]
 
 
-def mapped(scene: PlanarScene, generator: Generator) -> tuple[PlanarMap, Localizer]:
+def make_map(scene: PlanarScene, generator: Generator) -> tuple[PlanarMap, Localizer]:
     """Return a map of a scene from images of known pose, and what localizes in it without rendering."""
     training = [scene.view(T, f"{i:04d}", generator) for i, T in enumerate(scene.poses(16, generator))]
     side = 2 * scene.distance
@@ -159,10 +159,10 @@ def mapped(scene: PlanarScene, generator: Generator) -> tuple[PlanarMap, Localiz
     return found, Localizer(found, config=AutoConfig(fused_rays=0))
 
 
-def measured(scene: PlanarScene, queries: int, seed: int) -> list[dict[str, Any]]:
+def measure(scene: PlanarScene, queries: int, seed: int) -> list[dict[str, Any]]:
     """Map a scene and localize images in it."""
     generator = Generator().manual_seed(seed)
-    planar, localizer = mapped(scene, generator)
+    planar, localizer = make_map(scene, generator)
     rows = []
     for i, T in enumerate(scene.poses(queries, generator)):
         view = scene.view(T, f"query {i}", generator)
@@ -204,7 +204,7 @@ def main() -> None:
     every: list[dict[str, Any]] = []
     for number, scene in enumerate(scenes()):
         if given.only in scene.name:
-            rows = measured(scene, given.queries, number)
+            rows = measure(scene, given.queries, number)
             every += rows
             found[scene.name] = summary(rows) | {"landmarks": rows[0]["landmarks"]}
             print(scene.name, found[scene.name], flush=True)

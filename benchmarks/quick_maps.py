@@ -45,7 +45,7 @@ class StageTimes:
         self._stage, self._began = following, now
 
 
-def trained(data: Path, folder: Path) -> Row:
+def train_quick(data: Path, folder: Path) -> Row:
     """Train a quick map, unless it is there, and return its times."""
     stored = folder.with_name(f"{folder.name}.json")
     if not stored.exists():
@@ -68,7 +68,7 @@ def main() -> None:
     result: dict[str, Any] = {}
     for name in given.scenes:
         data = folder_of("BIDNERF_DATA") / name
-        about = trained(data, given.out / name)
+        about = train_quick(data, given.out / name)
         localizer, dataset = bn.Localizer(given.out / name), bn.open_dataset(data)
         result[name] = about | {"answers": {}}
         for mode in ("RGB", "RGB-D"):

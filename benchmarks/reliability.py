@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from _lab import BOUND, parser, record, within
-from confidence import assessed
+from confidence import assess
 
 from bidnerf.results import COLOURS, common_style, new_figure
 
@@ -37,7 +37,7 @@ def reliability(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     for name, met in CRITERIA.items():
         scenes = {scene: [r for r in stated if r["scene"] == scene] for scene in {r["scene"] for r in stated}}
         found[name] = {
-            scene: assessed([r["confidence"] for r in some], [met(r) for r in some])
+            scene: assess([r["confidence"] for r in some], [met(r) for r in some])
             for scene, some in {"all": stated, **dict(sorted(scenes.items()))}.items()
         }
     return found

@@ -62,7 +62,7 @@ class DoubledField(nn.Module):
         )
 
 
-def doubled(map: Map, T_world_copy: SE3) -> Map:
+def double(map: Map, T_world_copy: SE3) -> Map:
     """Return a map with its field and landmarks doubled, without its surface."""
     if map.landmarks is None:
         raise InputError("a map without landmarks, expected one that was baked")
@@ -113,7 +113,7 @@ def copies(bounds: SceneBounds) -> list[SE3]:
     return found
 
 
-def judged(localizer: Localizer, view: View, near: SE3 | None) -> tuple[bool, bool, str]:
+def judge_answer(localizer: Localizer, view: View, near: SE3 | None) -> tuple[bool, bool, str]:
     """Return whether the answer is accepted, whether it is right, and its outcome."""
     try:
         row = answer(lambda: localizer(view.frame, near, seed=0), view)
@@ -122,11 +122,11 @@ def judged(localizer: Localizer, view: View, near: SE3 | None) -> tuple[bool, bo
     return row["converged"], within(row), row["outcome"]
 
 
-def measured(scene: Map, views: list[View]) -> dict[str, Any]:
+def measure(scene: Map, views: list[View]) -> dict[str, Any]:
     """Return counts over all frames and copies, of images alone and with depth, without and with a start."""
     counts: dict[str, Counter[str]] = {}
     for number, T_world_copy in enumerate(copies(scene.bounds)):
-        localizer = Localizer(doubled(scene, T_world_copy))
+        localizer = Localizer(double(scene, T_world_copy))
         off = torch.zeros(6, dtype=torch.float64)
         off[0] = 0.1 * float(T_world_copy.translation.norm())
         for view in views:
@@ -135,7 +135,7 @@ def measured(scene: Map, views: list[View]) -> dict[str, Any]:
             modes += [("RGB, start", colour, view.T_ref_camera.retract(off))] if number == 0 else []
             modes += [("RGB-D", view, None)] if view.frame.has_depth else []
             for name, given, near in modes:
-                accepted, right, outcome = judged(localizer, given, near)
+                accepted, right, outcome = judge_answer(localizer, given, near)
                 both = {"believed": accepted, "right": right, "believed and right": accepted and right}
                 counts.setdefault(name, Counter()).update({"n": 1, outcome: 1} | both)
     return {name: dict(count) for name, count in counts.items()}
@@ -147,7 +147,7 @@ def main() -> None:
     scenes: dict[str, Any] = {}
     total: dict[str, Counter[str]] = {}
     for scene in map(Scene.open, given.scenes):
-        found = scenes[scene.folder.name] = measured(scene.map, scene.views(given.tuning_frames, given.frames))
+        found = scenes[scene.folder.name] = measure(scene.map, scene.views(given.tuning_frames, given.frames))
         print(scene.folder.name, found, flush=True)
         for name, count in found.items():
             total.setdefault(name, Counter()).update(count)

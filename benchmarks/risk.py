@@ -62,7 +62,7 @@ def least_confidence(confidences: Sequence[float], right: Sequence[bool], risk: 
     return float("inf") if last < 0 else float(confidences[order[last]])
 
 
-def calibrated(rows: Sequence[Row]) -> Thresholds:
+def calibrate(rows: Sequence[Row]) -> Thresholds:
     """Return the least confidence for each of ``RISKS``; a larger risk never requires more."""
     said, right = [row["confidence"] for row in rows], [within(row) for row in rows]
     least = np.minimum.accumulate([least_confidence(said, right, risk) for risk in RISKS])
@@ -94,19 +94,19 @@ def halves(rows: Sequence[Row], seed: int) -> tuple[list[Row], list[Row]]:
     return parts
 
 
-def tested(calibration: Sequence[Row], test: Sequence[Row]) -> Tested:
+def apply_thresholds(calibration: Sequence[Row], test: Sequence[Row]) -> Tested:
     """Return the rows ``test`` with the thresholds of the rows ``calibration``."""
-    thresholds = calibrated(calibration)
+    thresholds = calibrate(calibration)
     return [(row, thresholds) for row in test]
 
 
-def crossed(rows: Sequence[Row], seed: int = 0) -> Tested:
+def cross_calibrate(rows: Sequence[Row], seed: int = 0) -> Tested:
     """Return all rows, each with the thresholds of the half that it does not belong to."""
     one, other = halves(rows, seed)
-    return tested(one, other) + tested(other, one)
+    return apply_thresholds(one, other) + apply_thresholds(other, one)
 
 
-def realised(answers: Tested) -> dict[str, Any]:
+def count_outcomes(answers: Tested) -> dict[str, Any]:
     """Return for each risk how many answers are accepted, how many of these are wrong, and how many right ones are lost."""
     right = sum(within(row) for row, _ in answers)
     found: dict[str, Any] = {"n": len(answers), "right": right}
@@ -120,7 +120,7 @@ def realised(answers: Tested) -> dict[str, Any]:
 def by(group: Callable[[Row], str], answers: Tested) -> dict[str, Any]:
     """Return what was realised in each group of answers."""
     names = sorted({group(row) for row, _ in answers})
-    return {name: realised([pair for pair in answers if group(pair[0]) == name]) for name in names}
+    return {name: count_outcomes([pair for pair in answers if group(pair[0]) == name]) for name in names}
 
 
 def by_quarter(answers: Tested) -> dict[str, Any]:
@@ -147,7 +147,7 @@ def other_halves(rows: Sequence[Row], repeats: int = REPEATS) -> dict[str, Any]:
     shares: dict[str, list[float]] = {f"{risk:g}": [] for risk in RISKS}
     for seed in range(repeats):
         one, other = halves(rows, seed)
-        for found in (realised(tested(one, other)), realised(tested(other, one))):
+        for found in (count_outcomes(apply_thresholds(one, other)), count_outcomes(apply_thresholds(other, one))):
             for risk, some in shares.items():
                 some += [_share(found[risk])] if found[risk]["accepted"] else []
     return {
@@ -179,18 +179,20 @@ def main() -> None:
     arguments.add_argument("--write", action="store_true", help="store the thresholds in the package")
     given = arguments.parse_args()
     rows, without = examples(given.rows)
-    answers = crossed(rows)
+    answers = cross_calibrate(rows)
     scenes = sorted({row["scene"] for row in rows})
     held_out = {
-        scene: realised(tested([r for r in rows if r["scene"] != scene], [r for r in rows if r["scene"] == scene]))
+        scene: count_outcomes(
+            apply_thresholds([r for r in rows if r["scene"] != scene], [r for r in rows if r["scene"] == scene])
+        )
         for scene in scenes
     }
-    least = {f"{risk:g}": value for risk, value in calibrated(rows).items() if value < float("inf")}
+    least = {f"{risk:g}": value for risk, value in calibrate(rows).items() if value < float("inf")}
     results = {
         "error": ERROR,
         "accepted_without_confidence": without,
         "least_confidence": least,
-        "other_faults": realised(answers),
+        "other_faults": count_outcomes(answers),
         "other_faults_by_scene": by(lambda row: row["scene"], answers),
         "other_faults_by_fault": by(lambda row: row["fault"], answers),
         "other_faults_by_quarter": by_quarter(answers),

@@ -121,7 +121,7 @@ class Server:
 
 
 @contextlib.contextmanager
-def served(folder: Path, workers: int, *options: str) -> Iterator[Server]:
+def serve_maps(folder: Path, workers: int, *options: str) -> Iterator[Server]:
     server = Server(folder, "--workers", str(workers), *options)
     try:
         yield server
@@ -204,7 +204,7 @@ def difference(found: dict[str, Any], expected: dict[str, Any]) -> float:
     return worst
 
 
-def asked(server: Server, given: list[Photo], clients: int, seconds: float) -> Row:
+def run_clients(server: Server, given: list[Photo], clients: int, seconds: float) -> Row:
     """Let clients ask for some seconds; return latencies, statuses and how far answers differ from the expected ones."""
     until, taken, statuses, worst = time.monotonic() + seconds, list[float](), Counter[str](), list[float]()
 
@@ -243,12 +243,12 @@ def asked(server: Server, given: list[Photo], clients: int, seconds: float) -> R
 
 def load(folder: Path, given: list[Photo], workers: int, seconds: float) -> Row:
     rows = []
-    with served(folder, workers) as server:
+    with serve_maps(folder, workers) as server:
         loaded = server.memory()
-        asked(server, given, workers, 10)  # a worker's memory grows with its first requests
+        run_clients(server, given, workers, 10)  # a worker's memory grows with its first requests
         for clients in CLIENTS:
             before = server.memory()
-            row = asked(server, given, clients, seconds)
+            row = run_clients(server, given, clients, seconds)
             rows.append(row | {"memory_MiB": {"before": before, "after": server.memory()}})
             print(rows[-1], flush=True)
         return {"memory_MiB_without_requests": loaded, "levels": rows}
@@ -256,7 +256,7 @@ def load(folder: Path, given: list[Photo], workers: int, seconds: float) -> Row:
 
 def kills(folder: Path, given: list[Photo], workers: int, seconds: float) -> Row:
     drawn, killed = random.Random(0), 0
-    with served(folder, workers) as server:
+    with serve_maps(folder, workers) as server:
         done = threading.Event()
 
         def kill() -> None:
@@ -269,7 +269,7 @@ def kills(folder: Path, given: list[Photo], workers: int, seconds: float) -> Row
 
         killer = threading.Thread(target=kill)
         killer.start()
-        row = asked(server, given, 4, seconds)
+        row = run_clients(server, given, 4, seconds)
         done.set()
         killer.join()
         return row | {"killed": killed, "replaced": server.metric("worker_restarts_total")}
@@ -284,7 +284,7 @@ def malformed(folder: Path, given: list[Photo], workers: int, seconds: float) ->
         (b"/localize", FORM, given[0].body),
     ]
     bodies += [(b"/localize?focal=30", "image/png", png(40, 30)), (b"/maps/x/localize", FORM, small)]
-    with served(folder, workers) as server:
+    with serve_maps(folder, workers) as server:
         before = server.memory()
         for number in range(1000):
             path, kind, body = drawn.choice(bodies)
@@ -323,7 +323,7 @@ def png(width: int, height: int) -> bytes:
 
 def hostile(folder: Path, given: list[Photo], workers: int, seconds: float) -> Row:
     found: Row = {}
-    with served(folder, workers, "--upload-timeout", "5") as server:
+    with serve_maps(folder, workers, "--upload-timeout", "5") as server:
         before = server.memory()
         found["2 GB announced"] = flood(server, chunked=False)
         found["2 GB in chunks"] = flood(server, chunked=True)
@@ -359,7 +359,7 @@ def hostile(folder: Path, given: list[Photo], workers: int, seconds: float) -> R
     token = TemporaryDirectory()
     file = Path(token.name) / "token"
     file.write_text(TOKEN)
-    with token, served(folder, workers, "--host", "0.0.0.0", "--token-file", str(file)) as server:
+    with token, serve_maps(folder, workers, "--host", "0.0.0.0", "--token-file", str(file)) as server:
         asked_for = b"GET /maps HTTP/1.1\r\nHost: localhost\r\n"
         found["with --host, without the token"] = status_of(server.raw(asked_for + b"\r\n"))
         found["with --host and the token"] = status_of(
@@ -395,7 +395,7 @@ def beside(server: Server, given: list[Photo], attack: Callable[[], Row]) -> Row
     results: Row = {}
     attacking = threading.Thread(target=lambda: results.update(attack()))
     attacking.start()
-    row = asked(server, given, 2, 8)
+    row = run_clients(server, given, 2, 8)
     attacking.join()
     return results | {"others": {key: row[key] for key in ("statuses", "latency_seconds")}}
 
@@ -437,10 +437,10 @@ def schema(folder: Path, given: list[Photo], workers: int, seconds: float) -> Ro
             ("without a token", (), None, SCHEMA_EXAMPLES),
             ("with a token", closed, TOKEN, SCHEMA_EXAMPLES // 8),
         ):
-            with served(folder, workers, *options) as server:
+            with serve_maps(folder, workers, *options) as server:
                 before = server.memory()
                 address = f"http://127.0.0.1:{server.address.port}"
-                row = _openapi.tried(address, folder.resolve().name, images, examples, token=token)
+                row = _openapi.run_schemathesis(address, folder.resolve().name, images, examples, token=token)
                 print(row.pop("output"), file=sys.stderr)
                 row["headers"] = sorted(set().union(*row["headers"].values()))
                 ended = None if token else server.metric('worker_restarts_total{reason="died"}')
@@ -452,7 +452,7 @@ def schema(folder: Path, given: list[Photo], workers: int, seconds: float) -> Ro
 
 
 PARTS = {"load": load, "kills": kills, "malformed": malformed, "hostile": hostile}
-if _openapi.installed():
+if _openapi.is_installed():
     PARTS["schema"] = schema
 
 

@@ -85,7 +85,7 @@ def sift_points(views: Sequence[View], cache: Path) -> SiftPoints:
 
     path = cache / f"sift-{views_digest(views)}-{pycolmap.__version__}-{NEIGHBOURS}.npz"
     if not path.is_file():
-        found = triangulated(views)
+        found = triangulate(views)
         content = io.BytesIO()
         np.savez(content, **vars(found))
         cache.mkdir(parents=True, exist_ok=True)
@@ -94,7 +94,7 @@ def sift_points(views: Sequence[View], cache: Path) -> SiftPoints:
         return SiftPoints(**stored)
 
 
-def triangulated(views: Sequence[View]) -> SiftPoints:
+def triangulate(views: Sequence[View]) -> SiftPoints:
     """Triangulate the SIFT keypoints of ``views``, whose poses are T_world_camera."""
     detector = SiftDetector()
     pycolmap = detector.library

@@ -72,7 +72,7 @@ def whole(frames: Frames) -> Run:
     return Run(frames)
 
 
-def thinned(every: int) -> Callable[[Frames], Run]:
+def thin(every: int) -> Callable[[Frames], Run]:
     return lambda frames: Run(frames[::every])
 
 
@@ -80,10 +80,10 @@ def backwards(frames: Frames) -> Run:
     return Run(frames[::-1])
 
 
-def covered(frames: Frames) -> Run:
+def cover(frames: Frames) -> Run:
     """Cover the camera for 15 frames, which then show dark noise."""
     dark = partial(covered_frame, generator=torch.Generator().manual_seed(0))
-    return changed(frames, range(FIRST, FIRST + 15), dark)
+    return change_part(frames, range(FIRST, FIRST + 15), dark)
 
 
 def covered_frame(frame: Frame, generator: torch.Generator) -> Frame:
@@ -100,10 +100,10 @@ def plain_wall(frames: Frames) -> Run:
         rgb = (0.6 + 0.02 * torch.randn(frame.rgb.shape, generator=generator)).clamp(0, 1)
         return replace(frame, rgb=rgb, depth=None if frame.depth is None else torch.full_like(frame.depth, 1.0))
 
-    return changed(frames, range(FIRST, FIRST + 30), wall)
+    return change_part(frames, range(FIRST, FIRST + 30), wall)
 
 
-def half_covered(frames: Frames) -> Run:
+def cover_half(frames: Frames) -> Run:
     """Move a textured object with depth over the left half of the image for 30 frames; the scene stays visible."""
     shifts = iter(range(0, 10**6, 3))
 
@@ -118,10 +118,10 @@ def half_covered(frames: Frames) -> Run:
             depth[:, : width // 2] = 0.6 + 0.002 * shift
         return replace(frame, rgb=rgb, depth=depth)
 
-    return Run(changed(frames, range(FIRST, FIRST + 30), half).frames)
+    return Run(change_part(frames, range(FIRST, FIRST + 30), half).frames)
 
 
-def carried(frames: Frames) -> Run:
+def carry_on(frames: Frames) -> Run:
     """Leave out up to 100 frames, and close the gap in the time stamps."""
     there = min(FIRST + 100, len(frames) - 20)
     before, after = frames[:FIRST], frames[there:]
@@ -149,7 +149,7 @@ def exposure_ramp(frames: Frames) -> Run:
     return Run([replace(f, frame=exposed(i, f.frame)) for i, f in enumerate(frames)])
 
 
-def doubled(frames: Frames) -> Run:
+def double_frames(frames: Frames) -> Run:
     return Run([frame for frame in frames for _ in range(2)])
 
 
@@ -174,7 +174,7 @@ def without_depth_frames(run: Run) -> Run:
     return Run([run.frames[number] for number in kept], part, returns)
 
 
-def changed(frames: Frames, part: range, change: Callable[[Frame], Frame]) -> Run:
+def change_part(frames: Frames, part: range, change: Callable[[Frame], Frame]) -> Run:
     """Change the frames of a part, in which nothing of the scene is visible then."""
     shown = [replace(f, frame=change(f.frame)) if i in part else f for i, f in enumerate(frames)]
     return Run(shown, part, part.stop)
@@ -182,18 +182,18 @@ def changed(frames: Frames, part: range, change: Callable[[Frame], Frame]) -> Ru
 
 ORDERS: dict[str, Callable[[Frames], Run]] = {
     "in order": whole,
-    "every 2nd": thinned(2),
-    "every 4th": thinned(4),
+    "every 2nd": thin(2),
+    "every 4th": thin(4),
     "backwards": backwards,
 }
 FAULTS: dict[str, Callable[[Frames], Run]] = {
-    "covered for 15 frames": covered,
-    "carried 100 frames on": carried,
+    "covered for 15 frames": cover,
+    "carried 100 frames on": carry_on,
     "plain wall for 30 frames": plain_wall,
-    "half the image covered": half_covered,
+    "half the image covered": cover_half,
     "depth stops": depth_stops,
     "exposure ramp": exposure_ramp,
-    "frames doubled": doubled,
+    "frames doubled": double_frames,
     "frames out of order": out_of_order,
     "no time stamps": without_times,
 }
@@ -261,7 +261,7 @@ class GicpFromLast:
 # Tracking.
 
 
-def tracked(run: Run, step: Callable[[Frame, float | None], Localization], depth: bool) -> list[dict[str, Any]]:
+def track_run(run: Run, step: Callable[[Frame, float | None], Localization], depth: bool) -> list[dict[str, Any]]:
     """Track a run; return one row per frame."""
     rows = []
     for timed in run.frames:
@@ -344,7 +344,7 @@ def plan(localizer: Localizer, quick: bool) -> list[tuple[str, Callable[[Frames]
         runs += [(f"{kind}, {name}", order, depth, track) for name, order in ORDERS.items()]
         runs += [(f"{kind}, {name}", fault, depth, track) for name, fault in FAULTS.items()]
         if not quick:
-            runs.append((f"{kind}, auto on every 6th", thinned(6), depth, partial(EachAnew, localizer)))
+            runs.append((f"{kind}, auto on every 6th", thin(6), depth, partial(EachAnew, localizer)))
     if find_spec("small_gicp") is not None:
         runs.append(("RGB-D, GICP from the last pose", whole, True, partial(GicpFromLast, localizer)))
     return runs
@@ -362,7 +362,7 @@ def sequence(stored: Map, path: Path, given: argparse.Namespace, store: RowStore
         if not depth:  # frames with only depth would then show nothing
             run = without_depth_frames(run)
         key = [path.name, stored.info.weights, name, len(run.frames), given.tuning_frames]
-        rows = store.get(key, lambda run=run, make=make, depth=depth: tracked(run, make(), depth))
+        rows = store.get(key, lambda run=run, make=make, depth=depth: track_run(run, make(), depth))
         found[name] = summary(rows, run.blind, run.returns)
         held_out = [row for row in rows if row["split"] not in (None, "train")]
         if held_out and len(held_out) < len(rows):
@@ -424,7 +424,7 @@ def resident_bytes() -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
-def remembered(tracker: Tracker, frames: Iterator[TimedFrame], depth: bool) -> Iterator[dict[str, Any]]:
+def track_in_thousands(tracker: Tracker, frames: Iterator[TimedFrame], depth: bool) -> Iterator[dict[str, Any]]:
     """Track the frames; yield one row per thousand."""
     generator = torch.Generator().manual_seed(0)
     milliseconds, counts = list[float](), dict.fromkeys(("accepted", "wrong", "accepted_while_covered"), 0)
@@ -461,7 +461,7 @@ def memory(stored: Map, path: Path, count: int, depth: bool) -> dict[str, Any]:
         "resident_bytes_before": resident_bytes(),
         "rows": [],
     }
-    for row in remembered(Tracker(Localizer(stored)), back_and_forth(frames, count), depth):
+    for row in track_in_thousands(Tracker(Localizer(stored)), back_and_forth(frames, count), depth):
         results["rows"].append(row)
         print(row, flush=True)
     return results

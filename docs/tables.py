@@ -77,7 +77,7 @@ def table(make: Callable[[Records], str]) -> Callable[[Records], str]:
     return make
 
 
-def rendered(page: str, folder: Path = RECORDS) -> str:
+def render_page(page: str, folder: Path = RECORDS) -> str:
     """Return a page in which each generated block has been made anew from the records."""
 
     def block(found: re.Match[str]) -> str:
@@ -223,7 +223,7 @@ def measurements(records: Records) -> str:
         records[path.stem]
         record = records.used.pop(path.stem)
         script = re.sub(r".*?(\w+)\.py.*", r"\1", record["command"])
-        rows = list(_measured(record["results"], ()))
+        rows = list(_measures_of(record["results"], ()))
         columns = [name for name in MEASURES if any(name in cells for _, cells in rows)]
         what = f"{shows[script][0].upper()}{shows[script][1:]}.\n" if script in shows else ""
         text += f"\n## {path.stem}\n\n{what}{'' if not what else chr(10)}*{origin(record)}: `{record['command']}`*\n"
@@ -234,17 +234,17 @@ def measurements(records: Records) -> str:
     return text.lstrip("\n")
 
 
-def _measured(node: Any, path: tuple[str, ...]) -> Iterator[tuple[str, dict[str, str]]]:
+def _measures_of(node: Any, path: tuple[str, ...]) -> Iterator[tuple[str, dict[str, str]]]:
     """Yield the name and the measures of each part of a record that has any two of them."""
     if isinstance(node, list):
         for number, child in enumerate(node):
             if isinstance(child, dict):
                 own = [
-                    f"{child[k]} {k}" if k == "clients" else _named(str(child[k]))
+                    f"{child[k]} {k}" if k == "clients" else _in_words(str(child[k]))
                     for k in NAMES
                     if isinstance(child.get(k), (str, int))
                 ]
-                yield from _measured(child, (*path, ", ".join(own) or str(number + 1)))
+                yield from _measures_of(child, (*path, ", ".join(own) or str(number + 1)))
         return
     cells = {}
     for column, keys in MEASURES.items():
@@ -255,10 +255,10 @@ def _measured(node: Any, path: tuple[str, ...]) -> Iterator[tuple[str, dict[str,
         yield ", ".join(path), cells
     for key, child in node.items():
         if isinstance(child, (dict, list)) and key not in ASIDE and not _shown_value(child):
-            yield from _measured(child, path if key in INNER else (*path, _shown(_named(key))))
+            yield from _measures_of(child, path if key in INNER else (*path, _fault_label(_in_words(key))))
 
 
-def _named(key: str) -> str:
+def _in_words(key: str) -> str:
     """Return the name of a part of a record in words."""
     for name, title in SCENES.items():
         key = key.replace(name, title)
@@ -307,7 +307,7 @@ def _of(rate: Any) -> str:
     return f"{rate['successes']} of {rate['trials']}"
 
 
-def _shown(name: str) -> str:
+def _fault_label(name: str) -> str:
     """Return faults as ``--fault`` takes them, without the size of those that are just on or off."""
     parts = (part.partition(":") for part in name.split("+"))
     return "+".join(
@@ -714,7 +714,7 @@ def main() -> None:
     """Rewrite the generated blocks of all pages."""
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
-        if (new := rendered(text)) != text:
+        if (new := render_page(text)) != text:
             page.write_text(new, encoding="utf-8")
             print(f"rewrote {page.relative_to(ROOT)}")
 

@@ -8,21 +8,22 @@ from typing import Any
 
 import pytest
 
+from localizations import answer_row
+
 
 @pytest.fixture
 def alternate(script: Callable[[str], ModuleType]) -> Any:
     return script("alternate")
 
 
-def row(seconds: float, translation: float | None = 0.001, converged: bool = True) -> dict[str, Any]:
-    known = {"translation": translation, "rotation_deg": translation, "normalized_error_squared": translation}
-    return {"cpu_seconds": seconds, "converged": converged, "outcome": "converged"} | known
+def row(seconds: float, error: float | None = 0.001, accepted: bool = True) -> Any:
+    return answer_row(error, accepted, error, cpu_seconds=seconds)
 
 
 def test_times_are_compared_question_by_question_and_wrong_answers_are_counted(alternate: Any) -> None:
     pairs = [
         {"old": row(1.0), "new": row(0.5)},
-        {"old": row(1.0, 9.0), "new": row(0.5, 9.0, converged=False)},
+        {"old": row(1.0, 9.0), "new": row(0.5, 9.0, accepted=False)},
         {"old": row(8.0), "new": row(8.0, 9.0)},
     ]
     found = alternate.summary(pairs)

@@ -6,16 +6,17 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any, ClassVar
 
 import pytest
 import torch
 
-from bidnerf import SE3, Frame, View
+from bidnerf import SE3, Frame, Localization, View
 from bidnerf.evaluation import faulty
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
+from localizations import answer, answer_row
 
 
 @pytest.fixture(scope="module")
@@ -29,32 +30,21 @@ def view(name: str = "0007") -> View:
     return View(Frame(name, rgb, Intrinsics(30.0, 30.0, 16.0, 12.0, 32, 24), depth), SE3.identity())
 
 
-def moved(metres: float, degrees: float = 0.0) -> SE3:
+def shift(metres: float, degrees: float = 0.0) -> SE3:
     angle = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
     return SE3.exp(torch.tensor([metres, 0.0, 0.0, 0.0, 0.0, float(angle)], dtype=torch.float64))
 
 
-def answered(T: SE3, converged: bool = True) -> Any:
-    """Return what the script reads from an answer."""
-    covariance = torch.eye(6, dtype=torch.float64) / 3
-    return SimpleNamespace(
-        T_world_camera=T,
-        covariance=covariance,
-        converged=converged,
-        outcome="converged",
-        reason="said so",
-        confidence=0.9,
-        diagnostics=None,
-    )
+def make_answer(T: SE3) -> Localization:
+    return answer(T, covariance=torch.eye(6, dtype=torch.float64) / 3, confidence=0.9)
 
 
-def row(translation: float | None, converged: bool, squared: float | None = 1.0, seconds: float = 1.0) -> Any:
-    known = {"translation": translation, "rotation_deg": translation, "normalized_error_squared": squared}
-    said = {"pose": None, "covariance": None, "outcome": "converged", "reason": "", "confidence": None}
-    return known | said | {"converged": converged, "cpu_seconds": seconds}
+def row(error: float | None, accepted: bool, squared: float | None = 1.0, seconds: float = 1.0) -> Any:
+    unknown = {"pose": None, "covariance": None, "reason": "", "confidence": None}
+    return answer_row(error, accepted, squared, cpu_seconds=seconds, **unknown)
 
 
-def written(path: Path, rows: list[Any]) -> Path:
+def write_rows(path: Path, rows: list[Any]) -> Path:
     keys = [["room", "RGB", "as it is", f"{place}"] for place in range(len(rows))]
     lines = [json.dumps({"key": json.dumps(key), "row": some}) for key, some in zip(keys, rows, strict=True)]
     path.write_text("".join(f"{text}\n" for text in lines))
@@ -94,9 +84,9 @@ def test_a_picture_that_is_full_shows_nothing_beside_it(answers: ModuleType) -> 
 
 
 def test_an_answer_is_judged_by_the_nearest_right_pose(answers: ModuleType) -> None:
-    poses = [moved(0.0), moved(1.0)]
+    poses = [shift(0.0), shift(1.0)]
     right = [replace(view(), T_ref_camera=T) for T in poses]
-    found = answered(moved(1.01))
+    found = make_answer(shift(1.01))
     question = answers.Question(("", "", "", ""), view().frame, lambda *_, **__: found, right, unit=2.0)
     given = question.answer()
     assert given["translation"] == pytest.approx(0.005)
@@ -138,7 +128,7 @@ def test_a_run_resumes_after_a_torn_line_and_refuses_another_map(
 
         def question(self, key: tuple[str, str, str, str]) -> Any:
             asked.append(key[3])
-            return answers.Question(key, view().frame, lambda *_, **__: answered(moved(0.001)), [view()])
+            return answers.Question(key, view().frame, lambda *_, **__: make_answer(shift(0.001)), [view()])
 
     monkeypatch.setattr(answers, "Subject", Fake)
     out = tmp_path / "rows.jsonl"
@@ -148,8 +138,8 @@ def test_a_run_resumes_after_a_torn_line_and_refuses_another_map(
     answers.run(["room"], out, 1.0)
     assert asked == ["a", "b", "c", "c"]
     again = answers.read_rows(out)
-    assert {key: answers.untimed(some) for key, some in again.items()} == {
-        key: answers.untimed(some) for key, some in whole.items()
+    assert {key: answers.without_time(some) for key, some in again.items()} == {
+        key: answers.without_time(some) for key, some in whole.items()
     }
     monkeypatch.setattr(Fake, "content", ["other weights"])
     with pytest.raises(InputError, match="answers of another map of room"):
@@ -159,13 +149,13 @@ def test_a_run_resumes_after_a_torn_line_and_refuses_another_map(
 def test_two_files_are_compared(answers: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # Right and accepted, strictly right but rejected, wrong and accepted, and accepted without a right answer.
     rows = [row(0.03, True), row(0.01, False, seconds=3.0), row(9.0, True, 99.0), row(None, True, None)]
-    first = written(tmp_path / "a.jsonl", rows)
+    first = write_rows(tmp_path / "a.jsonl", rows)
     answers.compare([first])
     lines = capsys.readouterr().out.splitlines()
     assert "| room | RGB | all | 4 | 2 | 1 | 3 | 2 | 1/2 | 1.00 | 3.00 |" in lines
     # Of ten answers that the first file has right, the second has none.
     right, wrong = [row(0.01, True)] * 10 + rows[:1], [row(9.0, True)] * 10 + rows[:1]
-    answers.compare([written(tmp_path / "b.jsonl", right), written(tmp_path / "c.jsonl", wrong)])
+    answers.compare([write_rows(tmp_path / "b.jsonl", right), write_rows(tmp_path / "c.jsonl", wrong)])
     lines = capsys.readouterr().out.splitlines()
     assert "| right | 10 | 0 | 0.00195 |" in lines
     assert "| accepted | 0 | 0 | 1 |" in lines
@@ -174,15 +164,15 @@ def test_two_files_are_compared(answers: ModuleType, tmp_path: Path, capsys: pyt
         "Changed answers: any 10, pose 0, covariance 0, outcome 0, reason 0, confidence 0, pose beyond rounding 0"
     )  # rows of this test have no poses; their errors differ
     with pytest.raises(InputError, match="no answers that all files have"):
-        answers.compare([first, written(tmp_path / "d.jsonl", [])])
+        answers.compare([first, write_rows(tmp_path / "d.jsonl", [])])
 
 
 def test_rounding_moves_no_pose(answers: ModuleType) -> None:
     pose = SE3.identity().matrix()[:3]
-    assert not answers.moved(pose.tolist(), (pose + 1e-9).tolist())
-    assert answers.moved(pose.tolist(), (pose + 1e-4).tolist())
-    assert answers.moved(None, pose.tolist())
-    assert not answers.moved(None, None)
+    assert not answers.has_moved(pose.tolist(), (pose + 1e-9).tolist())
+    assert answers.has_moved(pose.tolist(), (pose + 1e-4).tolist())
+    assert answers.has_moved(None, pose.tolist())
+    assert not answers.has_moved(None, None)
 
 
 def test_a_record_is_compressed_and_compares_as_its_files(
@@ -191,7 +181,7 @@ def test_a_record_is_compressed_and_compares_as_its_files(
     monkeypatch.setattr(answers, "RESULTS", tmp_path)
     summaries: list[Any] = []
     monkeypatch.setattr(answers, "record", lambda name, results, seed: summaries.append(results))
-    rows = written(tmp_path / "a.jsonl", [row(0.03, True), row(9.0, False, None)])
+    rows = write_rows(tmp_path / "a.jsonl", [row(0.03, True), row(9.0, False, None)])
     answers.keep([rows], "answers")
     assert answers.read_rows(tmp_path / "answers.rows.jsonl.xz") == answers.read_rows(rows)
     (results,) = summaries

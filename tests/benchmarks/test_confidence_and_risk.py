@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from bidnerf_core.localization import LogisticModel
+from localizations import answer_row
 
 
 @pytest.fixture(scope="module")
@@ -32,25 +33,16 @@ def test_the_fit_recovers_probabilities(learning: ModuleType) -> None:
         features = dict(zip("ab", random.normal(size=2).tolist(), strict=True))
         right = bool(random.random() < true.probability(features))
         given.append(learning.Example(features, right, str(number % 2), str(number % 4)))
-    found = learning.fitted(given, ridge=1e-5)
+    found = learning.fit_model(given, ridge=1e-5)
     for values in ({"a": 1.0, "b": 0.0}, {"a": -1.0, "b": 1.0}):
         assert found.probability(values) == pytest.approx(true.probability(values), abs=0.06)
-    said = learning.cross_validated(given, by_fault=True)["all"]
+    said = learning.cross_validate(given, by_fault=True)["all"]
     assert said["expected_calibration_error"] < 0.1
 
 
-def row(confidence: float, right: bool, fault: str, scene: str = "a", inliers: int = 50) -> dict[str, Any]:
-    return {
-        "scene": scene,
-        "mode": "RGB",
-        "fault": fault,
-        "frame": "0",
-        "converged": True,
-        "confidence": confidence,
-        "translation": 0.01 if right else 1.0,
-        "rotation_deg": 0.1,
-        "diagnostics": {"inliers": inliers},
-    }
+def row(confidence: float, right: bool, fault: str, scene: str = "a") -> Any:
+    names = {"scene": scene, "mode": "RGB", "fault": fault, "frame": "0"}
+    return answer_row(0.01 if right else 9.0, confidence=confidence, diagnostics={"inliers": 50}, **names)
 
 
 def falling(confidence: np.ndarray) -> np.ndarray:
@@ -107,7 +99,7 @@ def test_a_larger_risk_never_requires_more_confidence(calibration: ModuleType) -
     for _ in range(20):
         said = random.random(300)
         rows = [row(p, random.random() < p, "none") for p in said]
-        least = list(calibration.calibrated(rows).values())
+        least = list(calibration.calibrate(rows).values())
         assert least == sorted(least, reverse=True)
 
 
@@ -121,5 +113,5 @@ def test_halves_share_no_fault_of_a_scene(calibration: ModuleType) -> None:
 
 def test_counts_of_a_test(calibration: ModuleType) -> None:
     rows = [row(0.9, True, "none"), row(0.7, False, "none"), row(0.7, True, "blur"), row(0.2, True, "blur")]
-    found = calibration.realised([(r, dict.fromkeys(calibration.RISKS, 0.7)) for r in rows])["0.1"]
+    found = calibration.count_outcomes([(r, dict.fromkeys(calibration.RISKS, 0.7)) for r in rows])["0.1"]
     assert found == {"accepted": 3, "wrong": 1, "right_lost": 1}

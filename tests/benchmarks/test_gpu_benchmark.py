@@ -40,5 +40,5 @@ def test_a_row_that_fails_says_why_and_does_not_stop_the_others(script: Script) 
     def broken() -> None:
         raise RuntimeError("out of memory\nand a second line")
 
-    assert gpu.attempted("a row", broken) == {"failed": "RuntimeError: out of memory"}
-    assert gpu.attempted("a row", lambda: {"ms": 1.0}) == {"ms": 1.0}
+    assert gpu.attempt("a row", broken) == {"failed": "RuntimeError: out of memory"}
+    assert gpu.attempt("a row", lambda: {"ms": 1.0}) == {"ms": 1.0}

@@ -48,7 +48,7 @@ def test_a_sequence_goes_back_and_forth_in_time_that_goes_on(tracking: Any) -> N
 
 
 def test_covered_frames_are_the_blind_ones_and_sight_returns_after_them(tracking: Any) -> None:
-    run = tracking.covered(recording(90, photo_every=3))
+    run = tracking.cover(recording(90, photo_every=3))
     dark = [float(timed.frame.rgb.max()) < 0.1 for timed in run.frames]
     assert [number for number, hidden in enumerate(dark) if hidden] == list(run.blind)
     assert run.returns == tracking.FIRST + 15
@@ -67,7 +67,7 @@ def test_depth_that_stops_takes_the_frames_of_depth_alone_with_it(tracking: Any)
 
 
 def test_carrying_leaves_no_trace_in_the_times(tracking: Any) -> None:
-    run = tracking.carried(recording(200))
+    run = tracking.carry_on(recording(200))
     assert run.returns == tracking.FIRST
     assert [timed.frame.name for timed in run.frames[tracking.FIRST - 1 : tracking.FIRST + 1]] == [
         "39",

@@ -29,7 +29,6 @@ from bidnerf_core.fields import (
     widen,
 )
 from bidnerf_core.geometry import SE3
-from resampled import Resampled
 
 BLUE = (0.1, 0.2, 0.9)
 
@@ -151,7 +150,7 @@ def test_absorption_in_a_homogeneous_ball(density: float) -> None:
     half = math.sqrt(radius**2 - axis_distance**2)
     near, far = torch.tensor([3 - half]).double(), torch.tensor([3 + half]).double()
     rays = Rays(origin, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), near, far)
-    field = Resampled(ball, Stratified(4000))
+    field = replace(ball, sampler=Stratified(4000))
     rendering = render(field, rays, BLUE)
     chord = 2 * half
     assert float(rendering.opacity) == pytest.approx(1 - math.exp(-density * chord), abs=1e-7)
@@ -193,7 +192,7 @@ def test_importance_sampling_gathers_where_the_weight_is() -> None:
     assert float(inside.mean()) == pytest.approx(2.5, abs=0.01)
     assert float(inside.std()) == pytest.approx(1 / math.sqrt(12), abs=0.01)
     field = HomogeneousBall(radius=0.5, density=30.0)
-    finer = Importance(Resampled(field, Stratified(16)), 32)(rays)
+    finer = Importance(replace(field, sampler=Stratified(16)), 32)(rays)
     assert finer.starts.shape == (1, 16 + 32)
     assert bool((finer.ends >= finer.starts).all())
 

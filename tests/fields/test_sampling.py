@@ -24,7 +24,6 @@ from bidnerf_core.fields import (
     render,
 )
 from bidnerf_hashgrid.occupancy import OccupancyGrid
-from resampled import Resampled
 from voxels import cell_centres
 
 BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.05, 8.0)
@@ -71,17 +70,17 @@ def rays(count: int = 200) -> Rays:
 
 
 def finer(sampler: RaySampler) -> Importance:
-    return Importance(Resampled(GaussianBlobs.random(), sampler), COUNT)
+    return Importance(replace(GaussianBlobs.random(), sampler=sampler), COUNT)
 
 
 def fewer(sampler: RaySampler, count: int = COUNT) -> Concentrated:
-    return Concentrated(Resampled(GaussianBlobs.random(), sampler), count)
+    return Concentrated(replace(GaussianBlobs.random(), sampler=sampler), count)
 
 
 @pytest.mark.parametrize("made", [lambda sampler: sampler, finer, fewer], ids=["rough", "finer", "fewer"])
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_the_contracts_laws_hold(name: str, made: Callable[[RaySampler], RaySampler]) -> None:
-    field = Resampled(GaussianBlobs.random(), made(SAMPLERS[name]()))
+    field = replace(GaussianBlobs.random(), sampler=made(SAMPLERS[name]()))
     for law in (check_intervals, check_repeatable, check_rays_alone, check_background):
         law(field)
 
@@ -134,9 +133,9 @@ def shell_cells() -> OccupancyGrid:
 
 
 SURFACES: dict[str, tuple[RaySampler, Callable[[RadianceField], RaySampler], float]] = {
-    "importance": (Stratified(48), lambda ball: Importance(Resampled(ball, Stratified(16)), 32), 0.7),
-    "in a grid": (shell_cells(), lambda ball: Importance(Resampled(ball, shell_cells()), 64), 0.5),
-    "concentrated": (Stratified(12), lambda ball: Concentrated(Resampled(ball, Stratified(256)), 12), 0.25),
+    "importance": (Stratified(48), lambda ball: Importance(replace(ball, sampler=Stratified(16)), 32), 0.7),
+    "in a grid": (shell_cells(), lambda ball: Importance(replace(ball, sampler=shell_cells()), 64), 0.5),
+    "concentrated": (Stratified(12), lambda ball: Concentrated(replace(ball, sampler=Stratified(256)), 12), 0.25),
 }
 """Even samples, those put where a ball's surface is, and how much smaller the error of its distance then is."""
 
@@ -146,10 +145,10 @@ def test_a_surface_is_seen_where_it_is(name: str) -> None:
     """On smooth blobs, even spacing is as good as it gets."""
     ball, where = HomogeneousBall(0.8, 40.0), rays(300)
     even, put, share = SURFACES[name]
-    exact = render(Resampled(ball, Stratified(4000)), where)
+    exact = render(replace(ball, sampler=Stratified(4000)), where)
     hit = exact.opacity > 0.99
     assert int(hit.sum()) > 50
-    seen = [render(Resampled(ball, sampler), where) for sampler in (put(ball), even)]
+    seen = [render(replace(ball, sampler=sampler), where) for sampler in (put(ball), even)]
     errors = [float((found.distance - exact.distance).abs()[hit].median()) for found in seen]
     assert errors[0] < share * errors[1]
     assert float((seen[0].opacity - exact.opacity).abs().mean()) < 0.05

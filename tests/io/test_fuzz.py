@@ -45,7 +45,7 @@ from commands import Run
 from damage import (
     Damages,
     array_file,
-    drawn,
+    draw_damage,
     of_array,
     of_bytes,
     of_colmap,
@@ -111,7 +111,7 @@ def test_a_damaged_file_is_refused_in_one_line_or_read(kind: str, folder: Path, 
     count = Counter[bool]()
 
     @settings(max_examples=15)
-    @given(damaged=drawn(damages(file.read_bytes())))
+    @given(damaged=draw_damage(damages(file.read_bytes())))
     def judged(damaged: tuple[str, bytes]) -> None:
         file.write_bytes(damaged[1])
         count[refused(functools.partial(read, file))] += 1
@@ -140,7 +140,7 @@ def test_a_dataset_with_a_damaged_file_is_refused_in_one_line_or_read(kind: str,
     count = Counter[bool]()
 
     def damaged(file: Path) -> st.SearchStrategy[tuple[Path, tuple[str, bytes]]]:
-        return st.tuples(st.just(file), drawn(FORMATS.get(file.suffix, of_bytes)(sound[file])))
+        return st.tuples(st.just(file), draw_damage(FORMATS.get(file.suffix, of_bytes)(sound[file])))
 
     @settings(max_examples=12)
     @given(case=chosen.flatmap(damaged))

@@ -23,16 +23,17 @@ from bidnerf import SE3, Frame, View
 from bidnerf.cli import main
 from bidnerf_core.datasets import read_posed_images, stored_keypoints
 from bidnerf_core.errors import InputError
+from bidnerf_core.geometry import look_at
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, Keypoints, track_views
 from bidnerf_core.maps import IMPORTERS
-from photo_room import CAMERA, looking, photograph, walk, write_photos
+from photo_room import CAMERA, photograph, walk, write_photos
 from refusals import refused
 
 COUNT = 6
 pytestmark = pytest.mark.skipif(
     "colmap" not in IMPORTERS, reason="bidnerf was installed before it had this importer: reinstall it"
 )
-UNSEEN = looking((-0.5, 0.1, -0.2), (1.7, 1.4, 0.2))
+UNSEEN = look_at((-0.5, 0.1, -0.2), (1.7, 1.4, 0.2))
 
 
 @dataclass(frozen=True)

@@ -131,7 +131,7 @@ def quick_auto(monkeypatch: pytest.MonkeyPatch, no_processes: None) -> None:
     monkeypatch.setitem(registered, ("methods", "auto"), dataclasses.replace(auto, solve=quick))
 
 
-def given(page: Path) -> dict[str, Any]:
+def names_of_reader(page: Path) -> dict[str, Any]:
     """Return what a page says that its reader has: for the loop, a sensor and its camera."""
     if page.stem != "embedding":
         return {}
@@ -141,12 +141,12 @@ def given(page: Path) -> dict[str, Any]:
     return {"sensor": moments, "camera": tiny.CAMERA}
 
 
-def executed(page: Path, containing: str = "") -> dict[str, Any]:
+def execute(page: Path, containing: str = "") -> dict[str, Any]:
     """Run the page's Python blocks, or those that contain a text, one after the other in one namespace, and return it."""
     module = ModuleType(f"docs_{page.stem.replace('-', '_')}")
     sys.modules[module.__name__] = module  # where dataclasses look for the names of annotations
     namespace = vars(module)
-    namespace.update(given(page))
+    namespace.update(names_of_reader(page))
     for block in blocks(page, "python"):
         if (page.name, block.text.splitlines()[0]) not in NOT_RUN and containing in block.text:
             padded = "\n" * (block.line - 1) + block.text  # errors then name the line of the page
@@ -160,7 +160,7 @@ def executed(page: Path, containing: str = "") -> dict[str, Any]:
 @pytest.mark.usefixtures("quick_auto")
 def test_python_blocks_run(page: Path, inside: Path) -> None:
     with patch.dict(DEPTH_RESIDUALS), patch.dict(registered):  # what a page registers ends with it
-        executed(page)
+        execute(page)
 
 
 def test_blocks_that_are_not_run_exist() -> None:
@@ -228,7 +228,7 @@ def extras(arguments: list[str]) -> set[str]:
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_auto")
 def test_the_backend_of_the_documentation_trains_and_localizes(inside: Path) -> None:
-    namespace = executed(ROOT / "docs" / "extend.md", "backend = Fog()")
+    namespace = execute(ROOT / "docs" / "extend.md", "backend = Fog()")
     field = next(block for block in blocks(ROOT / "README.md", "python") if "FogField" in block.text)
     assert field.text.partition("def query")[2].split("\n", 1)[1].strip() in (ROOT / "docs" / "extend.md").read_text()
     backend, scene, views = namespace["backend"], demo_object(), tiny.views(16)
@@ -248,7 +248,7 @@ def test_the_backend_of_the_documentation_trains_and_localizes(inside: Path) -> 
 class TestFog(BackendContract):
     """The backend of the documentation, as it stands there, keeps the contract."""
 
-    page = executed(ROOT / "docs" / "extend.md", "backend = Fog()")
+    page = execute(ROOT / "docs" / "extend.md", "backend = Fog()")
     backend, config = page["backend"], page["FogConfig"](cells=16, steps=40)
 
 
@@ -293,7 +293,7 @@ def tables() -> Any:
 
 
 def test_tables_are_those_of_the_records(tables: Any) -> None:
-    outdated = [page.name for page in tables.PAGES if tables.rendered(page.read_text()) != page.read_text()]
+    outdated = [page.name for page in tables.PAGES if tables.render_page(page.read_text()) != page.read_text()]
     assert outdated == [], "run python docs/tables.py"
 
 
@@ -316,7 +316,7 @@ def test_tables_follow_their_records(tables: Any, tmp_path: Path) -> None:
         if not (tmp_path / other.name).exists():
             (tmp_path / other.name).symlink_to(other)
     page = (ROOT / "docs" / "results.md").read_text()
-    (changed,) = set(tables.rendered(page, tmp_path).splitlines()) - set(page.splitlines())
+    (changed,) = set(tables.render_page(page, tmp_path).splitlines()) - set(page.splitlines())
     assert "of another scene | 400 | 17 |" in changed
 
 

@@ -68,10 +68,10 @@ def deep_imports(file: Path) -> set[tuple[str, str]]:
 
 def _is_module(package: str | None, name: str) -> bool:
     place = ROOT.joinpath(*(package or "").split("."), name)
-    return name not in _offered(str(package)) and (place.with_suffix(".py").exists() or place.is_dir())
+    return name not in _names_in_face(str(package)) and (place.with_suffix(".py").exists() or place.is_dir())
 
 
-def _offered(package: str) -> set[str]:
+def _names_in_face(package: str) -> set[str]:
     stub = ROOT.joinpath(*package.split("."), "__init__.pyi")
     return set(re.findall(r" as (\w+)$", stub.read_text(), re.MULTILINE)) if stub.exists() else set()
 
@@ -105,6 +105,6 @@ def test_exceptions_are_needed() -> None:
 def test_what_a_face_names_is_there(package: str) -> None:
     face = importlib.import_module(package)
     assert [name for name in face.__all__ if not hasattr(face, name)] == []
-    assert set(face.__all__) == _offered(face.__name__)
+    assert set(face.__all__) == _names_in_face(face.__name__)
     with pytest.raises(AttributeError, match="missing"):
         _ = face.missing

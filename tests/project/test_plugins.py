@@ -26,7 +26,7 @@ BUNDLED = {folder.name for folder in (ROOT / "backends").iterdir()}
 every_plugin = pytest.mark.parametrize("plugin", PLUGINS, ids=lambda plugin: plugin.name)
 
 
-def installed(sources: list[Path], target: Path) -> dict[str, str]:
+def install(sources: list[Path], target: Path) -> dict[str, str]:
     """Install folders or wheels; the environment in which they are found."""
     pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-build-isolation", "--no-index"]
     quietly([*pip, "--target", str(target), *map(str, sources)])
@@ -34,18 +34,18 @@ def installed(sources: list[Path], target: Path) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": path}
 
 
-def copied(plugin: Path, folder: Path) -> Path:
+def copy_plugin(plugin: Path, folder: Path) -> Path:
     junk = shutil.ignore_patterns("__pycache__", ".*", "build", "dist", "*.egg-info")
     return Path(shutil.copytree(plugin, folder / plugin.name, ignore=junk))
 
 
-def declared(source: Path) -> set[tuple[str, str]]:
+def entry_points_of(source: Path) -> set[tuple[str, str]]:
     """Return the group and the name of each entry point."""
     groups = tomllib.loads((source / "pyproject.toml").read_text())["project"]["entry-points"]
     return {(group.removeprefix("bidnerf."), name) for group, names in groups.items() for name in names}
 
 
-def offered(environment: dict[str, str]) -> dict[tuple[str, str], str]:
+def list_offered(environment: dict[str, str]) -> dict[tuple[str, str], str]:
     """Return the distribution of every plugin that is found and has no fault, by group and name."""
     program = "from bidnerf.cli import main; main(['plugins', '--json'])"
     listed = json.loads(quietly([sys.executable, "-c", program], env=environment))
@@ -62,13 +62,13 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], str
     if wheels := os.environ.get("BIDNERF_WHEELS"):
         sources = [*Path(wheels).glob("bidnerf_*.whl")]
     else:
-        sources = [copied(plugin, folder) for plugin in PLUGINS]
-    return offered(installed(sources, folder / "site"))
+        sources = [copy_plugin(plugin, folder) for plugin in PLUGINS]
+    return list_offered(install(sources, folder / "site"))
 
 
 @every_plugin
 def test_a_plugin_is_found(plugin: Path, found: dict[tuple[str, str], str]) -> None:
-    points = declared(plugin)
+    points = entry_points_of(plugin)
     assert {point: found.get(point) for point in points} == dict.fromkeys(points, plugin.name)
 
 
@@ -79,10 +79,10 @@ def test_a_plugin_is_typed_and_knows_the_core_only(plugin: Path) -> None:
     for package in packages:
         assert (package / "py.typed").is_file()
         for file in package.rglob("*.py"):
-            assert not imported(file) & BUNDLED, file
+            assert not imports_of(file) & BUNDLED, file
 
 
-def imported(file: Path) -> set[str]:
+def imports_of(file: Path) -> set[str]:
     """Top-level names of what a file imports."""
     nodes = list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
     plain = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
@@ -94,13 +94,13 @@ def test_the_template_can_be_renamed_as_it_says(tmp_path: Path) -> None:
     if shutil.which("perl") is None:
         pytest.skip("perl is not installed")
     checkout = tmp_path / "bidnerf"
-    template = copied(ROOT / "plugins" / "bidnerf-template", checkout / "plugins")
+    template = copy_plugin(ROOT / "plugins" / "bidnerf-template", checkout / "plugins")
     commands = re.findall(r"```sh\n(.*?)```", (template / "README.md").read_text(), re.DOTALL)[0]
     quietly(["sh", "-e", "-c", commands], cwd=checkout)
     mine = tmp_path / "bidnerf-mine"
     text = "".join(file.read_text() for file in mine.rglob("*") if file.suffix in (".py", ".toml"))
     assert "template" not in text.lower()
-    environment = installed([mine], tmp_path / "site")
+    environment = install([mine], tmp_path / "site")
     (distribution,) = metadata.distributions(path=[str(tmp_path / "site")])
     assert {(point.group, point.name, point.value) for point in distribution.entry_points} == {
         ("bidnerf.backends", "mine", "bidnerf_mine:backend"),

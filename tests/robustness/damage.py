@@ -18,6 +18,8 @@ import numpy as np
 from hypothesis import strategies as st
 from PIL import Image
 
+from bombs import chunk, png
+
 Damages: TypeAlias = dict[str, st.SearchStrategy[bytes]]
 
 TERMINAL = "\x1b[2J\x1b]0;owned\x07\x9b31m\x00\r\u202e\ud800\u2028"
@@ -62,7 +64,7 @@ def noise(seed: int, count: int) -> bytes:
     return np.random.default_rng(seed).bytes(count)
 
 
-def drawn(damages: Damages) -> st.SearchStrategy[tuple[str, bytes]]:
+def draw_damage(damages: Damages) -> st.SearchStrategy[tuple[str, bytes]]:
     """Draw a kind of damage, and content that has it."""
     return st.sampled_from(sorted(damages)).flatmap(lambda name: st.tuples(st.just(name), damages[name]))
 
@@ -111,10 +113,6 @@ def replaced_at(content: bytes, place: tuple[Any, ...], text: str) -> bytes:
     return json.dumps(whole)[1:-1].replace(json.dumps(MARKER), text).encode(errors="surrogatepass")
 
 
-def nested(depth: int, opening: str, closing: str) -> str:
-    return opening * depth + "1" + closing * depth
-
-
 def of_json(content: bytes) -> Damages:
     whole = json.loads(content)
     places = places_of(whole)
@@ -138,17 +136,17 @@ def of_json(content: bytes) -> Damages:
     def renamed(record: dict[str, Any], key: str, number: int) -> None:
         record[(TERMINAL, key + "s", key.upper(), "")[number]] = record.pop(key)
 
-    def twice(key: str, value: Any) -> bytes:
-        return f"{json.dumps(whole)[:-1]}, {json.dumps(key)}: {json.dumps(value)}}}".encode()
-
     values = st.sampled_from(OTHER_VALUES)
     damages = of_bytes(content) | {
         "wrong type": put(values.map(json.dumps)),
-        "odd number": put(st.sampled_from(NUMBERS), (int, float)),
+        "odd number": put(st.sampled_from(NUMBERS), (int, float)) | put(st.sampled_from(NUMBERS)),
         "odd text": put(st.sampled_from(TEXTS).map(json.dumps), str),
         "deep nesting": put(
-            st.builds(nested, st.sampled_from((50, 900, 5000, LARGE)), st.just("["), st.just("]"))
-            | st.builds(nested, st.sampled_from((50, 900, 5000, LARGE)), st.just('{"a":'), st.just("}"))
+            st.builds(
+                lambda depth, ends: ends[0] * depth + "1" + ends[1] * depth,
+                st.sampled_from((50, 900, 5000, LARGE)),
+                st.sampled_from(("[]", ('{"a":', "}"))),
+            )
         ),
         "missing key": edited(dict, lambda record, key, number: record.pop(key)),
         "other key": edited(dict, renamed),
@@ -157,7 +155,11 @@ def of_json(content: bytes) -> Damages:
         "another root": st.sampled_from(ROOTS),
     }
     if isinstance(whole, dict) and whole:
-        damages["key twice"] = st.builds(twice, st.sampled_from(sorted(whole)), values)
+        damages["key twice"] = st.builds(
+            lambda key, value: f"{json.dumps(whole)[:-1]}, {json.dumps(key)}: {json.dumps(value)}}}".encode(),
+            st.sampled_from(sorted(whole)),
+            values,
+        )
     return damages
 
 
@@ -190,65 +192,53 @@ MODES = (
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 24 24\n%%EndComments\n{} loop\n"
 
 
-def saved(image: Image.Image, kind: str, **more: Any) -> bytes:
+def encode(image: Image.Image, kind: str, **more: Any) -> bytes:
     file = io.BytesIO()
     image.save(file, kind, **more)
     return file.getvalue()
 
 
-def chunk(name: bytes, body: bytes) -> bytes:
-    return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
-
-
-def png(side: int, bits: int, colour: int, data: bytes) -> bytes:
-    """Return a square PNG of compressed rows, which may be of a kind that Pillow does not write."""
-    header = struct.pack(">IIBBBBB", side, side, bits, colour, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
-
-
 def zeros_png(side: int, colour: int = 0, channels: int = 1) -> bytes:
     """Return a PNG of ``side`` squared black pixels, a thousandth of their size."""
-    return png(side, 8, colour, zlib.compress(b"\0" * (side * (side * channels + 1)), 9))
+    return png(side, side, 8, colour, b"\0" * (side * (side * channels + 1)))
 
 
 def of_image(content: bytes) -> Damages:
     image = Image.open(io.BytesIO(content)).convert("RGB")
     frames = [Image.new("RGB", (24, 24), (i, 0, 0)) for i in range(3)]
-    of_jpeg = of_bytes(saved(image, "JPEG"))
+    of_jpeg = of_bytes(encode(image, "JPEG"))
 
     def size_in_header(size: tuple[int, int]) -> bytes:
         """Return a PNG with another size in its header, and a correct checksum."""
         return content[:8] + chunk(b"IHDR", struct.pack(">II", *size) + content[24:29]) + content[33:]
 
-    def of_mode(mode: str, kind: str) -> bytes:
-        return saved((image.convert("I") if mode == "I;16" else image).convert(mode), kind)
-
     def sixteen_bits(colour: int, channels: int) -> bytes:
         rows = b"".join(b"\0" + noise(row, 48 * channels) for row in range(24))
-        return png(24, 16, colour, zlib.compress(rows))
-
-    def long_text() -> bytes:
-        """Return a PNG whose compressed text is a thousand times as long as the file."""
-        return content[:33] + chunk(b"zTXt", b"k\0\0" + zlib.compress(b"a" * 5_000_000)) + content[33:]
+        return png(24, 24, 16, colour, rows)
 
     return of_bytes(content) | {
         "size in the header": st.sampled_from(SIZES).map(size_in_header),
-        "another mode": st.sampled_from(MODES).map(lambda mode: of_mode(*mode)),
+        "another mode": st.sampled_from(MODES).map(
+            lambda mode: encode((image.convert("I") if mode[0] == "I;16" else image).convert(mode[0]), mode[1])
+        ),
         "16 bits per channel": st.sampled_from(((2, 3), (4, 2), (6, 4))).map(lambda kind: sixteen_bits(*kind)),
         "animated": st.sampled_from(("GIF", "PNG", "WEBP", "TIFF")).map(
-            lambda kind: saved(frames[0], kind, save_all=True, append_images=frames[1:])
+            lambda kind: encode(frames[0], kind, save_all=True, append_images=frames[1:])
         ),
         "one pixel or line": st.builds(
-            lambda size, kind: saved(Image.new("RGB", size), kind),
+            lambda size, kind: encode(Image.new("RGB", size), kind),
             st.sampled_from(((1, 1), (1, 24), (24, 1))),
             st.sampled_from(("PNG", "JPEG")),
         ),
         "compressed zeros": st.sampled_from((500, 2000)).map(zeros_png),
         "part of a JPEG": of_jpeg["cut"] | of_jpeg["flipped"],
         "EXIF of noise": st.sampled_from((2, 40, 400)).map(
-            lambda count: saved(image, "JPEG", exif=b"Exif\0\0II*\0\x08\0\0\0" + noise(count, count))
+            lambda count: encode(image, "JPEG", exif=b"Exif\0\0II*\0\x08\0\0\0" + noise(count, count))
         ),
-        "long compressed text": st.builds(long_text),
+        # A thousand times as long as the file.
+        "long compressed text": st.builds(
+            lambda: content[:33] + chunk(b"zTXt", b"k\0\0" + zlib.compress(b"a" * 5_000_000)) + content[33:]
+        ),
         "PostScript": st.just(POSTSCRIPT),
     }
 
@@ -347,7 +337,7 @@ def parts_of(content: bytes) -> tuple[dict[str, Any], bytes]:
     return json.loads(content[8 : 8 + length]), content[8 + length :]
 
 
-def joined(header: bytes | dict[str, Any], numbers: bytes) -> bytes:
+def join(header: bytes | dict[str, Any], numbers: bytes) -> bytes:
     text = header if isinstance(header, bytes) else json.dumps(header).encode()
     return struct.pack("<Q", len(text)) + text + numbers
 
@@ -359,60 +349,67 @@ def of_tensors(content: bytes) -> Damages:
     del headers["deep nesting"], headers["empty"]
 
     def with_entry(name: str, changes: dict[str, Any]) -> bytes:
-        return joined(header | {name: header[name] | changes}, numbers)
+        return join(header | {name: header[name] | changes}, numbers)
 
     def another_shape(name: str, number: int) -> bytes:
         shape = header[name]["shape"]
-        shapes = ([*shape, 1], shape[::-1], [], [-1], [2**62, 4], [0], [int(np.prod(shape))])
+        shapes = ([*shape, 1], [1, *shape], shape[::-1], [], [-1], [2**62, 4], [0], [int(np.prod(shape))])
         return with_entry(name, {"shape": shapes[number]})
 
     def another_name(name: str, other: str) -> bytes:
-        return joined({other if key == name else key: entry for key, entry in header.items()}, numbers)
+        return join({other if key == name else key: entry for key, entry in header.items()}, numbers)
 
-    def not_finite(name: str) -> bytes:
-        """Fill a tensor with NaN, whatever its type: all bits set."""
+    def filled(name: str, byte: bytes) -> bytes:
+        """Fill a tensor with one byte: NaN, whatever its type, of 0xff; large and negative numbers of others."""
         begin, end = header[name]["data_offsets"]
-        return joined(header, numbers[:begin] + b"\xff" * (end - begin) + numbers[end:])
+        return join(header, numbers[:begin] + byte * (end - begin) + numbers[end:])
 
     def random_numbers(begin: int, count: int) -> bytes:
         new = noise(begin, min(count, len(numbers) - begin))
-        return joined(header, numbers[:begin] + new + numbers[begin + len(new) :])
+        return join(header, numbers[:begin] + new + numbers[begin + len(new) :])
 
-    return of_bytes(content) | {
+    damages = of_bytes(content) | {
         "length of the header": st.sampled_from((0, 1, 2**63, 2**64 - 1, 10**8, len(content))).map(
             lambda length: struct.pack("<Q", length) + content[8:]
         ),
-        "header of tensors": st.one_of(*headers.values()).map(lambda changed: joined(changed, numbers)),
+        "header of tensors": st.one_of(*headers.values()).map(lambda changed: join(changed, numbers)),
         "another type": st.builds(with_entry, names, st.sampled_from([{"dtype": kind} for kind in TYPES])),
-        "another shape": st.builds(another_shape, names, st.integers(0, 6)),
-        "not finite": st.builds(not_finite, names),
+        "another shape": st.builds(another_shape, names, st.integers(0, 7)),
+        "not finite": st.builds(filled, names, st.just(b"\xff")),
+        "of one byte": st.builds(filled, names, st.sampled_from((b"\0", b"\x7e", b"\xfe"))),
         "another name": st.builds(another_name, names, st.sampled_from((TERMINAL.replace("\ud800", ""), "other", ""))),
         "random numbers": st.builds(random_numbers, st.integers(0, len(numbers) - 1), st.sampled_from((1, 4, 1000))),
     }
+    if text := header.get("__metadata__", {}).get("bidnerf"):  # plain data beside the tensors
+        damages["metadata"] = st.one_of(*of_json(text.encode()).values()).map(
+            lambda changed: join(
+                header | {"__metadata__": {"bidnerf": changed.decode(errors="surrogateescape")}}, numbers
+            )
+        )
+    return damages
 
 
 # COLMAP's binary files, which begin with a count of 64 bits.
 
 
-def with_count(count: int, content: bytes, place: int = 0) -> bytes:
-    """Return the content with another count of 64 bits at a place."""
-    return content[:place] + struct.pack("<Q", count % 2**64) + content[place + 8 :]
-
-
-def false_counts(content: bytes) -> dict[str, bytes]:
-    """Return files with counts of more than they hold, of fewer, negative, and of more than any memory."""
-    held = struct.unpack_from("<Q", content)[0]
-    numbers = {
-        "2^63": 2**63,
-        "-1": -1,
-        "2^31": 2**31,
-        "10^6": 10**6,
-        "one more": held + 1,
-        "one less": held - 1,
-        "none": 0,
-    }
-    return {f"count {name}": with_count(number, content) for name, number in numbers.items()}
+COUNTS = (2**63, -1, 2**31, 10**6, 0)
+"""Counts of more than a file holds, of fewer, negative, and of more than any memory."""
+PLACES = (0, 16, 8 + struct.calcsize("<I7dI") + len("1.png\0"), 8 + struct.calcsize("<q3d3Bd"))
+"""Where a model has its count of cameras, images or points, the width of the first camera, the number of keypoints of the first
+image, and the length of the track of the first point.
+"""
 
 
 def of_colmap(content: bytes) -> Damages:
-    return of_bytes(content) | {name: st.just(bad) for name, bad in false_counts(content).items()}
+    known = struct.unpack_from("<Q", content)[0]
+
+    def with_count(count: int, place: int) -> bytes:
+        return content[:place] + struct.pack("<Q", count % 2**64) + content[place + 8 :]
+
+    return of_bytes(content) | {
+        **{f"count {number}": st.just(with_count(number, 0)) for number in (*COUNTS, known + 1, known - 1)},
+        "count inside": st.builds(
+            with_count, st.sampled_from(COUNTS), st.sampled_from(PLACES) | st.integers(0, len(content) - 8)
+        ),
+        "name without an end": st.just(content.replace(b"\0", b"x")),
+    }

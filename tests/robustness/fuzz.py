@@ -5,13 +5,13 @@ Every case runs in a child on a fresh copy of a folder of sound files.
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import shutil
-import stat
 import struct
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,40 +22,44 @@ import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from bidnerf import SE3, Frame, Intrinsics, Localizer, load_map
+import tiny
+from bidnerf import SE3, Frame, Intrinsics, Localizer, Tracker, load_map, open_sequence
 from bidnerf_core.localization import settings_of
 from damage import (
     NUMBERS,
     TEXTS,
     Damages,
-    drawn,
+    draw_damage,
     of_array,
     of_colmap,
     of_image,
     of_json,
     of_points,
     of_tensors,
+    zeros_png,
 )
 from harness import (
     AUTO,
     BAKED,
-    CAMERA,
+    MEMORY,
     NOBODY,
     QUICK,
-    SMALL_FIELD,
     Check,
+    Checks,
+    Door,
     defects,
     files_of,
-    localized,
+    localize_photo,
+    localizer,
     photo,
     run,
     sound_folder,
-    views_of,
 )
+from scan_layouts import read_all
 
 FolderDoor = list[str] | Callable[[Path], object]
 """An entry point: the words of a command, in which ``{}`` stands for the folder, or a function of the folder."""
-SHORT = [*SMALL_FIELD, "--steps", "2", "--no-bake"]
+SHORT = tiny.options(2)
 PHOTO = [*shlex.split("localize {}/map {}/photo.png --start {}/pose.json"), *QUICK]
 KNOWN = [*PHOTO, "--hfov", "40"]
 FRAME = [*shlex.split("localize {}/map {}/data --perturb 0.1 5"), *QUICK]
@@ -78,15 +82,27 @@ def frame_door(**options: Any) -> Callable[[Path], object]:
     return door
 
 
-def map_door(folder: Path) -> object:
+def load(folder: Path) -> object:
     return load_map(folder / "map")
 
 
-def data_door(folder: Path) -> object:
-    return views_of(folder / "data")
+def restore(folder: Path) -> None:
+    """Restore a tracker from its stored state, and track two frames more."""
+    tracker = Tracker(localizer(folder))
+    tracker.restore(folder / "state")
+    for timed in list(open_sequence(folder / "data"))[4:6]:
+        tracker(timed.frame, timed.time)
 
 
-OF_DATA: list[FolderDoor] = [TRAIN, RENDER, FRAME, [*EVALUATE, "{}/new.jsonl"], BAKE, TRACK, data_door]
+OF_DATA: list[FolderDoor] = [
+    TRAIN,
+    RENDER,
+    FRAME,
+    [*EVALUATE, "{}/new.jsonl"],
+    BAKE,
+    TRACK,
+    lambda folder: read_all(folder / "data"),
+]
 OF_MAP: list[FolderDoor] = [
     ["info", "{}/map"],
     ["info", "{}/map", "--json"],
@@ -94,8 +110,8 @@ OF_MAP: list[FolderDoor] = [
     FRAME,
     [*EVALUATE, "{}/new.jsonl"],
     BAKE,
-    map_door,
-    localized,
+    load,
+    localize_photo,
     ["train", "{}/data", "--out", "{}/map", "--resume"],
 ]
 OF_BAKED: list[FolderDoor] = [
@@ -103,12 +119,13 @@ OF_BAKED: list[FolderDoor] = [
     ["localize", "{}/map", "{}/data", *AUTO],
     BAKE,
     TRACK,
-    map_door,
-    localized,
+    load,
+    localize_photo,
     [*SEARCH, "{}/new.jsonl"],
 ]
 
 
+MODEL, STATE = "colmap/sparse/0/*.bin", "state"
 TARGETS: list[tuple[str, Callable[[bytes], Damages], list[FolderDoor]]] = [
     # A pattern of files in the folder, what can be wrong with them, and what reads them.
     ("data/transforms_t*.json", of_json, OF_DATA),
@@ -136,7 +153,12 @@ TARGETS: list[tuple[str, Callable[[bytes], Damages], list[FolderDoor]]] = [
     ("points.txt", of_points, [[*KNOWN, "--depth-points", "{}/points.txt"]]),
     ("points.npy", of_array, [[*KNOWN, "--depth-points", "{}/points.npy"]]),
     ("points.npz", of_array, [[*KNOWN, "--depth-points", "{}/points.npz"]]),
-    ("colmap/sparse/0/*.bin", of_colmap, [COLMAP, lambda folder: views_of(folder / "colmap")]),
+    (
+        MODEL,
+        of_colmap,
+        [COLMAP, lambda folder: read_all(folder / "colmap"), [*FRAME, "--depth-points", "{}/colmap/sparse/0"]],
+    ),
+    (STATE, of_tensors, [restore]),
     ("results.jsonl", of_json, [REPORT, [*SEARCH, "{}/results.jsonl"]]),
     ("results.meta.json", of_json, [REPORT, [*EVALUATE, "{}/results.jsonl"]]),
 ]
@@ -282,12 +304,12 @@ def odd_call(draw: st.DrawFn) -> tuple[str, Callable[[Path], object]]:
     calls: dict[str, Callable[[Path], object]] = {
         "Intrinsics": lambda folder: Intrinsics(*n, lens),
         "from_hfov": lambda folder: Intrinsics.from_hfov(*n[:3]),
-        "from_numpy": lambda folder: Frame.from_numpy(pixels, CAMERA),
-        "from_numpy depth": lambda folder: Frame.from_numpy(zeros, CAMERA, depth=pixels, depth_unit=n[0]),
-        "Frame": lambda folder: localized(folder, Frame("x", tensor, CAMERA)),
+        "from_numpy": lambda folder: Frame.from_numpy(pixels, tiny.CAMERA),
+        "from_numpy depth": lambda folder: Frame.from_numpy(zeros, tiny.CAMERA, depth=pixels, depth_unit=n[0]),
+        "Frame": lambda folder: localize_photo(folder, Frame("x", tensor, tiny.CAMERA)),
         "Localizer": lambda folder: Localizer(*n[:3]),
         "start": lambda folder: Localizer(load_map(folder / "map"), "bid", bid(), warm_up=False)(photo(folder), start),
-        "seed": lambda folder: localized(folder, seed=n[0]),
+        "seed": lambda folder: localize_photo(folder, seed=n[0]),
         "Frame.open": lambda folder: Frame.open(folder / "photo.png", hfov=n[0], largest=n[1]),
     }
     name = one_of(*calls)
@@ -308,27 +330,21 @@ class Case:
 
 
 @st.composite
-def cases(draw: st.DrawFn, sound: Path) -> Case:
-    kind = draw(st.sampled_from(["options"] * 2 + ["Python", "place"] + ["content"] * 6))
+def cases(draw: st.DrawFn, sound: Path, only: str | None) -> Case:
+    kind = "content" if only else draw(st.sampled_from(["options"] * 2 + ["Python", "place"] + ["content"] * 6))
     if kind == "options":
         return Case("options", draw(odd_words()))
     if kind == "Python":
         name, call = draw(odd_call())
         return Case(f"Python: {name}", call)
-    pattern, damages, doors = draw(st.sampled_from(TARGETS))
-    file = draw(st.sampled_from(sorted(sound.glob(pattern))))
+    pattern, damages, doors = draw(st.sampled_from([target for target in TARGETS if only in (None, target[0])]))
+    inside = draw(st.sampled_from(sorted(sound.glob(pattern)))).relative_to(sound)
     door = draw(st.sampled_from(doors))
     if kind == "place":
         name = draw(st.sampled_from(sorted(PLACES)))
-        damage = PLACES[name]
-    else:
-        name, content = draw(drawn(damages(file.read_bytes())))
-
-        def damage(path: Path) -> object:
-            return path.write_bytes(content)
-
-    inside = file.relative_to(sound)
-    return Case(f"{inside}: {name}", door, lambda folder: damage(folder / inside), name == "no permission")
+        return Case(f"{inside}: {name}", door, lambda folder: PLACES[name](folder / inside), name == "no permission")
+    name, content = draw(draw_damage(damages((sound / inside).read_bytes())))
+    return Case(f"{inside}: {name}", door, lambda folder: (folder / inside).write_bytes(content))
 
 
 def wrong_with(case: Case, folder: Path) -> list[str]:
@@ -338,27 +354,18 @@ def wrong_with(case: Case, folder: Path) -> list[str]:
     if case.nobody and os.geteuid() == 0:
         for path in (folder, *folder.rglob("*")):
             os.chown(path, NOBODY, NOBODY, follow_symlinks=False)
-    if isinstance(case.door, list):
-        words = [word.replace("{}", str(folder)) for word in case.door]
-        found = run(words, folder.with_suffix(".log"), nobody=case.nobody, before=partial(os.chdir, folder))
-        return defects(found, folder, before)
-    call = partial(case.door, folder)
-    return defects(run(call, folder.with_suffix(".log"), nobody=case.nobody, before=partial(os.chdir, folder)))
+    words = [word.replace("{}", str(folder)) for word in case.door] if isinstance(case.door, list) else None
+    door: Door = words or partial(case.door, folder)  # type: ignore[arg-type]
+    found = run(door, folder.with_suffix(".log"), nobody=case.nobody, before=partial(os.chdir, folder))
+    return defects(found, folder if words else None, before)
 
 
-def remove(folder: Path) -> None:
-    for path in folder.rglob("*"):
-        if not path.is_symlink() and not stat.S_IMODE(path.stat().st_mode) & stat.S_IWUSR:
-            path.chmod(0o755)
-    shutil.rmtree(folder, ignore_errors=True)
+def checks(work: Path, count: int, minutes: float = 10.0, only: str | None = None) -> Sequence[Check]:
+    """Return the checks of up to ``count`` cases, none of which begins when the time is over.
 
-
-def checks(work: Path, count: int, minutes: float = 10.0) -> Iterator[Check]:
-    """Return the checks of up to ``count`` cases; none begins when the time is over."""
-    work.chmod(0o755)
-    sound, found = work / "sound", list[Check]()
-    sound.mkdir()
-    sound_folder(sound)
+    ``only``: the pattern of one target, of which all cases are damaged content then.
+    """
+    sound, found = sound_folder(work / "sound"), list[Check]()
     until = time.monotonic() + 60 * minutes
 
     @settings(
@@ -369,13 +376,35 @@ def checks(work: Path, count: int, minutes: float = 10.0) -> Iterator[Check]:
         deadline=None,
         suppress_health_check=list(HealthCheck),
     )
-    @given(case=cases(sound))
-    def tried(case: Case) -> None:
+    @given(case=cases(sound, only))
+    def run_case(case: Case) -> None:
         if time.monotonic() < until:
             folder = Path(shutil.copytree(sound, work / f"case{len(found)}", symlinks=True))
             wrong = tuple(text.replace(str(folder), "{}") for text in wrong_with(case, folder))
             found.append(Check(f"{case.kind}: {case.door if isinstance(case.door, list) else 'call'}", wrong))
-            remove(folder)
+            shutil.rmtree(folder, ignore_errors=True)
 
-    tried()
-    return iter(found)
+    run_case()
+    return found
+
+
+def large_inputs(work: Path) -> Checks:
+    """Check that a small file of many pixels, and a description of many cameras, do not take gigabytes."""
+    folder = sound_folder(work / "sound")
+    (folder / "large.png").write_bytes(zeros_png(9900, 6, 4))  # 98 megapixels, RGBA
+    path = folder / "map" / "map.json"
+    plain = json.loads(path.read_text())
+    cameras = [plain["cameras"][n % len(plain["cameras"])] | {"name": f"{n:06}"} for n in range(200_000)]
+    path.write_text(json.dumps(plain | {"cameras": cameras}))
+    read = partial(Frame.open, folder / "large.png", hfov=41.0)
+    cases: dict[str, tuple[Door, int]] = {
+        "98 megapixels, largest=640": (partial(read, largest=640), 5 * 2**29),
+        "98 megapixels": (read, 3 * 2**30),
+        "info, 200,000 cameras": (["info", folder / "map"], MEMORY),
+        "localize, 200,000 cameras": (
+            ["localize", folder / "map", folder / "photo.png", "--hfov", "40", *AUTO],
+            MEMORY,
+        ),
+    }
+    for name, (door, memory) in cases.items():
+        yield Check(name, tuple(defects(run(door, work / "case", 60, memory=memory))))

@@ -2,8 +2,7 @@
 
 A case is a command line or a function. It must end in a result, in one line on stderr with status 1, in wrong usage with
 status 2, or, in Python, in an ``InputError``. A traceback, a crash, exceeding the limits of time or memory, a character that
-controls the terminal, and a half-written file are defects. Only the public interface is used, so that the cases also run
-against other versions.
+controls the terminal, and a half-written file are defects.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ import re
 import resource
 import shlex
 import signal
-import struct
 import sys
 import time
 import traceback
@@ -30,23 +28,19 @@ import numpy as np
 import torch
 from safetensors import safe_open
 
-from bidnerf import SE3, Frame, InputError, Intrinsics, Localizer, Tracker, load_map
+import sparse_model
+import tiny
+from bidnerf import Frame, InputError, Localization, Localizer, Tracker, load_map
 
 # Inside: the modules of the commands are imported before a process is forked for each case
 from bidnerf.cli import evaluate, localize, main, maps, track, train  # noqa: F401  (before a fork)
-from bidnerf.scenes import demo_object, orbit
-from bidnerf.scenes import views as seen_from
-from bidnerf_core.datasets import open_dataset, write_transforms
+from bidnerf_core.datasets import write_transforms
 from bidnerf_core.localization import settings_of
+from scan_layouts import metres, millimetres, pixels, write_image
 
-CAMERA = Intrinsics(32.0, 32.0, 12.0, 12.0, 24, 24)
-SMALL_FIELD = shlex.split(
-    "--levels 3 --log2-table-size 9 --base-resolution 4 --finest-resolution 16 --width 16 --geometry-features 3"
-    " --grid-resolution 16 --coarse-levels 1 --samples-per-step 2048 --rays-at-most 256 --prune-from 4 --prune-every 4"
-)
 QUICK = shlex.split("--method bid --max-steps 2 --rays 32")
-AUTO = shlex.split("--points 100 --hypotheses 8 --rounds 1 --refine-rays 64")
 AUTO_SETTINGS: dict[str, Any] = {"points": 100, "hypotheses": 8, "rounds": 1, "refine_rays": 64}
+AUTO = [word for name, value in AUTO_SETTINGS.items() for word in (f"--{name.replace('_', '-')}", str(value))]
 BAKED = ["--cells", "2000"]
 SECONDS, MEMORY = 25.0, 2 * 2**30
 """Limits of a case: wall time, and address space beyond that of the process before it."""
@@ -72,73 +66,48 @@ def command(*words: object) -> None:
 def sound_folder(folder: Path, test: int = 2) -> Path:
     """Write a dataset, a map of it with surface and landmarks, photos with depth, and every other kind of input."""
     torch.set_num_threads(1)
-    scene = demo_object()
-    seen, unseen = (seen_from(scene, CAMERA, orbit(3.5, count, seed=seed)) for seed, count in ((0, 6), (1, test)))
-    write_transforms(folder / "data", {"train": seen, "test": unseen}, scene.bounds.background)
-    command("train", folder / "data", "--out", folder / "map", *SMALL_FIELD, "--steps", "6", "--no-bake")
+    seen, unseen = tiny.views(6), tiny.views(test, seed=1)
+    write_transforms(folder / "data", {"train": seen, "test": unseen}, tiny.BACKGROUND)
+    command("train", folder / "data", "--out", folder / "map", *tiny.options(6))
     command("bake", folder / "map", "--data", folder / "data", *BAKED)
-    pose, frame = unseen[0].T_ref_camera.matrix().tolist(), unseen[0].frame
-    (folder / "pose.json").write_text(json.dumps({"T_world_camera": pose}))
     camera = {"fl_x": 32, "fl_y": 32, "cx": 12, "cy": 12, "w": 24, "h": 24, "k1": 0.01}
-    (folder / "camera.json").write_text(json.dumps(camera))
-    (folder / "cameras.txt").write_text("# camera\n1 OPENCV 24 24 32 32 12 12 0.01 0 0 0\n")
-    (folder / "points.txt").write_text("0.1 0.1 3\n-0.1 0.1 3\n0.1 -0.1 3.1\n")
+    texts = {
+        "pose.json": json.dumps({"T_world_camera": unseen[0].T_ref_camera.matrix().tolist()}),
+        "camera.json": json.dumps(camera),
+        "cameras.txt": "# camera\n1 OPENCV 24 24 32 32 12 12 0.01 0 0 0\n",
+        "points.txt": "0.1 0.1 3\n-0.1 0.1 3\n0.1 -0.1 3.1\n",
+    }
+    for name, text in texts.items():
+        (folder / name).write_text(text)
     np.save(folder / "points.npy", np.array([[0.1, 0.1, 3.0], [-0.1, 0.1, 3.0]]))
     np.savez(folder / "points.npz", points=np.array([[0.1, 0.1, 3.0]]), T_camera_sensor=np.eye(4))
-    assert frame.depth is not None
-    iio.imwrite(folder / "photo.png", (frame.rgb * 255).byte().numpy())
-    iio.imwrite(folder / "photo.depth.png", (frame.depth * 1000).numpy().astype(np.uint16))
-    np.save(folder / "photo.depth.npy", frame.depth.numpy())
-    write_colmap(folder / "colmap", [view.T_ref_camera for view in seen], [v.frame.rgb for v in seen])
+    iio.imwrite(folder / "photo.png", pixels(unseen[0]))
+    iio.imwrite(folder / "photo.depth.png", millimetres(unseen[0]))
+    np.save(folder / "photo.depth.npy", metres(unseen[0]))
+    names = [f"{number}.png" for number in range(1, 7)]
+    sparse_model.to_binary(sparse_model.write(folder / "colmap/sparse/0", sparse_model.known(seen, names)))
+    for name, view in zip(names, seen, strict=True):
+        write_image(folder / "colmap/images" / name, pixels(view))
     words = ("--protocol", "none", "--trials", "1", "--workers", "1", *AUTO)
     command("evaluate", folder / "map", folder / "data", "--out", folder / "results.jsonl", *words)
-    os.chmod(folder, 0o755)
+    tracker = Tracker(localizer(folder), start=unseen[0].T_ref_camera)  # with a start, it has a motion to store
+    for view in unseen:
+        tracker(view.frame)
+    tracker.save(folder / "state")
+    folder.parent.chmod(0o755)  # so that a user without privileges sees it
     return folder
-
-
-def write_colmap(project: Path, poses: Sequence[SE3], images: Sequence[torch.Tensor]) -> None:
-    """Write a COLMAP project with a binary model of one camera, whose images observe 20 points."""
-    (project / "images").mkdir(parents=True)
-    sparse = project / "sparse" / "0"
-    sparse.mkdir(parents=True)
-    camera = struct.pack("<QIiQQ4d", 1, 1, 1, 24, 24, 32.0, 32.0, 12.0, 12.0)
-    records = b""
-    for number, (T_world_camera, rgb) in enumerate(zip(poses, images, strict=True), start=1):
-        iio.imwrite(project / "images" / f"{number}.png", (rgb * 255).byte().numpy())
-        T = T_world_camera.inverse()
-        w = float(max(1e-6, 0.5 * (1 + torch.trace(T.rotation)) ** 0.5))
-        axis = torch.stack([T.rotation[k, j] - T.rotation[j, k] for j, k in ((1, 2), (2, 0), (0, 1))])
-        pose = [w, *(axis / (4 * w)).tolist(), *T.translation.tolist()]
-        seen = b"".join(struct.pack("<2dq", 12.0, 12.0, point) for point in range(1, 21))
-        records += struct.pack("<I7dI", number, *pose, 1) + f"{number}.png\0".encode()
-        records += struct.pack("<Q", 20) + seen
-    sightings = b"".join(struct.pack("<II", number, 0) for number in range(1, len(poses) + 1))
-    points = b"".join(
-        struct.pack("<q3d3BdQ", number, 0.02 * number, 0.0, 0.0, 1, 2, 3, 0.5, len(poses)) + sightings
-        for number in range(1, 21)
-    )
-    (sparse / "cameras.bin").write_bytes(camera)
-    (sparse / "images.bin").write_bytes(struct.pack("<Q", len(poses)) + records)
-    (sparse / "points3D.bin").write_bytes(struct.pack("<Q", 20) + points)
 
 
 def photo(folder: Path) -> Frame:
     return Frame.open(folder / "photo.png", hfov=40.0)
 
 
-def localized(folder: Path, frame: Frame | None = None, **options: Any) -> object:
-    localizer = Localizer(load_map(folder / "map"), "auto", settings_of("auto", AUTO_SETTINGS))
-    return localizer(photo(folder) if frame is None else frame, **options)
+def localizer(folder: Path) -> Localizer:
+    return Localizer(load_map(folder / "map"), "auto", settings_of("auto", AUTO_SETTINGS))
 
 
-def tracker(folder: Path, start: Any = None) -> Tracker:
-    localizer = Localizer(load_map(folder / "map"), "auto", settings_of("auto", AUTO_SETTINGS))
-    return Tracker(localizer, start=start)
-
-
-def views_of(folder: Path) -> object:
-    dataset = open_dataset(folder)
-    return [dataset.views(split) for split in dataset.splits]
+def localize_photo(folder: Path, frame: Frame | None = None, **options: Any) -> Localization:
+    return localizer(folder)(photo(folder) if frame is None else frame, **options)
 
 
 # Cases in a child.

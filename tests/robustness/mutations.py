@@ -1,4 +1,4 @@
-"""Mutation testing: 40 seeded faults in the core, one at a time, and the share of them that the test suite catches.
+"""Mutation testing: seeded faults in the core and the product, one at a time, and the share of them that the test suite catches.
 
     BIDNERF_DATA=... python tests/robustness/mutations.py [--tests ROOT] [--seconds 150] [--out out/mutations.json]
 
@@ -7,7 +7,7 @@ so that two versions of the suite are measured by the same ones. A fault is iden
 text of the expression, not by its line; one that no longer applies is reported and not counted. Without the list, a new
 one is drawn with a fixed seed: delete it to draw again.
 
-Tests run first on the sound code, which records the core's functions that they enter and the CPU time. With a fault, the
+Tests run first on the sound code, which records which functions they enter and the CPU time. With a fault, the
 files that enter its function run until a test fails, for up to ``--seconds`` of CPU: first those whose text speaks most of
 it, then all others, the slow tests last. A fault is caught if a test fails or hangs. What only other processes enter is not
 seen. Each run is a line of ``OUT.rows.jsonl``, from which the program goes on after an interruption, or with more seconds;
@@ -20,7 +20,6 @@ import argparse
 import ast
 import compileall
 import json
-import math
 import os
 import random
 import re
@@ -243,19 +242,19 @@ def run_tests_here(copy: Path, test: str, slow: bool, sound: Row | None) -> NoRe
 
         pytest_collectreport = pytest_runtest_logreport
 
-    def called(frame: FrameType, event: str, argument: object) -> None:
+    def record_call(frame: FrameType, event: str, argument: object) -> None:
         codes.add(frame.f_code)
 
     if sound:
         resource.setrlimit(resource.RLIMIT_CPU, (int(30 + 4 * sound["seconds"]),) * 2)
         options += ["-x", *(f"--deselect={name}" for name in sound["failed"])]
     else:
-        threading.settrace(called)
-        sys.settrace(called)
+        threading.settrace(record_call)
+        sys.settrace(record_call)
     status = pytest.main(options, plugins=[Recorder()])
     sys.settrace(None)
-    core, skipped = f"{copy}/bidnerf_core/", len(f"{copy}/")
-    entered = {(c.co_filename[skipped:], c.co_qualname) for c in codes if c.co_filename.startswith(core)}
+    code, skipped = f"{copy}/bidnerf", len(f"{copy}/")
+    entered = {(c.co_filename[skipped:], c.co_qualname) for c in codes if c.co_filename.startswith(code)}
     (copy / "result.json").write_text(json.dumps({"failed": failed, "entered": sorted(entered)}))
     os._exit(status)
 
@@ -291,13 +290,9 @@ class Measurement:
         defined = {node.name for node in module.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
         words = {name for name in defined if not name.startswith("_")} | {*fault.function.split(".")}
         words.add(fault.file.removesuffix(".py").replace("/", "."))
-        texts = {unit: (self.copy / unit[0]).read_text() for unit in self.units(slow=False)}
-        scores: dict[Unit, float] = dict.fromkeys(texts, 0.0)
-        for word in words:
-            counts = {unit: len(re.findall(rf"\b{re.escape(word)}\b", text)) for unit, text in texts.items()}
-            for unit, count in counts.items():
-                scores[unit] += count / max(1, sum(counts.values()))  # rare words say more
-        return sorted((unit for unit in texts if scores[unit]), key=lambda unit: -scores[unit])[:GUESSES]
+        spoken = re.compile(rf"\b({'|'.join(map(re.escape, words))})\b")
+        scores = {unit: len(spoken.findall((self.copy / unit[0]).read_text())) for unit in self.units(slow=False)}
+        return sorted(filter(scores.__getitem__, scores), key=lambda unit: -scores[unit])[:GUESSES]
 
     def judge(self, number: int, fault: Fault, units: list[Unit], seconds: float) -> None:
         """Run those tests that enter a fault's function, until one fails or the time is over."""
@@ -372,14 +367,12 @@ def main() -> None:
     for row in verdicts:
         if row["verdict"] != "caught":
             print("{verdict}, {left} left: {kind} in {file}, {function}: {text} -> {becomes}".format(**row))
-    count = sum(row["verdict"] == "caught" for row in verdicts)
-    total = len(verdicts)
-    z = 1.96  # Wilson's interval (1927) of 95 %
-    middle, half = count + z * z / 2, z * math.sqrt(count * (total - count) / total + z * z / 4)
-    low, high = (middle - half) / (total + z * z), (middle + half) / (total + z * z)
+    from bidnerf.results import success_rate  # not above: the runs import the code of the copy
+
+    rate = success_rate(sum(row["verdict"] == "caught" for row in verdicts), len(verdicts))
     minutes = sum(run["seconds"] for group in measurement.runs.values() for run in group.values()) / 60
-    print(f"caught: {count} of {total}, {low:.0%} to {high:.0%}; {minutes:.0f} CPU minutes")
-    summary = {"caught": count, "total": total, "interval": [low, high], "minutes": minutes}
+    print(f"caught: {rate.successes} of {rate.trials}, {rate.low:.0%} to {rate.high:.0%}; {minutes:.0f} CPU minutes")
+    summary = asdict(rate) | {"minutes": minutes}
     arguments.out.write_text(json.dumps({**summary, "faults": verdicts}, indent=1) + "\n")
 
 

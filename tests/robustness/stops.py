@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import errno
 import gc
+import itertools
 import json
 import os
 import random
@@ -25,12 +26,12 @@ from typing import Any
 
 import torch
 
+import tiny
 from bidnerf import Localizer, load_map
 from bidnerf_core.localization import settings_of
 from harness import (
     BAKED,
     QUICK,
-    SMALL_FIELD,
     TEMPORARY,
     Check,
     Checks,
@@ -40,14 +41,15 @@ from harness import (
     end,
     files_of,
     half_written,
-    localized,
+    localize_photo,
     photo,
     run,
     sound_folder,
 )
 
 VARIES = ("seconds", "peak_memory_bytes")
-STEPS, TRIALS, FRAMES = "12", "8", 24
+STEPS, TRIALS, FRAMES = 12, "8", 24
+OTHER_RESULT = "the result is another than the undisturbed one"
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGKILL)
 
 
@@ -66,8 +68,8 @@ def jobs(sound: Path) -> dict[str, Job]:
 
     def training(folder: Path) -> list[object]:
         out = folder / "map"
-        more = ["--resume"] if (out / "map.json").exists() else [*SMALL_FIELD, "--steps", STEPS]
-        return ["train", data, "--out", out, "--checkpoint-every", "0", *more, "--no-bake"]
+        more = ["--resume", "--no-bake"] if (out / "map.json").exists() else tiny.options(STEPS)
+        return ["train", data, "--out", out, "--checkpoint-every", "0", *more]
 
     def baking(folder: Path) -> list[object]:
         if not (folder / "map").exists():
@@ -81,15 +83,15 @@ def jobs(sound: Path) -> dict[str, Job]:
     def answers(command: str, *more: object) -> Job:
         return Job(
             lambda folder: [command, sound / "map", data, "--out", folder / "poses.json", *more],
-            lambda folder: len(poses(folder)),
-            lambda folder: [{k: v for k, v in row.items() if k not in VARIES} for row in poses(folder)],
+            lambda folder: len(rows(folder / "poses.json")),
+            lambda folder: rows(folder / "poses.json"),
             resumes=False,
         )
 
     return {
         "train": Job(training, step_of, lambda folder: parts(folder, ("weights",))),
         "bake": Job(baking, step_of, lambda folder: parts(folder, ("surface", "landmarks"))),
-        "evaluate": Job(trials, lambda folder: len(rows(folder)), rows),
+        "evaluate": Job(trials, lambda folder: len(rows(folder / "r.jsonl")), lambda folder: rows(folder / "r.jsonl")),
         "report": Job(
             lambda folder: ["report", sound / "results.jsonl", "--out", folder / "report"], pages, files_of_report
         ),
@@ -102,11 +104,6 @@ def jobs(sound: Path) -> dict[str, Job]:
 
 class Broken(Exception):
     """What a stop left is not whole."""
-
-
-def plain_map(folder: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((folder / "map" / "map.json").read_text())
-    return found
 
 
 def copy_map(source: Path, to: Path) -> None:
@@ -124,24 +121,18 @@ def step_of(folder: Path) -> int:
 
 def parts(folder: Path, names: Sequence[str]) -> object:
     """Return the bytes of the map's files, and check that there are no others."""
-    plain = plain_map(folder)
+    plain = json.loads((folder / "map" / "map.json").read_text())
     named = {"map.json", *(v for v in plain.values() if isinstance(v, str))}
     if others := {file.name for file in (folder / "map").iterdir()} - named:
         raise Broken(f"files that map.json does not name: {sorted(others)}")
     return [(folder / "map" / plain[part]).read_bytes() for part in names]
 
 
-def rows(folder: Path) -> list[dict[str, Any]]:
-    """Return the results of whole lines without what varies from run to run."""
-    path = folder / "r.jsonl"
-    found = [json.loads(line) for line in path.read_text().split("\n")[:-1]] if path.exists() else []
-    return [{name: value for name, value in line.items() if name not in VARIES} for line in found]
-
-
-def poses(folder: Path) -> list[dict[str, Any]]:
-    path = folder / "poses.json"
-    found: list[dict[str, Any]] = json.loads(path.read_text()) if path.exists() else []
-    return found
+def rows(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a list in JSON, or of whole lines of JSON, without what varies from run to run."""
+    text = path.read_text() if path.exists() else ""
+    found = map(json.loads, text.split("\n")[:-1]) if path.suffix == ".jsonl" else json.loads(text or "[]")
+    return [{name: value for name, value in row.items() if name not in VARIES} for row in found]
 
 
 def pages(folder: Path) -> int:
@@ -157,7 +148,7 @@ def files_of_report(folder: Path) -> object:
     return {file.name: file.read_bytes() for file in files}
 
 
-def undisturbed(job: Job, folder: Path) -> float:
+def run_undisturbed(job: Job, folder: Path) -> float:
     """Run a command to its end and return the seconds that it took."""
     folder.mkdir(parents=True, exist_ok=True)
     found = run(job.words(folder), folder.with_suffix(".log"), 300)
@@ -166,23 +157,19 @@ def undisturbed(job: Job, folder: Path) -> float:
     return found.seconds
 
 
-def equal(job: Job, folder: Path, expected: object) -> list[str]:
-    return [] if job.result(folder) == expected else ["the result is another than the undisturbed one"]
-
-
 # Kills, and resuming after them.
 
 
-def killed(job: Job, work: Path, expected: object, seconds: float, kills: int, chance: random.Random) -> Checks:
+def kill(job: Job, work: Path, expected: object, seconds: float, kills: int, chance: random.Random) -> Checks:
     """Kill a command at random moments and resume it; a run that comes to its end is compared and begun anew."""
     rounds, before, folder = 0, 0, work / "0"
     folder.mkdir(parents=True)
     for number in range(kills):
-        found = stopped(job, folder, signal.SIGKILL, chance.uniform(0, 1.1 * seconds))
-        wrong = kept_whole(job, folder, before)
+        found = stop(job, folder, signal.SIGKILL, chance.uniform(0, 1.1 * seconds))
+        wrong = damage_of(job, folder, before)
         before = 0 if wrong else job.kept(folder)
         if found.ending == "done":
-            wrong += equal(job, folder, expected)
+            wrong += [] if job.result(folder) == expected else [OTHER_RESULT]
             rounds, before = rounds + 1, 0
             folder = work / str(rounds)
             folder.mkdir()
@@ -191,7 +178,7 @@ def killed(job: Job, work: Path, expected: object, seconds: float, kills: int, c
         yield Check(f"kill {number}", tuple(wrong))
 
 
-def stopped(job: Job, folder: Path, number: int, moment: float) -> Outcome:
+def stop(job: Job, folder: Path, number: int, moment: float) -> Outcome:
     log = folder.with_suffix(".log")
     child = begin(job.words(folder), log)
     time.sleep(moment)
@@ -199,7 +186,7 @@ def stopped(job: Job, folder: Path, number: int, moment: float) -> Outcome:
     return end(child, log, 30)
 
 
-def kept_whole(job: Job, folder: Path, least: int) -> list[str]:
+def damage_of(job: Job, folder: Path, least: int) -> list[str]:
     try:
         now = job.kept(folder)
     except Exception as error:
@@ -210,16 +197,16 @@ def kept_whole(job: Job, folder: Path, least: int) -> list[str]:
 # Signals.
 
 
-def signalled(job: Job, work: Path, seconds: float, count: int, chance: random.Random) -> Checks:
+def send_signals(job: Job, work: Path, seconds: float, count: int, chance: random.Random) -> Checks:
     """Send one of the signals at each random moment; answers that were printed before must be in the file, which is whole."""
     for number in range(count):
         folder, kind = work / f"signal{number}", SIGNALS[number % len(SIGNALS)]
         folder.mkdir(parents=True)
         moment = chance.uniform(0, 1.1 * seconds)
-        found = stopped(job, folder, kind, moment)
+        found = stop(job, folder, kind, moment)
         answered = len(found.out.split("\n")) - 1 if "--json" in job.words(folder) else int(moment > 0.7 * seconds)
         printed = 0 if job.resumes else answered
-        wrong = kept_whole(job, folder, printed if kind != signal.SIGKILL else 0)
+        wrong = damage_of(job, folder, printed if kind != signal.SIGKILL else 0)
         if kind != signal.SIGKILL:
             wrong += half_written(folder, frozenset())
             if found.ending in ("traceback", "hang") and found.status != 128 + kind:
@@ -235,12 +222,10 @@ def signalled(job: Job, work: Path, seconds: float, count: int, chance: random.R
 
 def full_at(number: int) -> None:
     """Let the ``number``-th flush to the disk of this process fail, from 1, and each after it."""
-    real, count = os.fsync, 0
+    real, calls = os.fsync, itertools.count(1)
 
     def fsync(file: int) -> None:
-        nonlocal count
-        count += 1
-        if count >= number:
+        if next(calls) >= number:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         real(file)
 
@@ -260,34 +245,29 @@ def full_disk(job: Job, work: Path, expected: object) -> Checks:
             if (found.ending, "No space left" in found.last) == ("refused", True)
             else [f"{found.ending}: {found.last}"]
         )
-        wrong += kept_whole(job, folder, 0) + half_written(folder, frozenset())
-        undisturbed(job, folder)
-        yield Check(f"write {number}", tuple(wrong + equal(job, folder, expected)))
+        wrong += damage_of(job, folder, 0) + half_written(folder, frozenset())
+        run_undisturbed(job, folder)
+        wrong += [] if job.result(folder) == expected else [OTHER_RESULT]
+        yield Check(f"write {number}", tuple(wrong))
 
 
-def read_only(sound: Path, work: Path) -> Checks:
-    """Let a user without privileges write into folders and over files that it may only read, and with a full stdout."""
-    work.mkdir(parents=True, exist_ok=True)
+def unwritable(folder: Path) -> Checks:
+    """Let a user without privileges write into folders and over files that it may only read, and lose stdout: it is full, or
+    its reader is gone.
+    """
+    sound, work = sound_folder(folder / "sound"), folder / "read-only"
+    work.mkdir()
     copy_map(sound / "map", work / "map")
     shutil.copy(sound / "results.jsonl", work / "r.jsonl")
     (work / "poses.json").write_text("[]\n")
     for path in (work, *work.rglob("*")):
         path.chmod(0o555 if path.is_dir() else 0o444)
-    data, map_folder, shot = sound / "data", sound / "map", sound / "photo.png"
-    known = ["localize", map_folder, shot, "--hfov", "40", "--start", sound / "pose.json", *QUICK]
+    data, map_folder, training = sound / "data", sound / "map", tiny.options(2)
+    known = ["localize", map_folder, sound / "photo.png", "--hfov", "40", "--start", sound / "pose.json", *QUICK]
+    trials = ["evaluate", map_folder, data, "--trials", "1", "--workers", "1", *QUICK, "--out"]
     commands: dict[str, list[object]] = {
-        "train into it": ["train", data, "--out", work / "new", *SMALL_FIELD, "--steps", "2", "--no-bake"],
-        "train over a map": [
-            "train",
-            data,
-            "--out",
-            work / "map",
-            "--overwrite",
-            *SMALL_FIELD,
-            "--steps",
-            "2",
-            "--no-bake",
-        ],
+        "train into it": ["train", data, "--out", work / "new", *training],
+        "train over a map": ["train", data, "--out", work / "map", "--overwrite", *training],
         "resume": ["train", data, "--out", work / "map", "--resume"],
         "bake": ["bake", work / "map", "--data", data, *BAKED],
         "localize --out": [*known, "--out", work / "p.json"],
@@ -295,30 +275,8 @@ def read_only(sound: Path, work: Path) -> Checks:
         "localize --draw": [*known, "--draw", work / "pictures"],
         "track --out": ["track", map_folder, data, "--out", work / "t.json"],
         "track --plot": ["track", map_folder, data, "--out", work.parent / "t.json", "--plot", work / "t.png"],
-        "evaluate": [
-            "evaluate",
-            map_folder,
-            data,
-            "--out",
-            work / "e.jsonl",
-            "--trials",
-            "1",
-            "--workers",
-            "1",
-            *QUICK,
-        ],
-        "evaluate --resume": [
-            "evaluate",
-            map_folder,
-            data,
-            "--out",
-            work / "r.jsonl",
-            "--trials",
-            "1",
-            "--workers",
-            "1",
-            *QUICK,
-        ],
+        "evaluate": [*trials, work / "e.jsonl"],
+        "evaluate --resume": [*trials, work / "r.jsonl"],
         "report": ["report", sound / "results.jsonl", "--out", work / "report"],
         "render": ["render", map_folder, data, "--out", work / "images"],
         "demo": ["demo", "--out", work / "demo"],
@@ -334,6 +292,15 @@ def read_only(sound: Path, work: Path) -> Checks:
         found = run(words, work.parent / "full.log", 60, out=Path("/dev/full"))
         wrong = [] if found.ending == "refused" and "No space left" in found.last else [f"{found.ending}: {found.last}"]
         yield Check(f"full stdout: {name}", tuple(wrong))
+    moved = ["localize", map_folder, data, "--perturb", "0.1", "5", *QUICK, "--out"]
+    for name, more in {"closed pipe": [], "closed pipe, --json": ["--json"], "full disk": []}.items():
+        reading, out = os.pipe()
+        os.close(reading)
+        file = work.parent / f"{name}.json"
+        found = run([*moved, file, *more], work.parent / "lost.log", out=Path("/dev/full") if "disk" in name else out)
+        os.close(out)
+        wrong = ["a traceback"] if "Traceback" in found.err else []
+        yield Check(f"stdout is lost: {name}", tuple(wrong + ([] if rows(file) else ["no pose in the file"])))
 
 
 # Crowds.
@@ -353,7 +320,7 @@ def two_at_once(job: Job, work: Path, times: int) -> Checks:
             one.ending != "done" for one in found
         )
         good = sound and all("another" in line or "exists already" in line for line in refused)
-        wrong = kept_whole(job, folder, 0) + ([] if good else [f"{[one.ending for one in found]}, {refused}"])
+        wrong = damage_of(job, folder, 0) + ([] if good else [f"{[one.ending for one in found]}, {refused}"])
         yield Check(f"two at once {number}", tuple(wrong))
 
 
@@ -362,13 +329,13 @@ def replaced_while_read(sound: Path, work: Path, seconds: float) -> Checks:
     folder = work / "replaced"
     copy_map(sound / "map", folder / "map")
     copy_map(sound / "map", folder / "other")
-    words = ["train", sound / "data", *SMALL_FIELD, "--no-bake", "--overwrite", "--steps"]
 
     def replace() -> None:
         from bidnerf.cli import main
 
         for step in range(1_000_000):
-            main([str(word) for word in (*words, 2 + step % 2, "--out", folder / "map")])
+            words = ["train", sound / "data", "--out", folder / "map", "--overwrite", *tiny.options(2 + step % 2)]
+            main([str(word) for word in words])
 
     writer = begin(replace, folder.with_suffix(".log"))
     until, loads = time.monotonic() + seconds, 0
@@ -396,7 +363,7 @@ def threads(sound: Path, seconds: float) -> Checks:
 
     def answer(number: int) -> torch.Tensor:
         if number % 2:
-            return localized(sound, view, seed=number).T_world_camera.matrix()  # type: ignore[attr-defined, no-any-return]
+            return localize_photo(sound, view, seed=number).T_world_camera.matrix()
         return bid(view, start.numpy(), seed=number).T_world_camera.matrix()
 
     alone, memory, began = [answer(number) for number in range(32)], list[int](), time.monotonic()
@@ -413,36 +380,21 @@ def threads(sound: Path, seconds: float) -> Checks:
     yield Check("memory", () if growth < 50 else (f"grew by {growth:.0f} MiB",))
 
 
-def checks(work: Path, kinds: Sequence[str], kills: int, signals: int, seconds: float = 20, seed: int = 0) -> Checks:
-    """Yield all checks of some ``kinds``: kills, signals, disks, read-only, crowds."""
-    work.chmod(0o755)
-    sound = work / "sound"
-    sound.mkdir()
-    sound_folder(sound, FRAMES)
+def checks(work: Path, kind: str, count: int, seconds: float = 20, seed: int = 0) -> Checks:
+    """Yield the checks of one kind: kills and signals (``count`` of each command), disks, or crowds (for some seconds)."""
+    sound = sound_folder(work / "sound", FRAMES)
     for name, job in jobs(sound).items():
-        folder, chance = work / name, random.Random(f"{seed}/{name}")
-        wanted = {
-            "kills": job.resumes,
-            "disks": job.resumes,
-            "crowds": job.resumes,
-            "signals": name not in ("train", "bake"),
-        }
-        if not any(wanted.get(kind) for kind in kinds):
+        if name in ("train", "bake") if kind == "signals" else not job.resumes:
             continue
-        took = undisturbed(job, folder / "whole")
-        expected = job.result(folder / "whole")
-        parts_of_job = {
-            "kills": lambda j=job, f=folder, e=expected, t=took, c=chance: killed(j, f / "kills", e, t, kills, c),
-            "signals": lambda j=job, f=folder, t=took, c=chance: signalled(j, f / "signals", t, signals, c),
+        folder, chance = work / name, random.Random(f"{seed}/{name}")
+        took, expected = run_undisturbed(job, folder / "whole"), job.result(folder / "whole")
+        made = {
+            "kills": lambda j=job, f=folder, t=took, e=expected, c=chance: kill(j, f / "kills", e, t, count, c),
+            "signals": lambda j=job, f=folder, t=took, c=chance: send_signals(j, f / "signals", t, count, c),
             "disks": lambda j=job, f=folder, e=expected: full_disk(j, f / "full", e),
             "crowds": lambda j=job, f=folder: two_at_once(j, f / "two", 2),
-        }
-        for kind in kinds:
-            if wanted.get(kind):
-                for check in parts_of_job[kind]():
-                    yield Check(f"{name}, {check.name}", check.wrong)
-    if "read-only" in kinds:
-        yield from read_only(sound, work / "read-only")
-    if "crowds" in kinds:
+        }[kind]()
+        yield from (Check(f"{name}, {check.name}", check.wrong) for check in made)
+    if kind == "crowds":
         yield from replaced_while_read(sound, work, seconds)
         yield from threads(sound, seconds)

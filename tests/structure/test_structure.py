@@ -37,13 +37,13 @@ from bidnerf.structure.sources import (
 )
 from bidnerf.testing import PoserContract
 from bidnerf_core.datasets import lacks_poses, write_transforms
-from bidnerf_core.geometry import fit_similarity
+from bidnerf_core.geometry import fit_similarity, look_at
 
 # Inside: each stage of the search for poses, with its rare geometry
 from bidnerf_core.maps.training import posed_images, poses_folder
 from commands import Run
 from photo_files import write_photo
-from photo_room import CAMERA, looking, photograph, walk, write_photos
+from photo_room import CAMERA, photograph, walk, write_photos
 from refusals import refused
 
 pytestmark = pytest.mark.slow
@@ -274,7 +274,7 @@ def test_a_damaged_record_is_replaced_only_on_request(search: Search) -> None:
 
 
 def test_photos_from_one_place_are_refused(tmp_path: Path) -> None:
-    write_photos(tmp_path / "turned", [looking((0, 0, 0), (1.7, 0.5 + 0.25 * n, 0.1)) for n in range(4)])
+    write_photos(tmp_path / "turned", [look_at((0, 0, 0), (1.7, 0.5 + 0.25 * n, 0.1)) for n in range(4)])
     with refused(where=tmp_path / "turned", found="no three of 4 photos could be placed") as caught:
         bn.find_poses(tmp_path / "turned", tmp_path / "out")
     assert re.search("one place|overlap", caught.error.found)
@@ -285,7 +285,7 @@ def test_three_photos_of_one_wall_by_a_known_camera(tmp_path: Path) -> None:
 
     EXIF turns one photo: the dataset has the camera of the image as stored, and a remark says so.
     """
-    poses = [looking((0.2, -0.9 + 0.8 * n, 0.3 * (n % 2) - 0.2), (2, 0.1 * n, 0.1)) for n in range(4)]
+    poses = [look_at((0.2, -0.9 + 0.8 * n, 0.3 * (n % 2) - 0.2), (2, 0.1 * n, 0.1)) for n in range(4)]
     files = write_photos(tmp_path / "wall", poses, walls=1)
     write_photo(files[2], np.asarray(Image.open(files[2])), 6)
     found = bn.find_poses(tmp_path / "wall", tmp_path / "out", camera=CAMERA)

@@ -13,6 +13,7 @@ from bidnerf.results import pose_error
 from bidnerf.testing import textured_map, view
 from bidnerf_core.geometry import look_at
 from bidnerf_core.localization import AutoConfig
+from localizations import assert_near
 from localizations import without_depth as without_depth
 
 FRAMES = 10
@@ -60,11 +61,8 @@ def tracked(
 def assert_right(answers: list[Localization], frames: list[tuple[float, Frame, SE3]]) -> None:
     """Assert that all answers are accepted and near the truth."""
     for answer, (_, frame, truth) in zip(answers, frames, strict=True):
-        error = pose_error(answer.T_world_camera, truth)
         assert answer.converged, (frame.name, answer.reason)
-        found = float(error.translation), float(error.rotation_deg)
-        assert found[0] < 0.045, (frame.name, found)  # a pixel is 1.3 cm
-        assert found[1] < 1.3, (frame.name, found)  # and 0.44 degrees
+        assert_near(answer.T_world_camera, truth, 0.045, 1.3)  # a pixel is 1.3 cm and 0.44 degrees
 
 
 def assert_honest(answers: list[Localization], frames: list[tuple[float, Frame, SE3]]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from bidnerf import SE3, Frame, Intrinsics, View
 from bidnerf_core.camera import exposure_times, poses_of_rows
+from bidnerf_core.geometry import look_at
 from bidnerf_core.mapping import Keypoints, quantize
 
 PINHOLE = Intrinsics(300.0, 300.0, 200.0, 150.0, 400, 300)
@@ -85,14 +87,9 @@ class Points:
 
 
 def looking_in(angle: float, height: float = 0.3, distance: float = 4.0) -> SE3:
-    """A camera on a ring about the origin (radians), looking at it."""
-    a = torch.tensor(angle, dtype=torch.float64)
-    centre = torch.stack([distance * a.sin(), torch.tensor(-height, dtype=torch.float64), -distance * a.cos()])
-    z = -centre / centre.norm()
-    down = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-    x = torch.linalg.cross(down, z)
-    x = x / x.norm()
-    return SE3(torch.stack([x, torch.linalg.cross(z, x), z], dim=-1), centre)
+    """Return the pose of a camera on a ring about the origin (radians) that looks at it."""
+    eye = (distance * math.sin(angle), -height, -distance * math.cos(angle))
+    return look_at(eye, (0.0, 0.0, 0.0), (0.0, -1.0, 0.0))
 
 
 def ring(points: Points, count: int = 10, **options: object) -> list[View]:

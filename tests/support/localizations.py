@@ -28,10 +28,16 @@ def answer(T: SE3 | None = None, outcome: Outcome = Outcome.CONVERGED, **changes
     return Localization(pose, outcome, **(fields | changes))
 
 
+def answer_row(error: float | None, accepted: bool | None = True, squared: float | None = 1.0, **more: Any) -> Any:
+    """Return the row that benchmarks keep of an answer; ``error`` in metres and degrees alike, None for no pose."""
+    errors = {"translation": error, "rotation_deg": error, "normalized_error_squared": squared}
+    return errors | {"converged": accepted, "outcome": "converged", "cpu_seconds": 1.0} | more
+
+
 def assert_near(T: SE3, truth: SE3, metres: float, degrees: float) -> None:
     error = pose_error(T, truth)
-    assert float(error.translation) < metres
-    assert float(error.rotation_deg) < degrees
+    assert float(error.translation) < metres, error
+    assert float(error.rotation_deg) < degrees, error
 
 
 def assert_covered(T: SE3, truth: SE3, covariance: torch.Tensor | None, most: float = CHI2_99) -> None:

@@ -12,26 +12,18 @@ import torch
 from PIL import Image
 
 from bidnerf import SE3, Intrinsics
+from bidnerf_core.geometry import look_at
 
 CAMERA = Intrinsics(230.0, 230.0, 128.0, 96.0, 256, 192)
 HALF = 2.0  # metres: from the middle of the room to each wall
 PIXELS = 500  # of a wall's pattern
 
 
-def looking(eye: Sequence[float], at: Sequence[float]) -> SE3:
-    """T_world_camera of a level camera; z points up."""
-    forward = np.subtract(at, eye) / np.linalg.norm(np.subtract(at, eye))
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    R = np.stack([right, np.cross(forward, right), forward], axis=1)
-    return SE3(torch.from_numpy(R), torch.tensor(eye, dtype=torch.float64))
-
-
 def walk(count: int) -> list[SE3]:
     """Poses along a curve, all looking into one corner."""
     steps = np.linspace(0, 1, count)
     eyes = [(-1.2 + 1.6 * s, 0.9 - 1.9 * s, -0.4 + 0.5 * np.sin(5 * s)) for s in steps]
-    return [looking(eye, (1.7, 1.3 + 0.2 * s, 0.2)) for eye, s in zip(eyes, steps, strict=True)]
+    return [look_at(eye, (1.7, 1.3 + 0.2 * s, 0.2)) for eye, s in zip(eyes, steps, strict=True)]
 
 
 @lru_cache(maxsize=64)

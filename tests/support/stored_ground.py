@@ -3,37 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from bidnerf import SE3, Frame, Intrinsics, View, evaluation
-from bidnerf.testing import MapWithLandmarks, textured_map
+from bidnerf import SE3, Frame, Intrinsics, Map, View, evaluation
+from bidnerf.testing import textured_map
 from bidnerf_core.captures import StoredCamera
 from bidnerf_core.datasets import write_transforms
-from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.maps import MapInfo
-
-
-@dataclass(frozen=True, eq=False)
-class StoredGround(MapWithLandmarks):
-    """The textured ground with the description that stored maps have."""
-
-    cameras: tuple[StoredCamera, ...] = ()
-
-    @property
-    def info(self) -> MapInfo:
-        return MapInfo("ground", {}, self.bounds, 1, True, "data", weights="ground", cameras=self.cameras)
-
-    @property
-    def unit(self) -> LengthUnit:
-        return self.info.unit
-
-    @property
-    def up(self) -> None:
-        return None
 
 
 def open_ground(
@@ -46,8 +26,10 @@ def open_ground(
     if assumed:  # as if trial photos by that camera had been localized in the map
         scatter = torch.full((4,), 0.001, dtype=torch.float64)
         landmarks = replace(landmarks, cameras=assumed, calibration_scatter=scatter)
-    ground = StoredGround(known.field, known.bounds, landmarks, known.surface, cameras=tuple(cameras))
-    open_map(patch, ground)
+    info = MapInfo(
+        "ground", {}, known.bounds, 1, True, "data", weights="ground", cameras=tuple(cameras), colour_noise=0.0
+    )
+    open_map(patch, Map(info, known.field, known.surface, landmarks))
 
 
 def open_map(patch: pytest.MonkeyPatch, scene: object) -> None:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 import torch
 
@@ -21,6 +20,7 @@ from bidnerf_core.maps import Anchor
 from bidnerf_core.training import TrainingBatch
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid.encoding import HashEncodingConfig
+from scan_layouts import millimetres, opengl, write_image
 
 SIZE = 24
 BACKGROUND = demo_object().bounds.background
@@ -79,20 +79,16 @@ def write_dataset(folder: Path, train: int = 6, test: int = 3, depth: bool = Tru
     frames, listed = [], {"train_filenames": [], "test_filenames": []}
     for split, letter, view in seen:
         name = f"images/{letter}_{view.frame.name}.png"
-        frame: dict[str, Any] = {"file_path": name, "transform_matrix": _opengl(view)}
-        _write_png(folder / name, _rgba(view))
+        frame: dict[str, Any] = {"file_path": name, "transform_matrix": opengl(view).tolist()}
+        write_image(folder / name, _rgba(view))
         if depth:
             frame["depth_file_path"] = f"depth/{letter}_{view.frame.name}.png"
-            _write_png(folder / frame["depth_file_path"], _millimetres(view))
+            write_image(folder / frame["depth_file_path"], millimetres(view))
         frames.append(frame)
         listed[f"{split}_filenames"].append(name)
     camera = {"fl_x": CAMERA.fx, "fl_y": CAMERA.fy, "cx": CAMERA.cx, "cy": CAMERA.cy, "w": SIZE, "h": SIZE}
     (folder / "transforms.json").write_text(json.dumps(camera | {"frames": frames} | listed))
     return folder
-
-
-def _opengl(view: View) -> list[list[float]]:
-    return (view.T_ref_camera.matrix() * torch.tensor([1.0, -1.0, -1.0, 1.0])).tolist()
 
 
 def _rgba(view: View) -> np.ndarray:
@@ -101,16 +97,6 @@ def _rgba(view: View) -> np.ndarray:
     cover = alpha[..., None]
     colour = (view.frame.rgb - (1 - cover) * torch.tensor(BACKGROUND)) / cover.clamp(min=1e-3)
     return (torch.cat([colour.clamp(0, 1), cover], dim=-1) * 255).round().to(torch.uint8).numpy()
-
-
-def _millimetres(view: View) -> np.ndarray:
-    assert view.frame.depth is not None
-    return (view.frame.depth * 1000).round().numpy().astype(np.uint16)
-
-
-def _write_png(path: Path, pixels: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    iio.imwrite(path, pixels)
 
 
 def depth_rays_of(views: Sequence[View]) -> Observations:
