@@ -63,7 +63,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import interpolate
 
 from bidnerf import Localizer
-from bidnerf.evaluation import faulty, provenance, warped
+from bidnerf.evaluation import faulty, provenance, warp
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
@@ -130,7 +130,7 @@ def shear(frame: Frame) -> Frame:
     """Shift each row sideways by 15 % of its height above the middle."""
     pixels = frame.intrinsics.pixel_centres()
     shift = 0.15 * (pixels[..., 1] - frame.intrinsics.height / 2)
-    return warped(frame, torch.stack([pixels[..., 0] + shift, pixels[..., 1]], dim=-1))
+    return warp(frame, torch.stack([pixels[..., 0] + shift, pixels[..., 1]], dim=-1))
 
 
 def picture(frame: Frame, kind: str) -> Frame:
@@ -151,7 +151,7 @@ def picture(frame: Frame, kind: str) -> Frame:
     reach = [float(at[..., side].abs().max() / rays[..., side].abs().max()) for side in (0, 1)]
     scale = max(reach) if kind == "full" else 0.8
     pixels = camera.project(torch.cat([at / scale, torch.ones_like(at[..., :1])], dim=-1))
-    shown = warped(frame, pixels)
+    shown = warp(frame, pixels)
     size = pixels.new_tensor([camera.width, camera.height])
     outside = ((pixels < 0) | (pixels >= size)).any(-1)
     rgb = torch.where(outside[..., None], torch.full_like(shown.rgb, 0.6), shown.rgb)

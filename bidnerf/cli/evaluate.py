@@ -214,13 +214,13 @@ def run_report(
     The page works offline. Trials are compared by map, data, start, method and settings. A trial in several files counts once.
     """
     # Imported when a report is made, since help pages do not need it.
-    from bidnerf.evaluation import ResultTable, chosen_criterion, read_runs, write_report
+    from bidnerf.evaluation import ResultTable, choose_criterion, read_runs, write_report
 
     if not results:
         raise UsageError("no results file", expected="at least one written by 'bidnerf evaluate'")
     table = ResultTable.load(*results)
     with wrong_usage():
-        chosen = chosen_criterion(criterion, table.groups)
+        chosen = choose_criterion(criterion, table.groups)
     if view is not None and not view.is_file():
         raise InputError("no such page", where=view, expected="one written by 'bidnerf view MAP --results ... --save'")
     if missing := [folder for folder in data if not Path(folder).is_dir()]:

@@ -8,7 +8,7 @@ from .faults import faulty as faulty
 from .faults import parse_faults as parse_faults
 from .faults.changes import rolling_shutter as rolling_shutter
 from .faults.changes import texture as texture
-from .faults.changes import warped as warped
+from .faults.changes import warp as warp
 from .plan import PROTOCOLS as PROTOCOLS
 from .plan import Plan as Plan
 from .plan import Protocol as Protocol
@@ -20,7 +20,7 @@ from .plan import find_protocol as find_protocol
 from .plan import list_trials as list_trials
 from .plan import parse_settings as parse_settings
 from .plots import comparison_figure as comparison_figure
-from .report import chosen_criterion as chosen_criterion
+from .report import choose_criterion as choose_criterion
 from .report import write_report as write_report
 from .results import ResultsFile as ResultsFile
 from .results import ResultTable as ResultTable
@@ -31,8 +31,8 @@ from .results import read_results as read_results
 from .results import read_runs as read_runs
 from .results import script_command as script_command
 from .run import evaluate as evaluate
-from .run import left_to_do as left_to_do
 from .run import local_processes as local_processes
+from .run import missing_trials as missing_trials
 from .run import run_trials as run_trials
 from .summary import NEVER as NEVER
 from .summary import Group as Group
@@ -44,8 +44,8 @@ from .summary import summarize as summarize
 from .trial import ScalarPoseError as ScalarPoseError
 from .trial import Trace as Trace
 from .trial import TrialResult as TrialResult
-from .trial import forget_peak_memory as forget_peak_memory
 from .trial import open_scene as open_scene
 from .trial import peak_memory_bytes as peak_memory_bytes
+from .trial import reset_peak_memory as reset_peak_memory
 from .trial import run_trial as run_trial
 from .trial import views_digest as views_digest

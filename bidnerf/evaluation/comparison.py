@@ -15,13 +15,13 @@ import torch
 from torch import nn
 
 from bidnerf.evaluation.plan import Plan, Trial, list_trials
-from bidnerf.evaluation.results import aligned, as_line
+from bidnerf.evaluation.results import align_cells, as_line
 from bidnerf.evaluation.run import (
     InThisProcess,
     data_name,
     device_name,
-    ended_on_failure,
     local_processes,
+    terminate_on_failure,
 )
 from bidnerf.evaluation.summary import ABSOLUTE, RELATIVE, Summary, summarize
 from bidnerf.evaluation.trial import (
@@ -88,20 +88,20 @@ class MapRow(Summary):
         return {
             "backend": self.backend,
             **rates,
-            "median error": f"{_known(self.translation, 4)} {symbol(self.unit)}",
-            "median error, deg": _known(self.rotation_deg, 2),
+            "median error": f"{_number(self.translation, 4)} {symbol(self.unit)}",
+            "median error, deg": _number(self.rotation_deg, 2),
             "s a trial": f"{self.seconds:.2f}",
             "steps": f"{self.steps:g}",
-            "steps to success": _known(usual.steps, 0),
+            "steps to success": _number(usual.steps, 0),
             "ms a step": f"{self.ms_per_step:.1f}",
-            "ms to success": _known(usual.milliseconds, 0),
+            "ms to success": _number(usual.milliseconds, 0),
             "peak memory, MiB": f"{self.peak_memory_bytes / 2**20:.0f}",
             "samples a ray": f"{self.samples_per_ray:.1f}",
             "map, MiB": f"{self.map_bytes / 2**20:.1f}",
         }
 
 
-def _known(value: float | None, digits: int) -> str:
+def _number(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
@@ -138,7 +138,7 @@ class Comparison:
         ]
         usual = RELATIVE if self.rows[0].success[RELATIVE] else ABSOLUTE
         note = f"success: number and Wilson's 95 % interval; to success: median of the trials that met {usual}"
-        return "\n".join([printable(self.title), aligned(lines), note])
+        return "\n".join([printable(self.title), align_cells(lines), note])
 
     def save(self, path: str | Path) -> None:
         """Write the comparison with all results as JSON."""
@@ -184,7 +184,7 @@ def compare(
         trials = list_trials(plan, "", data_name(data, dataset), dataset)
         starts = [trial for trial in trials if trial.size == trials[0].size]
         executors = {
-            name: stack.enter_context(ended_on_failure(InThisProcess() if name in here else local_processes(1)))
+            name: stack.enter_context(terminate_on_failure(InThisProcess() if name in here else local_processes(1)))
             for name in sources
         }
         turns = list(product(starts, sources))

@@ -68,11 +68,6 @@ def each_in_turn(frames: int, trials: int, seed: int, times: int = 1) -> list[tu
     return [(order[i // times % frames], seed + i) for i in range(trials)]
 
 
-def once_each(frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
-    """Return the frame index and seed of each trial: at most ``trials`` distinct frames, in random order; seeds are distinct."""
-    return each_in_turn(frames, min(trials, frames), seed)
-
-
 @dataclass(frozen=True)
 class Protocol:
     """A way of choosing frames, seeds and starts.
@@ -86,14 +81,9 @@ class Protocol:
     units: tuple[str, ...] = ()  # units of the numbers in a size
     trials: int = 24  # per size, by default
     seed: int = 0
-    cases_of: Callable[[int, int, int], list[tuple[int, int]]] = each_in_turn
-    """Takes the numbers of frames and trials and the seed; returns the index of the frame and the seed of each trial."""
-
-    def cases(self, frames: int, trials: int, seed: int) -> list[tuple[int, int]]:
-        """Return the frame index and seed of each trial of one size; a larger number of trials only appends cases."""
-        if frames < 1:
-            raise InputError("nothing to try:", expected="at least one frame")
-        return self.cases_of(frames, trials, seed)
+    cases: Callable[[int, int, int], list[tuple[int, int]]] = each_in_turn
+    """Takes the numbers of frames and trials and the seed; returns the index of the frame and the seed of each trial of one
+    size. A larger number of trials only appends cases."""
 
     def check_size(self, size: Size) -> None:
         """Raise ``InputError`` for a size with the wrong number of values, or with a value out of range."""
@@ -121,7 +111,7 @@ PROTOCOLS = {
         "iNeRF: up to 40 degrees about a random axis and up to 0.2 along each axis; five starts per frame",
         lambda T_true, size, seed: inerf_start(T_true, seed),
         trials=25,
-        cases_of=partial(each_in_turn, times=5),  # starts for each frame
+        cases=partial(each_in_turn, times=5),  # starts for each frame
     ),
     "perturb": Protocol(
         "exactly the given errors, in random directions",
@@ -132,7 +122,7 @@ PROTOCOLS = {
     "none": Protocol(
         "no start at all; one trial per frame",
         lambda T_true, size, seed: None,
-        cases_of=lambda frames, trials, seed: each_in_turn(frames, min(trials, frames), seed),
+        cases=lambda frames, trials, seed: each_in_turn(frames, min(trials, frames), seed),
     ),
 }
 """All protocols, by name."""
@@ -236,7 +226,7 @@ class Plan(Setup, Settings):
     # settings of the method, a dictionary of those that differ from the defaults, or its JSON
     config: Any = "{}"
     trials: Annotated[int, WholeNumbers(1, MOST_TRIALS)] | None = (
-        None  # of each size; without a start, at most one per frame
+        None  # of each size; without starts, one per frame at most
     )
     seed: Annotated[int, WholeNumbers(0, LARGEST_SEED)] | None = None
     frames: Sequence[str] | None = None  # use only these
@@ -254,12 +244,12 @@ class Plan(Setup, Settings):
                 raise InputError(f"{name} is {getattr(self, name)!r}", expected="a whole number")
         if not 0 <= self.shard < self.shards:
             raise InputError(f"shard is {self.shard}", expected=f"0 to {self.shards - 1}")
-        given = self.config
-        if isinstance(given, Mapping):
-            given = settings_of(self.method, dict(given))
-        text = given if isinstance(given, str) else changed_settings(self.method, given)
-        parse_settings(self.method, text)
-        object.__setattr__(self, "config", text)
+        config = self.config
+        if not isinstance(config, str):
+            settings = settings_of(self.method, dict(config)) if isinstance(config, Mapping) else config
+            config = changed_settings(self.method, settings)
+        parse_settings(self.method, config)
+        object.__setattr__(self, "config", config)
         object.__setattr__(self, "faults", expand_faults(self.faults) or (NO_FAULT,))
         self.starts()  # checks the sizes
 
@@ -280,14 +270,15 @@ class Plan(Setup, Settings):
 
 def changed_settings(method: str, settings: Any) -> str:
     """Return the JSON of the settings that differ from the method's defaults."""
-    usual, given = to_flat(find_method(method).config_type()), to_flat(settings)
-    return json.dumps({k: v for k, v in given.items() if v != usual[k]}, sort_keys=True)
+    usual = to_flat(find_method(method).config_type())
+    changed = {name: value for name, value in to_flat(settings).items() if value != usual[name]}
+    return json.dumps(changed, sort_keys=True)
 
 
 def parse_settings(method: str, config: str) -> Any:
     """Return the settings of ``method`` from the JSON of those that differ from its defaults."""
-    given = parse_record("config", config, f"an object of settings of {method}").values
-    return settings_of(method, dict(given))
+    record = parse_record("config", config, f"an object of settings of {method}")
+    return settings_of(method, dict(record.values))
 
 
 # Plans.
@@ -317,13 +308,15 @@ def list_trials(plan: Plan, map: str, data: str, dataset: Capture) -> list[Trial
         if not visible:
             raise InputError(f"{text}; {INVERTED}", where=where)
         warnings.warn(f"{where}: {text}", InputWarning, stacklevel=2)
+    if not visible:
+        raise InputError("nothing to try:", expected="at least one frame")
     count = protocol.trials if plan.trials is None else plan.trials
     cases = protocol.cases(len(visible), count, protocol.seed if plan.seed is None else plan.seed)
     shared = {field.name: getattr(plan, field.name) for field in fields(Setup)}
     every = [
-        Trial(map, data, (visible[place],), size, seed, fault, **shared)
+        Trial(map, data, (visible[index],), size, seed, fault, **shared)
         for fault in plan.faults
         for size in plan.starts()
-        for place, seed in cases
+        for index, seed in cases
     ]
     return every[plan.shard :: plan.shards]

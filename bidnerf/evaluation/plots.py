@@ -102,18 +102,6 @@ class Figures:
         labels = dict.fromkeys(group.label for group in groups)
         self.looks = {label: line_style(number) for number, label in enumerate(labels)}
 
-    def all(self) -> list[Figure]:
-        """Draw every figure for which the results have data."""
-        return [figure for figure in (self.errors(), self.convergence()) if figure is not None]
-
-    @property
-    def omitted(self) -> str:
-        """A sentence about what is not drawn; empty if everything is drawn."""
-        count = len(situations(self.groups))
-        if count <= MOST_SITUATIONS:
-            return ""
-        return f" At most {MOST_SITUATIONS} of {count} situations are drawn; the tables have all."
-
     def errors(self) -> Figure | None:
         """Draw the cumulative share of trials over their errors, and that of right answers over time, for each situation."""
         return self._by_situation(
@@ -122,7 +110,7 @@ class Figures:
             self.cumulative(),
             "Cumulative errors: the share of all trials whose final error is at most that on the axis; answers that the"
             " method itself refused count as well, and the dashed lines are 0.05 and 5 degrees. Right: the share of all"
-            f" trials that were answered rightly (within both) in at most that time.{self.omitted}",
+            " trials that were answered rightly (within both) in at most that time.",
         )
 
     def cumulative(self) -> list[Callable[..., None]]:
@@ -137,8 +125,7 @@ class Figures:
             [group for group in self.groups if are_stepwise(group.results)],
             draw,
             "Errors after each step: median and quartiles of all trials; the dashed lines are 0.05 and 5 degrees. Right: the"
-            f" share of all trials that meet the criterion ({CRITERION_NAMES[self.criterion]}) from each step on."
-            f"{self.omitted}",
+            f" share of all trials that meet the criterion ({CRITERION_NAMES[self.criterion]}) from each step on.",
         )
 
     # What a panel shows of the groups of a situation.
@@ -148,12 +135,12 @@ class Figures:
         label, share, bound, value = QUANTITIES[of]
         for group in groups:
             values = sorted(value(result, self.criterion) for result in group.results)
-            known = [each for each in values if each < NEVER]
+            reached = [each for each in values if each < NEVER]
             if bound is not None:  # errors below bound / 500 are drawn as equal on the logarithmic axis
-                known = np.maximum(known, bound / 500).tolist()
-            if known:
-                shares = [100 * count / len(values) for count in range(len(known) + 1)]
-                axes.step([known[0], *known], shares, where="post", **self.looks[group.label])
+                reached = np.maximum(reached, bound / 500).tolist()
+            if reached:
+                shares = [100 * count / len(values) for count in range(len(reached) + 1)]
+                axes.step([reached[0], *reached], shares, where="post", **self.looks[group.label])
         axes.set(xlabel=label.format(unit=unit_of(groups[0].results)), ylabel=share, ylim=(-2, 102))
         if bound is not None:
             axes.axvline(bound, **BOUND)
@@ -186,7 +173,9 @@ class Figures:
         self, name: str, groups: Sequence[Group], draw: Sequence[Callable[..., None]], caption: str
     ) -> Figure | None:
         """Draw a row of panels for each situation, one panel for each function in ``draw``."""
-        panels: list[Panel] = []
+        panels, count = list[Panel](), len(situations(groups))
+        if count > MOST_SITUATIONS:
+            caption += f" At most {MOST_SITUATIONS} of {count} situations are drawn; the tables have all."
         for situation in situations(groups)[:MOST_SITUATIONS]:
             own = [group for group in groups if group.situation == situation]
             panels += [(own[0].title, partial(each, groups=own)) for each in draw]
@@ -204,9 +193,9 @@ class Figures:
             return None
         columns = min(COLUMNS, len(panels))
         rows = math.ceil(len(panels) / columns)
-        titles = [_wrapped(title, WIDTH / columns - 0.4) for title, _ in panels]
+        titles = [_wrap(title, WIDTH / columns - 0.4) for title, _ in panels]
         beside = 2 if len(looks) > 2 and max(map(len, looks)) < WIDTH / 2 * PER_INCH else 1
-        labels = [_wrapped(label, WIDTH / beside - 0.5) for label in looks]
+        labels = [_wrap(label, WIDTH / beside - 0.5) for label in looks]
         legend = 0.35 + 0.2 * sum(label.count("\n") + 1 for label in labels) / beside
         with common_style():
             figure = new_figure(WIDTH, rows * (2.7 + 0.15 * max(t.count("\n") for t in titles)) + legend)
@@ -235,7 +224,7 @@ def _set_logarithmic(axes: Any, name: str) -> None:
     axes.grid(which="major")
 
 
-def _wrapped(text: str, width: float, lines: int = 4) -> str:
+def _wrap(text: str, width: float, lines: int = 4) -> str:
     """Wrap each line of text to a width (inches), truncated to ``lines`` lines."""
     wrap = partial(textwrap.wrap, width=int(width * PER_INCH), max_lines=lines, placeholder=" ...")
     return "\n".join("\n".join(wrap(line)) or line for line in text.split("\n"))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import base64
 import io
+import math
 import os
 from collections.abc import Sequence
 from importlib.resources import files
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
@@ -58,40 +58,41 @@ def write_report(
     if not table.rows:
         raise InputError("no finished trial, nothing to report")
     folder = Path(folder)
-    chosen = chosen_criterion(criterion, table.groups)
+    chosen = choose_criterion(criterion, table.groups)
     require_matplotlib()
     path = folder / "index.html"
     is_ours = path.is_file() and MARK.encode() in path.read_bytes()[:4096]  # the head of the page
     if folder.is_dir() and not is_ours and not all(is_temporary(file.name) for file in folder.iterdir()):
         raise InputError("holds something other than a bidnerf report; name another --out or remove it", where=folder)
-    frames = add_images(worst(table.rows)[:24], data)
+    frames = add_images(worst_first(table.rows)[:24], data)
     with output_folder(folder, overwrite=True):
         if not path.exists():  # so that an interrupted report is recognized as one
             text = "This report was interrupted; the same command rewrites it."
             write_file(path, f"<!doctype html>{MARK}<title>Unfinished report</title><p>{text}</p>\n".encode())
-        figures = Figures(table.groups, folder, chosen).all()
-        write_file(path, page(title, table, figures, runs, view, frames).encode())
+        drawn = Figures(table.groups, folder, chosen)
+        figures = [figure for figure in (drawn.errors(), drawn.convergence()) if figure is not None]
+        write_file(path, render_page(title, table, figures, runs, view, frames).encode())
     return path
 
 
-def chosen_criterion(given: str | None, groups: Sequence[Group]) -> str:
-    """Return the criterion to use where a report shows a single one: ``given``, or one that applies to all groups.
+def choose_criterion(name: str | None, groups: Sequence[Group]) -> str:
+    """Return the criterion to use where a report shows a single one: ``name``, or one that applies to all groups.
 
     Raises ``InputError`` for an unknown criterion, and for one that applies to no trial.
     """
-    if given is None:
+    if name is None:
         return RELATIVE if all(applies(RELATIVE, group.results) for group in groups) else ABSOLUTE
-    if given not in CRITERIA:
-        raise InputError(f"criterion is {given!r}", expected=f"one of {', '.join(CRITERIA)}")
-    if not any(applies(given, group.results) for group in groups):
+    if name not in CRITERIA:
+        raise InputError(f"criterion is {name!r}", expected=f"one of {', '.join(CRITERIA)}")
+    if not any(applies(name, group.results) for group in groups):
         raise InputError(
-            f"criterion is {given}, relative to the start's error, but no trial had a start;",
+            f"criterion is {name}, relative to the start's error, but no trial had a start;",
             expected="5deg 0.05 or 1deg 0.02",
         )
-    return given
+    return name
 
 
-def page(
+def render_page(
     title: str,
     table: ResultTable,
     figures: Sequence[Figure],
@@ -100,7 +101,13 @@ def page(
     frames: Sequence[tuple[TrialResult, str | None]] = (),
 ) -> str:
     """Return a report as HTML; ``frames`` lists trials with their images, see ``add_images``."""
-    environment = Environment(autoescape=True, finalize=_printed, undefined=StrictUndefined, keep_trailing_newline=True)
+    environment = Environment(
+        autoescape=True,
+        # No character of a name reaches a browser or a terminal as an instruction; markup of the template is kept.
+        finalize=lambda x: printable(x) if isinstance(x, str) and not isinstance(x, Markup) else x,
+        undefined=StrictUndefined,
+        keep_trailing_newline=True,
+    )
     environment.filters["number"] = _number
     source = files(__package__).joinpath("report.html.jinja").read_text(encoding="utf-8")
     template = environment.from_string(source.strip() + "\n")
@@ -123,22 +130,18 @@ def page(
         is_right=is_right,
         wrong=sum(row.converged and not is_right(row) for row in table.rows),
         refused=sum(not row.converged for row in table.rows),
-        runs=[(name, _facts(name, known), list(dict.fromkeys(r.command for r in known))) for name, known in runs],
+        runs=[(name, _describe_runs(name, own), list(dict.fromkeys(r.command for r in own))) for name, own in runs],
     )
 
 
-def worst(rows: Sequence[TrialResult]) -> list[TrialResult]:
+def worst_first(rows: Sequence[TrialResult]) -> list[TrialResult]:
     """Return the trials, the most worrying ones first.
 
     Wrongly accepted trials (beyond 5 degrees or 0.05 units) come first, then the refused ones, then the others;
     each kind is sorted by decreasing error.
     """
-
-    def rank(row: TrialResult) -> tuple[bool, bool, float]:
-        error = float("inf") if row.error is None else row.error.translation
-        return row.converged and is_right(row), not row.converged, -error
-
-    return sorted(rows, key=rank)
+    errors = {id(row): math.inf if row.error is None else row.error.translation for row in rows}
+    return sorted(rows, key=lambda row: (row.converged and is_right(row), not row.converged, -errors[id(row)]))
 
 
 def add_images(rows: Sequence[TrialResult], data: Sequence[str | Path]) -> list[tuple[TrialResult, str | None]]:
@@ -165,11 +168,6 @@ def add_images(rows: Sequence[TrialResult], data: Sequence[str | Path]) -> list[
     return pairs
 
 
-def _printed(value: Any) -> Any:
-    """Return text without characters that a browser or a terminal would interpret; markup of the template is kept."""
-    return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
-
-
 def _number(value: float | None, digits: int | None = None, unit: str = "") -> str:
     """Return a number as text, with a dash in place of an unknown one."""
     if value is None:
@@ -177,13 +175,15 @@ def _number(value: float | None, digits: int | None = None, unit: str = "") -> s
     return f"{value:g}{unit}" if digits is None else f"{value:.{digits}f}{unit}"
 
 
-def _facts(name: str, runs: Sequence[Provenance]) -> dict[str, str]:
+def _describe_runs(name: str, runs: Sequence[Provenance]) -> dict[str, str]:
     """Return the facts about how a results file was made, by name; empty if no runs are recorded."""
     if not runs:
         return {}
     first, last = runs[0], runs[-1]
-    changed = {False: "", True: ", with local changes"}
-    commits = [f"{r.commit}{changed[r.dirty]}" if r.commit else "unknown (no checkout of this code)" for r in runs]
+    commits = [
+        f"{r.commit}{', with local changes' * r.dirty}" if r.commit else "unknown (no checkout of this code)"
+        for r in runs
+    ]
     machines = [
         f"{r.cpu}, {r.cores} cores{f', {r.memory_bytes / 2**30:.0f} GiB' if r.memory_bytes else ''},"
         f" {r.gpu or 'no GPU'}, {r.system}"

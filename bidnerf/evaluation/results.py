@@ -13,6 +13,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
@@ -77,7 +78,7 @@ class ResultTable:
                 if summary.translation is not None and summary.rotation_deg is not None:
                     error = f"{summary.translation:.3f} {symbol(summary.unit)} {summary.rotation_deg:6.2f} deg"
                 lines.append([f"  {group.label}", str(summary.trials), str(summary.frames), *rates, error])
-        return aligned(lines)
+        return align_cells(lines)
 
     def save(self, path: str | Path) -> None:
         """Write the results as JSON lines, which ``bidnerf report`` reads; an existing file is replaced as a whole."""
@@ -89,7 +90,7 @@ class ResultTable:
         return cls(tuple(read_results(map(Path, paths))))
 
 
-def aligned(lines: Sequence[Sequence[str]]) -> str:
+def align_cells(lines: Sequence[Sequence[str]]) -> str:
     """Format lines of cells as text: the first column is flush left and the others are flush right.
 
     A line with a single cell is a heading, which may be wider than its column; a very wide first cell is put
@@ -165,12 +166,12 @@ class ResultsFile:
         file = self._open(self.path)
         try:
             content = read_open_file(file, self.path, EXPECTED, LARGEST_FILE)
-            results, whole = _parse(self.path, content)
+            results, complete = _parse(self.path, content)
             for result in results:
                 self.values.setdefault(key_of(result.trial), result)
-            if whole < len(content):
-                file.truncate(whole)
-            if whole and content[whole - 1 : whole] != b"\n":
+            if complete < len(content):
+                file.truncate(complete)
+            if complete and content[complete - 1 : complete] != b"\n":
                 file.write(b"\n")
             file.flush()
         except BaseException:
@@ -320,25 +321,24 @@ def _git(*arguments: str) -> str:
 
 def _cpu_model() -> str:
     """Return the name of the processor."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(names, platform.processor())
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor()
 
 
 def script_command() -> str:
     """Return the command of the running script, with paths relative to the checkout; outside it, only file names."""
     root = Path(bidnerf_core.__file__).resolve().parents[1]
 
-    def shortened(part: str) -> str:
+    def shorten(part: str) -> str:
         path = Path(part)
         if not path.is_absolute():
             return part
         return str(path.relative_to(root)) if path.is_relative_to(root) else path.name
 
     # Words such as ``--out=PATH`` and ``MAP:DATA`` hold paths, too.
-    words = ["".join(map(shortened, re.split(r"([=:])", word))) for word in sys.argv]
-    is_ours = Path(words[0]).stem == "bidnerf"  # wherever it is installed
-    return shlex.join(["bidnerf", *words[1:]] if is_ours else ["python", *words])
+    words = ["".join(map(shorten, re.split(r"([=:])", word))) for word in sys.argv]
+    # The program may be installed anywhere.
+    return shlex.join(["bidnerf", *words[1:]] if Path(words[0]).stem == "bidnerf" else ["python", *words])

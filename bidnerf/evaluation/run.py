@@ -126,9 +126,9 @@ def run_trials(
     killed. No trial begins once the job is cancelled. A trial that fails ends the run with its error, after
     the results of the other running trials have been stored. ``scene`` is the map and data of all trials, by
     default those that the trials name; other processes read them from folders. Raises ``InputError`` as
-    ``left_to_do`` does, and ``Cancelled``.
+    ``missing_trials`` does, and ``Cancelled``.
     """
-    todo = left_to_do(trials, file, scene)
+    todo = missing_trials(trials, file, scene)
     if len(todo) < len(trials):
         log.info("%s: %d of %d trials are already there", file.path, len(trials) - len(todo), len(trials))
     if unchecked := sum(trial in file and file[trial].inputs is None for trial in trials):
@@ -153,9 +153,10 @@ def run_trials(
             ) from error
         except Cancelled as error:
             left = sum(trial not in file for trial in trials)
-            kept = "nothing is kept without a results file" if file.path is None else "the same command resumes"
-            are = "is" if left == 1 else "are"
-            raise Cancelled(f"stopped; {amount(left, 'trial')} {are} left{where}, {kept}") from error
+            advice = "nothing is stored without a results file" if file.path is None else "the same command resumes"
+            raise Cancelled(
+                f"stopped; {amount(left, 'trial')} {'is' if left == 1 else 'are'} left{where}, {advice}"
+            ) from error
 
 
 def _run(todo: Sequence[Trial], file: ResultsFile, executor: Executor, at_once: int, scene: Scene | None) -> None:
@@ -187,7 +188,7 @@ def _run(todo: Sequence[Trial], file: ResultsFile, executor: Executor, at_once: 
         raise
 
 
-def left_to_do(trials: Sequence[Trial], file: ResultsFile, scene: Scene | None = None) -> list[Trial]:
+def missing_trials(trials: Sequence[Trial], file: ResultsFile, scene: Scene | None = None) -> list[Trial]:
     """Return the trials that have no result in the file.
 
     ``scene`` is the map and data of the trials, by default those that the trials name. Raises ``InputError`` if
@@ -197,20 +198,20 @@ def left_to_do(trials: Sequence[Trial], file: ResultsFile, scene: Scene | None =
     digests = dict[Any, InputDigests]()
     advice = "name another --out, or remove the file to start again"
     for trial in (trial for trial in trials if trial in file):
-        known = file[trial]
+        result = file[trial]
         stored, dataset = scene or open_scene(trial.map, trial.data, trial)
-        if known.weights != stored.training:
+        if result.weights != stored.training:
             raise InputError(
-                f"holds results of another training run of map {trial.map} ({known.weights}, expected"
+                f"holds results of another training run of map {trial.map} ({result.weights}, expected"
                 f" {stored.training}); {advice}",
                 where=file.path,
             )
         usual = to_flat(find_method(trial.method).config_type())
         for name, value in (usual | json.loads(trial.config)).items():
-            before = known.settings.get(name, usual.get(name))
+            before = result.settings.get(name, usual.get(name))
             if before != value:
                 raise InputError(f"was made with {name} {before}, expected {value}; {advice}", where=file.path)
-        if known.inputs is None:  # not recorded by an earlier version
+        if result.inputs is None:  # not recorded by an earlier version
             continue
         # The images depend on the seed only if they have faults.
         seed = None if trial.fault == NO_FAULT else trial.seed
@@ -218,10 +219,10 @@ def left_to_do(trials: Sequence[Trial], file: ResultsFile, scene: Scene | None =
         if read not in digests:
             digests[read] = InputDigests(views_digest(trial_views(trial, dataset)), stored.info.surface)
         for name, meaning in CHANGED.items():
-            if getattr(known.inputs, name) != getattr(digests[read], name):
-                what = meaning.format(trial=trial)
+            if getattr(result.inputs, name) != getattr(digests[read], name):
                 raise InputError(
-                    f"holds results of frame {trial.frame} made with other {what}; {advice}", where=file.path
+                    f"holds results of frame {trial.frame} made with other {meaning.format(trial=trial)}; {advice}",
+                    where=file.path,
                 )
     return [trial for trial in trials if trial not in file]
 
@@ -295,12 +296,12 @@ def executor_of(workers: Workers, trials: int, on_cpu: bool) -> Iterator[tuple[E
     if workers is not None and workers < 1:
         raise InputError(f"workers is {workers}", expected="1 or more, or None for one per core")
     count = min(workers or (usable_cores() if on_cpu else 1), trials)
-    with ended_on_failure(InThisProcess() if count == 1 else local_processes(count)) as executor:
+    with terminate_on_failure(InThisProcess() if count == 1 else local_processes(count)) as executor:
         yield executor, count, f"{count} local process{'es' if count > 1 else ''} of one thread"
 
 
 @contextmanager
-def ended_on_failure(executor: Executor) -> Iterator[Executor]:
+def terminate_on_failure(executor: Executor) -> Iterator[Executor]:
     """Yield an executor, which is shut down afterwards; if the block fails, the executor's processes are terminated."""
     try:
         yield executor

@@ -80,12 +80,10 @@ def group_results(results: Sequence[TrialResult]) -> list[Group]:
         rows.setdefault((pooled, label), []).append(result)
         sizes.setdefault((pooled, label), set()).add(t.size)
     order = {situation: number for number, (situation, _) in reversed(list(enumerate(sizes)))}
-
-    def rank(key: tuple[Situation, str]) -> tuple[Any, ...]:
-        size = key[0].size
-        return order[replace(key[0], size=None)], size is None, size or ()
-
-    keys = sorted((key for key in rows if key not in sizes or len(sizes[key]) > 1), key=rank)
+    keys = sorted(
+        (key for key in rows if key not in sizes or len(sizes[key]) > 1),
+        key=lambda key: (order[replace(key[0], size=None)], key[0].size is None, key[0].size or ()),
+    )
     titles = situation_titles([situation for situation, _ in keys])
     return [Group(situation, titles[situation], label, tuple(rows[situation, label])) for situation, label in keys]
 
@@ -104,9 +102,9 @@ def situation_titles(every: Sequence[Situation]) -> dict[Situation, str]:
     for s in every:
         retrained = sum(name == s.map for name, _ in trainings) > 1
         name = f"{s.map} ({s.weights.partition('.')[0]})" if retrained else s.map
-        places = [name] if len(maps) > 1 or retrained else []
-        places += [f"{s.data}/{s.split}"] if len(datasets) > 1 else []
-        titles[s] = ": ".join([" on ".join(places), s.start] if places else [s.start])
+        names = [name] if len(maps) > 1 or retrained else []
+        names += [f"{s.data}/{s.split}"] if len(datasets) > 1 else []
+        titles[s] = ": ".join([" on ".join(names), s.start] if names else [s.start])
     return titles
 
 
@@ -240,17 +238,13 @@ def is_right(result: TrialResult) -> bool:
     return bool(CRITERIA[ABSOLUTE](error, error))
 
 
-def rate_of(results: Sequence[TrialResult], outcomes: Sequence[bool]) -> Rate:
-    """Return the rate of an outcome among trials, with an interval that accounts for repeated frames."""
-    return success_rate_by_frame(outcomes, [frame_of(result) for result in results])
-
-
 def success_of(results: Sequence[TrialResult], criterion: str) -> Success | None:
     """Return how often and how soon trials met a criterion; None if it does not apply to them."""
     if not applies(criterion, results):
         return None
     steps = steps_of(results, criterion)
-    rate = rate_of(results, [s < NEVER for s in steps])
+    # The interval accounts for frames that were tried several times.
+    rate = success_rate_by_frame([s < NEVER for s in steps], [frame_of(result) for result in results])
     # The time of a method without steps is that of the whole answer.
     reached = [
         (s, 1000 * (s * r.seconds / r.steps if r.steps > 1 else r.seconds))

@@ -65,15 +65,16 @@ class Trace:
     rotation_deg: tuple[float | None, ...]
 
     def __post_init__(self) -> None:
-        lengths = len(self.translation), len(self.rotation_deg)
-        if lengths[0] != lengths[1] or lengths[0] == 0:
-            raise ValueError(f"{lengths[0]} translation and {lengths[1]} rotation errors, expected as many of each")
+        if not len(self.translation) == len(self.rotation_deg) > 0:
+            lengths = f"{len(self.translation)} translation and {len(self.rotation_deg)} rotation errors"
+            raise ValueError(f"{lengths}, expected as many of each")
 
     def as_error(self) -> PoseError:
         """Return the errors as tensors (n), NaN where a pose was not finite."""
-        rows = ([math.nan if x is None else x for x in row] for row in (self.translation, self.rotation_deg))
-        translation, rotation_deg = (torch.tensor(row, dtype=torch.float64) for row in rows)
-        return PoseError(translation, rotation_deg)
+        rows = (self.translation, self.rotation_deg)
+        return PoseError(
+            *(torch.tensor([math.nan if x is None else x for x in row], dtype=torch.float64) for row in rows)
+        )
 
 
 @dataclass(frozen=True)
@@ -86,10 +87,7 @@ class InputDigests:
 
 @dataclass(frozen=True)
 class TrialResult:
-    """One line of results: the output of ``bidnerf localize --json``, and everything that a report needs.
-
-    Raises ``ValueError`` for a count that does not fit into 64 bits.
-    """
+    """One line of results: the output of ``bidnerf localize --json``, and everything that a report needs."""
 
     T_world_camera: Rows | None  # 4x4; None if it was not finite
     converged: bool  # according to the method itself
@@ -115,11 +113,6 @@ class TrialResult:
     confidence: float | None = None  # probability that the pose is right; None if unknown
     unit: LengthUnit = "units"  # of all lengths: that of the map
     inputs: InputDigests | None = None  # None in results of earlier versions
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "seed", "peak_memory_bytes"):
-            if abs(getattr(self, name)) >= 2**63:  # JSON can hold integers that no tensor or float can
-                raise ValueError(f"{name} is larger than any measurement")
 
     def plain(self) -> dict[str, Any]:
         """Return the result as an object of strict JSON, in which the trial has flat names; ``read_result`` reads it."""
@@ -152,7 +145,7 @@ def run_trial(trial: Trial, scene: Scene | None = None, registered: Sequence[tup
         settings = parse_settings(trial.method, trial.config)
         localizer = Localizer(stored, trial.method, settings, warm_up=False)
         inputs = InputDigests(views_digest(views), stored.info.surface)
-        forget_peak_memory()
+        reset_peak_memory()
         answer = localizer(views, start, seed=trial.seed)
     trace = pose_error(answer.poses, truth)
     plain = plain_localization(answer, stored.info.backend, pose_error(answer.T_world_camera, truth))
@@ -219,10 +212,9 @@ def open_data(data: DataSource, options: DatasetOptions, stored: Map | None = No
         if count > 1:  # trials identify their frames by name
             raise InputError(f"data holds {count} frames named {name!r}", expected="different names")
         capture = of_views(views, Path("views"))
-    usual, taken = DatasetOptions(), ("split", "masks", "mask_hides", "background")
-    given = [name for name, value in vars(options).items() if name not in taken and value != getattr(usual, name)]
-    if given:
-        raise InputError(f"has its own cameras and depth; leave out {enumeration(given)}", where=capture.path)
+    usual = replace(options, camera=None, register_depth=None, depth_unit=None, largest=None)
+    if superfluous := [name for name, value in vars(options).items() if value != getattr(usual, name)]:
+        raise InputError(f"has its own cameras and depth; leave out {enumeration(superfluous)}", where=capture.path)
     return capture if options.mask_folder is None else capture.masked(options.mask_folder)
 
 
@@ -231,10 +223,8 @@ def open_scene(source: MapSource, data: DataSource, setup: Setup = USUAL) -> Sce
 
     If both are in folders, they are read once per process unless the map has changed since.
     """
-    if not isinstance(source, str | Path):
-        return source, open_data(data, setup.images, source)
-    if not isinstance(data, str | Path):
-        stored = open_map(str(source), setup.device)
+    if not (isinstance(source, str | Path) and isinstance(data, str | Path)):
+        stored = source if isinstance(source, Map) else open_map(str(source), setup.device)
         return stored, open_data(data, setup.images, stored)
     version: tuple[int, int] | None = None
     with contextlib.suppress(OSError):  # a closed-form scene, or not a map, which is detected on reading
@@ -269,7 +259,7 @@ def views_digest(views: Sequence[View]) -> str:
     return hashed.hexdigest()
 
 
-def forget_peak_memory() -> None:
+def reset_peak_memory() -> None:
     """Reset the peaks that ``peak_memory_bytes`` reports.
 
     If the operating system cannot reset the peak resident memory, it remains the peak since the process began.
@@ -282,15 +272,13 @@ def forget_peak_memory() -> None:
 
 
 def peak_memory_bytes() -> int:
-    """Return the peak GPU memory if a GPU is in use, else the peak resident memory of this process (0 if unknown)."""
+    """Return the peak GPU memory if a GPU is in use, else the peak resident memory of this process."""
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         return int(torch.cuda.max_memory_allocated())
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024
-    try:
-        import resource
-    except ImportError:  # Windows
-        return 0
+    import resource  # absent on Windows
+
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

@@ -116,6 +116,7 @@ def test_shards_share_all_trials_between_them(shards: int) -> None:
             "size is 0.5",
             "none, since this protocol has no sizes, as bid and others have",
         ),
+        ({"frames": []}, "nothing to try", "at least one frame"),
         ({"frames": ["nope"]}, "split 'test': no frame 'nope'", None),
         ({"images": DatasetOptions()}, "no split 'train'", "test"),
         ({"scene": "demo:object"}, "'demo:object'", "'bidnerf demo' trains maps"),

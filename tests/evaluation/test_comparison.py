@@ -30,7 +30,7 @@ from bidnerf.evaluation import (
     trial,
 )
 from bidnerf.evaluation.comparison import MapRow, map_bytes, run_and_sample
-from bidnerf.evaluation.run import InThisProcess, ended_on_failure, local_processes
+from bidnerf.evaluation.run import InThisProcess, local_processes, terminate_on_failure
 from bidnerf.evaluation.summary import success_of
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.io import from_plain
@@ -202,7 +202,7 @@ def test_a_failure_ends_the_processes_with_their_trials() -> None:
     for failure in (LookupError, None):
         pool, process = InThisProcess(), Process()
         vars(pool)["_processes"] = {7: process}
-        with suppress(LookupError), ended_on_failure(pool):
+        with suppress(LookupError), terminate_on_failure(pool):
             if failure is not None:
                 raise failure
         assert process.ended == (failure is not None)

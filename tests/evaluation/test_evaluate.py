@@ -28,10 +28,10 @@ from bidnerf.evaluation import (
     ResultTable,
     Trial,
     TrialResult,
-    forget_peak_memory,
     open_scene,
     peak_memory_bytes,
     read_results,
+    reset_peak_memory,
     run_trial,
 )
 
@@ -283,7 +283,7 @@ def test_a_cancelled_evaluation_goes_on(tmp_path: Path) -> None:
     table = bn.evaluate(BLOBS, BLOBS, quick(trials=5), out=out)
     assert out.read_bytes().startswith(before)
     assert timeless(table.rows) == timeless(bn.evaluate(BLOBS, BLOBS, quick(trials=5)).rows)
-    with pytest.raises(bn.Cancelled, match="nothing is kept"):
+    with pytest.raises(bn.Cancelled, match="nothing is stored"):
         bn.evaluate(BLOBS, BLOBS, quick(trials=1), cancel=lambda: True)
 
 
@@ -461,12 +461,12 @@ def test_a_trial_that_cannot_be_is_refused(trial: Trial) -> None:
 
 
 def test_peak_memory_is_of_what_went_on_since() -> None:
-    forget_peak_memory()
+    reset_peak_memory()
     before = peak_memory_bytes()
     block = torch.ones(40_000_000)
     assert peak_memory_bytes() >= before + 100_000_000
     del block
-    forget_peak_memory()
+    reset_peak_memory()
     assert peak_memory_bytes() < before + 100_000_000
 
 

@@ -23,8 +23,8 @@ from bidnerf.evaluation import (
     Trial,
     faulty,
     key_of,
-    left_to_do,
     list_trials,
+    missing_trials,
 )
 
 # Inside: the images of a trial
@@ -83,11 +83,11 @@ def test_results_notice_when_a_fault_has_changed(tmp_path: Path, monkeypatch: py
         config='{"max_steps": 2, "rays": 16}',
     )
     with ResultsFile(tmp_path / "r.jsonl") as file:
-        assert left_to_do(trials, file) == []
+        assert missing_trials(trials, file) == []
         other = dataclasses.replace(FAULTS["exposure"], change=FAULTS["blur"].change)
         monkeypatch.setitem(registered, ("faults", "exposure"), other)
         with refused(where=tmp_path / "r.jsonl", found="made with other images"):
-            left_to_do(trials, file)
+            missing_trials(trials, file)
 
 
 # The benchmark.

@@ -42,38 +42,38 @@ def uniform_number(generator: Generator, low: float = 0.0, high: float = 1.0) ->
 
 def random_pixel(mask: Bool[Tensor, "h w"], generator: Generator) -> tuple[int, int]:
     """Return the row and column of a random pixel of ``mask``, which marks at least one."""
-    places = mask.nonzero()
-    row, column = places[int(torch.randint(len(places), (), generator=generator))].tolist()
+    pixels = mask.nonzero()
+    row, column = pixels[int(torch.randint(len(pixels), (), generator=generator))].tolist()
     return row, column
 
 
 # Depth.
 
 
-def remeasured(frame: Frame, depth: Float[Tensor, "h w"]) -> Frame:
+def replace_depth(frame: Frame, depth: Float[Tensor, "h w"]) -> Frame:
     """Return the frame with new depth where there was a measurement; values of 0 and below count as not measured."""
     valid = (depth_of(frame) > 0) & (depth > 0)
     return frame.replace(depth=torch.where(valid, depth, torch.zeros_like(depth)))
 
 
-def noisy(frame: Frame, size: float, generator: Generator, power: int = 1) -> Frame:
+def add_noise(frame: Frame, size: float, generator: Generator, power: int = 1) -> Frame:
     """Add independent Gaussian noise of standard deviation ``size * depth ** power``; power 2 is typical of triangulating sensors."""
     depth = depth_of(frame)
     noise = torch.randn(depth.shape, generator=generator, dtype=depth.dtype)
-    return remeasured(frame, depth + size * depth**power * noise)
+    return replace_depth(frame, depth + size * depth**power * noise)
 
 
-def cleared(frame: Frame, kept: Bool[Tensor, "h w"]) -> Frame:
-    """Return the frame with depth only at the pixels marked in ``kept``."""
-    return frame.replace(depth=depth_of(frame).where(kept, 0))
+def keep_depth(frame: Frame, mask: Bool[Tensor, "h w"]) -> Frame:
+    """Return the frame with depth only at the pixels marked in ``mask``."""
+    return frame.replace(depth=depth_of(frame).where(mask, 0))
 
 
-def random_holes(frame: Frame, share: float, generator: Generator) -> Frame:
+def remove_random_depth(frame: Frame, share: float, generator: Generator) -> Frame:
     """Remove the depth of each pixel with probability ``share``, independently."""
-    return cleared(frame, torch.rand(depth_of(frame).shape, generator=generator) >= share)
+    return keep_depth(frame, torch.rand(depth_of(frame).shape, generator=generator) >= share)
 
 
-def one_hole(frame: Frame, share: float, generator: Generator) -> Frame:
+def remove_depth_on_one_side(frame: Frame, share: float, generator: Generator) -> Frame:
     """Remove ``share`` of the measured pixels in one piece: all that lie on one side of a line of random direction."""
     depth = depth_of(frame)
     across, down = random_direction(generator)
@@ -81,34 +81,37 @@ def one_hole(frame: Frame, share: float, generator: Generator) -> Frame:
     along = across * columns + down * rows
     order = along[depth > 0].sort().values
     removed = round(share * len(order))
-    return frame if removed == 0 else cleared(frame, along > order[removed - 1])
+    return frame if removed == 0 else keep_depth(frame, along > order[removed - 1])
 
 
-def misregistered(frame: Frame, pixels: float, generator: Generator) -> Frame:
+def misregister(frame: Frame, pixels: float, generator: Generator) -> Frame:
     """Shift the depth by ``pixels`` relative to the colour image, in a random direction."""
     depth = depth_of(frame)
     move = depth.new_tensor(random_direction(generator)) * pixels
     return frame.replace(depth=nearest(depth, frame.intrinsics.pixel_centres() - move))
 
 
-def square_window(frame: Frame, pixels: float, generator: Generator) -> Frame:
-    """Keep only the depth inside a square of ``pixels`` by ``pixels`` around a random measured pixel."""
-    rows, columns = _around_a_pixel(frame, int(pixels), generator)
-    return cleared(frame, rows[:, None] & columns)
+def keep_window(frame: Frame, size: float, generator: Generator, whole_rows: bool = False) -> Frame:
+    """Keep only the depth inside a square of ``size`` by ``size`` pixels around a random measured pixel.
+
+    With ``whole_rows``, keep the depth of ``size`` adjacent rows instead, as from a line scanner. The window lies inside
+    the image as far as possible.
+    """
+    depth, masks = depth_of(frame), []
+    for middle, length in zip(random_pixel(depth > 0, generator), depth.shape, strict=True):
+        first = max(0, min(middle - int(size) // 2, length - int(size)))
+        indices = torch.arange(length)
+        masks.append((indices >= first) & (indices < first + int(size)))
+    rows, columns = masks
+    return keep_depth(frame, rows[:, None] & (columns | whole_rows))
 
 
-def few_rows(frame: Frame, count: float, generator: Generator) -> Frame:
-    """Keep only the depth of ``count`` adjacent rows around a random measured pixel, as from a line scanner."""
-    rows, columns = _around_a_pixel(frame, int(count), generator)
-    return cleared(frame, rows[:, None].expand(-1, len(columns)))
-
-
-def one_wall(frame: Frame, on: float, generator: Generator) -> Frame:
+def keep_largest_plane(frame: Frame, on: float, generator: Generator) -> Frame:
     """Keep only the depth of the plane that contains the most measured points."""
     depth = depth_of(frame)
     points = frame.intrinsics.unproject(frame.intrinsics.pixel_centres()) * depth[..., None]
     plane = _largest_plane(points[depth > 0], generator)
-    return cleared(frame, _on_plane(points, plane))
+    return keep_depth(frame, _on_plane(points, plane))
 
 
 def _largest_plane(points: Float[Tensor, "n 3"], generator: Generator) -> Float[Tensor, "4"]:
@@ -133,32 +136,22 @@ def _on_plane(points: Float[Tensor, "*p 3"], plane: Float[Tensor, "4"]) -> Bool[
     return (points @ plane[:3] + plane[3]).abs() <= 0.01 * points[..., 2]
 
 
-def _around_a_pixel(frame: Frame, size: int, generator: Generator) -> list[Bool[Tensor, "n"]]:
-    """Return masks of ``size`` adjacent rows and of columns, centred on a random measured pixel as far as borders allow."""
-    found = []
-    for middle, length in zip(random_pixel(depth_of(frame) > 0, generator), depth_of(frame).shape, strict=True):
-        first = max(0, min(middle - size // 2, length - size))
-        places = torch.arange(length)
-        found.append((places >= first) & (places < first + size))
-    return found
-
-
 # The stated camera, and what the image shows of it.
 
 
-def restated(frame: Frame, **changes: Any) -> Frame:
+def restate_camera(frame: Frame, **changes: Any) -> Frame:
     """Change parameters of the stated camera; the image is unchanged."""
     return frame.replace(intrinsics=replace(frame.intrinsics, **changes))
 
 
-def nominal(frame: Frame, on: float, generator: Generator) -> Frame:
+def state_focal_alone(frame: Frame, on: float, generator: Generator) -> Frame:
     """Reduce the stated camera to an approximate focal length, as for an uncalibrated photo; the image is unchanged."""
     camera = frame.intrinsics
     stated = Intrinsics.from_focal(math.sqrt(camera.fx * camera.fy), camera.width, camera.height)
     return frame.replace(intrinsics=stated, focal_is_approximate=True)
 
 
-def cropped(frame: Frame, share: float, generator: Generator) -> Frame:
+def crop(frame: Frame, share: float, generator: Generator) -> Frame:
     """Crop away a ``share`` of the width and height at a random corner; the stated principal point ignores the crop.
 
     The stated offset of the principal point from the centre of the cropped image equals its true offset from
@@ -176,13 +169,13 @@ def cropped(frame: Frame, share: float, generator: Generator) -> Frame:
     return _of_images(frame, lambda image: image[rows, columns].contiguous(), intrinsics=stated)
 
 
-def principal_point_moved(frame: Frame, pixels: float, generator: Generator) -> Frame:
+def move_principal_point(frame: Frame, pixels: float, generator: Generator) -> Frame:
     """Move the stated principal point by ``pixels`` in a random direction; the image is unchanged."""
     camera, (across, down) = frame.intrinsics, random_direction(generator)
-    return restated(frame, cx=camera.cx + pixels * across, cy=camera.cy + pixels * down)
+    return restate_camera(frame, cx=camera.cx + pixels * across, cy=camera.cy + pixels * down)
 
 
-def distorted(frame: Frame, k1: float, generator: Generator) -> Frame:
+def distort(frame: Frame, k1: float, generator: Generator) -> Frame:
     """Distort the image with a lens whose first radial coefficient is larger by ``k1``.
 
     The stated intrinsics are unchanged.
@@ -190,7 +183,7 @@ def distorted(frame: Frame, k1: float, generator: Generator) -> Frame:
     camera = frame.intrinsics
     own = camera.distortion or (0.0, 0.0, 0.0, 0.0)
     lens = replace(camera, distortion=(own[0] + k1, *own[1:]))
-    return warped(frame, camera.project(_rays(lens)))
+    return warp(frame, camera.project(_rays(lens)))
 
 
 def rolling_shutter(frame: Frame, degrees: float, generator: Generator) -> Frame:
@@ -205,15 +198,15 @@ def rolling_shutter(frame: Frame, degrees: float, generator: Generator) -> Frame
     turns = poses_of_rows(times, torch.cat([torch.zeros_like(axis), axis]))
     seen = turns.rotate(_rays(camera).reshape(-1, 3)).reshape(camera.height, camera.width, 3)
     pixels = camera.project(seen).nan_to_num(-1.0)
-    turned = warped(frame, pixels)
+    image = warp(frame, pixels)
     if frame.depth is None:
-        return turned
+        return image
     # Along a row's ray (x, y, 1), a point's depth is its z in the frame's camera divided by the ray's z in
     # that camera.
-    return turned.replace(depth=(nearest(frame.depth, pixels) / seen[..., 2]).float())
+    return image.replace(depth=(nearest(frame.depth, pixels) / seen[..., 2]).float())
 
 
-def turned(frame: Frame, on: float, generator: Generator, columns: bool = False, rows: bool = False) -> Frame:
+def flip(frame: Frame, on: float, generator: Generator, columns: bool = False, rows: bool = False) -> Frame:
     """Reverse the columns, the rows, or both; with both reversed, the image is that of a camera held upside down.
 
     If only columns or only rows are reversed, no camera pose gives such an image of the scene.
@@ -222,7 +215,7 @@ def turned(frame: Frame, on: float, generator: Generator, columns: bool = False,
     return _of_images(frame, orientation.upright, intrinsics=frame.intrinsics.upright(orientation))
 
 
-def covered_lens(frame: Frame, on: float, generator: Generator) -> Frame:
+def cover_lens(frame: Frame, on: float, generator: Generator) -> Frame:
     """Replace the image with one random colour, and remove any measured depth."""
     colour = torch.rand(3, generator=generator).to(frame.rgb)
     depth = None if frame.depth is None else torch.zeros_like(frame.depth)
@@ -245,7 +238,7 @@ def _of_images(frame: Frame, change: Callable[[Tensor], Tensor], **more: Any) ->
 # Colours, as they are stored, in [0, 1].
 
 
-def recoloured(frame: Frame, rgb: Float[Tensor, "h w 3"]) -> Frame:
+def recolour(frame: Frame, rgb: Float[Tensor, "h w 3"]) -> Frame:
     """Return the frame with other colours; values brighter than white are clipped."""
     return replace(frame, rgb=rgb.clamp(0, 1))
 
@@ -256,47 +249,47 @@ def blur(frame: Frame, pixels: float, generator: Generator) -> Frame:
     # Padding by reflection at the border cannot be wider than the image.
     size = min(2 * max(1, round(3 * pixels)) + 1, smallest - 1 + smallest % 2)
     images = frame.rgb.permute(2, 0, 1)[None]
-    return recoloured(frame, gaussian_blur2d(images, (size, size), (pixels, pixels))[0].permute(1, 2, 0))
+    return recolour(frame, gaussian_blur2d(images, (size, size), (pixels, pixels))[0].permute(1, 2, 0))
 
 
-def jpeg(frame: Frame, quality: float, generator: Generator) -> Frame:
+def compress(frame: Frame, quality: float, generator: Generator) -> Frame:
     """Compress the colours as JPEG with a ``quality`` of 1 to 100, and decode them."""
     file = io.BytesIO()
     Image.fromarray((frame.rgb * 255).round().to(torch.uint8).numpy()).save(file, "JPEG", quality=int(quality))
-    return recoloured(frame, torch.from_numpy(np.array(Image.open(file))).to(frame.rgb) / 255)
+    return recolour(frame, torch.from_numpy(np.array(Image.open(file))).to(frame.rgb) / 255)
 
 
-def grey(frame: Frame, share: float, generator: Generator) -> Frame:
+def desaturate(frame: Frame, share: float, generator: Generator) -> Frame:
     """Remove ``share`` of the colours' saturation: 1 leaves only their brightness."""
     brightness = rgb_to_grayscale(frame.rgb.permute(2, 0, 1)).permute(1, 2, 0)
-    return recoloured(frame, frame.rgb + share * (brightness - frame.rgb))
+    return recolour(frame, frame.rgb + share * (brightness - frame.rgb))
 
 
-def vignetting(frame: Frame, share: float, generator: Generator) -> Frame:
+def darken_corners(frame: Frame, share: float, generator: Generator) -> Frame:
     """Darken the image in proportion to the squared distance from its centre, by ``share`` in the corners."""
     camera = frame.intrinsics
     middle = frame.rgb.new_tensor([camera.width / 2, camera.height / 2])
     radius = (camera.pixel_centres() - middle).norm(dim=-1, keepdim=True) / middle.norm()
-    return recoloured(frame, frame.rgb * (1 - share * radius.square()))
+    return recolour(frame, frame.rgb * (1 - share * radius.square()))
 
 
 # Resampling.
 
 
-def warped(frame: Frame, pixels: Float[Tensor, "h w 2"]) -> Frame:
+def warp(frame: Frame, pixels: Float[Tensor, "h w 2"]) -> Frame:
     """Return the frame whose pixel (v, u) shows what ``frame`` shows at ``pixels[v, u]``, given as (u, v).
 
     Colour and alpha are interpolated, with border values replicated beyond the border. Depth is that of the
     nearest pixel, since a mean across an edge lies on neither surface; it is 0 beyond the border.
     """
-    alpha = None if frame.alpha is None else _interpolated(frame.alpha[..., None], pixels)[..., 0]
+    alpha = None if frame.alpha is None else _interpolate(frame.alpha[..., None], pixels)[..., 0]
     depth = None if frame.depth is None else nearest(frame.depth, pixels)
     hidden = None if frame.hidden is None else nearest(frame.hidden.float(), pixels) > 0
-    rgb = _interpolated(frame.rgb, pixels).clamp(0, 1)
+    rgb = _interpolate(frame.rgb, pixels).clamp(0, 1)
     return replace(frame, rgb=rgb, alpha=alpha, depth=depth, hidden=hidden)
 
 
-def reflected(pixels: Float[Tensor, "*p 2"], width: int, height: int) -> Float[Tensor, "*p 2"]:
+def reflect(pixels: Float[Tensor, "*p 2"], width: int, height: int) -> Float[Tensor, "*p 2"]:
     """Return pixels (u, v) mapped into an image: those beyond a border are reflected at it."""
     size = pixels.new_tensor([width, height])
     folded = pixels.remainder(2 * size)
@@ -312,7 +305,7 @@ def nearest(image: Float[Tensor, "h w"], pixels: Float[Tensor, "*p 2"]) -> Float
     return torch.where(inside, values, torch.zeros_like(values))
 
 
-def _interpolated(image: Float[Tensor, "h w c"], pixels: Float[Tensor, "h w 2"]) -> Float[Tensor, "h w c"]:
+def _interpolate(image: Float[Tensor, "h w c"], pixels: Float[Tensor, "h w 2"]) -> Float[Tensor, "h w c"]:
     height, width = image.shape[:2]
     size = torch.tensor([width, height], dtype=torch.float64)
     grid = (pixels.double() * 2 / size - 1).to(image.dtype)
@@ -328,7 +321,7 @@ RIM = 3
 """Width, in pixels, of the surroundings from which a hole is filled."""
 
 
-def occluder(frame: Frame, share: float, generator: Generator, is_measured: bool = True) -> Frame:
+def add_occluder(frame: Frame, share: float, generator: Generator, is_measured: bool = True) -> Frame:
     """Put a textured object in front of ``share`` of the image.
 
     If the frame has depth, so does the object, unless ``is_measured`` is False, as for an object too near for
@@ -337,14 +330,14 @@ def occluder(frame: Frame, share: float, generator: Generator, is_measured: bool
     height, width = frame.rgb.shape[:2]
     mask, colours = blob(height, width, share, generator), texture(height, width, generator)
     if not is_measured or frame.depth is None or not frame.has_depth:
-        return _pasted(frame, mask, colours, None if frame.depth is None else torch.zeros_like(frame.depth))
+        return _paste(frame, mask, colours, None if frame.depth is None else torch.zeros_like(frame.depth))
     # The object is nearer than the nearest part of the scene, the second percentile of its depth, with a relief of 5 %.
     near = float(np.quantile(frame.depth[frame.depth > 0].numpy(), 0.02))
     relief = 1 + 0.05 * _bounded_noise(frame, 3, generator)
-    return _pasted(frame, mask, colours, uniform_number(generator, 0.4, 0.8) * near * relief)
+    return _paste(frame, mask, colours, uniform_number(generator, 0.4, 0.8) * near * relief)
 
 
-def moved_thing(frame: Frame, share: float, generator: Generator) -> Frame:
+def move_piece(frame: Frame, share: float, generator: Generator) -> Frame:
     """Copy a piece of the scene, slightly nearer, to another position, where it covers ``share`` of the image.
 
     The features of the copy match those of the map, and consistently support a wrong pose.
@@ -354,27 +347,27 @@ def moved_thing(frame: Frame, share: float, generator: Generator) -> Frame:
     # The piece moves by a fraction of the image's shorter side, and comes slightly nearer.
     travel = uniform_number(generator, 0.15, 0.3) * min(height, width)
     move = torch.tensor(random_direction(generator)) * travel
-    elsewhere = warped(frame, reflected(frame.intrinsics.pixel_centres() - move, width, height))
+    elsewhere = warp(frame, reflect(frame.intrinsics.pixel_centres() - move, width, height))
     depth = None if elsewhere.depth is None else elsewhere.depth * uniform_number(generator, 0.85, 0.98)
-    return _pasted(frame, mask, elsewhere.rgb, depth, elsewhere.alpha)
+    return _paste(frame, mask, elsewhere.rgb, depth, elsewhere.alpha)
 
 
-def added_thing(frame: Frame, share: float, generator: Generator) -> Frame:
+def add_object(frame: Frame, share: float, generator: Generator) -> Frame:
     """Put a textured object on ``share`` of the measured surface, from which it protrudes slightly."""
-    mask = _surface_piece(frame, share, generator)
+    mask = _mark_surface_piece(frame, share, generator)
     # The height above the surface, towards the camera, is relative to the depth.
     rise = uniform_number(generator, 0.02, 0.1) * (1 + 0.4 * _bounded_noise(frame, 6, generator))
     colours = texture(frame.intrinsics.height, frame.intrinsics.width, generator)
-    return _pasted(frame, mask, colours, depth_of(frame) * (1 - rise))
+    return _paste(frame, mask, colours, depth_of(frame) * (1 - rise))
 
 
-def vanished_thing(frame: Frame, share: float, generator: Generator) -> Frame:
+def remove_piece(frame: Frame, share: float, generator: Generator) -> Frame:
     """Remove ``share`` of the measured surface in one piece, and show the background or the surroundings in its place.
 
     If the frame has alpha and the piece reaches the edge of the scene, the background is visible; otherwise
     the surrounding colours are continued, at the depth of the farthest surrounding surface.
     """
-    mask = _surface_piece(frame, share, generator)
+    mask = _mark_surface_piece(frame, share, generator)
     rim = torch.from_numpy(binary_dilation(mask.numpy(), iterations=RIM)) & ~mask
     if not mask.any() or not rim.any():
         return frame
@@ -382,14 +375,14 @@ def vanished_thing(frame: Frame, share: float, generator: Generator) -> Frame:
     empty = None if frame.alpha is None else rim & (frame.alpha < 0.5)
     if empty is not None and empty.any():
         background = frame.rgb[empty].median(dim=0).values.expand_as(frame.rgb)
-        return _pasted(frame, mask, background, torch.zeros_like(depth), torch.zeros_like(depth))
+        return _paste(frame, mask, background, torch.zeros_like(depth), torch.zeros_like(depth))
     # The surrounding colours are continued (Telea 2004).
     colours = (frame.rgb * 255).round().to(torch.uint8).contiguous().numpy()
     filled = cv2.inpaint(colours, mask.to(torch.uint8).numpy(), RIM, cv2.INPAINT_TELEA)
-    return _pasted(frame, mask, torch.from_numpy(filled).to(frame.rgb) / 255, depth[rim].max().expand_as(depth))
+    return _paste(frame, mask, torch.from_numpy(filled).to(frame.rgb) / 255, depth[rim].max().expand_as(depth))
 
 
-def _surface_piece(frame: Frame, share: float, generator: Generator) -> Bool[Tensor, "h w"]:
+def _mark_surface_piece(frame: Frame, share: float, generator: Generator) -> Bool[Tensor, "h w"]:
     """Mark ``share`` of the measured pixels: those whose points are nearest to a randomly chosen one."""
     depth = depth_of(frame)
     points = frame.intrinsics.unproject(frame.intrinsics.pixel_centres()) * depth[..., None]
@@ -406,7 +399,7 @@ def _bounded_noise(frame: Frame, cells: int, generator: Generator) -> Float[Tens
     return smooth_noise(camera.height, camera.width, cells, cells, generator).clamp(-2, 2)
 
 
-def _pasted(
+def _paste(
     frame: Frame,
     mask: Bool[Tensor, "h w"],
     rgb: Float[Tensor, "h w 3"],
@@ -414,13 +407,13 @@ def _pasted(
     alpha: Float[Tensor, "h w"] | None = None,
 ) -> Frame:
     """Return the frame with new colours, depth and alpha (1 by default) inside ``mask``."""
-    pasted = replace(frame, rgb=torch.where(mask[..., None], rgb, frame.rgb))
+    changed = replace(frame, rgb=torch.where(mask[..., None], rgb, frame.rgb))
     if frame.depth is not None and depth is not None:
-        pasted = pasted.replace(depth=torch.where(mask, depth.to(frame.depth), frame.depth))
+        changed = changed.replace(depth=torch.where(mask, depth.to(frame.depth), frame.depth))
     if frame.alpha is not None:
         cover = torch.ones_like(frame.alpha) if alpha is None else alpha
-        pasted = pasted.replace(alpha=torch.where(mask, cover, frame.alpha))
-    return pasted
+        changed = changed.replace(alpha=torch.where(mask, cover, frame.alpha))
+    return changed
 
 
 def blob(height: int, width: int, share: float, generator: Generator) -> Bool[Tensor, "h w"]:

@@ -85,15 +85,15 @@ def expand_faults(words: Iterable[str]) -> tuple[str, ...]:
     joined by ``+``, which are applied together, from left to right. A fault that is simply on or off needs no
     size. Raises ``InputError`` for anything else, and for duplicate faults.
     """
-    found: list[str] = []
+    faults: list[str] = []
     for word in words:
         name, colon, sizes = word.partition(":")
-        parts = [name + colon + size for size in sizes.split(",")] if "+" not in word else [word]
-        found += ["+".join(map(str, parse_faults(part))) or NO_FAULT for part in parts]
-    twice = next((fault for place, fault in enumerate(found) if fault in found[:place]), None)
-    if twice is not None:
-        raise InputError(f"fault {twice} is given twice", expected="different ones")
-    return tuple(found)
+        for part in [name + colon + size for size in sizes.split(",")] if "+" not in word else [word]:
+            fault = "+".join(map(str, parse_faults(part))) or NO_FAULT
+            if fault in faults:
+                raise InputError(f"fault {fault} is given twice", expected="different ones")
+            faults.append(fault)
+    return tuple(faults)
 
 
 def parse_faults(text: str) -> tuple[AppliedFault, ...]:
@@ -137,8 +137,8 @@ def faulty(view: View, faults: str, seed: int) -> View:
         stream = int.from_bytes(hashlib.blake2b(text, digest_size=7).digest(), "big")
         changed: Any = fault.change(view.frame, applied.size, torch.Generator().manual_seed(stream))
         if not isinstance(changed, Frame):
-            found = f"returned a {type(changed).__name__}"
-            raise InputError(found, where=f"fault {applied}", expected="a Frame")
+            what = f"returned a {type(changed).__name__}"
+            raise InputError(what, where=f"fault {applied}", expected="a Frame")
         if fault.T_true_faulty is not None:
             T_ref_camera = T_ref_camera.to(dtype=torch.float64) @ fault.T_true_faulty
         view = View(changed, T_ref_camera)
