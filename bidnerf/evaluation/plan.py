@@ -277,8 +277,7 @@ def changed_settings(method: str, settings: Any) -> str:
 
 def parse_settings(method: str, config: str) -> Any:
     """Return the settings of ``method`` from the JSON of those that differ from its defaults."""
-    record = parse_record("config", config, f"an object of settings of {method}")
-    return settings_of(method, dict(record.values))
+    return settings_of(method, dict(parse_record("config", config, f"an object of settings of {method}").values))
 
 
 # Plans.

@@ -71,10 +71,9 @@ class Trace:
 
     def as_error(self) -> PoseError:
         """Return the errors as tensors (n), NaN where a pose was not finite."""
-        rows = (self.translation, self.rotation_deg)
-        return PoseError(
-            *(torch.tensor([math.nan if x is None else x for x in row], dtype=torch.float64) for row in rows)
-        )
+        rows = [[math.nan if x is None else x for x in row] for row in (self.translation, self.rotation_deg)]
+        values = torch.tensor(rows, dtype=torch.float64)
+        return PoseError(values[0], values[1])
 
 
 @dataclass(frozen=True)
@@ -147,8 +146,7 @@ def run_trial(trial: Trial, scene: Scene | None = None, registered: Sequence[tup
         inputs = InputDigests(views_digest(views), stored.info.surface)
         reset_peak_memory()
         answer = localizer(views, start, seed=trial.seed)
-    trace = pose_error(answer.poses, truth)
-    plain = plain_localization(answer, stored.info.backend, pose_error(answer.T_world_camera, truth))
+    trace, error = (pose_error(poses, truth) for poses in (answer.poses, answer.T_world_camera))
     more = {
         "frame": trial.frame,
         "seed": trial.seed,
@@ -163,7 +161,7 @@ def run_trial(trial: Trial, scene: Scene | None = None, registered: Sequence[tup
         "trial": to_flat(trial.portable),
         "inputs": to_plain(inputs),
     }
-    return read_result(plain | more, "result")
+    return read_result(plain_localization(answer, stored.info.backend, error) | more, "result")
 
 
 def registered_for(trial: Trial) -> list[tuple[str, str]]:

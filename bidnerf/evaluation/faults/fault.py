@@ -137,8 +137,7 @@ def faulty(view: View, faults: str, seed: int) -> View:
         stream = int.from_bytes(hashlib.blake2b(text, digest_size=7).digest(), "big")
         changed: Any = fault.change(view.frame, applied.size, torch.Generator().manual_seed(stream))
         if not isinstance(changed, Frame):
-            what = f"returned a {type(changed).__name__}"
-            raise InputError(what, where=f"fault {applied}", expected="a Frame")
+            raise InputError(f"returned a {type(changed).__name__}", where=f"fault {applied}", expected="a Frame")
         if fault.T_true_faulty is not None:
             T_ref_camera = T_ref_camera.to(dtype=torch.float64) @ fault.T_true_faulty
         view = View(changed, T_ref_camera)
