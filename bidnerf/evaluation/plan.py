@@ -137,10 +137,15 @@ def find_protocol(name: str) -> Protocol:
 
 # Trials.
 
-# Forward references in the annotations of ``DatasetOptions`` cannot be resolved, so pydantic needs to be given its schema.
+
+def _read_options(options: DatasetOptions | dict[str, Any]) -> DatasetOptions:
+    return options if isinstance(options, DatasetOptions) else DatasetOptions(**options)
+
+
 Images = Annotated[
     DatasetOptions,
-    GetPydanticSchema(lambda kind, handler: core_schema.no_info_plain_validator_function(lambda given: kind(**given))),
+    # pydantic cannot resolve the annotations of ``DatasetOptions``, which names types that it does not import.
+    GetPydanticSchema(lambda kind, handler: core_schema.no_info_plain_validator_function(_read_options)),
 ]
 TEST_IMAGES = DatasetOptions(split="test")
 
@@ -193,7 +198,9 @@ class Trial(Setup):
                 return flat
             options = vars(TEST_IMAGES)
             images = {name: flat.get(name, usual) for name, usual in options.items()}
-            return {name: value for name, value in flat.items() if name not in options} | {"images": images}
+            others = {name: value for name, value in flat.items() if name not in options}
+            # JSON has lists where a trial has tuples.
+            return {n: tuple(v) if isinstance(v, list) else v for n, v in others.items()} | {"images": images}
 
         return core_schema.no_info_before_validator_function(nested, handler(kind))
 
