@@ -41,7 +41,7 @@ from paper_tables import test_frames
 from bidnerf import Localizer, View
 from bidnerf.evaluation import open_scene
 from bidnerf_core.backend import SceneBounds, load_backend
-from bidnerf_core.devices import captured, moved, without_waiting
+from bidnerf_core.devices import capture_graph, move_to, without_waiting
 from bidnerf_core.fields import RadianceField, derivatives_of, levels, render_image, trained_field
 from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.io import from_plain
@@ -128,7 +128,7 @@ def timed_steps(steps: AdamSteps, device: torch.device, generator: torch.Generat
             torch.cuda.set_sync_debug_mode("default")
         found = operations(steps)
         began = time.perf_counter()
-        replay = captured(steps, device, generator)
+        replay = capture_graph(steps, device, generator)
         capturing = time.perf_counter() - began
         measure_time(replay, WARM_UP)
         graph = measure_time(replay, TIMED)
@@ -205,13 +205,13 @@ def search_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
     for poses, rays in ((64, 256), (1, TIMED_RAYS)):
         term = RayTerms(ColourSettings(), DepthLossSettings()).term(problem, rays, 0)
         starts = SE3.stack([perturb(view.T_ref_camera, 0.05, 2.0, seed) for seed in range(poses)])
-        states = moved(states_at(starts), device)
+        states = move_to(states_at(starts), device)
         step = partial(descend, states, [term], SEARCH_STEPS, pivot_of_scene)
         with torch.no_grad(), without_waiting():
             for _ in range(3):
                 step()
             torch.cuda.reset_peak_memory_stats()
-            replay = captured(step, device)
+            replay = capture_graph(step, device)
             milliseconds = measure_time(replay, 50)[0]
         found[f"{poses} poses, {rays} rays"] = {
             "ms": milliseconds,

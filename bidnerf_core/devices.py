@@ -12,7 +12,7 @@ from contextvars import ContextVar
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from threading import Lock
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 from jaxtyping import Shaped
@@ -87,7 +87,7 @@ class Resident:
     """Base class of objects that stay on their device, such as a map's surface; ``run_on`` does not move them."""
 
 
-def captured(
+def capture_graph(
     step: Callable[[], None],
     device: torch.device,
     generator: Generator | None = None,
@@ -146,7 +146,7 @@ def wait_for(device: torch.device) -> None:
 def run_on(device: torch.device, function: Callable[..., T], *values: Any) -> T:
     """Return ``function(*values)``, computed on ``device``, with all tensors of the result on the CPU.
 
-    Tensors in ``values`` are found as ``moved`` finds them, except that modules and ``Resident`` objects must already be
+    Tensors in ``values`` are found as ``move_to`` finds them, except that modules and ``Resident`` objects must already be
     on the device. All CPU tensors are sent in one copy, and all results return in another, which is the only point at
     which the host waits. On a GPU, repeated calls with values of the same shapes replay a CUDA graph, so the
     function must not draw random numbers, nor let the contents of a tensor decide which operations it runs.
@@ -204,10 +204,10 @@ class _Remote:
             first += size
 
         # The structure of the values with empty tensors, so that the original tensors are not kept alive.
-        template = _rebuilt(values, (torch.empty(0) for _ in tensors))
+        template = _rebuild(values, (torch.empty(0) for _ in tensors))
 
         def step() -> None:
-            self._result = function(*_rebuilt(template, iter(self._arguments)))
+            self._result = function(*_rebuild(template, iter(self._arguments)))
             parts: list[Tensor] = []
             _structure(self._result, parts)
             self._parts = parts
@@ -226,14 +226,14 @@ class _Remote:
                 # linear algebra, and another thread may have made the first call.
                 launched = self._step
                 launched()
-                self._step = captured(launched, self._lane.device, memory=self._lane.memory)
+                self._step = capture_graph(launched, self._lane.device, memory=self._lane.memory)
                 if self._step is launched and self._lane.memory:  # a failed capture leaves its pool unusable
                     self._lane.memory = graph_memory(self._lane.device)
             self._step()
         self._calls += 1
         bytes_of = self._bytes.cpu().split([part.nbytes for part in self._parts])
         shapes = zip(bytes_of, self._parts, strict=True)
-        return _rebuilt(self._result, (b.clone().view(part.dtype).view(part.shape) for b, part in shapes))
+        return _rebuild(self._result, (b.clone().view(part.dtype).view(part.shape) for b, part in shapes))
 
 
 def _structure(value: Any, tensors: list[Tensor]) -> Hashable:
@@ -250,14 +250,13 @@ def _structure(value: Any, tensors: list[Tensor]) -> Hashable:
         return dict, tuple(value), *(_structure(part, tensors) for part in value.values())
     if type(value) in (list, tuple):
         return type(value), *(_structure(part, tensors) for part in value)
-    kept: Hashable = value
-    return kept
+    return cast(Hashable, value)
 
 
-def _rebuilt(value: Any, tensors: Iterator[Tensor]) -> Any:
+def _rebuild(value: Any, tensors: Iterator[Tensor]) -> Any:
     """Return ``value`` with its tensors replaced, in order, by the next ones from ``tensors``."""
     whole = nn.Module, Resident
-    return _mapped(value, lambda part: next(tensors) if isinstance(part, Tensor) else part, whole)
+    return _map_parts(value, lambda part: next(tensors) if isinstance(part, Tensor) else part, whole)
 
 
 # Moving objects that hold tensors to a device.
@@ -280,7 +279,7 @@ def working_device(device: torch.device | str) -> torch.device:
     return found
 
 
-def moved(value: T, device: torch.device | str) -> T:
+def move_to(value: T, device: torch.device | str) -> T:
     """Return ``value`` with every tensor in it on ``device``; ``value`` itself is not modified.
 
     Tensors are found in modules, in the fields of dataclasses, and in lists, tuples and dictionaries of
@@ -295,27 +294,27 @@ def moved(value: T, device: torch.device | str) -> T:
         tensors = (*part.parameters(), *part.buffers())
         return part if all(_is_on(t, there) for t in tensors) else copy.deepcopy(part).to(there)
 
-    found: T = _mapped(value, change, (nn.Module,))
+    found: T = _map_parts(value, change, (nn.Module,))
     return found
 
 
-def _mapped(value: Any, change: Callable[[Any], Any], whole: tuple[type, ...]) -> Any:
+def _map_parts(value: Any, change: Callable[[Any], Any], whole: tuple[type, ...]) -> Any:
     """Return ``value`` with ``change`` applied to its tensors and its parts of the types ``whole``; ``value`` itself if none changes."""
     if isinstance(value, (Tensor, *whole)):
         return change(value)
     if is_dataclass(value) and not isinstance(value, type):
         parts = {part.name: vars(value)[part.name] for part in fields(value) if part.name in vars(value)}
-        there = _mapped(parts, change, whole)
+        there = _map_parts(parts, change, whole)
         if there is parts:
             return value
         found = object.__new__(type(value))
         vars(found).update(there)  # also the fields that its constructor does not take
         return found
     if isinstance(value, dict):
-        content = {key: _mapped(part, change, whole) for key, part in value.items()}
+        content = {key: _map_parts(part, change, whole) for key, part in value.items()}
         return content if any(content[key] is not value[key] for key in value) else value
     if type(value) in (list, tuple):
-        items = [_mapped(part, change, whole) for part in value]
+        items = [_map_parts(part, change, whole) for part in value]
         same = all(new is old for new, old in zip(items, value, strict=True))
         return value if same else type(value)(items)
     return value

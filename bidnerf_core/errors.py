@@ -22,11 +22,11 @@ class InputError(ValueError):
     """What was expected, with any advice that follows; None if the message does not say."""
 
     def __init__(self, found: object = "", *, where: object = None, expected: object = None) -> None:
-        places = [where]
+        parts = [where]
         if isinstance(found, InputError):
-            places.append(found.where)
+            parts.append(found.where)
             expected, found = found.expected if expected is None else expected, found.found
-        self.where = ": ".join(str(place) for place in places if place) or None
+        self.where = ": ".join(str(part) for part in parts if part) or None
         self.found = str(found)
         self.expected = None if expected is None else str(expected)
         problem = self.found

@@ -190,13 +190,13 @@ def _declared(group: str) -> tuple[PluginInfo, ...]:
             dist = metadata[p.dist]
             points.append((p, dist["Name"], dist["Version"], dist.get("Summary", "")))
     except Exception as error:
-        why = f"the metadata of an installed package cannot be read ({_described(error)})"
+        why = f"the metadata of an installed package cannot be read ({_describe(error)})"
         raise PluginError(why, expected="a sound one; reinstall or remove it") from error
     for p, *source in points:
         try:
             names = p.load() if p.name == TABLE else [p.name]
         except Exception as error:
-            raise PluginError(f"{p.value}: the table cannot be imported ({_described(error)})") from error
+            raise PluginError(f"{p.value}: the table cannot be imported ({_describe(error)})") from error
         infos += [PluginInfo(group, name, p.value, *source) for name in names]
     found = []
     for info in infos:
@@ -239,13 +239,13 @@ def load_plugin(group: str, name: str, defects: Defects | None = None, wanted_by
     except (
         BaseException
     ) as error:  # a plugin may raise anything, even SystemExit, which must not end the caller's program
-        raise PluginError(f"{doing}: {_described(error)}", where=where) from error
+        raise PluginError(f"{doing}: {_describe(error)}", where=where) from error
     if wrong is not None:
         raise PluginError(f"not {kind}: {wrong}", where=where)
     return plugin
 
 
-def _described(error: BaseException) -> str:
+def _describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
 
 

@@ -16,7 +16,7 @@ from bidnerf_adanerf.dense import dense_samples, opacity, render_softly, soft_we
 from bidnerf_adanerf.field import AdaNerfField
 from bidnerf_adanerf.oracle_loss import oracle_loss
 from bidnerf_core.carving import occupied_voxels
-from bidnerf_core.devices import moved
+from bidnerf_core.devices import move_to
 from bidnerf_core.fields import (
     OccupancyMask,
     SceneBounds,
@@ -56,7 +56,7 @@ def sparsity(step: int, config: AdaNerfConfig) -> float:
 def train(field: AdaNerfField, views: Sequence[View], config: AdaNerfConfig, report: Report) -> None:
     """Fit ``field`` to ``views``; see ``Supervision.fit`` for checkpoints and stopping."""
     room = room_for_matter(views, field.bounds, config.room_resolution) if config.carve else None
-    room = moved(room, device_of(field))
+    room = move_to(room, device_of(field))
     supervision = Supervision(views, field.bounds, config, device_of(field))
 
     @cache

@@ -200,10 +200,10 @@ def _interrupted(
     """
     from bidnerf_core.backend import load_backend
     from bidnerf_core.io import from_plain
-    from bidnerf_core.maps import interrupted, longest_side
+    from bidnerf_core.maps import check_resumable, longest_side
     from bidnerf_core.settings import to_flat
 
-    info = interrupted(out, not target.no_bake)
+    info = check_resumable(out, not target.no_bake)
 
     def require_same(name: str, value: object, usual: object, before: object) -> None:
         if value not in (usual, before):

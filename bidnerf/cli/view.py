@@ -86,7 +86,7 @@ def run_view(
     from bidnerf.evaluation import read_results
     from bidnerf.viewer import LiveView, MapView, map_json, require_viewer, row_json, serve_view, trajectory_json
     from bidnerf_core.camera import CameraSource
-    from bidnerf_core.datasets import DatasetFrames, in_other_split
+    from bidnerf_core.datasets import DatasetFrames, describe_other_split
     from bidnerf_core.localization import Localizer
     from bidnerf_core.maps import load_info, load_map
 
@@ -111,7 +111,7 @@ def run_view(
         for name in frame:
             if name not in source.names:
                 hint = f"no frame {name!r}{spelling_hint(name, source.names)}"
-                raise InputError(in_other_split(name, splits) or hint)
+                raise InputError(describe_other_split(name, splits) or hint)
         step = -(-len(source.names) // 24) if page.save else 1  # a page of at most 24 images, spread over all
         places = [source.names.index(name) for name in frame] or range(0, len(source.names), step)
         source = Chosen(source, places)

@@ -18,7 +18,7 @@ from pydantic_core import core_schema
 
 from bidnerf.evaluation.faults import NO_FAULT, check_depth, expand_faults
 from bidnerf.scenes import is_closed_form
-from bidnerf_core.datasets import Capture, DatasetOptions, in_other_split
+from bidnerf_core.datasets import Capture, DatasetOptions, describe_other_split
 from bidnerf_core.errors import InputError, InputWarning, amount, refuse_text, unknown_name
 from bidnerf_core.frames import INVERTED
 from bidnerf_core.geometry import SE3, perturb, random_units
@@ -302,7 +302,7 @@ def list_trials(plan: Plan, map: str, data: str, dataset: Capture) -> list[Trial
     for name in plan.frames or ():
         if name not in names:
             others = {split: dataset.frame_names(split) for split in dataset.splits}
-            elsewhere = in_other_split(name, others) or f"no frame {name!r}"
+            elsewhere = describe_other_split(name, others) or f"no frame {name!r}"
             raise InputError(f"split {split!r}: {elsewhere}", where=data)
     chosen = names if plan.frames is None else [name for name in names if name in plan.frames]
     hidden = {*dataset.wholly_hidden(split)}.intersection(chosen)

@@ -26,7 +26,7 @@ from bidnerf.evaluation.plan import USUAL, Setup, Trial, find_protocol, parse_se
 from bidnerf.results import PoseError, plain_localization, pose_error
 from bidnerf.scenes import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets import Capture, DatasetOptions, of_views
+from bidnerf_core.datasets import Capture, DatasetOptions, capture_of
 from bidnerf_core.devices import threads_at_most, working_device
 from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.frames import View
@@ -209,7 +209,7 @@ def open_data(data: DataSource, options: DatasetOptions, stored: Map | None = No
         name, count = Counter(view.frame.name for view in views).most_common(1)[0]
         if count > 1:  # trials identify their frames by name
             raise InputError(f"data holds {count} frames named {name!r}", expected="different names")
-        capture = of_views(views, Path("views"))
+        capture = capture_of(views, Path("views"))
     usual = replace(options, camera=None, register_depth=None, depth_unit=None, largest=None)
     if superfluous := [name for name, value in vars(options).items() if value != getattr(usual, name)]:
         raise InputError(f"has its own cameras and depth; leave out {enumeration(superfluous)}", where=capture.path)

@@ -23,7 +23,7 @@ from bidnerf_core.datasets import (
     camera_of,
     first_file,
     read_matrices,
-    remark,
+    warn_about,
 )
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import photos_in
@@ -49,7 +49,7 @@ def _read(path: Path, folder: Path, options: DatasetOptions) -> Capture:
     by_number = {int(image.stem): image for image in images}
     listed = max(len(poses), len(times))
     if gone := sorted(set(range(listed)) - by_number.keys()):
-        remark(path, f"{len(gone)} of {amount(listed, 'image')} are missing, first: number {gone[0]}")
+        warn_about(path, f"{len(gone)} of {amount(listed, 'image')} are missing, first: number {gone[0]}")
     shots = [
         Shot(
             image=image,

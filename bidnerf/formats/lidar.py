@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Integer
 
-from bidnerf_core.datasets import remark
+from bidnerf_core.datasets import warn_about
 from bidnerf_core.depth import MILLIMETRE, DepthImage, read_depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import decode
@@ -76,7 +76,7 @@ class LidarDepth:
         if not self._remarked and bool(metres.any()) and not bool(sure.any()):
             self._remarked = True
             values = ", ".join(str(value) for value in np.unique(confidence)[:4])
-            remark(
+            warn_about(
                 where,
                 f"has the values {values}, expected {high} where depth is sure; without it, all depth"
                 " of this image is left out, and so it is in such images that follow",

@@ -26,7 +26,7 @@ from bidnerf_core.datasets import (
     Shot,
     camera_of,
     first_file,
-    remark,
+    warn_about,
 )
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order
@@ -48,7 +48,7 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     part = max(parts, key=lambda part: len(part["shots"]))
     entries, cameras = part["shots"], part.get("cameras")
     if len(parts) > 1:
-        remark(file, f"has {len(parts)} reconstructions, of which the one with {len(entries)} images is used")
+        warn_about(file, f"has {len(parts)} reconstructions, of which the one with {len(entries)} images is used")
     others = ("images", "opensfm/images", ".", "../images")
     names, shots = FileNames(*(path / place for place in others)), list[Shot]()
     for name in sorted(entries, key=natural_order):

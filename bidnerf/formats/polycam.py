@@ -25,7 +25,7 @@ from bidnerf_core.datasets import (
     Shot,
     camera_of,
     pose_of_rows,
-    remark,
+    warn_about,
 )
 from bidnerf_core.errors import amount
 from bidnerf_core.frames import natural_order, photos_in
@@ -40,7 +40,7 @@ def _read(path: Path, cameras: Path, options: DatasetOptions) -> Capture:
     images = cameras.with_name(cameras.name.replace("cameras", "images"))
     corrected = cameras.name != "cameras"
     if not corrected:
-        remark(
+        warn_about(
             path,
             "has no corrected_cameras, so the poses are ARKit's, which drift; Polycam can correct them on export",
         )
@@ -79,7 +79,7 @@ def _read(path: Path, cameras: Path, options: DatasetOptions) -> Capture:
             )
         )
     if photos:
-        remark(images, f"{len(photos)} of {total} have no camera in {cameras.name} and are left out")
+        warn_about(images, f"{len(photos)} of {total} have no camera in {cameras.name} and are left out")
     return Capture(path, shots, options.colour, unit="metres", up=lidar.UP, pose_file=cameras)
 
 

@@ -19,7 +19,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields import render_picture
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import reduced, write_file
+from bidnerf_core.io import reduce_image, write_file
 from bidnerf_core.localization import Localization, SceneMap, Start, origin_of, scene_of, start_pose
 
 SIDE = 240
@@ -60,7 +60,7 @@ class Painter:
         self._map = map
         self._camera = frame.intrinsics if scale >= 1 else frame.intrinsics.scaled(scale)
         size = (self._camera.width, self._camera.height)
-        self.observed: Float[Tensor, "h w 3"] = frame.rgb if scale >= 1 else reduced(frame.rgb, *size)
+        self.observed: Float[Tensor, "h w 3"] = frame.rgb if scale >= 1 else reduce_image(frame.rgb, *size)
 
     def render(self, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
         """Render the map with the photo's camera at a pose."""

@@ -20,7 +20,7 @@ from bidnerf_core.captures import (
     horizontal_axes,
     up_direction,
 )
-from bidnerf_core.devices import moved
+from bidnerf_core.devices import move_to
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.io import write_file
@@ -202,7 +202,7 @@ def draw_path(
             # A sample of the surfels around the path is drawn, up to a distance of at least half of the
             # scene's extent.
             if surface is not None:
-                surfels = moved(surface.surfels, "cpu")
+                surfels = move_to(surface.surfels, "cpu")
                 points, middle = surfels.positions.double().numpy() @ projection, places.mean(0)
                 size = max(0.5 * surface.extent, 1.5 * float(np.abs(places - middle).max()))
                 near = np.flatnonzero((np.abs(points - middle) <= size).all(-1))

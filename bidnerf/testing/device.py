@@ -28,7 +28,7 @@ from bidnerf.testing.field_checks import close
 from bidnerf.testing.scene import SCENE_BOUNDS, rgbd_views
 from bidnerf.testing.textured_field import MapWithLandmarks
 from bidnerf_core import devices
-from bidnerf_core.devices import moved, without_waiting
+from bidnerf_core.devices import move_to, without_waiting
 from bidnerf_core.fields import RadianceField, levels
 from bidnerf_core.localization import (
     AdamSettings,
@@ -328,7 +328,7 @@ def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor
 def _second_order(problem: Problem, level: int, mode: Elsewhere) -> None:
     terms = RayTerms(ColourSettings(), DepthLossSettings())
     rays = terms.term(problem, CHECKED_RAYS, 0, level)
-    start = moved(states_at(problem.start_for("bid-lm")[None]), DEVICE)
+    start = move_to(states_at(problem.start_for("bid-lm")[None]), DEVICE)
     with without_waiting():
         descend(start, [rays], 1)
         with mode.strict():

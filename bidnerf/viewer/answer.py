@@ -16,7 +16,7 @@ from bidnerf.viewer.scene import frustum, rows_of
 from bidnerf_core.fields import RenderedImage, has_field, render_picture
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3, symbol
-from bidnerf_core.io import reduced, resampled
+from bidnerf_core.io import reduce_image, resample_nearest
 from bidnerf_core.localization import (
     ADVICE,
     DISPLACEMENT,
@@ -131,7 +131,7 @@ def answer_json(
             )
         frame = localization.frame_as_taken(frame)
         small = frame.intrinsics.at_most(OBSERVED)
-        observed = jpeg_json(reduced(frame.rgb, small.width, small.height))
+        observed = jpeg_json(reduce_image(frame.rgb, small.width, small.height))
         answer |= {"camera": camera, "shape": frustum(frame.intrinsics), "observed": observed}
     if finite:
         answer |= {"pose": rows_of(T), "ellipsoid": ellipsoid(T, localization.covariance)}
@@ -197,7 +197,7 @@ def depth_difference(image: RenderedImage, frame: Frame) -> Json | None:
     if frame.depth is None or not frame.has_depth:
         return None
     height, width = image.depth.shape
-    measured = resampled(frame.depth.cpu(), width, height)
+    measured = resample_nearest(frame.depth.cpu(), width, height)
     known = (measured > 0) & (image.depth > 0)
     if not bool(known.any()):
         return None

@@ -26,7 +26,7 @@ from bidnerf.viewer.pictures import (
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import StoredCamera, poses_of
 from bidnerf_core.datasets import read_trajectory
-from bidnerf_core.devices import moved
+from bidnerf_core.devices import move_to
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SplatField
 from bidnerf_core.geometry import SE3, LengthUnit, pose_from_matrix, symbol
@@ -172,7 +172,7 @@ def _splats(scene: Map) -> Json | None:
     """Return the splats of the field, except nearly transparent ones, as points with their own radii."""
     if not isinstance(scene.field, SplatField):
         return None
-    splats = moved(scene.field.splats(), "cpu")
+    splats = move_to(scene.field.splats(), "cpu")
     seen = (splats.opacity >= 0.2).nonzero()[:, 0]
     some = seen[_subset(len(seen), MOST_POINTS)]
     return _points(

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.devices import moved, threads_at_most
+from bidnerf_core.devices import move_to, threads_at_most
 from bidnerf_core.fields import VoxelGrid
 from bidnerf_core.frames import Frame, View
 
@@ -168,13 +168,13 @@ def occupied_cells(
     at_once = 128 if device.type == "cpu" else max(1, len(votes))  # so few blocks stay in the cache
     with threads_at_most(1):  # more threads would slow down such short operations
         for view in (view for view in views if view.frame.has_depth or view.frame.alpha is not None):
-            space = moved(FreeSpace.seen_by(view, tolerance, footprint), device)
+            space = move_to(FreeSpace.seen_by(view, tolerance, footprint), device)
             # In double precision, since the world's origin may be far away.
             T_camera_world = view.T_ref_camera.to(torch.float64).inverse()
             # The middles of the blocks' first cells, and the offsets of a block's cells from them (metres, camera frame)
             step = T_camera_world.rotation * size
             corner = T_camera_world.apply(first + size / 2)[:, None] + step @ (blocks * BLOCK).double()
-            corners, within = moved((corner.float(), (step @ cells.double()).float()), device)
+            corners, within = move_to((corner.float(), (step @ cells.double()).float()), device)
             seen = space.may_free(corners + within.mean(dim=1, keepdim=True), BLOCK * radius)
             for rows in (seen & undecided).nonzero()[:, 0].split(at_once):
                 points = (corners[:, rows, None] + within[:, None, :]).flatten(1)

@@ -4,11 +4,11 @@ from .capture import Capture as Capture
 from .capture import DepthFile as DepthFile
 from .capture import Shot as Shot
 from .capture import TimedFrame as TimedFrame
+from .capture import capture_of as capture_of
+from .capture import describe_other_split as describe_other_split
 from .capture import hold_out as hold_out
-from .capture import in_other_split as in_other_split
-from .capture import of_views as of_views
-from .capture import remark as remark
 from .capture import unique_names as unique_names
+from .capture import warn_about as warn_about
 from .colmap import SparseChoice as SparseChoice
 from .colmap import SparsePoints as SparsePoints
 from .colmap_files import read_model as read_model

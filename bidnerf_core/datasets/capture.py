@@ -44,7 +44,7 @@ from bidnerf_core.frames import (
     read_mask,
 )
 from bidnerf_core.geometry import SE3, LengthUnit
-from bidnerf_core.io import ImageSource, is_file, read_compact_image, read_header, reduced
+from bidnerf_core.io import ImageSource, is_file, read_compact_image, read_header, reduce_image
 
 Colour: TypeAlias = tuple[float, float, float]
 
@@ -136,7 +136,7 @@ class Shot:
         if isinstance(self.image, ImageSource):
             rgb, alpha = read_compact_image(self.image, background, None if size == raster.size else size)
         elif pixels is not None:
-            rgb, alpha = pixels if size == raster.size else reduced(pixels, *size), None
+            rgb, alpha = pixels if size == raster.size else reduce_image(pixels, *size), None
         metres, hidden, about = None, None, dict[str, Any]()
         if self.depth is not None:
             measured, where = self.depth.read(), Path(self.depth.path)
@@ -224,7 +224,7 @@ class Capture:
 
     def __post_init__(self) -> None:
         if not all(shot.name for shot in self.shots):
-            object.__setattr__(self, "shots", _named(self.shots))
+            object.__setattr__(self, "shots", _name_shots(self.shots))
 
     def __repr__(self) -> str:
         """A one-line description, for which no image is opened."""
@@ -283,7 +283,7 @@ class Capture:
                 known = ", ".join(self.splits) or "none, since only images with poses are in a split"
                 raise InputError(f"no split {name!r}", where=self.path, expected=f"one of {known}")
             own = [shot for shot in self.shots if (shot.splits if every else name in shot.splits)]
-            self._by_split[name] = replace(self, shots=_named(own, one_split=not every))
+            self._by_split[name] = replace(self, shots=_name_shots(own, one_split=not every))
         return self._by_split[name]
 
     def in_time_order(self) -> Capture:
@@ -331,7 +331,7 @@ class Capture:
         unknown = next((name for name in names if name not in by_name), None)
         if unknown is None:
             return [by_name[name] for name in names]
-        elsewhere = in_other_split(unknown, {each: self.frame_names(each) for each in self.splits})
+        elsewhere = describe_other_split(unknown, {each: self.frame_names(each) for each in self.splits})
         meant = [shot.name for shot in chosen if shot.stem == unknown]
         hint, expected = spelling_hint(unknown, by_name), f"one of {', '.join(meant[:4])}" if meant else None
         found = f"frame {unknown!r} is ambiguous" if meant else elsewhere
@@ -377,7 +377,7 @@ class Capture:
             raise InputError(f"has no pose for any of {images}", where=where, expected=self.poses_expected)
         if posed < len(self):
             why = f": {self.unposed}" if self.unposed else ""
-            remark(where, f"{len(self) - posed} of {images} have no pose and are left out{why}")
+            warn_about(where, f"{len(self) - posed} of {images} have no pose and are left out{why}")
         return self
 
     def view(self, shot: Shot, limit: int | None = None) -> View:
@@ -409,13 +409,13 @@ def unique_names(paths: Sequence[tuple[str, ...]], separator: str = "_") -> list
     return list(seen)
 
 
-def in_other_split(name: str, splits: Mapping[str, Sequence[str]]) -> str | None:
+def describe_other_split(name: str, splits: Mapping[str, Sequence[str]]) -> str | None:
     """Return an error clause that names the split that contains frame ``name``, or None if no split contains it."""
     found = next((split for split, names in splits.items() if name in names), None)
     return found and f"no frame {name!r}, which is in split {found!r}; choose that split"
 
 
-def _named(shots: Sequence[Shot], one_split: bool = False) -> list[Shot]:
+def _name_shots(shots: Sequence[Shot], one_split: bool = False) -> list[Shot]:
     """Return the shots with unique names; a name includes the split only where needed to make it unique."""
     mixed = not one_split and len({shot.splits[:1] for shot in shots}) > 1
     paths = [(*(shot.splits[:1] or ("",) if mixed else ()), *shot.parts) for shot in shots]
@@ -445,7 +445,7 @@ def hold_out(
     return [replace(shot, splits=splits.get(number, ())) for number, shot in enumerate(shots)]
 
 
-def of_views(views: Sequence[View], path: Path, splits: tuple[str, ...] = SPLITS) -> Capture:
+def capture_of(views: Sequence[View], path: Path, splits: tuple[str, ...] = SPLITS) -> Capture:
     """Return views in memory as a capture in which each of the ``splits`` contains all of the views."""
     return Capture(
         path, [_ViewShot(view=v, stem=v.frame.name, T_world_camera=v.T_ref_camera, splits=splits) for v in views]
@@ -461,12 +461,12 @@ class _ViewShot(Shot):
         return found if side is None else found.at_most(side)
 
 
-def remark(where: Path | str, text: str) -> None:
+def warn_about(where: Path | str, text: str) -> None:
     """Issue a one-line ``InputWarning`` about what was assumed or left out in ``where``."""
     warnings.warn(f"{where}: {text}", InputWarning, stacklevel=3)
 
 
-def with_files(capture: Capture) -> list[Shot]:
+def drop_missing_files(capture: Capture) -> list[Shot]:
     """Return the shots whose image files exist, without masks and depth images that do not exist.
 
     Remarks count the missing files. Raises ``InputError`` if all images or all masks are missing.
@@ -479,7 +479,7 @@ def with_files(capture: Capture) -> list[Shot]:
         if gone:
             first = gone[0].relative_to(capture.path) if gone[0].is_relative_to(capture.path) else gone[0]
             count = f"{len(gone)} of {amount(len(files), noun)} {'is' if len(gone) == 1 else 'are'}"
-            remark(capture.path, f"{count} missing and left out, first: {first}")
+            warn_about(capture.path, f"{count} missing and left out, first: {first}")
         return set(gone)
 
     gone = missing("image", [shot.image for shot in capture.shots])

@@ -71,7 +71,7 @@ class SparsePoints:
                 where=folder,
             )
         pairs = [(self._image(name, split), T.translation) for name, T in places]
-        known = [(image.T_camera_model.inverse().translation, place) for image, place in pairs if image]
+        known = [(image.T_camera_model.inverse().translation, position) for image, position in pairs if image]
         if len(known) < 2:
             raise InputError(
                 f"has {len(known)} of the {len(places)} training cameras",
@@ -84,10 +84,10 @@ class SparsePoints:
             for _ in range(2):
                 # The second fit leaves out cameras whose error exceeds three times the median, unless it is tiny.
                 used, fit = fits, fit_similarity(there[fits], here[fits])
-                off = torch.linalg.vector_norm(fit.apply(there) - here, dim=-1)
-                fits = off <= max(3 * float(off.median()), 0.01 * spread(here))
+                errors = torch.linalg.vector_norm(fit.apply(there) - here, dim=-1)
+                fits = errors <= max(3 * float(errors.median()), 0.01 * spread(here))
             self.metres, self.cameras = fit.scale, int(used.sum())
-            self.misfit = float(off[used].median()) / spread(here[used])
+            self.misfit = float(errors[used].median()) / spread(here[used])
         except InputError as error:
             where = f"{folder}: the unit cannot be estimated from the training cameras"
             raise InputError(error, where=where) from error
@@ -124,9 +124,9 @@ class SparsePoints:
         image = self._image(name, split)
         if image is None:
             return torch.zeros((0, 3), dtype=torch.float64)
-        place = torch.searchsorted(self._points.ids, image.points).clamp(max=len(self._points.ids) - 1)
-        place = place[(self._points.ids[place] == image.points) & self._chosen[place]]
-        points = image.T_camera_model.apply(self._points.positions[place]) * self.metres
+        position = torch.searchsorted(self._points.ids, image.points).clamp(max=len(self._points.ids) - 1)
+        position = position[(self._points.ids[position] == image.points) & self._chosen[position]]
+        points = image.T_camera_model.apply(self._points.positions[position]) * self.metres
         return points[points[:, 2] > 0]
 
     def rays(self, views: Sequence[View], split: str) -> Observations:

@@ -57,15 +57,15 @@ class FileNames:
         """Return the file that ``find`` returns or, if there is none, the path where it is expected."""
         return self.find(name, endings, moved) or self._folders[0] / posix_name(str(name))
 
-    def _ignoring_case(self, place: Path, parts: tuple[str, ...]) -> Path:
+    def _ignoring_case(self, folder: Path, parts: tuple[str, ...]) -> Path:
         """Return the path of ``parts`` below a folder, each with the upper and lower case used on disk unless that is ambiguous."""
         for part in parts:
-            if place not in self._listed:
+            if folder not in self._listed:
                 try:
-                    names = [child.name for child in place.iterdir()]
+                    names = [child.name for child in folder.iterdir()]
                 except OSError:
                     names = []
                 count = Counter(name.lower() for name in names)
-                self._listed[place] = {name.lower(): name for name in names if count[name.lower()] == 1}
-            place = place / (part if part == ".." else self._listed[place].get(part.lower(), part))
-        return place
+                self._listed[folder] = {name.lower(): name for name in names if count[name.lower()] == 1}
+            folder = folder / (part if part == ".." else self._listed[folder].get(part.lower(), part))
+        return folder

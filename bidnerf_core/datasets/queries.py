@@ -52,8 +52,8 @@ class QuerySource(Protocol):
     @property
     def names(self) -> Sequence[str]: ...
 
-    def read(self, place: int) -> Query:
-        """Read the query with index ``place``. Raises ``InputError`` if any of its files is missing or unusable."""
+    def read(self, index: int) -> Query:
+        """Read the query with index ``index``. Raises ``InputError`` if any of its files is missing or unusable."""
         ...
 
 
@@ -151,17 +151,17 @@ class Photos:
     def names(self) -> Sequence[str]:
         return self.capture.names
 
-    def read(self, place: int) -> Query:
-        """Read the query with index ``place``. Raises ``InputError`` if any of its files is missing or unusable.
+    def read(self, index: int) -> Query:
+        """Read the query with index ``index``. Raises ``InputError`` if any of its files is missing or unusable.
 
         The source of the photo's camera and any assumptions are logged, unless already logged for an earlier photo.
         """
-        shot = self.capture.shots[place]
+        shot = self.capture.shots[index]
         if self._depth and shot.file not in self._depth:
             log.info("%s: no measured depth was given; colour only", shot.name)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", InputWarning)
-            frame = self.capture[place].frame
+            frame = self.capture[index].frame
         texts = [str(warning.message) for warning in caught]
         for text in [*(text.partition(": ")[2] or text for text in texts), f"{frame.camera_source}"]:
             if text not in self._remarks:
@@ -204,9 +204,9 @@ class DatasetFrames:
     def names(self) -> Sequence[str]:
         return [rig[-1] for rig in self._rigs]
 
-    def read(self, place: int) -> Query:
-        """Read the query with index ``place``. Raises ``InputError`` if any of its files is missing or unusable."""
-        rig = self._rigs[place]
+    def read(self, index: int) -> Query:
+        """Read the query with index ``index``. Raises ``InputError`` if any of its files is missing or unusable."""
+        rig = self._rigs[index]
         views, (shot,) = (
             tuple(self.capture.views(self._split, rig)),
             self.capture.select(self._split, rig[-1:]),

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Generic, Literal, Protocol, TypeVar, runtime_checkable
 
 from bidnerf_core.camera import Camera, CameraSource, Intrinsics
-from bidnerf_core.datasets.capture import Capture, hold_out, remark, with_files
+from bidnerf_core.datasets.capture import Capture, drop_missing_files, hold_out, warn_about
 from bidnerf_core.datasets.options import DatasetOptions as DatasetOptions
 from bidnerf_core.datasets.options import DepthRegistration
 from bidnerf_core.depth import DepthCamera as DepthCamera  # for authors of readers
@@ -87,7 +87,7 @@ def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
     if not isinstance(found, Capture):
         who = f"reader {type(reader).__name__} returned a {type(found).__name__}"
         raise InputError(who, where=path, expected="a Capture")
-    shots = with_files(found)
+    shots = drop_missing_files(found)
     farthest = 1e10  # even in millimetres from the centre of the Earth, its surface is at 6.4e9
     for shot in shots:
         pose = shot.T_world_camera
@@ -103,7 +103,7 @@ def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
         posed = [bool(shot.splits) for shot in shots if shot.T_world_camera is not None]
         if not all(posed):
             rate = f"{found.rate:g} per second; the sequence has all"
-            remark(path, f"the dataset has {sum(posed)} of {amount(len(posed), 'frame')}, {rate}")
+            warn_about(path, f"the dataset has {sum(posed)} of {amount(len(posed), 'frame')}, {rate}")
     faces = [replace(face, name="") for shot in shots for face in shot.faces()]
     found = replace(found, shots=faces, largest=options.largest)
     return found if (masks := options.mask_folder) is None else found.masked(masks)
@@ -269,7 +269,7 @@ def _if_recognised(name: str, reader: Reader | PluginError, path: Path) -> Reade
     except Exception as error:
         if isinstance(reader, Format):
             raise
-        remark(path, f"reader {name!r} failed to examine it: {type(error).__name__}: {error}")
+        warn_about(path, f"reader {name!r} failed to examine it: {type(error).__name__}: {error}")
         return None
 
 

@@ -26,7 +26,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from bidnerf_core.datasets.capture import remark
+from bidnerf_core.datasets.capture import warn_about
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.geometry import SE3, rigid_pose
 from bidnerf_core.io import LARGEST_ROWS, Row, is_file, parse_rows, read_file, read_lines, read_rows
@@ -89,7 +89,7 @@ def _complete(
         raise InputError("has no rows", where=path, expected=f"lines of {columns}")
     last, words = rows[-1]
     if len(rows) > 1 and len(words) < count:
-        remark(last.where, f"the last row is truncated ({len(words)} of {count} entries) and was left out")
+        warn_about(last.where, f"the last row is truncated ({len(words)} of {count} entries) and was left out")
         rows = rows[:-1]
     for row, words in rows:
         if len(words) < count:
@@ -163,7 +163,7 @@ class Trajectory:
             return SE3(self.rotations[after], self.translations[after])
         if after in (0, len(self)):
             return None
-        start, end = (float(self.times[place]) for place in (after - 1, after))
+        start, end = (float(self.times[index]) for index in (after - 1, after))
         if end - start > largest_gap:
             return None
         share = (time - start) / (end - start)
@@ -188,7 +188,7 @@ def read_trajectory(path: Path, times: Sequence[float] | None = None) -> Traject
             images = "images with known times" if times is None else amount(len(times), "image")
             found = f"has {kind}, which have no times; there are {len(rows)} for {images}"
             raise InputError(found, where=path, expected="one for each image")
-        remark(path, f"is read as {kind}, one for each image")
+        warn_about(path, f"is read as {kind}, one for each image")
         poses = SE3.stack(read_matrices(path))
         return Trajectory(torch.tensor(times, dtype=torch.float64), poses.rotation, poses.translation)
     lines = content.decode("utf-8-sig", "replace").splitlines()
@@ -203,7 +203,7 @@ def read_trajectory(path: Path, times: Sequence[float] | None = None) -> Traject
         raise InputError("has no finite pose", where=path, expected=f"lines of timestamp {POSE}")
     if len(known) < len(timed):
         left = amount(len(timed) - len(known), "pose")
-        remark(path, f"{left} of {len(timed)} not finite or zero, left out")
+        warn_about(path, f"{left} of {len(timed)} not finite or zero, left out")
     for (one, pose), (other, others) in pairwise(known):
         if one.time == other.time and pose != others:
             found = f"another pose at the time {other.time:.6f}"

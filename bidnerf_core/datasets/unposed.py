@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets.capture import remark
+from bidnerf_core.datasets.capture import warn_about
 from bidnerf_core.datasets.reader import find_reader
 from bidnerf_core.datasets.video import is_video
 from bidnerf_core.errors import InputError, enumeration
@@ -54,10 +54,10 @@ POSERS: Plugins[Poser] = Plugins("posers", lambda poser: interface_defects(poser
 
 def lacks_poses(path: str | Path) -> bool:
     """Return whether a path is a video, or a folder of photos that no dataset reader recognizes."""
-    place = Path(path)
-    if find_reader(place) is not None:
+    below = Path(path)
+    if find_reader(below) is not None:
         return False
-    return bool(photos_below(place)) if place.is_dir() else is_video(place)
+    return bool(photos_below(below)) if below.is_dir() else is_video(below)
 
 
 def photos_below(folder: Path, out: Path | None = None) -> list[Path]:
@@ -82,35 +82,35 @@ def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
     for photo in photos:
         groups.setdefault(photo.parent, []).append(photo)
     copies, alike = list[Path](), dict[tuple[Path, frozenset[str]], list[tuple[int, int, Path]]]()
-    for place, group in groups.items():
+    for below, group in groups.items():
         with contextlib.suppress(InputError):  # raised again when that photo is read
             header = read_header(group[0])
-            key = place.parent, frozenset(photo.stem for photo in group)
-            alike.setdefault(key, []).append((header.width, header.height, place))
+            key = below.parent, frozenset(photo.stem for photo in group)
+            alike.setdefault(key, []).append((header.width, header.height, below))
     for sized in alike.values():
         whole_width, whole_height, _ = max(sized)
-        for width, height, place in sized:
+        for width, height, below in sized:
             # Sizes are rounded.
             if width < whole_width and abs(height - width * whole_height / whole_width) <= 1:
-                copies.append(place)
+                copies.append(below)
     if copies:
-        names = enumeration([str(place.relative_to(folder)) for place in copies])
-        remark(folder, f"{names}: smaller copies of the photos beside them, which are left out")
+        names = enumeration([str(below.relative_to(folder)) for below in copies])
+        warn_about(folder, f"{names}: smaller copies of the photos beside them, which are left out")
     return [photo for photo in photos if photo.parent not in copies]
 
 
 def _subfolders(folder: Path, out: Path | None) -> Iterator[Path]:
     """Yield the photos in subfolders of ``folder`` at any depth, except those of datasets."""
-    for place, inside, _ in os.walk(folder):
+    for below, inside, _ in os.walk(folder):
         inside[:] = sorted(
             name
             for name in inside
             if not name.startswith(".")
             and name.lower() not in ("depth", "depths", "mask", "masks", "confidence", "conf", "thumbnails")
-            and not (out is not None and out.exists() and Path(place, name).samefile(out))
+            and not (out is not None and out.exists() and Path(below, name).samefile(out))
         )
-        if Path(place) != folder:
-            if find_reader(Path(place)) is not None:
+        if Path(below) != folder:
+            if find_reader(Path(below)) is not None:
                 inside.clear()
                 continue
-            yield from photos_in(place)[0]
+            yield from photos_in(below)[0]

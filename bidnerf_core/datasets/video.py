@@ -38,7 +38,7 @@ class Video:
         self.path = path
         with open_binary(path, "a video file"):
             pass
-        with _opened(path) as (container, stream):
+        with _open_stream(path) as (container, stream):
             self.size = int(stream.codec_context.width), int(stream.codec_context.height)
             found = [packet for packet in container.demux(stream) if packet.pts is not None]
             start = (container.start_time or 0) / 1e6  # microseconds
@@ -101,7 +101,7 @@ class Video:
         """Seek to the key frame before a frame."""
         self.close()
         self._open = ExitStack()
-        container, stream = self._open.enter_context(_opened(self.path))
+        container, stream = self._open.enter_context(_open_stream(self.path))
         if number:
             container.seek(self._stamps[number], stream=stream, backward=True)
         self._decoded = container.decode(stream)
@@ -153,7 +153,7 @@ def require_av(path: Path) -> None:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+def _open_stream(path: Path) -> Iterator[tuple[Any, Any]]:
     """Open a video file; only its first video stream is read. Raises ``InputError`` if it is not a video."""
     import av
 

@@ -38,14 +38,14 @@ def write_transforms(
             raise InputError(
                 f"two frames of split {split!r} have the same name", where=folder, expected="different ones"
             )
-        frames = [_written(folder, split, view, background) for view in views]
+        frames = [_write_view(folder, split, view, background) for view in views]
         if not frames:  # readers reject a file without frames
             continue
         folder.mkdir(parents=True, exist_ok=True)
         write_file(folder / SPLIT_FILES[split], json.dumps({"frames": frames}, indent=1, allow_nan=False).encode())
 
 
-def _written(folder: Path, split: str, view: View, background: tuple[float, float, float]) -> dict[str, Any]:
+def _write_view(folder: Path, split: str, view: View, background: tuple[float, float, float]) -> dict[str, Any]:
     """Write the images of a frame and return the frame's entry."""
     frame = view.frame
     file = f"images/{split}/{frame.name}.png"

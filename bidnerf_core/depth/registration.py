@@ -12,7 +12,7 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics, Raster, read_camera
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3, rigid_pose
-from bidnerf_core.io import read_record, resampled
+from bidnerf_core.io import read_record, resample_nearest
 
 EXTRINSICS = "T_colour_depth"
 """Key, in a depth sensor's file, of the 4x4 matrix T_colour_depth (metres, OpenCV axes) next to the intrinsics."""
@@ -76,7 +76,7 @@ class DepthCamera:
                 where=file,
                 expected="metres and OpenCV axes",
             )
-        return found if coarse == colour else resampled(found, colour.width, colour.height)
+        return found if coarse == colour else resample_nearest(found, colour.width, colour.height)
 
 
 def nearest_depth(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Float[Tensor, "h w"]:

@@ -25,7 +25,7 @@ from bidnerf_core.camera import (
     read_exif,
 )
 from bidnerf_core.depth import DepthCamera, depth_image, read_depth_image
-from bidnerf_core.devices import moved
+from bidnerf_core.devices import move_to
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.frames.masks import MaskFile, WhollyHidden, read_mask
 from bidnerf_core.frames.photos import fit_depth, pinhole_of
@@ -33,13 +33,13 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import (
     Background,
     background_colour,
-    over,
+    composite,
     pixel_array,
     read_compact_image,
     read_header,
     read_image,
-    reduced,
-    resampled,
+    reduce_image,
+    resample_nearest,
     split_alpha,
 )
 
@@ -318,7 +318,7 @@ class Frame:
             metres = fit_depth(measured, raster, raster.size, f"{where}: depth")
             if remark := measured.remark(depth_unit is None):
                 warnings.warn(f"{where}: {remark}", InputWarning, stacklevel=2)
-        laid = over(colour, cover, BLACK if background is None else background_colour(background))
+        laid = composite(colour, cover, BLACK if background is None else background_colour(background))
         unused = None if hidden is None else torch.as_tensor(hidden)
         awaits = background is None and cover is not None
         return Frame(name, laid, intrinsics, metres, cover, hidden=unused, awaits_background=awaits)
@@ -329,7 +329,7 @@ class Frame:
 
     def to(self, device: torch.device | str) -> Frame:
         """Return the frame with its images on ``device``; the frame itself if they are already there."""
-        return moved(self, device)
+        return move_to(self, device)
 
     def at_most(self, largest: int) -> Frame:
         """Return the frame downscaled to ``largest`` pixels along its longer side; the frame itself if it is not larger.
@@ -342,10 +342,10 @@ class Frame:
             return self
         small = camera.at_most(largest)
         size = (small.width, small.height)
-        depth = None if self.depth is None else resampled(self.depth.cpu(), *size)
-        alpha = None if self.alpha is None else reduced(self.alpha.cpu().float(), *size)
-        hidden = None if self.hidden is None else reduced(self.hidden.cpu().float(), *size) > 0
-        rgb = reduced(self.rgb_bytes.cpu(), *size)
+        depth = None if self.depth is None else resample_nearest(self.depth.cpu(), *size)
+        alpha = None if self.alpha is None else reduce_image(self.alpha.cpu().float(), *size)
+        hidden = None if self.hidden is None else reduce_image(self.hidden.cpu().float(), *size) > 0
+        rgb = reduce_image(self.rgb_bytes.cpu(), *size)
         return self.replace(rgb=rgb, intrinsics=small, depth=depth, alpha=alpha, hidden=hidden)
 
     @property
@@ -448,7 +448,7 @@ class View:
 
     def to(self, device: torch.device | str) -> View:
         """Return the view with its images and its pose on ``device``."""
-        return moved(self, device)
+        return move_to(self, device)
 
     def over(self, background: tuple[float, float, float]) -> View:
         """Return the view with ``background`` behind the frame, see ``Frame.over``."""

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Raster
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.io import IMAGE_SUFFIXES, decode, resampled
+from bidnerf_core.io import IMAGE_SUFFIXES, decode, resample_nearest
 
 HiddenColour = Literal["black", "white"]
 """The mask colour that marks pixels to ignore."""
@@ -50,7 +50,7 @@ def read_mask(path: Path, raster: Raster, size: tuple[int, int], hides: HiddenCo
     """
     white = raster.turned(torch.from_numpy(_white(decode(path))), "mask", path)
     if tuple(white.shape) != size[::-1]:
-        white = resampled(white, *size)
+        white = resample_nearest(white, *size)
     hidden = white if hides == "white" else ~white
     if bool(hidden.all()):
         raise WhollyHidden(f"mask is all {hides}, which hides the whole image; {INVERTED}", where=path)

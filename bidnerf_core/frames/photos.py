@@ -15,7 +15,7 @@ from bidnerf_core.io import (
     HEIF_SUFFIXES,
     IMAGE_SUFFIXES,
     looks_like_image,
-    resampled,
+    resample_nearest,
 )
 
 DEPTH_STEM = ".depth"
@@ -36,7 +36,7 @@ def fit_depth(measured: DepthImage, raster: Raster, size: tuple[int, int], what:
     with ``what``, if the aspect ratio differs from the image's.
     """
     metres = raster.turned(measured.metres, what)
-    return metres if tuple(metres.shape) == size[::-1] else resampled(metres, *size)
+    return metres if tuple(metres.shape) == size[::-1] else resample_nearest(metres, *size)
 
 
 def photos_in(folder: str | Path) -> tuple[list[Path], list[Path]]:

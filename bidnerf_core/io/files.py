@@ -94,13 +94,13 @@ def is_file(path: Path) -> bool:
     return os.path.isfile(path)
 
 
-def temporary(path: Path) -> Path:
+def temporary_name(path: Path) -> Path:
     """Return a new name next to ``path`` that ``is_temporary`` recognizes."""
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}")
 
 
 def is_temporary(name: str) -> bool:
-    """Return whether ``name`` was made by ``temporary``; such a file remains if its process is killed while writing."""
+    """Return whether ``name`` was made by ``temporary_name``; such a file remains if its process is killed while writing."""
     return re.fullmatch(r"\..+\.[0-9a-f]{8}", name) is not None
 
 
@@ -109,7 +109,7 @@ def write_file(path: Path, content: bytes) -> None:
 
     Raises ``OSError``, which names the file, if writing fails; an existing file of that name is then left untouched.
     """
-    beside = temporary(path)
+    beside = temporary_name(path)
     try:
         with beside.open("wb") as file:
             file.write(content)
@@ -135,7 +135,7 @@ class FileInUse(InputError):
 
 
 @contextlib.contextmanager
-def locked(path: Path) -> Iterator[None]:
+def lock(path: Path) -> Iterator[None]:
     """Hold the lock of an existing file or folder within the context.
 
     Raises ``FileInUse`` if another process holds the lock, or held it and removed the file or folder.
@@ -224,13 +224,13 @@ def output_folder(
     try:
         with removed_on_failure():
             out.mkdir(parents=True, exist_ok=True)
-            probe = temporary(out / "writable")
+            probe = temporary_name(out / "writable")
             probe.write_bytes(b"")
             probe.unlink()
     except OSError as error:
         found, expected = f"cannot be written ({error.strerror})", "a folder that can be created and written"
         raise InputError(found, where=out, expected=expected) from error
     # The folder is removed while the lock is held: afterwards, it may belong to another process.
-    with locked(out), removed_on_failure():
+    with lock(out), removed_on_failure():
         check()  # another process may have finished meanwhile
         yield

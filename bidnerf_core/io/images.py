@@ -72,7 +72,7 @@ def read_image(
 
     Grey becomes three channels, CMYK becomes RGB, and 16-bit values are scaled by the sensor's range: 10, 12
     or 14 bits if no value needs more. The image is returned as stored, ignoring the EXIF orientation, and downscaled
-    to ``size`` (width, height) as by ``reduced``. It is converted in strips, so that only its bytes and
+    to ``size`` (width, height) as by ``reduce_image``. It is converted in strips, so that only its bytes and
     the result are in memory. Raises ``InputError`` if the file is not a complete image with 1 to 4 channels of
     8 or 16 bits, or is too large.
     """
@@ -84,10 +84,10 @@ def read_image(
             raise InputError("image is of float32", where=path, expected=expected)
         for strip, white in _strips(path, image):
             colour, cover = split_alpha(pixel_array(strip, f"{path}: image", white))
-            rgb.append(reduced(over(colour, cover, background), width, len(strip)))
+            rgb.append(reduce_image(composite(colour, cover, background), width, len(strip)))
             if cover is not None:
-                alpha.append(reduced(cover, width, len(strip)))
-    return reduced(torch.cat(rgb), width, height), reduced(torch.cat(alpha), width, height) if alpha else None
+                alpha.append(reduce_image(cover, width, len(strip)))
+    return reduce_image(torch.cat(rgb), width, height), reduce_image(torch.cat(alpha), width, height) if alpha else None
 
 
 def read_compact_image(
@@ -107,7 +107,7 @@ def read_compact_image(
                 fitting = [s for s in sides if len(s) == 2 and s[0] >= size[0] and s[1] >= size[1]]
                 image.draft(image.mode, fitting[0] if fitting else image.size)
             pixels = torch.from_numpy(_pixels(path, image))
-            found = pixels if size is None else reduced(pixels, *size)
+            found = pixels if size is None else reduce_image(pixels, *size)
             return (found if found.ndim == 3 else found[..., None].repeat(1, 1, 3)), None
     rgb, alpha = read_image(path, background, size)
     return rgb if size is None else (rgb * FULL_SCALE["uint8"]).round_().to(torch.uint8), alpha
@@ -157,7 +157,7 @@ def to_numpy(array: np.ndarray | Tensor) -> np.ndarray:
     return (values.float() if values.dtype == torch.bfloat16 else values).numpy()
 
 
-def over(
+def composite(
     colour: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"] | None, background: Sequence[float]
 ) -> Float[Tensor, "h w 3"]:
     """Composite straight (not premultiplied) colour over ``background``."""
@@ -180,7 +180,7 @@ def background_colour(background: Background) -> tuple[float, float, float]:
     return values[0], values[1], values[2]
 
 
-def reduced(image: Shaped[Tensor, "h w *c"], width: int, height: int) -> Shaped[Tensor, "nh nw *c"]:
+def reduce_image(image: Shaped[Tensor, "h w *c"], width: int, height: int) -> Shaped[Tensor, "nh nw *c"]:
     """Downscale an image of floats or bytes; each new pixel is the mean over the area that it covers.
 
     An image that already has this size is returned unchanged.
@@ -193,7 +193,7 @@ def reduced(image: Shaped[Tensor, "h w *c"], width: int, height: int) -> Shaped[
     return torch.from_numpy(small.reshape(height, width, *image.shape[2:]))
 
 
-def resampled(image: Shaped[Tensor, "h w"], width: int, height: int) -> Shaped[Tensor, "nh nw"]:
+def resample_nearest(image: Shaped[Tensor, "h w"], width: int, height: int) -> Shaped[Tensor, "nh nw"]:
     """Resize an image by nearest-neighbour sampling."""
     rows = ((torch.arange(height) + 0.5) * image.shape[0] / height).long()
     columns = ((torch.arange(width) + 0.5) * image.shape[1] / width).long()

@@ -194,7 +194,7 @@ def to_plain(value: Any, where: str = "", tensors: dict[str, Tensor] | None = No
         inside = f"{where}." if where else ""
         return {key: to_plain(item, f"{inside}{key}", tensors) for key, item in value.items()}
     if isinstance(value, tuple | list):
-        return [to_plain(item, f"{where}[{place}]", tensors) for place, item in enumerate(value)]
+        return [to_plain(item, f"{where}[{index}]", tensors) for index, item in enumerate(value)]
     if _is_tensor(value) and tensors is not None:
         tensors[where] = value
         return {"tensor": where}

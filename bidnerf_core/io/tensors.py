@@ -147,7 +147,7 @@ def load_part(path: Path, make: Callable[[dict[str, Tensor]], _Part], what: str,
         raise InputError(f"not {what} ({why})", where=path, expected=expected) from error
 
 
-def packed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+def pack_tensors(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return contiguous copies of ``tensors`` on the CPU, as safetensors requires."""
     return {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
 

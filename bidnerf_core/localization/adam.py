@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
-from bidnerf_core.devices import captured, constant, moved, without_waiting
+from bidnerf_core.devices import capture_graph, constant, move_to, without_waiting
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.problem import Pivot
 from bidnerf_core.localization.settings import AdamSettings
@@ -34,7 +34,7 @@ class AdamSteps:
 
     def __init__(self, loss: Loss, pivot: Pivot, config: AdamSettings, start: SE3) -> None:
         device = start.translation.device
-        self._loss, self._pivot, self._config = loss, moved(pivot, device), config
+        self._loss, self._pivot, self._config = loss, move_to(pivot, device), config
         lever = pivot.lever_arm
         length = RATE * lever if config.learning_rate is None else config.learning_rate
         self._rate = torch.tensor([length] * 3 + [length / lever] * 3, dtype=torch.float64).to(device)
@@ -113,7 +113,7 @@ def follow_gradient(
             for step in range(count):
                 # Three steps before the capture fill caches and load kernels, which a capture does not allow.
                 if generator is not None and first + step == 3:
-                    take = captured(steps, device, generator)
+                    take = capture_graph(steps, device, generator)
                 take()
         T, values, finite = steps.block()
         for number in range(count):

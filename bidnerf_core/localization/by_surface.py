@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Generator, Tensor
 from torch.nn.functional import normalize
 
-from bidnerf_core.devices import moved
+from bidnerf_core.devices import move_to
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Support, support
@@ -162,7 +162,7 @@ def by_images(
     the typical distance of the scene, and whether it has a background. ``detailed`` is for partly occluded images: colour scales are
     narrow, as wider ones favour poses that partly explain the occluders' colours, and the exposure stays close to the map's.
     """
-    small = moved(Thumbnail.of(problem.views[-1], 16), surface.device)
+    small = move_to(Thumbnail.of(problem.views[-1], 16), surface.device)
     keyframes = SE3.from_matrix(surface.keyframes[:: max(1, len(surface.keyframes) // 16)]).to(small.flat)
     directions = normalize(small.flat, dim=-1) @ keyframes.rotation.mT
     origins = keyframes.translation[:, None].expand_as(directions)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.depth import UNKNOWN, DepthSensorModel
-from bidnerf_core.devices import moved, working_device
+from bidnerf_core.devices import move_to, working_device
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import Observations, RadianceField, SceneBounds, device_of, levels, render
 from bidnerf_core.frames import View, draw, measured_middle, uniform
@@ -80,7 +80,7 @@ def on_device(scene: _Map, device: torch.device | str) -> _Map:
             f"the map's field is a {type(field).__name__}", where=f"device {device}", expected="an nn.Module"
         )
     parts = {"field": field, "surface": scene.surface, "landmarks": scene.landmarks}
-    there = moved(parts, working_device(device))
+    there = move_to(parts, working_device(device))
     if there is parts:
         return scene
     found = copy.copy(scene)
@@ -236,7 +236,7 @@ class Pivot:
         return (T @ self.T_camera_pivot).retract(delta) @ self.T_camera_pivot.inverse()
 
     def moved_linearly(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
-        """Return ``moved`` to first order in ``delta``: cheaper, with the same value and derivative at 0."""
+        """Return ``move_to`` to first order in ``delta``: cheaper, with the same value and derivative at 0."""
         if self.T_camera_pivot is None:
             return SE3.identity(device=delta.device).retract_linearly(delta) @ T
         return (T @ self.T_camera_pivot).retract_linearly(delta) @ self.T_camera_pivot.inverse()

@@ -23,7 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.devices import moved
+from bidnerf_core.devices import move_to
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import (
@@ -281,7 +281,7 @@ class SearchRecord:
         if scores is None:
             scores = torch.arange(len(T.translation), dtype=torch.float64)
         best = scores.argsort()[:400]  # only the best poses of a step are kept
-        T, scores = moved((T[best], scores[best]), "cpu")
+        T, scores = move_to((T[best], scores[best]), "cpu")
         self.steps.append(RecordedStep(caption, T, scores.double(), min(kept, len(best))))
 
 

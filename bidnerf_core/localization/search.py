@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from bidnerf_core.devices import moved, without_waiting
+from bidnerf_core.devices import move_to, without_waiting
 from bidnerf_core.errors import amount
 from bidnerf_core.geometry import SE3, Robust
 from bidnerf_core.localization.accept import DISPLACEMENT, Support, same_pose, support
@@ -69,7 +69,7 @@ def halve(
     answer, the last of them is replaced by the best different pose. Steps are taken on ``device``; the host waits for the device
     between stages, but not within a stage.
     """
-    states, middle = moved(start, device), middle.to(device, torch.float64)
+    states, middle = move_to(start, device), middle.to(device, torch.float64)
     poses, losses, margin, scores = [states.T[None]], list[Tensor](), float("inf"), states.noise
     rivals = before = states[:0]
     for stage in stages:
@@ -97,7 +97,7 @@ def halve(
         states, scores = states[passing], scores[passing]
     path_losses = torch.stack([values[0] for values in losses]) if losses else scores[:0]
     path_poses = SE3.cat([T[:, 0] for T in poses])
-    return moved(SearchResult(states, scores, margin, rivals, before, path_poses, path_losses), "cpu")
+    return move_to(SearchResult(states, scores, margin, rivals, before, path_poses, path_losses), "cpu")
 
 
 def image_stages(
@@ -109,7 +109,7 @@ def image_stages(
 ) -> Iterator[Stage]:
     """Yield the ``stages`` of a search with small images, given as pixels of the longer side, steps, and poses to keep."""
     for width, steps, keep in stages:
-        thumbnails = [moved(Thumbnail.of(view, width), device) for view in problem.views]
+        thumbnails = [move_to(Thumbnail.of(view, width), device) for view in problem.views]
         yield Stage([Images(renderer, thumbnails, scales)], steps, keep)
 
 
@@ -205,9 +205,9 @@ def localization_by_rays(
     """
     some = States.cat([found.before, found.states[:1]])
     best = some[fresh.costs(some).sum(-1).argmin()[None]]
-    T, here = best.T[0].normalized(), fresh.at(moved(best, fresh.rgb.device))
+    T, here = best.T[0].normalized(), fresh.at(move_to(best, fresh.rgb.device))
     rays = replace(fresh, noise=here.fitted_noise(), independent=ALONE * len(problem.views))
-    normal = moved(replace(here, term=rays).normal(), "cpu")
+    normal = move_to(replace(here, term=rays).normal(), "cpu")
     covariance = torch.linalg.inv_ex(normal.hessian[0, :6, :6]).inverse
     determined = bool(covariance.isfinite().all()) and float(torch.linalg.eigvalsh(covariance)[0]) > 0
     # The step as the shift of the visible scene, relative to its distance, and the rotation (radians).

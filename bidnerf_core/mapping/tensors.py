@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bidnerf_core.fields import LARGEST_LENGTH, VoxelGrid
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import COLOUR_ROUNDING, TensorKind, check_tensors, packed
+from bidnerf_core.io import COLOUR_ROUNDING, TensorKind, check_tensors, pack_tensors
 from bidnerf_core.mapping.landmarks.landmark_map import HeldOutTrial, LandmarkMap, Tracks
 from bidnerf_core.mapping.surface.surface_map import SurfaceMap, Surfels
 from bidnerf_core.mapping.surface.surfel_index import CELLS_OF_BLOCK, COARSER_FROM, SurfelIndex, block_shape
@@ -67,7 +67,7 @@ def surface_tensors(surface: SurfaceMap) -> dict[str, Tensor]:
 
 
 def _copies(found: dict[str, Any], kinds: Mapping[str, TensorKind]) -> dict[str, Tensor]:
-    return packed({name: torch.as_tensor(found[name], dtype=kind.dtype) for name, kind in kinds.items()})
+    return pack_tensors({name: torch.as_tensor(found[name], dtype=kind.dtype) for name, kind in kinds.items()})
 
 
 def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:

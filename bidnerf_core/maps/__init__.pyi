@@ -26,7 +26,7 @@ from .map import Localizer as Localizer
 from .map import Map as Map
 from .map import load_map as load_map
 from .store import Checkpoints as Checkpoints
-from .store import frozen_field as frozen_field
+from .store import build_frozen_field as build_frozen_field
 from .store import map_folder as map_folder
 from .store import read_part as read_part
 from .store import write_parts as write_parts
@@ -36,7 +36,7 @@ from .summary import rendering_scores as rendering_scores
 from .training import MapOptions as MapOptions
 from .training import OtherSettings as OtherSettings
 from .training import TrainOptions as TrainOptions
-from .training import interrupted as interrupted
+from .training import check_resumable as check_resumable
 from .training import resume as resume
 from .training import train as train
 from .views import Images as Images

@@ -32,7 +32,7 @@ from bidnerf_core.errors import InputError, amount
 from bidnerf_core.fields import NoField, device_of, render_image, trained_field
 from bidnerf_core.frames import Frame, SeenLandmarks, View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import from_plain, locked, to_plain
+from bidnerf_core.io import from_plain, lock, to_plain
 from bidnerf_core.localization import Localizer, Outcome, landmark_cameras
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
@@ -89,7 +89,7 @@ def extend(
     folder = scene.folder if isinstance(scene, Map) else Path(scene)
     if folder is not None:
         load_info(folder)  # raises if there is no map
-    with job_context(progress, cancel), contextlib.nullcontext() if folder is None else locked(folder):
+    with job_context(progress, cancel), contextlib.nullcontext() if folder is None else lock(folder):
         scene = scene if isinstance(scene, Map) else load_map(scene)
         if scene.info.interruption is not None:
             raise InputError(f"cannot be extended: {scene.info.interruption}", where=scene.name)
@@ -97,14 +97,14 @@ def extend(
             raise InputError(
                 "has no radiance field to extend; 'bidnerf train DATA --out MAP' adds one", where=scene.name
             )
-        new = locate(scene, *_frames(photos, scene, split))
+        new = localize_new(scene, *_frames(photos, scene, split))
         if not new:
             log.info(f"{scene.name}: was built from these photos already; nothing to add")
             return scene
-        return _extended(scene, new, _old_views(scene, data, split), data is not None, steps, config)
+        return _extend(scene, new, _old_views(scene, data, split), data is not None, steps, config)
 
 
-def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> list[View]:
+def localize_new(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> list[View]:
     """Localize frames in a map, and return those that are new to it as views, with names that the map does not use yet.
 
     ``unread`` lists the photos that could not be read; they count as left out. Raises ``InputError`` if the map
@@ -128,11 +128,11 @@ def locate(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> li
             left_out.append((frame.name, str(error)))
         else:
             like = _names_like(frame.name, cameras)
-            place = found.T_world_camera.translation
+            position = found.T_world_camera.translation
             outcomes.append(found.outcome)
             if not found.converged:
                 left_out.append((frame.name, f"{found.outcome}: {found.reason}"))
-            elif any(float((place - cameras[name].translation).norm()) < near for name in like):
+            elif any(float((position - cameras[name].translation).norm()) < near for name in like):
                 known += 1
             else:
                 like = _names_like(frame.name, {*cameras, *(view.frame.name for view in views)})
@@ -169,9 +169,9 @@ def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], lis
         camera = CameraSource(assumed=landmark_cameras(scene))
         source = Photos(photo_files([path]), DatasetOptions(camera, background=background)).capture
     if isinstance(source, Capture):
-        for place, name in enumerate(source.names):
+        for index, name in enumerate(source.names):
             try:
-                frames.append(source.at_most(side)[place].frame)
+                frames.append(source.at_most(side)[index].frame)
             except InputError as error:
                 unread.append((name, str(error)))
     else:
@@ -213,7 +213,7 @@ def _old_views(scene: Map, data: Images | None, split: str) -> list[View]:
     return views
 
 
-def _extended(
+def _extend(
     scene: Map,
     new: Sequence[View],
     old: Sequence[View],
@@ -236,7 +236,7 @@ def _extended(
             sum(v.frame.intrinsics.width * v.frame.intrinsics.height for v in part) / len(part) for part in (old, new)
         ]
         weighted = [*old] * min(3, max(1, round(pixels[1] / pixels[0]))) + seeing
-    grown = _trained_on(scene, weighted, steps, len(new) / max(1, len(everything)))
+    grown = _train_further(scene, weighted, steps, len(new) / max(1, len(everything)))
     info = replace(
         grown.info,
         cameras=(*scene.info.cameras, *stored_cameras(new)),
@@ -277,7 +277,7 @@ def _extended(
     return replace(grown, info=replace(grown.info, anchor=stored.anchor)).stored_in(scene.folder)
 
 
-def _trained_on(scene: Map, views: Sequence[View], steps: int | None, share: float) -> Map:
+def _train_further(scene: Map, views: Sequence[View], steps: int | None, share: float) -> Map:
     """Train a copy of the map's field further on ``views``, and return the map in memory with the new field.
 
     By default, the number of steps is the usual one times ``share``, the fraction of new views, or times 0.25
@@ -295,9 +295,9 @@ def _trained_on(scene: Map, views: Sequence[View], steps: int | None, share: flo
         raise InputError(f"the map's field is a {type(field).__name__}", expected="an nn.Module of a backend")
     if info.field_frame is not None:
         views = [_in_field_unit(view, 1 / info.field_frame.scale) for view in views]
-    begun = replace(info, step=0, complete=False, config=to_plain(settings, "config"))
+    restarted = replace(info, step=0, complete=False, config=to_plain(settings, "config"))
     options = TrainOptions(device=device_of(scene.field))
-    grown = train_field(views, Map(begun, NoField()), options, weights=field.state_dict())
+    grown = train_field(views, Map(restarted, NoField()), options, weights=field.state_dict())
     info = replace(info, step=info.step + grown.info.step, seconds=grown.info.seconds)
     return replace(scene, info=info, field=grown.field, folder=None, record=scene.capture)
 

@@ -40,9 +40,9 @@ from bidnerf_core.mapping import (
 from bidnerf_core.maps.description import MapInfo, cameras_of
 from bidnerf_core.maps.importers import ImportedField, Structure, bounds_about, importer_of, robust_box
 from bidnerf_core.maps.map import Map
-from bidnerf_core.maps.store import frozen_field, map_folder, write_parts
-from bidnerf_core.maps.training import MapOptions, bake_settings, baked_if_possible, given_settings
-from bidnerf_core.maps.views import USEFUL_SIDE, Images, Origin, ReadViews, chosen_origin, read_views
+from bidnerf_core.maps.store import build_frozen_field, map_folder, write_parts
+from bidnerf_core.maps.training import MapOptions, bake_if_possible, bake_settings, settings_from
+from bidnerf_core.maps.views import USEFUL_SIDE, Images, Origin, ReadViews, choose_origin, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, job_context
 from bidnerf_core.settings import Above
 from bidnerf_core.training import TrainingState
@@ -102,15 +102,15 @@ def import_map(
     """
     path, scale = Path(path), options.scale
     name, chosen = importer_of(path, options.importer)
-    settings, baking = given_settings(config, chosen.config_type, f"importer {name!r}"), bake_settings(bake)
+    settings, baking = settings_from(config, chosen.config_type, f"importer {name!r}"), bake_settings(bake)
     T = SE3.identity() if options.T_world_file is None else options.T_world_file
-    origin = chosen_origin(T.translation[None])
+    origin = choose_origin(T.translation[None])
     if any(origin):
         T = T.translated(-torch.tensor(origin, dtype=torch.float64))
-    place, device, where = None if out is None else Path(out), working_device(options.device), str(path)
+    folder, device, where = None if out is None else Path(out), working_device(options.device), str(path)
     with (
         job_context(progress, cancel),
-        contextlib.nullcontext() if place is None else map_folder(place, options.overwrite),
+        contextlib.nullcontext() if folder is None else map_folder(folder, options.overwrite),
     ):
         found = chosen.read(path, settings, Similarity(scale, T))
         for line in found.found:
@@ -118,7 +118,7 @@ def import_map(
         if found.structure is not None:
             if photos is not None:
                 raise InputError("is a model with photos of its own; leave out the photos", where=where)
-            return _of_structure(found, found.structure, options, place, baking is not None)
+            return _of_structure(found, found.structure, options, folder, baking is not None)
         images = photos
         if images is None and found.photos is not None:
             try:
@@ -146,7 +146,7 @@ def import_map(
             origin=origin,
             gravity_up=None if read is None else read.gravity_up,
         )
-        scene = Map(info, frozen_field(info, found.tensors, None)).to(device)
+        scene = Map(info, build_frozen_field(info, found.tensors, None)).to(device)
         cameras = found.cameras if read is None else read.with_files(stored_cameras(views))
         if read is None and cameras:
             log.info(f"{where}: {amount(len(cameras), 'camera')} of its training images found next to it")
@@ -162,26 +162,26 @@ def import_map(
                 text = f"the photos' measured depth is {ratio:.3g} times the field's; is its scale different?"
                 text = f"{where}: {text} The poses of the photos would have to be scaled as well"
                 warnings.warn(text, InputWarning, stacklevel=2)
-        if place is not None:
+        if folder is not None:
             state = TrainingState(step, found.tensors, {})
-            scene = replace(scene, info=write_parts(place, scene.info, state), folder=place)
+            scene = replace(scene, info=write_parts(folder, scene.info, state), folder=folder)
         if baking is None:
             return scene
-        return baked_if_possible(scene, lambda scene: _baked(scene, found, views, baking))
+        return bake_if_possible(scene, lambda scene: _bake(scene, found, views, baking))
 
 
 def _of_structure(
-    found: ImportedField, structure: Structure, options: ImportOptions, place: Path | None, bake: bool
+    found: ImportedField, structure: Structure, options: ImportOptions, folder: Path | None, bake: bool
 ) -> Map:
     """Build a landmark-only map from posed images and the points that they observe."""
     capture, features = structure.capture, options.features
     T_world_camera = SE3.stack([shot.T_world_camera for shot in capture.shots if shot.T_world_camera])
-    origin = chosen_origin(T_world_camera.translation)
+    origin = choose_origin(T_world_camera.translation)
     offset = -torch.tensor(origin, dtype=torch.float64)
     unit: LengthUnit = "metres" if options.scale != 1 else "units"
     tracked = None
     if structure.keypoints:
-        read, tracked = _described(structure, features, origin)
+        read, tracked = _stored_views(structure, features, origin)
     else:
         read = read_views(capture, replace(options.images, split="all")).about(origin)
     bounds = bounds_about(structure.positions[structure.positions.isfinite().all(-1)] + offset)
@@ -199,8 +199,8 @@ def _of_structure(
         origin=origin,
     )
     scene = Map(info, NoField()).to(working_device(options.device))
-    if place is not None:
-        scene = replace(scene, info=write_parts(place, info, TrainingState(0, {}, {})), folder=place)
+    if folder is not None:
+        scene = replace(scene, info=write_parts(folder, info, TrainingState(0, {}, {})), folder=folder)
     if not bake:
         return scene
     if tracked is None:
@@ -214,7 +214,7 @@ def _of_structure(
     return scene if structure.keypoints else scene.with_survey(read.views, tracked)
 
 
-def _described(structure: Structure, features: str, origin: Origin) -> tuple[ReadViews, TrackedViews]:
+def _stored_views(structure: Structure, features: str, origin: Origin) -> tuple[ReadViews, TrackedViews]:
     """Return the images of a structure as blank views, and their stored keypoints grouped into tracks.
 
     Keypoints that observe the same point form a track. Positions are relative to ``origin``.
@@ -295,7 +295,7 @@ def ratio_to_measured_depth(field: RadianceField, bounds: SceneBounds, views: Se
     return float((pixels.distance[both] * seen.opacity[both] / seen.distance[both]).median())
 
 
-def _baked(scene: Map, found: ImportedField, views: Sequence[View], config: BakeConfig) -> Map:
+def _bake(scene: Map, found: ImportedField, views: Sequence[View], config: BakeConfig) -> Map:
     name, surface = scene.info.data, None
     if found.surface is not None:
         surface = surface_of_points(*found.surface, scene.bounds, cameras_of(scene.info), config)

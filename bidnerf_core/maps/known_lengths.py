@@ -52,7 +52,7 @@ def factor_of_distance(scene: Map, first: Place, second: Place, metres: float) -
     """
     if not 0 < metres < math.inf:
         raise InputError(f"distance is {metres} m", expected="a positive length")
-    apart = float(torch.linalg.vector_norm(place_of(scene, first) - place_of(scene, second)))
+    apart = float(torch.linalg.vector_norm(locate_point(scene, first) - locate_point(scene, second)))
     if not apart > 0:
         raise InputError(f"{first} and {second} are the same place", expected="two different places")
     return metres / apart
@@ -78,23 +78,23 @@ def factor_of_poses(scene: Map, known: Mapping[str, SE3 | Position]) -> ScaleFit
     source = torch.stack([camera.pose.translation for camera in found.values()])
     target = torch.stack([_position(known[name]) for name in found])
     fit = fit_similarity(source, target)
-    off = float((fit.apply(source) - target).square().sum(-1).mean().sqrt())
+    error = float((fit.apply(source) - target).square().sum(-1).mean().sqrt())
     # A misfit that is large relative to the spread of the positions indicates another capture.
-    if off > 0.2 * spread(target):
+    if error > 0.2 * spread(target):
         raise InputError(
-            f"the cameras are {off:.3g} m (root mean square) from their known positions after the best scaling",
+            f"the cameras are {error:.3g} m (root mean square) from their known positions after the best scaling",
             expected="known positions of the same capture",
         )
-    return ScaleFit(fit.scale, len(found), off)
+    return ScaleFit(fit.scale, len(found), error)
 
 
-def place_of(scene: Map, place: Place) -> Float[Tensor, "3"]:
+def locate_point(scene: Map, point: Place) -> Float[Tensor, "3"]:
     """Return the world coordinates (float64) of a point of the map, see ``Place``. Raises ``InputError`` for an unknown point."""
-    if not isinstance(place, str):
-        return _position(place)
-    if (camera := _camera_of(scene, place)) is not None:
+    if not isinstance(point, str):
+        return _position(point)
+    if (camera := _camera_of(scene, point)) is not None:
         return camera.pose.translation + origin_of(scene)
-    name, at, pixel = place.rpartition("@")
+    name, at, pixel = point.rpartition("@")
     numbers = list[float]()
     with contextlib.suppress(ValueError):
         numbers = [float(word) for word in pixel.split(",")]
@@ -104,15 +104,14 @@ def place_of(scene: Map, place: Place) -> Float[Tensor, "3"]:
         return _seen_at(scene, camera, numbers[0], numbers[1]) + origin_of(scene)
     if not at and len(numbers) == 3:
         return torch.tensor(numbers, dtype=torch.float64)
-    raise InputError(f"no place {place!r} in the map: {_no_camera(scene, name if at else place)}")
+    raise InputError(f"no place {point!r} in the map: {_no_camera(scene, name if at else point)}")
 
 
-def _position(place: SE3 | Position) -> Float[Tensor, "3"]:
+def _position(given: SE3 | Position) -> Float[Tensor, "3"]:
     """Return a position, or the position of a pose (float64). Raises ``InputError`` unless it has three coordinates."""
-    given = place.translation if isinstance(place, SE3) else place
-    point = torch.as_tensor(given, dtype=torch.float64).cpu()
+    point = torch.as_tensor(given.translation if isinstance(given, SE3) else given, dtype=torch.float64).cpu()
     if point.shape != (3,) or not bool(point.isfinite().all()):
-        raise InputError(f"place is {place!r}", expected="three coordinates")
+        raise InputError(f"place is {given!r}", expected="three coordinates")
     return point
 
 

@@ -40,7 +40,7 @@ from bidnerf_core.fields import (
 )
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import LengthUnit
-from bidnerf_core.io import locked
+from bidnerf_core.io import lock
 from bidnerf_core.localization import Localizer as Localizer  # from the door, with maps to load
 from bidnerf_core.localization import on_device, origin_of, scene_of
 from bidnerf_core.mapping import (
@@ -58,8 +58,8 @@ from bidnerf_core.mapping import (
 )
 from bidnerf_core.maps.description import Anchor, LandmarkSource, MapInfo, cameras_of, load_info
 from bidnerf_core.maps.store import (
+    build_frozen_field,
     content_digest,
-    frozen_field,
     load_state,
     map_folder,
     read_part,
@@ -269,7 +269,7 @@ class Map:
             scene = replace(self, info=replace(self.info, landmark_features=features))
         with (
             job_context(progress, cancel),
-            contextlib.nullcontext() if self.folder is None else locked(self.folder),
+            contextlib.nullcontext() if self.folder is None else lock(self.folder),
         ):
             views = list[View]()
             if data is not None:
@@ -284,11 +284,11 @@ class Map:
         """Raise ``InputError`` if photos differ too much from the field's renderings, whether or not the map was built from them."""
         # The difference (RMS) between rendered and photographed colours indicates another scene if it is much larger than for the
         # photos from which the map was built or, in a map that was never baked, if it is large in itself.
-        off, usual = colour_noise(self.field, self.bounds, views), self.colour_noise
-        if off > (0.3 if usual is None else max(0.2, 2 * usual)):
+        error, usual = colour_noise(self.field, self.bounds, views), self.colour_noise
+        if error > (0.3 if usual is None else max(0.2, 2 * usual)):
             raise InputError(
                 f"built from {self.info.data or 'other views'!r}, and its renderings differ from the photos by"
-                f" {off:.0%} of the range of colours;",
+                f" {error:.0%} of the range of colours;",
                 where=where,
                 expected="photos of the same scene, with poses in the coordinates of the map",
             )
@@ -330,7 +330,7 @@ class Map:
             if photos is not None:
                 log.info(f"{self.name}: its landmarks from photos are kept; --rendered-landmarks replaces them")
                 return replace(self, landmarks=photos), None
-        began, info, landmarks = time.monotonic(), self.info, None
+        started, info, landmarks = time.monotonic(), self.info, None
         source: LandmarkSource = "photos" if views else "rendered images"
         images = views or render_views(self.field, info.bounds, cameras_of(info))
         if not images:
@@ -357,7 +357,7 @@ class Map:
             info = replace(info, landmark_source=source, landmark_features=landmarks.features)
             log.info(
                 f"{self.name}: {len(landmarks)} landmarks ({landmarks.megabytes:.1f} MB) from {len(images)} {source},"
-                f" {time.monotonic() - began:.1f} s"
+                f" {time.monotonic() - started:.1f} s"
             )
         return replace(self, info=info).with_parts(None, landmarks), tracked
 
@@ -371,7 +371,7 @@ class Map:
         check_cancelled("surface")
         if surface is not None:
             return self.with_parts(surface)
-        began = time.monotonic()
+        started = time.monotonic()
         cameras = cameras_of(self.info) or [(view.frame.intrinsics, view.T_ref_camera) for view in views]
         if not cameras:
             raise self._no_cameras()
@@ -382,7 +382,7 @@ class Map:
         source = f"{len(measured)} measured" if measured else f"{len(cameras)} rendered"
         log.info(
             f"{self.name}: surface of {len(surface.surfels)} surfels from {source} views,"
-            f" {time.monotonic() - began:.1f} s"
+            f" {time.monotonic() - started:.1f} s"
         )
         return self.with_parts(surface)
 
@@ -478,7 +478,7 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     info, weights, surface, landmarks = read_parts(folder, baked)
     if info.interruption is not None:
         log.info(f"{folder}: {info.interruption}")
-    return Map(info, frozen_field(info, weights, folder), surface, landmarks, folder).to(device)
+    return Map(info, build_frozen_field(info, weights, folder), surface, landmarks, folder).to(device)
 
 
 for kind in (str, Path):  # a Localizer opens a folder

@@ -33,7 +33,7 @@ from bidnerf_core.io import (
     from_plain,
     load_part,
     output_folder,
-    packed,
+    pack_tensors,
     read_json,
     read_tensors,
     to_plain,
@@ -78,7 +78,7 @@ def _json(value: Any) -> bytes:
     return json.dumps(to_plain(value), indent=1, allow_nan=False).encode()
 
 
-_STATE = PartFile(lambda tensors: tensors_to_bytes(packed(tensors)), lambda path: read_tensors(path, NEEDED))
+_STATE = PartFile(lambda tensors: tensors_to_bytes(pack_tensors(tensors)), lambda path: read_tensors(path, NEEDED))
 PARTS = {
     "weights": _STATE,
     "training": _STATE,
@@ -242,7 +242,7 @@ def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingSta
     """Return the state from which to resume the training of ``field``. Raises ``InputError`` if training is complete."""
     if info.training is None:
         raise InputError(f"training is complete ({amount(info.step, 'step')}), nothing to resume", where=folder)
-    weights = checked_weights(trained_field(field), read_part(folder, info, "weights"), folder / info.weights)
+    weights = check_weights(trained_field(field), read_part(folder, info, "weights"), folder / info.weights)
     return TrainingState(info.step, weights, read_part(folder, info, "training"))
 
 
@@ -271,7 +271,7 @@ def with_tracks_in(info: MapInfo, landmarks: LandmarkMap, names: Sequence[str]) 
     return replace(landmarks, tracks=landmarks.tracks.renumbered(images=images))
 
 
-def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
+def check_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
     """Check the tensors of a field from a file, after upgrading those of earlier versions, and return them.
 
     Names, shapes and values are checked against the field here, since torch's own error message would take many
@@ -301,7 +301,7 @@ def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path
     return tensors
 
 
-def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None = None) -> RadianceField:
+def build_frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None = None) -> RadianceField:
     """Build the field described by ``info`` with the weights ``tensors``; no parameter requires a gradient.
 
     ``folder`` is the map's folder, for error messages. Raises ``InputError`` if the backend cannot build the
@@ -321,10 +321,10 @@ def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None 
     except Exception:  # a backend may raise anything for missing values
         log.debug("%s: backend %r needs real tensors to build its field", where, info.backend)
     else:
-        tensors, checked = checked_weights(outline, tensors, path), True
+        tensors, checked = check_weights(outline, tensors, path), True
     field = build_field(info, where)
     if not checked:
-        tensors = checked_weights(field, tensors, path)
+        tensors = check_weights(field, tensors, path)
     cast(nn.Module, field).load_state_dict(tensors)
     cast(nn.Module, field).requires_grad_(False).eval()
     return info.in_map_unit(field)
@@ -333,7 +333,7 @@ def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None 
 def build_field(info: MapInfo, where: str) -> RadianceField:
     """Build the untrained field (an ``nn.Module``) that ``info`` describes.
 
-    Raises ``InputError`` as ``frozen_field`` does.
+    Raises ``InputError`` as ``build_frozen_field`` does.
     """
     backend = load_backend(info.backend, where)
     config: Any = from_plain(backend.config_type, info.config, f"{where}: config")
@@ -394,14 +394,14 @@ def _adopt_anchor(folder: Path) -> None:
 
 def _sweep(folder: Path) -> None:
     """Remove files of earlier and interrupted saves that ``map.json`` does not name; none if ``map.json`` is damaged."""
-    kept = set[str]()
+    listed = set[str]()
     if os.path.lexists(folder / DESCRIPTION):
         try:
             found = read_json(folder / DESCRIPTION, "the description of a map")
-            kept = {name for part in PART_NAMES if isinstance(name := found.get(part), str)}
+            listed = {name for part in PART_NAMES if isinstance(name := found.get(part), str)}
         except (InputError, AttributeError):
             return
     for file in list(folder.iterdir()):
-        if OURS.fullmatch(file.name) and file.name not in kept:
+        if OURS.fullmatch(file.name) and file.name not in listed:
             with contextlib.suppress(OSError):  # a left-over file does no harm
                 file.unlink()

@@ -71,7 +71,7 @@ class StructureImporter:
                 raise InputError(why, where=given, expected=f"the keypoints of {model}")
             used = "the keypoints and their descriptors" if why is None else f"not used: {why}"
             found.append(f"{source}: {used}")
-        left_out, kept = list[str](), list[int]()
+        left_out, usable = list[str](), list[int]()
         for number, image in enumerate(images):
             if known and image.name not in known:
                 left_out.append(f"{image.name}: it has no keypoints in the file of them")
@@ -80,26 +80,26 @@ class StructureImporter:
             elif int((observed[number] >= 0).sum()) < 6:  # too few to determine even its own pose by RANSAC
                 left_out.append(f"{image.name}: it observes fewer than 6 points")
             else:
-                kept.append(number)
-        if not kept:
+                usable.append(number)
+        if not usable:
             raise InputError(
                 f"none of its {amount(len(images), 'image')} can be used, such as {left_out[0]}", where=model
             )
         found += [f"left out: {line}" for line in left_out]
         poses = [image.T_camera_model.inverse() for image in images]
         scaled = [SE3(T.rotation, placement.scale * T.translation) for T in poses]
-        names = unique_names([shots[number].parts for number in kept])
+        names = unique_names([shots[number].parts for number in usable])
         posed = [
             replace(
                 shots[number], name=name, T_world_camera=placement.T_target_source @ scaled[number], splits=("train",)
             )
-            for number, name in zip(kept, names, strict=True)
+            for number, name in zip(usable, names, strict=True)
         ]
         structure = Structure(
             Capture(path, posed),
             positions,
-            tuple(observed[number] for number in kept),
-            tuple(known[images[number].name] for number in kept) if known else (),
+            tuple(observed[number] for number in usable),
+            tuple(known[images[number].name] for number in usable) if known else (),
         )
         bounds = bounds_about(positions[sound])
         return ImportedField("", None, {}, bounds, found=tuple(found), steps=0, structure=structure)
@@ -109,8 +109,8 @@ def _numbers(observed: Tensor, ids: Tensor, sound: Tensor) -> Tensor:
     """Convert the ids of observed points to their indices in ``ids``; -1 for points that are unknown or not finite."""
     if not len(ids):
         return torch.full_like(observed, -1)
-    place = torch.searchsorted(ids, observed).clamp(max=len(ids) - 1)
-    return torch.where((ids[place] == observed) & sound[place], place, -1)
+    index = torch.searchsorted(ids, observed).clamp(max=len(ids) - 1)
+    return torch.where((ids[index] == observed) & sound[index], index, -1)
 
 
 def _misfit(known: Mapping[str, Keypoints], counts: Mapping[str, int], cameras: list[object]) -> str | None:

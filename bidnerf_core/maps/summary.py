@@ -92,7 +92,7 @@ class MapSummary:
         up, surface = facts["up"], facts["surface"]
         photos = amount(len(info.cameras), "image") if info.cameras else "cameras not recorded"
         added = f", {info.added} of which were added later" if info.added else ""
-        place = f"{facts['map']}, {(facts['bytes'] or 0) / 2**20:.1f} MiB" if facts["map"] else "in memory"
+        stored = f"{facts['map']}, {(facts['bytes'] or 0) / 2**20:.1f} MiB" if facts["map"] else "in memory"
         training = "none; 'bidnerf train DATA --out MAP' trains a field and builds a surface"
         field = "none; landmarks alone localize photos"
         built = "none"
@@ -113,7 +113,7 @@ class MapSummary:
             sources = {"gravity": "gravity", "planes": "planes and cameras", "cameras": "the cameras"}
             frame += f"; up is {_shown(tuple(round(x, 4) for x in up.direction))}, by {sources[up.source]}"
         rows = {
-            "map": f"{place}, written by bidnerf {info.bidnerf}",
+            "map": f"{stored}, written by bidnerf {info.bidnerf}",
             "made from": f"{info.data or 'views in memory'}, {photos}{added}",
             "training": training,
             "field": field,
@@ -128,7 +128,7 @@ class MapSummary:
             "settings": _shown(info.config) if info.config else "",
         }
         listed = [f"{key + ':':<12} {value}" for key, value in rows.items() if value]
-        return "\n".join([*listed, *(f"- {remark}" for remark in self.remarks)])
+        return "\n".join([*listed, *(f"- {sentence}" for sentence in self.remarks)])
 
 
 def _shown(value: Any) -> str:

@@ -27,11 +27,11 @@ from bidnerf_core.captures import (
 )
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.datasets import HOLD_OUT_EVERY, POSERS, DatasetOptions, SparseChoice, lacks_poses
-from bidnerf_core.devices import moved, working_device
+from bidnerf_core.devices import move_to, working_device
 from bidnerf_core.errors import Cancelled, InputError, amount, enumeration
 from bidnerf_core.fields import NoField, device_of, trained_field
 from bidnerf_core.frames import View
-from bidnerf_core.io import from_plain, packed, to_plain
+from bidnerf_core.io import from_plain, pack_tensors, to_plain
 from bidnerf_core.mapping import (
     USUAL_FEATURES,
     BakeConfig,
@@ -45,13 +45,13 @@ from bidnerf_core.maps.store import (
     USUAL_SECONDS,
     Checkpoints,
     build_field,
-    frozen_field,
+    build_frozen_field,
     load_state,
     map_folder,
     read_part,
     write_parts,
 )
-from bidnerf_core.maps.views import Images, ReadViews, chosen_origin, read_views, views_again
+from bidnerf_core.maps.views import Images, ReadViews, choose_origin, read_views, views_again
 from bidnerf_core.progress import (
     Cancel,
     ProgressCallback,
@@ -150,35 +150,35 @@ def train(
     images unless ``options.trust_poses`` is set; the folder must be empty unless ``options.overwrite`` is set.
     """
     chosen = load_backend(backend)
-    settings = given_settings(
+    settings = settings_from(
         quick_config(chosen) if config == "quick" else config, chosen.config_type, f"backend {backend!r}"
     )
     baking = bake_settings(bake)
     working_device(options.device)  # an invalid one is rejected before anything is read
-    place, known = None if out is None else Path(out), None
-    if place is not None and not options.overwrite:
+    folder, known = None if out is None else Path(out), None
+    if folder is not None and not options.overwrite:
         with contextlib.suppress(InputError):
-            there = load_info(place)
+            there = load_info(folder)
             # A map that is complete without a field, such as an imported COLMAP model, gets a field.
             known = there if there.complete and not there.step else None
     with (
         job_context(progress, cancel),
-        finished_parts(place),
-        contextlib.nullcontext() if place is None else map_folder(place, options.overwrite or known is not None),
-        posed_images(data, options.images, place, options.overwrite) as (posed, images),
+        report_finished_parts(folder),
+        contextlib.nullcontext() if folder is None else map_folder(folder, options.overwrite or known is not None),
+        open_posed_images(data, options.images, folder, options.overwrite) as (posed, images),
     ):
-        if known is not None and place is not None:
-            scene, views, tracked = _with_field(load_map(place), posed, images, options)
+        if known is not None and folder is not None:
+            scene, views, tracked = _with_field(load_map(folder), posed, images, options)
             info = replace(scene.info, backend=backend, config=to_plain(settings, "config"))
-            return _completed(replace(scene, info=info), views, tracked, options, baking)
-        read = read_views(posed, images, options.depth_points, options.point_choice, place)
-        origin = chosen_origin(torch.stack([view.T_ref_camera.translation.cpu() for view in read.views]))
+            return _complete(replace(scene, info=info), views, tracked, options, baking)
+        read = read_views(posed, images, options.depth_points, options.point_choice, folder)
+        origin = choose_origin(torch.stack([view.T_ref_camera.translation.cpu() for view in read.views]))
         if any(origin):
-            log.info(f"{read.place}: the map's own coordinates begin at {origin}, near its cameras")
+            log.info(f"{read.where}: the map's own coordinates begin at {origin}, near its cameras")
         read = read.about(origin)
         part = f" in split {images.split!r}" if read.source else ""
         if not any(view.frame.has_depth for view in read.views):
-            log.info(f"{read.place}: no measured depth{part}; training on colour only")
+            log.info(f"{read.where}: no measured depth{part}; training on colour only")
         taken = prepare_views(
             read.views,
             options.refine_poses,
@@ -188,7 +188,7 @@ def train(
         )
         if not taken.distances:
             log.info(
-                f"{read.place}: the photos are from one place and do not determine distances; the map's"
+                f"{read.where}: the photos are from one place and do not determine distances; the map's"
                 " depth will be arbitrary, and localization in it will give directions, but no positions"
             )
         counter("finding the bounds of the scene", "stage")(0, 1)
@@ -209,15 +209,15 @@ def train(
             origin=origin,
             gravity_up=read.gravity_up,
         )
-        build_field(info, str(place or read.place))  # raises before anything is written
+        build_field(info, str(folder or read.where))  # raises before anything is written
         scene = Map(info, NoField())
         # A map that is already there stays until the first checkpoint.
-        if baking is not None and place is not None and not (place / DESCRIPTION).exists():
-            scene = replace(scene, info=write_parts(place, info, TrainingState(0, {}, {})), folder=place)
-        return _completed(scene, taken.views, taken.tracked, options, baking, out=place)
+        if baking is not None and folder is not None and not (folder / DESCRIPTION).exists():
+            scene = replace(scene, info=write_parts(folder, info, TrainingState(0, {}, {})), folder=folder)
+        return _complete(scene, taken.views, taken.tracked, options, baking, out=folder)
 
 
-def given_settings(config: Any, kind: type, what: str) -> Any:
+def settings_from(config: Any, kind: type, what: str) -> Any:
     """Return the settings of a backend or an importer, given as an object or as a dict of non-default values.
 
     Raises ``InputError`` if ``config`` is neither, and for unknown settings or values out of range.
@@ -239,7 +239,7 @@ def _with_field(
     own = {camera.name for camera in info.cameras}
     if unknown := [view.frame.name for view in read.views if view.frame.name not in own]:
         found, expected = f"image {unknown[0]!r} is none of those of {scene.name}", "images of that map"
-        raise InputError(found, where=read.place, expected=expected)
+        raise InputError(found, where=read.where, expected=expected)
     tracked, views = track_landmarks(views, info.landmark_features, True, read.depth_unit)
     bounds = estimate_bounds(views, read.background)
     info = replace(info, bounds=bounds, complete=False, hidden=read.hidden, sparse_depth=read.sparse_depth)
@@ -247,7 +247,7 @@ def _with_field(
 
 
 @contextlib.contextmanager
-def finished_parts(folder: Path | None) -> Iterator[None]:
+def report_finished_parts(folder: Path | None) -> Iterator[None]:
     """Add the finished parts of the map to the message of a ``Cancelled`` that is raised within the context."""
     try:
         yield
@@ -282,14 +282,14 @@ def resume(
     The other arguments and the errors are as for ``train``. Raises ``InputError`` if nothing is left to do.
     """
     out, baking, device = Path(folder), bake_settings(bake), working_device(options.device)
-    interrupted(out, baking is not None)
+    check_resumable(out, baking is not None)
     with (
         job_context(progress, cancel),
-        finished_parts(out),
+        report_finished_parts(out),
         map_folder(out, overwrite=True),
-        posed_images(data, options.images, out) as (posed, images),
+        open_posed_images(data, options.images, out) as (posed, images),
     ):
-        info = interrupted(out, baking is not None)  # another process may have finished meanwhile
+        info = check_resumable(out, baking is not None)  # another process may have finished meanwhile
         images = replace(images, largest=longest_side(info))
         read, views = views_again(info, posed, images, options.depth_points, options.point_choice, out)
         _check_same_views(out, info, read, images.split)
@@ -303,15 +303,15 @@ def resume(
                 done = replace(info, complete=True)  # the state that resuming would need is dropped
                 stored = write_parts(out, done, TrainingState(info.step, field, {}), keep=True)
                 scene = replace(scene, info=stored)
-            return _completed(scene, views, tracked, options, baking, out=out)
+            return _complete(scene, views, tracked, options, baking, out=out)
         scene, state = Map(info, NoField(), None, read_part(out, info, "landmarks"), out), None
         if info.step:
             state = load_state(out, info, build_field(info, str(out)))
             log.info(f"{out}: resuming from step {info.step}")
-        return _completed(scene, views, tracked, options, baking, state, out)
+        return _complete(scene, views, tracked, options, baking, state, out)
 
 
-def interrupted(folder: Path, baking: bool = True) -> MapInfo:
+def check_resumable(folder: Path, baking: bool = True) -> MapInfo:
     """Check that the map in ``folder`` has work left to resume, and return its description.
 
     Work is left if training is incomplete or, with ``baking``, if the surface or the capture record is
@@ -335,7 +335,7 @@ def bake_settings(bake: bool | BakeConfig) -> BakeConfig | None:
 
 
 @contextlib.contextmanager
-def posed_images(
+def open_posed_images(
     data: Images, options: DatasetOptions, out: Path | None, overwrite: bool = False
 ) -> Iterator[tuple[Images, DatasetOptions]]:
     """Yield images with poses, and the options with which to read them.
@@ -363,8 +363,8 @@ def posed_images(
 
 def poses_folder(out: Path) -> Path:
     """Return the folder next to a map that holds the poses of its photos: MAP-poses."""
-    place = out if out.name else out.absolute()  # "." has no name
-    return place.with_name(f"{place.name}-poses")
+    folder = out if out.name else out.absolute()  # "." has no name
+    return folder.with_name(f"{folder.name}-poses")
 
 
 def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> None:
@@ -373,24 +373,24 @@ def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> 
         part = f"split {split!r} has" if read.source else "these have"
         raise InputError(
             f"{part} frames or poses that differ from those {out} was started with",
-            where=read.place,
+            where=read.where,
             expected=f"those of {info.data!r} unchanged",
         )
-    background, kept = info.bounds.background, "resuming keeps"
+    background, outcome = info.bounds.background, "resuming keeps"
     for before, now, what in (
         (background, read.background if read.source else background, "background {}, got {}"),
-        (info.hidden, read.hidden, f"{{}} pixels hidden by masks, got {{}}; {kept} the masks (--masks)"),
+        (info.hidden, read.hidden, f"{{}} pixels hidden by masks, got {{}}; {outcome} the masks (--masks)"),
         (
             info.sparse_depth,
             read.sparse_depth,
-            f"the depth of {{}} pixels from points, got {{}}; {kept} the points (--depth-points) and their selection",
+            f"the depth of {{}} pixels from points, got {{}}; {outcome} the points (--depth-points) and their selection",
         ),
     ):
         if before != now:
             raise OtherSettings(f"was started with {what.format(before, now)}", where=out)
 
 
-def _completed(
+def _complete(
     scene: Map,
     views: Sequence[View],
     tracked: TrackedViews | None,
@@ -413,7 +413,7 @@ def _completed(
         scene = train_field(views, scene, options, state)
     if baking is not None and scene.has_field:
         if scene.surface is None:
-            scene = baked_if_possible(scene, lambda whole: whole.with_surface(views, baking))
+            scene = bake_if_possible(scene, lambda whole: whole.with_surface(views, baking))
         scene = scene.with_survey(views, tracked)
     if scene.folder is not None:
         size = sum(file.stat().st_size for file in scene.folder.iterdir()) / 2**20
@@ -437,24 +437,24 @@ def train_field(
     unsaved = scene.landmarks if scene.info.landmarks is None else None
     report = Checkpoints(scene.info, out, state, options.checkpoint_seconds, unsaved)
     del state  # the report frees it once training resumes from it
-    field = moved(build_field(scene.info, where), device)
+    field = move_to(build_field(scene.info, where), device)
     if weights is not None:
         cast(nn.Module, field).load_state_dict(weights)
     config: Any = from_plain(backend.config_type, scene.info.config, f"{where}: config")
     try:
         backend.train(field, views, config, report)
     except TrainingStopped as stopped:
-        kept, advice = (
+        outcome, advice = (
             ("cancelled", ", nothing is stored") if out is None else ("saved", "; --resume continues from there")
         )
-        raise Cancelled(f"{where}: {kept} after step {stopped.step}{advice}") from stopped
+        raise Cancelled(f"{where}: {outcome} after step {stopped.step}{advice}") from stopped
     report.finish(field)
     log.info(f"{where}: field trained for {amount(report.info.step, 'step')}, {duration_text(report.info.seconds)}")
-    frozen = frozen_field(report.info, packed(cast(nn.Module, field).state_dict()), out)
+    frozen = build_frozen_field(report.info, pack_tensors(cast(nn.Module, field).state_dict()), out)
     return Map(report.info, frozen, None, scene.landmarks, out, scene.record).to(device)
 
 
-def baked_if_possible(scene: Map, bake: Callable[[Map], Map]) -> Map:
+def bake_if_possible(scene: Map, bake: Callable[[Map], Map]) -> Map:
     """Return the result of ``bake`` or, if the images do not allow baking, the map without a new surface."""
     try:
         return bake(scene)

@@ -52,7 +52,7 @@ Origin: TypeAlias = tuple[float, float, float]
 """The origin of a map's local coordinate frame, in world coordinates; see ``Map.origin``."""
 
 
-def chosen_origin(points: Float[Tensor, "n 3"]) -> Origin:
+def choose_origin(points: Float[Tensor, "n 3"]) -> Origin:
     """Choose the origin of a map with the given ``points``, such as its camera centres.
 
     The origin is 0, or a round position near the middle of the points if they are far from 0.
@@ -73,7 +73,7 @@ class ReadViews:
 
     views: list[View]
     source: str  # name of the dataset's folder; empty for views from memory
-    place: str  # path of the dataset, or a description for views in memory
+    where: str  # path of the dataset, or a description for views in memory
     background: tuple[float, float, float]  # behind images with an alpha channel
     hidden: int = 0  # pixels that masks hide
     unit: LengthUnit = "units"  # of the poses
@@ -149,7 +149,7 @@ def read_views(
         read = ReadViews(views, "", "views in memory", colour, unit=_unit_of(views))
     hidden = [view.frame.hidden for view in read.views]
     if (sentence := masks_sentence(hidden)) is not None:
-        log.info(f"{read.place}: {sentence}")
+        log.info(f"{read.where}: {sentence}")
     read = replace(read, hidden=sum(int(pixels.sum()) for pixels in hidden if pixels is not None))
     if depth_points is None:
         return read
@@ -158,9 +158,9 @@ def read_views(
 
 def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path | None) -> ReadViews:
     """Read the views of a split one after another, so that only one image at a time is in memory at full size."""
-    place, shots = str(data.path), data.select(split)
+    where, shots = str(data.path), data.select(split)
     if not shots:
-        raise InputError(f"split {split!r} has no frames", where=place)
+        raise InputError(f"split {split!r} has no frames", where=where)
     count, views = counter("reading", "images"), list[View]()
     whole = data if largest is None else data.at_most(sys.maxsize)  # the first image's own size is logged
     store, limit = PixelStore(0), 0
@@ -178,22 +178,22 @@ def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path |
                 if small is not view.frame:
                     before, after = (f"{f.intrinsics.width}x{f.intrinsics.height}" for f in (view.frame, small))
                     log.info(
-                        f"{place}: {amount(len(shots), 'image')} of {before} read at {after},"
+                        f"{where}: {amount(len(shots), 'image')} of {before} read at {after},"
                         f" {len(shots) * bytes_of(small) / 1e6:.0f} MB; --largest (largest=) sets another size"
                     )
             views.append(replace(view, frame=store.stored(view.frame.at_most(limit))))
         count(number, len(shots))
     if left_out := len(shots) - len(views):
-        log.info(f"{place}: {amount(left_out, 'image')} left out, being entirely hidden; {INVERTED}")
+        log.info(f"{where}: {amount(left_out, 'image')} left out, being entirely hidden; {INVERTED}")
     if not views:
-        raise InputError(f"masks hide every image in split {split!r} entirely; {INVERTED}", where=place)
+        raise InputError(f"masks hide every image in split {split!r} entirely; {INVERTED}", where=where)
     source, folder = data.path.resolve().name, data.path if data.path.is_dir() else data.path.parent
     files = {shot.name: shot.file for shot in shots if shot.file is not None}
     once = Counter(files.values())
     return ReadViews(
         views,
         source,
-        place,
+        where,
         data.background,
         0,
         data.unit or _unit_of(views),

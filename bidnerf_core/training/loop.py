@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 from torch.autograd.graph import increment_version
 
-from bidnerf_core.devices import captured, graph_memory, without_waiting
+from bidnerf_core.devices import capture_graph, graph_memory, without_waiting
 from bidnerf_core.errors import InputError
 
 
@@ -190,7 +190,7 @@ def fit(
                 seen[key] += 1
                 # Two steps before the capture load kernels and create Adam's moments, which a capture does not allow.
                 if seen[key] > 2 and key not in graphs:
-                    graphs[key] = captured(partial(take, step), device, generator, memory)
+                    graphs[key] = capture_graph(partial(take, step), device, generator, memory)
                 graphs.get(key, partial(take, step))()
         if (step + 1) % every and step + 1 < steps:
             continue

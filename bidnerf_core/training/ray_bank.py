@@ -12,7 +12,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import pad
 
 from bidnerf_core.camera import AT_REST, CameraBatch, Intrinsics, poses_of_rows
-from bidnerf_core.devices import constant, moved
+from bidnerf_core.devices import constant, move_to
 from bidnerf_core.fields import Observations, Rays, SceneBounds
 from bidnerf_core.frames import SPARSE, Frame, ImagePixels, View, bytes_of
 from bidnerf_core.geometry import SE3
@@ -69,7 +69,7 @@ class RayBank:
         self._hidden = ImagePixels.of([frame.hidden for frame in frames], 1, 0.0, home)
         visible = _visible_pixels(frames)
         self._few = self._few_measured(frames, offsets).to(home)
-        self._landmarks = moved(_landmark_pixels(views, offsets), home)
+        self._landmarks = move_to(_landmark_pixels(views, offsets), home)
         self._cameras = _PixelRays([frame.intrinsics for frame in frames], home)
         rotation = torch.stack([view.T_ref_camera.rotation for view in views]).float()
         origin = torch.stack([view.T_ref_camera.translation for view in views]).float()
@@ -77,7 +77,7 @@ class RayBank:
         if any(view.motion is not None for view in views):
             rows = [AT_REST if view.motion is None else view.motion for view in views]
             motion = torch.stack(rows).float()
-        self.offsets, self._visible, self._rotation, self._origin, self._motion = moved(
+        self.offsets, self._visible, self._rotation, self._origin, self._motion = move_to(
             (offsets, visible, rotation, origin, motion), home
         )
         self._drawn = self.count if visible is None else int(visible[-1])
@@ -121,7 +121,7 @@ class RayBank:
         origins, coloured = T.translation, torch.ones_like(index, dtype=torch.bool)
         observed = Observations(origins, directions, rgb, distance, coloured)
         rays = self.bounds.rays(origins, directions)
-        return moved(TrainingBatch(rays, observed, background, view, deviation), self.device)
+        return move_to(TrainingBatch(rays, observed, background, view, deviation), self.device)
 
     def _random(self, below: int, count: int, generator: Generator) -> Int[Tensor, "n"]:
         return torch.randint(below, (count,), generator=generator, device=generator.device).to(self.home)
@@ -169,7 +169,7 @@ class _PixelRays:
         if int(sizes.sum()) <= MOST_RAYS:
             grid = torch.cat([kind.unproject(kind.pixel_centres()).reshape(-1, 3) for kind in kinds])
         kind = torch.tensor([number[camera] for camera in cameras])
-        self._kind, self._size, self._start, self._grid, self._batch = moved(
+        self._kind, self._size, self._start, self._grid, self._batch = move_to(
             (kind, size, sizes.cumsum(0) - sizes, grid, CameraBatch.of(kinds)), device
         )
 

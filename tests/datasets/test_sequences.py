@@ -19,7 +19,7 @@ from bidnerf_core.datasets import (
     Capture,
     DatasetOptions,
     Reader,
-    of_views,
+    capture_of,
     open_dataset,
     open_sequence,
     write_transforms,
@@ -120,7 +120,7 @@ def test_captures_of_other_readers_are_sequences(tmp_path: Path) -> None:
             return True
 
         def read(self, path: Path, options: DatasetOptions) -> Capture:
-            train, test = of_views(views[:2], path, ("train",)), of_views(views[2:], path, ("test",))
+            train, test = capture_of(views[:2], path, ("train",)), capture_of(views[2:], path, ("test",))
             return Capture(path, [*train.shots, *test.shots])
 
     sequence = open_sequence(tmp_path, readers=[Anything()])

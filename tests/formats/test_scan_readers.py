@@ -22,7 +22,7 @@ from bidnerf_core.datasets import (
     open_dataset,
     open_sequence,
 )
-from bidnerf_core.datasets.capture import with_files
+from bidnerf_core.datasets.capture import drop_missing_files
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.maps import read_views
@@ -188,7 +188,7 @@ def test_pictures_need_no_hash(tmp_path: Path) -> None:
 
     shots = [Shot(image=Plain(), stem="a"), Shot(image=tmp_path / "b.png"), Shot(image=Plain(), stem="c")]
     (tmp_path / "b.png").touch()
-    assert len(with_files(Capture(tmp_path, shots))) == 3
+    assert len(drop_missing_files(Capture(tmp_path, shots))) == 3
 
 
 @pytest.mark.parametrize(

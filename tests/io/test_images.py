@@ -24,15 +24,15 @@ from bidnerf_core.frames import as_floats, photos_in
 # Inside: the header of an image alone, and a system that refuses to open a file
 from bidnerf_core.io import (
     IMAGE_SUFFIXES,
+    composite,
     decode,
     files,
-    over,
     pixel_array,
     read_compact_image,
     read_header,
     read_image,
-    reduced,
-    resampled,
+    reduce_image,
+    resample_nearest,
 )
 from bidnerf_core.io.images import ImageHeader
 from photo_files import noise
@@ -221,7 +221,7 @@ def test_strips_give_what_the_whole_image_gives(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr("bidnerf_core.io.images.STRIP", 41 * 7)
     for one, other in zip(before, parts(), strict=True):
         assert one is other is None or torch.equal(one, other)  # type: ignore[arg-type]
-    torch.testing.assert_close(before[2], reduced(before[0], 13, 16))  # type: ignore[arg-type]
+    torch.testing.assert_close(before[2], reduce_image(before[0], 13, 16))  # type: ignore[arg-type]
 
 
 def test_a_large_image_that_is_reduced_takes_little_memory(tmp_path: Path) -> None:
@@ -310,19 +310,19 @@ def test_arrays_that_are_no_images(array: np.ndarray, found: str, expected: str)
 def test_reducing_keeps_means_and_commutes_with_compositing() -> None:
     """An area filter: each new pixel is the mean of a block, and both steps are linear in premultiplied colour."""
     image = torch.from_numpy(noise(12, 20, 4)).float() / 255
-    small = reduced(image, 5, 3)
+    small = reduce_image(image, 5, 3)
     torch.testing.assert_close(small, image.reshape(3, 4, 5, 4, 4).mean((1, 3)))
-    torch.testing.assert_close(reduced(image, 7, 5).mean((0, 1)), image.mean((0, 1)), atol=1e-5, rtol=0)
+    torch.testing.assert_close(reduce_image(image, 7, 5).mean((0, 1)), image.mean((0, 1)), atol=1e-5, rtol=0)
     premultiplied = image[..., :3] * image[..., 3:]
-    expected = reduced(premultiplied, 5, 3) + 0.3 * (1 - small[..., 3:])
-    torch.testing.assert_close(reduced(over(image[..., :3], image[..., 3], (0.3,) * 3), 5, 3), expected)
+    expected = reduce_image(premultiplied, 5, 3) + 0.3 * (1 - small[..., 3:])
+    torch.testing.assert_close(reduce_image(composite(image[..., :3], image[..., 3], (0.3,) * 3), 5, 3), expected)
 
 
 def test_resampling_takes_the_nearest_and_invents_nothing() -> None:
     image = torch.arange(12.0).reshape(3, 4)
-    assert resampled(image, 8, 6).equal(image.repeat_interleave(2, 0).repeat_interleave(2, 1))
-    assert resampled(resampled(image, 12, 9), 4, 3).equal(image)
-    assert set(resampled(image, 7, 5).flatten().tolist()) <= set(image.flatten().tolist())
+    assert resample_nearest(image, 8, 6).equal(image.repeat_interleave(2, 0).repeat_interleave(2, 1))
+    assert resample_nearest(resample_nearest(image, 12, 9), 4, 3).equal(image)
+    assert set(resample_nearest(image, 7, 5).flatten().tolist()) <= set(image.flatten().tolist())
 
 
 def test_threads_that_read_images_leave_warnings_as_they_were(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 import tiny
 
 # Inside: a lock is taken late, as if between two steps of another process; names of temporary files
-from bidnerf_core.io import FileInUse, files, locked, output_folder
+from bidnerf_core.io import FileInUse, files, lock, output_folder
 from bidnerf_core.maps import load_map
 from commands import Run
 
@@ -43,7 +43,7 @@ def test_files_of_others_and_of_whole_maps_are_not_overwritten(bidnerf: Run, sha
 
 
 def test_a_map_that_another_process_writes_is_not_baked(bidnerf: Run, shared: Path, map_folder: Path) -> None:
-    with locked(map_folder):
+    with lock(map_folder):
         status, said, err = bidnerf("bake", map_folder, "--data", shared / "data", *BAKE)
     assert (status, said, err.count("\n")) == (1, "", 1)
     assert "another bidnerf process is writing here" in err
@@ -72,7 +72,7 @@ def test_a_folder_is_not_removed_from_under_another_process(tmp_path: Path, monk
 
 
 def test_a_folder_that_was_removed_has_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(FileInUse), locked(tmp_path / "none"):
+    with pytest.raises(FileInUse), lock(tmp_path / "none"):
         pass
     (tmp_path / "map").mkdir()
     take = files.take_lock
@@ -82,7 +82,7 @@ def test_a_folder_that_was_removed_has_no_lock(tmp_path: Path, monkeypatch: pyte
         return take(number)
 
     monkeypatch.setattr(files, "take_lock", taken_late)
-    with pytest.raises(FileInUse), locked(tmp_path / "map"):
+    with pytest.raises(FileInUse), lock(tmp_path / "map"):
         pass
 
 
@@ -91,15 +91,15 @@ def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
-        with locked(tmp_path):
+        with lock(tmp_path):
             os.write(writing, b"x")
             signal.pause()
     assert os.read(reading, 1) == b"x"
-    with pytest.raises(FileInUse), locked(tmp_path):
+    with pytest.raises(FileInUse), lock(tmp_path):
         pass
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    with locked(tmp_path):
+    with lock(tmp_path):
         pass
     os.close(reading)
     os.close(writing)

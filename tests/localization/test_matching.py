@@ -9,7 +9,7 @@ import torch
 
 from bidnerf import SE3, Frame, Intrinsics, View
 from bidnerf.testing import DEVICE, Elsewhere, unseen
-from bidnerf_core.devices import moved
+from bidnerf_core.devices import move_to
 from bidnerf_core.localization import LandmarkMatcher
 
 # Inside: the matches, of which answers show only the number
@@ -93,7 +93,7 @@ def test_products_in_half_precision_find_the_nearest_but_for_near_ties() -> None
     queries = (landmarks.descriptors[::2].int() + 3).clamp(max=255).byte()
     expected = LandmarkMatcher(landmarks).nearest(queries, 3)
     with Elsewhere() as mode:
-        matcher = LandmarkMatcher(moved(landmarks, DEVICE))
+        matcher = LandmarkMatcher(move_to(landmarks, DEVICE))
         mode.waits.clear()
         distances, index = matcher.nearest(queries, 3)
         assert mode.waits == {"_to_copy": 2}

@@ -15,7 +15,7 @@ from torch import Generator, Tensor
 import baked
 import module_fields
 from bidnerf.testing import DEVICE, DeviceFault, Elsewhere
-from bidnerf_core.devices import moved, without_waiting
+from bidnerf_core.devices import move_to, without_waiting
 from bidnerf_core.fields import RadianceField
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, perturb
@@ -46,7 +46,7 @@ class Place:
 
     def descended(self, terms: list[CostTerm], T: SE3) -> list[Tensor]:
         """Take a step, which fills caches, and two more that are checked, and return all that these lead to."""
-        start, about = moved(states_at(T), self.device), torch.tensor([0.0, 0.0, 3.5]).to(self.device)
+        start, about = move_to(states_at(T), self.device), torch.tensor([0.0, 0.0, 3.5]).to(self.device)
         first, _ = descend(start, terms, 1, about)
         with without_waiting(), self.checked():
             done, normal = descend(first, terms, 2, about)
@@ -65,7 +65,7 @@ def align_points(place: Place) -> list[Tensor]:
 
 def compare_images(place: Place) -> list[Tensor]:
     view = baked.unseen()[0]
-    small = moved(Thumbnail.of(View(view.frame, SE3.identity()), 16), place.device)
+    small = move_to(Thumbnail.of(View(view.frame, SE3.identity()), 16), place.device)
     return place.descended([Images(surface_renderer(place.toy(), None), [small])], near(view))
 
 
@@ -74,7 +74,7 @@ def cast_rays(place: Place) -> list[Tensor]:
     generator, toy = Generator().manual_seed(0), place.toy()
     origins = 3 * torch.nn.functional.normalize(torch.randn((200, 3), generator=generator), dim=-1)
     aims = 0.7 * torch.randn((200, 3), generator=generator)
-    rays = moved((origins, torch.nn.functional.normalize(aims - origins, dim=-1)), place.device)
+    rays = move_to((origins, torch.nn.functional.normalize(aims - origins, dim=-1)), place.device)
     trace(toy, *rays)
     with without_waiting(), place.checked():
         found, distance = cast(toy, *rays), trace(toy, *rays)
@@ -84,7 +84,7 @@ def cast_rays(place: Place) -> list[Tensor]:
 def align_points_and_render(place: Place) -> list[Tensor]:
     """The steps of a refinement: rendered rays beside measured points."""
     (view,) = module_fields.shown(1, seed=5)
-    field: RadianceField = moved(module_fields.field(), place.device)
+    field: RadianceField = move_to(module_fields.field(), place.device)
     there = place.surface(module_fields.surface().to(place.device))
     problem = rig(FieldMap(field, baked.BOUNDS, there), [view], None)
     points = baked.points(view, count=400, surface=there)

@@ -16,7 +16,7 @@ from bidnerf_core.errors import Cancelled
 from bidnerf_core.mapping import BakeConfig
 
 # Inside: the location of new photos alone, without the training that follows
-from bidnerf_core.maps.extending import locate
+from bidnerf_core.maps.extending import localize_new
 from bidnerf_core.progress import job_context
 from commands import Run
 from photo_files import write_photo
@@ -73,10 +73,10 @@ def test_a_photo_that_was_added_under_another_name_is_known(stored: Path) -> Non
     scene, new = bn.load_map(stored), training_views()[7]
     name = scene.info.cameras[0].name
     frame = replace(new.frame, name=name)
-    located = locate(scene, [frame], [])
+    located = localize_new(scene, [frame], [])
     assert [each.frame.name for each in located] == [f"{name}_2"]
     info = replace(scene.info, cameras=(*scene.info.cameras, *stored_cameras(located)))
-    assert locate(replace(scene, info=info), [frame], []) == []
+    assert localize_new(replace(scene, info=info), [frame], []) == []
 
 
 def test_another_scene_is_refused(map_folder: Path) -> None:
@@ -93,7 +93,7 @@ def test_photos_found_too_imprecisely_are_not_called_another_scene(
     solved = bn.Localizer.solved
     monkeypatch.setattr(bn.Localizer, "solved", lambda *given: replace(solved(*given), outcome=bn.Outcome.IMPRECISE))
     with refused(found="localizes 0 of 1 photo, and 1 more, but too imprecisely", expected="from as near"):
-        locate(bn.load_map(stored), [training_views()[7].frame], [])
+        localize_new(bn.load_map(stored), [training_views()[7].frame], [])
 
 
 def test_a_cancelled_extension_leaves_the_map(map_folder: Path) -> None:

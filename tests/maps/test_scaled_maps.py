@@ -15,11 +15,11 @@ from bidnerf.results import read_positions
 from bidnerf.testing import BOUNDS, CAMERA, textured_map, unseen
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.fields import levels
-from bidnerf_core.io import FileInUse, locked
+from bidnerf_core.io import FileInUse, lock
 
 # Inside: the place of a map by its name
 from bidnerf_core.maps import Anchor, Map, MapInfo, factor_of_distance, factor_of_poses, load_info
-from bidnerf_core.maps.known_lengths import place_of
+from bidnerf_core.maps.known_lengths import locate_point
 from commands import Run
 from refusals import refused
 
@@ -88,7 +88,7 @@ def test_a_known_length_gives_the_factor(ground: Map) -> None:
         assert instead in caught.error.found
     assert factor_of_distance(ground, "c0.png", "c1.JPG", 2.8284271247) == pytest.approx(2)
     file, name = f"c0.png@{0.25 * CAMERA.width},1", f"c0@{0.25 * CAMERA.width},1"
-    assert torch.equal(place_of(ground, file), place_of(ground, name))
+    assert torch.equal(locate_point(ground, file), locate_point(ground, name))
 
 
 def test_known_poses_give_the_factor(ground: Map) -> None:
@@ -173,7 +173,7 @@ def test_a_map_that_is_being_changed_is_not_read(bidnerf: Run, tmp_path: Path, m
     refused, read = list[str](), bn.load_map
 
     def load(folder: Path) -> Map:
-        with pytest.raises(FileInUse) as found, locked(folder):
+        with pytest.raises(FileInUse) as found, lock(folder):
             pass
         refused.append(str(found.value))
         return read(folder)

@@ -36,8 +36,8 @@ from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps import ImportedField, ImportOptions
 
 # Inside: where a map's own coordinates begin, and what the names of its places mean
-from bidnerf_core.maps.known_lengths import place_of
-from bidnerf_core.maps.views import chosen_origin
+from bidnerf_core.maps.known_lengths import locate_point
+from bidnerf_core.maps.views import choose_origin
 from bidnerf_core.progress import Progress
 from bidnerf_core.registry import registered
 
@@ -77,10 +77,10 @@ def queries() -> list[Frame]:
 
 def test_only_scenes_far_from_the_origin_are_recentred() -> None:
     cube = torch.tensor([[0.0, 0, 0], [2, 2, 2]], dtype=torch.float64)
-    assert chosen_origin(cube + OFFSET) == ORIGIN
-    assert chosen_origin(cube + 900) == (0, 0, 0)  # single precision suffices
-    assert chosen_origin(1e6 * cube) == (0, 0, 0)  # the scene is as large as it is far away
-    assert chosen_origin(cube[:1] + OFFSET) == ORIGIN
+    assert choose_origin(cube + OFFSET) == ORIGIN
+    assert choose_origin(cube + 900) == (0, 0, 0)  # single precision suffices
+    assert choose_origin(1e6 * cube) == (0, 0, 0)  # the scene is as large as it is far away
+    assert choose_origin(cube[:1] + OFFSET) == ORIGIN
 
 
 def test_the_map_is_the_same_but_for_its_origin() -> None:
@@ -162,9 +162,9 @@ def test_scaling_scales_the_origin() -> None:
     twice = far().scaled(2.0)
     assert twice.origin == tuple(2 * x for x in ORIGIN)
     name = far().info.cameras[0].name
-    assert torch.allclose(place_of(twice, name), 2 * place_of(far(), name))
+    assert torch.allclose(locate_point(twice, name), 2 * locate_point(far(), name))
     place = shifted(training_views())[0].T_ref_camera.translation
-    assert torch.allclose(place_of(far(), name), place, rtol=0, atol=1e-6)
+    assert torch.allclose(locate_point(far(), name), place, rtol=0, atol=1e-6)
 
 
 def test_a_dataset_is_trained_interrupted_resumed_and_baked(tmp_path: Path) -> None:

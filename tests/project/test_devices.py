@@ -18,7 +18,7 @@ from bidnerf import Localizer, Map
 from bidnerf.scenes import HomogeneousBall
 from bidnerf.testing import DEVICE, Elsewhere, textured_map
 from bidnerf_core.backend import load_backend
-from bidnerf_core.devices import Resident, may_wait, moved, run_on
+from bidnerf_core.devices import Resident, may_wait, move_to, run_on
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.mapping import LandmarkMap
@@ -128,7 +128,7 @@ def nested() -> Nested:
 def test_tensors_move_wherever_they_are_held() -> None:
     here = nested()
     with Elsewhere():
-        there = moved(here, DEVICE)
+        there = move_to(here, DEVICE)
         assert elsewhere_of(there, DEVICE) == []
         assert sum(1 for _ in tensors_in(there)) == 5
     assert elsewhere_of(here, CPU) == []
@@ -151,7 +151,7 @@ def test_functions_run_elsewhere_with_one_copy_there_and_one_back() -> None:
     calls = [(given, table, torch.tensor([k, 1, 0]).int(), 0.5) for k in range(3)]
     expected = [looked_up(*call) for call in calls]
     with Elsewhere() as mode:
-        there = moved(table, DEVICE)
+        there = move_to(table, DEVICE)
         mode.waits.clear()
         found = [run_on(DEVICE, looked_up, call[0], there, *call[2:]) for call in calls]
         assert mode.waits == {"copy_": 3, "_to_copy": 3}
@@ -174,7 +174,7 @@ def test_neither_a_capture_nor_a_call_may_wait(monkeypatch: pytest.MonkeyPatch) 
         waits.append(may_wait(values.device))
         return 2 * values
 
-    monkeypatch.setattr("bidnerf_core.devices.captured", noted)
+    monkeypatch.setattr("bidnerf_core.devices.capture_graph", noted)
     with Elsewhere():
         assert [float(run_on(DEVICE, doubled, torch.tensor(k))) for k in (1.0, 2.0, 3.0)] == [2, 4, 6]
     assert waits == [False] * 5  # one of them before the capture, and one in it

@@ -40,7 +40,7 @@ from bidnerf_core.datasets import lacks_poses, write_transforms
 from bidnerf_core.geometry import fit_similarity, look_at
 
 # Inside: each stage of the search for poses, with its rare geometry
-from bidnerf_core.maps.training import posed_images, poses_folder
+from bidnerf_core.maps.training import open_posed_images, poses_folder
 from commands import Run
 from photo_files import write_photo
 from photo_room import CAMERA, photograph, walk, write_photos
@@ -183,7 +183,7 @@ def test_train_takes_photos_without_poses(search: Search, bidnerf: Run, caplog: 
         assert len(bn.load_map(out).info.cameras) == PLACED
         with (
             caplog.at_level("INFO", "bidnerf"),
-            posed_images(search.photos, bn.DatasetOptions(), out) as (data, _),
+            open_posed_images(search.photos, bn.DatasetOptions(), out) as (data, _),
         ):
             assert data == beside
         assert "1 photo of 6 is held out" in caplog.text

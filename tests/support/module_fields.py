@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 import baked
 from bidnerf.scenes import GaussianBlobs, orbit
-from bidnerf_core.devices import moved
+from bidnerf_core.devices import move_to
 from bidnerf_core.fields import FieldValues, RaySampler, render_image
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.mapping import SurfaceMap, bake
@@ -33,7 +33,7 @@ class AsModule(nn.Module):
 
     def _apply(self, *args: Any, **options: Any) -> AsModule:
         super()._apply(*args, **options)
-        self.closed_form = moved(self.closed_form, self.place.device)
+        self.closed_form = move_to(self.closed_form, self.place.device)
         return self
 
 

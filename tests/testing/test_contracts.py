@@ -29,7 +29,7 @@ from bidnerf_core.datasets import (
     DatasetOptions,
     Poser,
     Reader,
-    of_views,
+    capture_of,
     photos_below,
     write_transforms,
 )
@@ -107,7 +107,7 @@ class Converting(Reader):
 
     def read(self, path: Path, options: DatasetOptions) -> Capture:
         capture = options.open(path, [READERS["transforms"]])
-        mistaken = of_views([self.mistake(view) for view in capture.views("train")], path, ("train",))
+        mistaken = capture_of([self.mistake(view) for view in capture.views("train")], path, ("train",))
         return replace(mistaken, background=capture.background)
 
 

@@ -19,7 +19,7 @@ from bidnerf.testing import SCENE_BOUNDS as BOUNDS
 from bidnerf.testing import rgbd_views, textured_map, unseen
 from bidnerf_core import devices
 from bidnerf_core.backend import load_backend, quick_config
-from bidnerf_core.devices import captured, constant
+from bidnerf_core.devices import capture_graph, constant
 from bidnerf_core.fields import FieldValues, SceneBounds, device_of, levels, render_image
 from bidnerf_core.geometry import perturb
 from bidnerf_core.localization import settings_of
@@ -62,11 +62,11 @@ def captures(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     found: list[bool] = []
 
     def noted(step: Any, *rest: Any) -> Any:
-        replay = captured(step, *rest)
+        replay = capture_graph(step, *rest)
         found.append(replay is not step)
         return replay
 
-    monkeypatch.setattr("bidnerf_core.localization.adam.captured", noted)
+    monkeypatch.setattr("bidnerf_core.localization.adam.capture_graph", noted)
     return found
 
 
@@ -79,7 +79,7 @@ def test_replayed_steps_are_those_that_are_launched(
     field = backend.build(backend.config_type(), BOUNDS)
     replayed = descent(field, BOUNDS, method)
     assert captures == [True]
-    monkeypatch.setattr("bidnerf_core.localization.adam.captured", lambda step, *_: step)
+    monkeypatch.setattr("bidnerf_core.localization.adam.capture_graph", lambda step, *_: step)
     launched = descent(field, BOUNDS, method)
     assert len(replayed) == len(launched) == 51
     torch.testing.assert_close(replayed, launched, rtol=0, atol=1e-4)
@@ -94,7 +94,7 @@ def test_a_captured_step_keeps_the_constants_that_it_reads(captures: list[bool])
         step_result.copy_(start + constant((1.25, -2.5, 3.75), start))
 
     step()
-    replay = captured(step, device, torch.Generator(device))
+    replay = capture_graph(step, device, torch.Generator(device))
     devices.forget()
     _ = [torch.full((3,), -1.0, device=device) for _ in range(1000)]  # would take its place
     step_result.zero_()
@@ -122,11 +122,11 @@ def test_queries_have_the_answers_of_the_cpu_and_replay_graphs(monkeypatch: pyte
     frames = [unseen().frame, unseen().frame.replace(depth=None)]
 
     def noted(step: Any, *rest: Any, **more: Any) -> Any:
-        replay = captured(step, *rest, **more)
+        replay = capture_graph(step, *rest, **more)
         replayed.append(replay is not step)
         return replay
 
-    monkeypatch.setattr("bidnerf_core.devices.captured", noted)
+    monkeypatch.setattr("bidnerf_core.devices.capture_graph", noted)
     expected, there = [Localizer(scene)(frame) for frame in frames], Localizer(scene, device="cuda")
     for _ in range(3):
         found = [there(frame) for frame in frames]
@@ -184,7 +184,7 @@ def test_training_on_a_gpu_replays_its_steps_and_learns_what_it_learns_on_a_cpu(
     config = replace(quick_config(backend), steps=60)
 
     def noted(step: Any, *rest: Any) -> Any:
-        replay = captured(step, *rest)
+        replay = capture_graph(step, *rest)
         replayed.append(replay is not step)
         return replay
 
@@ -192,7 +192,7 @@ def test_training_on_a_gpu_replays_its_steps_and_learns_what_it_learns_on_a_cpu(
         return step
 
     for device, capture in (("cpu", launched), ("cuda", launched), ("cuda", noted)):
-        monkeypatch.setattr("bidnerf_core.training.loop.captured", capture)
+        monkeypatch.setattr("bidnerf_core.training.loop.capture_graph", capture)
         torch.manual_seed(0)
         field: Any = backend.build(config, BOUNDS)
         report = LossRecorder()

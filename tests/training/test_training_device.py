@@ -15,7 +15,7 @@ import torch
 import tiny
 from bidnerf.testing import DEVICE, Elsewhere
 from bidnerf_core.carving import estimate_bounds
-from bidnerf_core.devices import moved
+from bidnerf_core.devices import move_to
 from bidnerf_core.fields import RaySamples, query_packed, query_samples
 from bidnerf_core.frames import View
 from bidnerf_core.training import RayBank, TrainingStopped, ray_bank
@@ -47,7 +47,7 @@ def elsewhere(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
 
             return replay
 
-        monkeypatch.setattr("bidnerf_core.training.loop.captured", captured)
+        monkeypatch.setattr("bidnerf_core.training.loop.capture_graph", captured)
         yield replays
 
 
@@ -59,7 +59,7 @@ def trained(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         field: Any = backend.build(config, BOUNDS)
-    field = moved(field, device)
+    field = move_to(field, device)
     backend.train(field, views, config, report)
     return field
 

@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import get_args
 
 from bidnerf_core.camera import Camera, CameraSource, PanoramaFace, same_aspect
-from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, remark
+from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, warn_about
 from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames
 from bidnerf_core.datasets.formats.transforms_json import SPLIT_FILES, FrameRecord, read_splits
 from bidnerf_core.datasets.reader import DatasetOptions, Format
@@ -103,7 +103,7 @@ def _check_images(folder: Path, frames: Sequence[FrameRecord], images: Sequence[
         if not remarked and is_file(image) and not str(image).startswith(str(folder / written)):
             remarked = True
             text = f"file_path {written!r} is taken for {image.relative_to(folder)}, and others likewise"
-            remark(folder, text)
+            warn_about(folder, text)
 
 
 def _camera(frame: FrameRecord, size: tuple[int, int] | None) -> Camera | CameraSource:
@@ -123,7 +123,7 @@ def _first_size(frames: Sequence[FrameRecord], images: Sequence[Path]) -> tuple[
         given = frame.camera.width or size[0], frame.camera.height or size[1]
         if given != size and same_aspect(given, size):
             expected = f"w and h are {given[0]}x{given[1]}; cameras are scaled to the images"
-            remark(frame.record.where, f"{image.name} is {size[0]}x{size[1]}, but {expected}")
+            warn_about(frame.record.where, f"{image.name} is {size[0]}x{size[1]}, but {expected}")
         return size
     return None
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bidnerf_core.camera import CameraRecord, camera_record
-from bidnerf_core.datasets.capture import SPLITS, remark
+from bidnerf_core.datasets.capture import SPLITS, warn_about
 from bidnerf_core.datasets.file_names import posix_name
 from bidnerf_core.datasets.formats.photos import timestamp
 from bidnerf_core.datasets.pose_rows import pose_and_scale
@@ -70,7 +70,7 @@ def read_splits(path: Path) -> list[tuple[FrameRecord, tuple[str, ...]]]:
         found = f"{split}_filenames and the other lists have {count} that no frame has, the first of them {first!r}"
         if not splits:
             raise record.error(found, expected=f"the file_path of one of its {len(by_path)} frames")
-        remark(record.where, found)
+        warn_about(record.where, found)
     return list(splits.items())
 
 
@@ -89,7 +89,7 @@ def read_frames(file: Record) -> list[FrameRecord]:
         found = (
             f"{count} of {amount(len(entries), 'frame')} have no pose (transform_matrix is missing, zero or not finite)"
         )
-        remark(file.where, f"{found} and are left out, first: {first}")
+        warn_about(file.where, f"{found} and are left out, first: {first}")
     all_are = len(unposed) == len(entries)  # an error, raised when the first frame is read
     frames = [_frame(file, n, entry) for n, entry in enumerate(entries) if all_are or n not in unposed]
     seen: dict[tuple[str, ...], int] = {}
@@ -101,7 +101,7 @@ def read_frames(file: Record) -> list[FrameRecord]:
         whose = "all" if len(scaled) == len(frames) else f"{len(scaled)} of"
         first = f"frame {scaled[0].file_path}: {scaled[0].scale:.6g}"
         found = f"{whose} {len(frames)} matrices have a scale ({first}), which is removed"
-        remark(file.where, f"{found}; the positions of the cameras are those of the matrices")
+        warn_about(file.where, f"{found}; the positions of the cameras are those of the matrices")
     return frames
 
 

@@ -30,7 +30,7 @@ from pathlib import Path
 import numpy as np
 
 from bidnerf_core.camera import Camera, Intrinsics, folder_camera
-from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, remark
+from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, warn_about
 from bidnerf_core.datasets.file_names import FileNames
 from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
 from bidnerf_core.datasets.trajectories import (
@@ -72,7 +72,7 @@ def _read(path: Path, colour_list: Path, options: DatasetOptions) -> Capture:
     measured = [(row.time, _file(row, names)) for row in read_timed_files(depth_list)] if is_file(depth_list) else []
     depths = [(time, file) for time, file in measured if is_file(file)]
     if lost := len(measured) - len(depths):
-        remark(depth_list, f"{lost} of {amount(len(measured), 'depth image')} are missing and left out")
+        warn_about(depth_list, f"{lost} of {amount(len(measured), 'depth image')} are missing and left out")
     # Only existing files are associated: an image whose nearest depth image is missing may belong to the next one.
     there = [index for index, image in enumerate(images) if is_file(image)]
     partners = associate([times[index] for index in there], [time for time, _ in depths], 0.02)  # as in the benchmark

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, normalize, pad
 
-from bidnerf_core.devices import moved
+from bidnerf_core.devices import move_to
 from bidnerf_core.fields import Observations, RadianceField, SceneBounds, device_of, render
 from bidnerf_core.frames import Frame, View, inpaint
 from bidnerf_core.geometry import Robust
@@ -100,14 +100,14 @@ class RenderedRays:
             )
         image, times, R, t, rgb, coloured, depth = (torch.cat(part) for part in zip(*parts, strict=True))
         seen = Sights(image, times, R, t, single=len(views) == 1 and depth_rays is None)
-        measured = moved((seen, rgb, coloured, depth), device or device_of(field))
+        measured = move_to((seen, rgb, coloured, depth), device or device_of(field))
         return RenderedRays(field, bounds, *measured)
 
     def __len__(self) -> int:
         return len(self.rgb)
 
     def __call__(self, states: States) -> Normal:
-        return moved(self.at(moved(states, self.rgb.device)).normal(), states.z.device)
+        return move_to(self.at(move_to(states, self.rgb.device)).normal(), states.z.device)
 
     def at(self, states: States, derivatives: bool = True) -> ComparedRays:
         """Render the rays at ``states``, which are on the field's device, and compare them with the measurements."""
@@ -121,12 +121,12 @@ class RenderedRays:
 
     def costs(self, states: States) -> Float[Tensor, "h n"]:
         """Return each ray's robust loss, divided by the variance of the noise, without derivatives."""
-        found = self.at(moved(states, self.rgb.device), derivatives=False)
+        found = self.at(move_to(states, self.rgb.device), derivatives=False)
         return (self._robust(found.value)[0] / self.noise**2).to(states.z.device)
 
     def agreement(self, states: States) -> Float[Tensor, "h"]:
         """Return the fraction of the rays whose colours and distances agree with the rendering."""
-        return self.at(moved(states, self.rgb.device), derivatives=False).agreement().to(states.z.device)
+        return self.at(move_to(states, self.rgb.device), derivatives=False).agreement().to(states.z.device)
 
     def plain_costs(self) -> Float[Tensor, "n"] | None:
         """Return each ray's ``costs``, on the CPU, as if all rays had been rendered in the single colour that fits best.
@@ -142,7 +142,7 @@ class RenderedRays:
 
     def fitted(self, states: States) -> RenderedRays:
         """Return the term with its noise estimated from the scatter of the rays' gradients at the first state."""
-        return replace(self, noise=self.at(moved(states[:1], self.rgb.device)).fitted_noise())
+        return replace(self, noise=self.at(move_to(states[:1], self.rgb.device)).fitted_noise())
 
     @property
     def _depth_unit(self) -> float:

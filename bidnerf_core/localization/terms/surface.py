@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera import exposure_times
-from bidnerf_core.devices import moved
+from bidnerf_core.devices import move_to
 from bidnerf_core.fields import Observations
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import MAD_TO_SIGMA, inlier_weight
@@ -102,7 +102,7 @@ class Surface:
             return None
         order = torch.randperm(total, generator=generator)
         image, times, R, t, z, fixed, rgb, coloured = (torch.cat(part)[order] for part in zip(*parts, strict=True))
-        measured = moved((Sights(image, times, R, t), z, fixed, rgb, coloured), device or surface.device)
+        measured = move_to((Sights(image, times, R, t), z, fixed, rgb, coloured), device or surface.device)
         return Surface(surface, *measured, noise=2 * surface.cell)
 
     def __len__(self) -> int:
@@ -127,7 +127,7 @@ class Surface:
         return self.sights.translation
 
     def __call__(self, states: States) -> Normal:
-        here = moved(states, self.surface.device)
+        here = move_to(states, self.surface.device)
         r, squared, normal, index, along, local, rays = self._offsets(here)
         # Geman-McClure: points of an occluder have almost no influence
         inlier = inlier_weight(squared, 2 * self.noise)
@@ -147,14 +147,14 @@ class Surface:
         rows = self._rows(here, slopes, local, rays).flatten(1, 2)
         weighted = (rows * weights.flatten(1)[..., None]).mT
         gradient = (weighted @ residuals.flatten(1)[..., None])[..., 0]
-        return moved(Normal(cost, gradient, weighted @ rows), states.z.device)
+        return move_to(Normal(cost, gradient, weighted @ rows), states.z.device)
 
     def inliers(self, states: States) -> tuple[Float[Tensor, "h n"], Float[Tensor, "h n"]]:
         """Return each point's inlier weights by distance and by colour."""
-        here = moved(states, self.surface.device)
+        here = move_to(states, self.surface.device)
         _, squared, _, index, along, *_ = self._offsets(here)
         found = inlier_weight(squared, 2 * self.noise), self._alike(self._colours(index, along)[0])
-        return moved(found, states.z.device)
+        return move_to(found, states.z.device)
 
     def costs(self, states: States) -> Float[Tensor, "h n"]:
         """Return each point's cost, from 0 to 1 plus the colour weight."""
@@ -163,7 +163,7 @@ class Surface:
 
     def fitted_noise(self, states: States) -> Surface:
         """Return the term with the noise estimated from the points at the first state."""
-        r = self._offsets(moved(states[:1], self.surface.device))[0].abs()
+        r = self._offsets(move_to(states[:1], self.surface.device))[0].abs()
         found = (MAD_TO_SIGMA * r.median()).clamp(min=0.25 * self.surface.cell)
         return replace(self, noise=found.clamp(max=3 * self.noise))
 
@@ -172,7 +172,7 @@ class Surface:
 
         The colours are left unchanged if the conversion makes hardly any more points match the surface's colour.
         """
-        here = moved(states[:1], self.surface.device)
+        here = move_to(states[:1], self.surface.device)
         _, squared, _, index, along, *_ = self._offsets(here)
         difference, near = self._colours(index, along)[0], inlier_weight(squared, 2 * self.noise)
         known = (near * self.coloured)[..., None].float()

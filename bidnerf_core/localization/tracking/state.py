@@ -20,7 +20,7 @@ from bidnerf_core.io import (
     TensorKind,
     check_tensors,
     from_plain,
-    packed,
+    pack_tensors,
     parse_json,
     read_tensors_and_metadata,
     to_plain,
@@ -96,7 +96,7 @@ def save_state(path: Path, state: TrackerState, key: str) -> None:
     tensors: dict[str, Tensor] = {}
     numbers = to_plain(state, tensors=tensors)
     content = {"format": STATE_FORMAT, "version": STATE_VERSION, "map": key, "state": numbers}
-    write_file(path, tensors_to_bytes(packed(tensors), {"bidnerf": json.dumps(content, allow_nan=False)}))
+    write_file(path, tensors_to_bytes(pack_tensors(tensors), {"bidnerf": json.dumps(content, allow_nan=False)}))
 
 
 def load_tracker_state(path: Path, key: str) -> TrackerState:

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.devices import moved, working_device
+from bidnerf_core.devices import move_to, working_device
 from bidnerf_core.geometry import KEYPOINTS_PER_INDEPENDENT, SE3
 from bidnerf_core.mapping.landmarks.descriptors import unrelated_distance
 from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
@@ -194,7 +194,7 @@ class LandmarkMap:
         Only descriptor matching runs on that device. Keypoint detection, RANSAC and resection run on the CPU (OpenCV, poselib,
         scipy), so ``LandmarkMatcher`` also keeps the landmarks in CPU memory.
         """
-        return moved(self, working_device(device))
+        return move_to(self, working_device(device))
 
     def correlation_of(self, matches: int) -> float:
         """Return how many keypoints amount to one independent measurement in an image with ``matches`` matched keypoints.

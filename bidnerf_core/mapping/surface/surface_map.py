@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from bidnerf_core.devices import Resident, constant, may_wait, moved, working_device
+from bidnerf_core.devices import Resident, constant, may_wait, move_to, working_device
 from bidnerf_core.fields import VoxelGrid
 from bidnerf_core.geometry import scale_point
 from bidnerf_core.mapping.surface.surfel_index import SurfelIndex, index_bytes
@@ -91,7 +91,7 @@ class SurfaceMap(Resident):
 
     def to(self, device: torch.device | str) -> SurfaceMap:
         """Return the surface on another device; ``self`` if it is already there."""
-        return moved(self, working_device(device))
+        return move_to(self, working_device(device))
 
     @property
     def grid(self) -> VoxelGrid:

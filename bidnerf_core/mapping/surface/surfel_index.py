@@ -18,7 +18,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from bidnerf_core.devices import moved
+from bidnerf_core.devices import move_to
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import VoxelGrid
 
@@ -99,7 +99,7 @@ class SurfelIndex:
         offset = 1 - torch.tensor(self.grid.lower, dtype=torch.float64) / self.grid.cell
         base = longest * torch.arange(3, dtype=torch.int32)[:, None]
         tables = offset.float()[:, None], rate, torch.cat(parts).int(), base
-        return moved(tables, self.entries.device)
+        return move_to(tables, self.entries.device)
 
     @cached_property
     def _blocks(self) -> tuple[Int[Tensor, "b"], Int[Tensor, "b"]]:

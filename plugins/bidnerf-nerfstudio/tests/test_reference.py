@@ -16,7 +16,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import FieldValues, levels, render
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import to_plain
-from bidnerf_core.maps import UNMOVED, MapInfo, frozen_field
+from bidnerf_core.maps import UNMOVED, MapInfo, build_frozen_field
 from bidnerf_nerfstudio.importer import ImportSettings, importer
 from bidnerf_nerfstudio.placement import inverse
 from stored_runs import RUNS, RunOf
@@ -33,7 +33,7 @@ def imported(folder: Path) -> Map:
     """Return a map of a run without its cameras, which would be looked for in free space."""
     found = importer.read(folder, ImportSettings(), UNMOVED)
     info = MapInfo(found.backend, to_plain(found.config), found.bounds, found.steps, True, folder.name)
-    return Map(info, frozen_field(info, found.tensors, None))
+    return Map(info, build_frozen_field(info, found.tensors, None))
 
 
 def at_points(scene: Map, expected: dict[str, Tensor]) -> FieldValues:
