@@ -274,11 +274,11 @@ def _fields_type(kind: Any) -> Any:
     from pydantic import InstanceOf
     from typing_extensions import TypedDict
 
-    hints = typing.get_type_hints(kind, include_extras=True)
-    fields = {field.name: hints[field.name] for field in dataclasses.fields(kind)}
-    own = {
-        name: cast(Any, InstanceOf)[hint] if dataclasses.is_dataclass(hint) else hint for name, hint in fields.items()
+    hints, plain = typing.get_type_hints(kind, include_extras=True), typing.get_type_hints(kind)
+    types = {
+        name: cast(Any, InstanceOf)[of] if dataclasses.is_dataclass(of) else hints[name] for name, of in plain.items()
     }
+    own = {field.name: types[field.name] for field in dataclasses.fields(kind)}
     return cast(Any, TypedDict)(kind.__name__, own)
 
 
