@@ -168,8 +168,7 @@ def run_on(device: torch.device, function: Callable[..., T], *values: Any) -> T:
         lane.remotes.move_to_end(key)
         while len(lane.remotes) > 128:  # functions of different shapes; the least recently used is discarded
             lane.remotes.popitem(last=False)
-        found: T = lane.remotes[key](tensors)
-        return found
+        return cast(T, lane.remotes[key](tensors))
     finally:
         with _sharing:
             free.append(lane)
@@ -294,8 +293,7 @@ def move_to(value: T, device: torch.device | str) -> T:
         tensors = (*part.parameters(), *part.buffers())
         return part if all(_is_on(t, there) for t in tensors) else copy.deepcopy(part).to(there)
 
-    found: T = _map_parts(value, change, (nn.Module,))
-    return found
+    return cast(T, _map_parts(value, change, (nn.Module,)))
 
 
 def _map_parts(value: Any, change: Callable[[Any], Any], whole: tuple[type, ...]) -> Any:

@@ -258,8 +258,7 @@ class Plugins(Mapping[str, Plugin], Generic[Plugin]):
 
     def load(self, name: str, wanted_by: str = "") -> Plugin:
         """Import the plugin called ``name``, check it, and return it, see ``load_plugin``."""
-        found: Plugin = load_plugin(self._group, name, self._defects, wanted_by)
-        return found
+        return cast(Plugin, load_plugin(self._group, name, self._defects, wanted_by))
 
     def __iter__(self) -> Iterator[str]:
         ranks = {name: rank for rank, name in enumerate(self._first)}

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass
 from numbers import Real
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast
@@ -28,11 +28,8 @@ LARGEST_SEED = 2**31 - 1
 """Largest seed that commands and requests accept; every language represents it exactly. Python functions accept larger ones."""
 
 
-class Allowed:
+class Allowed(Container[object]):
     """An annotation that limits a setting to the values in it; ``str()`` describes them for messages and help pages."""
-
-    def __contains__(self, value: object) -> bool:
-        raise NotImplementedError
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         """Return pydantic's validator of the annotated type, followed by the check that the value is allowed."""

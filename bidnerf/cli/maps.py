@@ -144,7 +144,7 @@ def run_scale(
         elif distance is not None:
             factor = factor_of_distance(scene, first, second, metres)
         assert factor is not None
-        stored = scene.scaled(factor).stored_in(out or map)
+        stored = scene.scaled(factor).write_to(out or map)
     sides = " x ".join(f"{side:.3g}" for side in stored.bounds.size)
     show(f"{out or map}: all lengths multiplied by {factor:.6g}; the scene is now in metres, in a box of {sides}")
 

@@ -305,7 +305,7 @@ def list_trials(plan: Plan, map: str, data: str, dataset: Capture) -> list[Trial
             elsewhere = describe_other_split(name, others) or f"no frame {name!r}"
             raise InputError(f"split {split!r}: {elsewhere}", where=data)
     chosen = names if plan.frames is None else [name for name in names if name in plan.frames]
-    hidden = {*dataset.wholly_hidden(split)}.intersection(chosen)
+    hidden = {*dataset.hidden_frames(split)}.intersection(chosen)
     visible = [name for name in chosen if name not in hidden]
     if hidden:
         where, shown = plan.images.masks or data, [name for name in chosen if name in hidden]

@@ -213,7 +213,7 @@ def open_data(data: DataSource, options: DatasetOptions, stored: Map | None = No
     usual = replace(options, camera=None, register_depth=None, depth_unit=None, largest=None)
     if superfluous := [name for name, value in vars(options).items() if value != getattr(usual, name)]:
         raise InputError(f"has its own cameras and depth; leave out {enumeration(superfluous)}", where=capture.path)
-    return capture if options.mask_folder is None else capture.masked(options.mask_folder)
+    return capture if options.mask_folder is None else capture.with_masks(options.mask_folder)
 
 
 def open_scene(source: MapSource, data: DataSource, setup: Setup = USUAL) -> Scene:

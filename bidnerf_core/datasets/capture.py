@@ -293,7 +293,7 @@ class Capture:
             return replace(self, shots=[replace(shot, time=None) for shot in shots])
         return replace(self, shots=sorted(shots, key=lambda shot: shot.time or 0.0))
 
-    def masked(self, folder: MaskFolder, by_stem: bool = False) -> Capture:
+    def with_masks(self, folder: MaskFolder, by_stem: bool = False) -> Capture:
         """Return the frames with the masks in a folder applied; with ``by_stem``, masks are matched regardless of folders.
 
         Raises ``InputError`` if no frame has a mask with a matching name.
@@ -361,7 +361,7 @@ class Capture:
                     raise
         return views
 
-    def wholly_hidden(self, split: str) -> list[str]:
+    def hidden_frames(self, split: str) -> list[str]:
         """Return the frames of a split that are entirely hidden by a mask; only masks are read."""
         return [
             shot.name

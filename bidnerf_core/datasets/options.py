@@ -144,3 +144,7 @@ class DatasetOptions:
         if register is False:
             return None
         return register if isinstance(register, DepthCamera) else DepthCamera.read(Path(register))
+
+
+AS_STORED = DatasetOptions()
+"""The options for images of split "train" as the dataset stores them."""

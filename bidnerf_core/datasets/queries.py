@@ -15,6 +15,7 @@ import torch
 from bidnerf_core.datasets.capture import Capture
 from bidnerf_core.datasets.colmap import SparsePoints
 from bidnerf_core.datasets.formats.photos import PhotoShot
+from bidnerf_core.datasets.options import AS_STORED
 from bidnerf_core.datasets.reader import DatasetOptions, file_of_dataset, no_dataset
 from bidnerf_core.errors import InputError, InputWarning, UsageError, amount
 from bidnerf_core.fields import Observations
@@ -25,7 +26,6 @@ from bidnerf_core.localization import window as windowed
 
 log = logging.getLogger("bidnerf")
 
-AS_STORED = DatasetOptions()
 EXPECTED_POINTS = "n rows of x, y, z in metres"
 
 
@@ -145,7 +145,7 @@ class Photos:
         ]
         self.capture = Capture(Path("photos"), shots, options.colour)
         if (masks := options.mask_folder) is not None:
-            self.capture = self.capture.masked(masks, by_stem=True)
+            self.capture = self.capture.with_masks(masks, by_stem=True)
 
     @property
     def names(self) -> Sequence[str]:

@@ -106,7 +106,7 @@ def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
             warn_about(path, f"the dataset has {sum(posed)} of {amount(len(posed), 'frame')}, {rate}")
     faces = [replace(face, name="") for shot in shots for face in shot.faces()]
     found = replace(found, shots=faces, largest=options.largest)
-    return found if (masks := options.mask_folder) is None else found.masked(masks)
+    return found if (masks := options.mask_folder) is None else found.with_masks(masks)
 
 
 def open_dataset(

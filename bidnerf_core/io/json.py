@@ -108,12 +108,10 @@ class Record:
         return None if found is None else int(found)
 
     def text(self, key: str) -> str | None:
-        found: str | None = self._of_type(key, str, "text")
-        return found
+        return cast(str | None, self._of_type(key, str, "text"))
 
     def items(self, key: str) -> list[Any] | None:
-        found: list[Any] | None = self._of_type(key, list, "a list")
-        return found
+        return cast(list[Any] | None, self._of_type(key, list, "a list"))
 
     def _of_type(self, key: str, kind: type, expected: str) -> Any:
         found = self.value(key)
@@ -247,8 +245,7 @@ def from_plain(kind: type[_T], value: Any, where: str) -> _T:
         raise _first_error(error.errors(include_url=False), where, kind, value) from None
     except (TypeError, OverflowError) as error:  # raised by a dataclass itself
         raise InputError(error, where=where) from error
-    found: _T = rows[0]
-    return found
+    return cast(_T, rows[0])
 
 
 def check_fields(instance: Any) -> None:

@@ -101,14 +101,14 @@ class MapCollection:
         self.method, self.config, self.limit = method, config, limit
         self._maps = _maps_by_name(scenes)
         self._given_localizers = localizers or {}
-        self._localizer = functools.lru_cache(maxsize=6)(self._loaded)  # this many maps stay in memory after use
+        self._localizer = functools.lru_cache(maxsize=6)(self._load)  # this many maps stay in memory after use
         self._infos = {
             name: scene.info if isinstance(scene, Map) else load_info(scene) for name, scene in self._maps.items()
         }
-        self._pooled: dict[str, Float[Tensor, "v p"]] = {}
+        self._pooled_views: dict[str, Float[Tensor, "v p"]] = {}
         self._vocabularies: dict[tuple[str, int], Vocabulary] = {}
         with job_context(progress, cancel):
-            self._key = self._indexed()
+            self._key = self._index()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -132,12 +132,12 @@ class MapCollection:
             raise InputError(f"no map {name!r}", expected=f"one of {', '.join(self._maps)}")
         return self._given_localizers.get(name) or self._localizer(name)
 
-    def _loaded(self, name: str) -> Localizer:
+    def _load(self, name: str) -> Localizer:
         scene = self._maps[name]
         stored = scene if isinstance(scene, Map) else load_map(scene)
         return Localizer(stored, self.method, self.config, warm_up=False)
 
-    def ranked(self, frame: Frame) -> dict[str, float]:
+    def rank(self, frame: Frame) -> dict[str, float]:
         """Return the cosine similarity of an image to each map, most similar first; -1 where it cannot be computed."""
         vectors: dict[tuple[str, int], Float[Tensor, "p"]] = {}
         for key, vocabulary in self._vocabularies.items():
@@ -147,7 +147,7 @@ class MapCollection:
         found = dict.fromkeys(self._maps, -1.0)
         for name, own in self._key.items():
             if own in vectors:
-                found[name] = float((self._pooled[name] @ vectors[own]).max())
+                found[name] = float((self._pooled_views[name] @ vectors[own]).max())
         return dict(sorted(found.items(), key=lambda item: -item[1]))
 
     def __call__(self, frame: Frame, seed: int = 0) -> Placement:
@@ -158,7 +158,7 @@ class MapCollection:
         the maps tried: among those that accept it, or among all if none does, the one with the most inliers.
         Raises ``InputError`` for a frame that cannot be localized at all.
         """
-        ranking = self.ranked(frame)
+        ranking = self.rank(frame)
         quick: dict[str, Localization] = {}
         compared = [name for name, similarity in ranking.items() if similarity > -1.0]
         for name in [*compared[: self.limit], *(name for name in ranking if name not in compared)]:
@@ -185,10 +185,10 @@ class MapCollection:
                 return localizer(frame, seed=seed)
             found = localize_by_landmarks(localizer.problem(frame), localizer.shared.rays, seed)
         except InputError as error:  # such as a map without a surface
-            return _unrecognised(str(error), self.method)
+            return _no_localization(str(error), self.method)
         return replace(found, unit=unit_of(localizer.scene)).translated(origin_of(localizer.scene))
 
-    def _indexed(self) -> dict[str, tuple[str, int]]:
+    def _index(self) -> dict[str, tuple[str, int]]:
         """Pool the descriptors of all maps; return the detector and descriptor length of each map with landmarks."""
         count, landmarks = counter("reading", "maps"), dict[str, LandmarkMap]()
         for number, (name, scene) in enumerate(self._maps.items(), start=1):
@@ -203,7 +203,7 @@ class MapCollection:
             self._vocabularies[key] = Vocabulary.of(same)
         for name, found in landmarks.items():
             cameras = cameras_of(self._infos[name])
-            self._pooled[name] = pool_views(self._vocabularies[keys[name]], found, cameras)
+            self._pooled_views[name] = pool_views(self._vocabularies[keys[name]], found, cameras)
         if bare := [name for name in self._maps if name not in landmarks]:
             log.info(f"{amount(len(bare), 'map')} without landmarks, tried last: {', '.join(bare)}")
         return keys
@@ -253,7 +253,7 @@ def _maps_by_name(scenes: str | Path | Sequence[Map | str | Path] | Mapping[str,
     return name_maps(found)
 
 
-def _unrecognised(reason: str, method: str) -> Localization:
+def _no_localization(reason: str, method: str) -> Localization:
     """Return the answer for a map in which an image was not recognized at all; its pose is meaningless."""
     T = SE3.identity()
     return Localization(

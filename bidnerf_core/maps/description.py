@@ -148,7 +148,7 @@ def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
 
 def named_poses(info: MapInfo) -> list[tuple[str, SE3]]:
     """Return the name and T_world_camera (float64, relative to the map's origin) of each training image."""
-    return [(stored.name, T) for stored, (_, T) in zip(info.cameras, cameras_of(info), strict=True)]
+    return [(camera.name, camera.pose) for camera in info.cameras]
 
 
 def longest_side(info: MapInfo) -> int | None:

@@ -274,7 +274,7 @@ def _extend(
     if stored.weights != scene.info.weights:
         raise InputError("was retrained meanwhile; extend it again", where=where)
     check_cancelled("extending")
-    return replace(grown, info=replace(grown.info, anchor=stored.anchor)).stored_in(scene.folder)
+    return replace(grown, info=replace(grown.info, anchor=stored.anchor)).write_to(scene.folder)
 
 
 def _train_further(scene: Map, views: Sequence[View], steps: int | None, share: float) -> Map:

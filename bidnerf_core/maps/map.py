@@ -26,7 +26,7 @@ from bidnerf_core.captures import (
     up_direction,
     up_from_gravity,
 )
-from bidnerf_core.datasets import DatasetOptions
+from bidnerf_core.datasets import AS_STORED, DatasetOptions
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.fields import (
     LARGEST_LENGTH,
@@ -69,7 +69,7 @@ from bidnerf_core.maps.store import (
     write_parts,
 )
 from bidnerf_core.maps.summary import MapSummary
-from bidnerf_core.maps.views import AS_STORED, Images, views_again
+from bidnerf_core.maps.views import Images, views_again
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context
 from bidnerf_core.training import TrainingState
 
@@ -435,9 +435,9 @@ class Map:
         and if the field does not come from a backend.
         """
         with map_folder(Path(folder), overwrite):
-            return self.stored_in(Path(folder))
+            return self.write_to(Path(folder))
 
-    def stored_in(self, folder: Path) -> Map:
+    def write_to(self, folder: Path) -> Map:
         """Write the complete map to a folder as ``save`` does; the caller must hold the folder's lock."""
         field = trained_field(self.field)
         if not isinstance(field, nn.Module):

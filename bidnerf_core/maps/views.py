@@ -19,6 +19,7 @@ from torch import Tensor
 from bidnerf_core.camera import UPRIGHT, check_side
 from bidnerf_core.captures import StoredCamera, apply_stored_poses
 from bidnerf_core.datasets import (
+    AS_STORED,
     Capture,
     DatasetOptions,
     SparseChoice,
@@ -44,9 +45,6 @@ log = logging.getLogger("bidnerf")
 
 Images: TypeAlias = Capture | Sequence[View] | str | Path
 """Images with poses: a dataset, the path to one, or views whose reference frame is the world."""
-AS_STORED = DatasetOptions()
-"""The options for images of split "train" as the dataset stores them."""
-
 
 Origin: TypeAlias = tuple[float, float, float]
 """The origin of a map's local coordinate frame, in world coordinates; see ``Map.origin``."""

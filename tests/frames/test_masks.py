@@ -153,10 +153,10 @@ def test_mask_path_and_dynamic_masks_are_read(tmp_path: Path) -> None:
     with refused(error=WhollyHidden):  # the one hides the left, the other the rest
         opened.views("train", names[:1])
     assert [view.frame.name for view in opened.views("train")] == names[1:]
-    assert opened.wholly_hidden("train") == []  # neither mask hides everything by itself
+    assert opened.hidden_frames("train") == []  # neither mask hides everything by itself
     saved(data / "masks" / f"{names[1]}.png", np.zeros((48, 48), np.uint8))
-    assert opened.wholly_hidden("train") == names[1:2]
-    assert opened.wholly_hidden("all") == names[1:2]
+    assert opened.hidden_frames("train") == names[1:2]
+    assert opened.hidden_frames("all") == names[1:2]
     assert names[1] not in [view.frame.name for view in opened.views("all")]
 
 

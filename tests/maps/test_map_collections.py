@@ -130,16 +130,16 @@ def test_landmarks_that_a_camera_sees(grounds: list[Map]) -> None:
 
 def test_maps_without_landmarks_come_last(grounds: list[Map]) -> None:
     maps = bn.MapCollection([grounds[2], grounds[0]])
-    assert list(maps.ranked(view(POSES[1]).frame)) == ["ground0", "bare"]
+    assert list(maps.rank(view(POSES[1]).frame)) == ["ground0", "bare"]
     dark = bn.Frame.from_numpy(np.zeros((96, 128, 3), np.uint8), CAMERA)
-    assert set(maps.ranked(dark).values()) == {-1.0}
+    assert set(maps.rank(dark).values()) == {-1.0}
 
 
 def test_the_limit_counts_only_maps_that_can_be_compared(grounds: list[Map], monkeypatch: pytest.MonkeyPatch) -> None:
     """Maps without landmarks cannot be ranked, so that any of them may be the one that the image shows."""
     bare = {f"bare{n}": grounds[2] for n in range(7)}
     maps = bn.MapCollection({**bare, "ground0": grounds[0], "ground4": grounds[1]}, limit=1)
-    none = collections_module._unrecognised("nothing matches", "auto")
+    none = collections_module._no_localization("nothing matches", "auto")
     monkeypatch.setattr(maps, "_by_landmarks", lambda *_: none)
     monkeypatch.setattr(maps, "localizer", lambda name: lambda frame, seed: none)
     assert maps(photo(SEEDS[1]).frame).tried == ("ground4", *bare)
