@@ -60,12 +60,6 @@ def spelling_hint(name: str, known: Collection[str], otherwise: str = "") -> str
     return f", did you mean {near[0]!r}?" if near else otherwise
 
 
-def refuse_text(what: str, given: object) -> None:
-    """Raise ``InputError`` if ``given`` is a string where a list is expected: iteration would yield its letters."""
-    if isinstance(given, str):
-        raise InputError(f"{what} is {given!r}", expected=f"a list, such as [{given!r}]")
-
-
 def amount(count: int, noun: str) -> str:
     """Return a count with its noun, in the plural unless the count is 1."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -29,7 +29,7 @@ from bidnerf_core.camera import (
     same_aspect,
 )
 from bidnerf_core.depth import DepthCamera, DepthImage
-from bidnerf_core.errors import InputError, InputWarning, amount, refuse_text, spelling_hint
+from bidnerf_core.errors import InputError, InputWarning, amount, spelling_hint
 from bidnerf_core.frames import (
     BLACK,
     Frame,
@@ -327,7 +327,8 @@ class Capture:
         chosen, by_name = list(part.shots), part._by_name
         if names is None:
             return chosen
-        refuse_text(f"{where}: names", names)
+        if isinstance(names, str):  # its letters would be taken for names
+            raise InputError(f"names is {names!r}", where=where, expected=f"a list, such as [{names!r}]")
         unknown = next((name for name in names if name not in by_name), None)
         if unknown is None:
             return [by_name[name] for name in names]

@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -22,20 +23,15 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields import Observations
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, fit_similarity, spread
+from bidnerf_core.settings import Above, Settings, WholeNumbers
 
 
 @dataclass(frozen=True)
-class SparseChoice:
+class SparseChoice(Settings):
     """Selection criteria for the points of a COLMAP model."""
 
-    points_error: float = 2.0  # largest mean reprojection error of a selected point, pixels
-    points_views: int = 2  # smallest number of images that observe a selected point
-
-    def __post_init__(self) -> None:
-        if not self.points_error > 0:
-            raise InputError(f"points_error is {self.points_error}", expected="a positive number of pixels")
-        if self.points_views < 1:
-            raise InputError(f"points_views is {self.points_views}", expected="1 or more")
+    points_error: Annotated[float, Above(0)] = 2.0  # largest mean reprojection error of a selected point, pixels
+    points_views: Annotated[int, WholeNumbers(1)] = 2  # smallest number of images that observe a selected point
 
 
 class SparsePoints:

@@ -200,9 +200,9 @@ def test_what_is_left_out_is_a_setting(model: Path, scene: Known) -> None:
     with refused(where=model, found=f"none of its {len(scene.points)} points has a reprojection error of 0.1 pixels"):
         opened(model, scene, SparseChoice(points_error=0.1))
     for name, value, expected in (
-        ("points_error", 0.0, "a positive number of pixels"),
-        ("points_error", float("nan"), "a positive number of pixels"),
-        ("points_views", 0, "1 or more"),
+        ("points_error", 0.0, "more than 0"),
+        ("points_error", float("nan"), "more than 0"),
+        ("points_views", 0, "a whole number, from 1 up"),
     ):
         with refused(found=f"{name} is {value}", expected=expected):
             SparseChoice(**{name: value})  # type: ignore[arg-type]
