@@ -73,8 +73,8 @@ def read_exif(path: Path) -> Exif:
     """Read the tags of an image file; damaged tags count as missing. Raises ``InputError`` if it is not an image."""
     with open_image(path) as image:
         try:
-            found = image.getexif()
-            tags: dict[int, Any] = {**found, **found.get_ifd(IFD.Exif)}
+            exif = image.getexif()
+            tags: dict[int, Any] = {**exif, **exif.get_ifd(IFD.Exif)}
             # The length in millimetres of the resolution's unit: inch, centimetre, millimetre, micrometre.
             units = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
             unit = units.get(tags.get(Base.FocalPlaneResolutionUnit, 2))

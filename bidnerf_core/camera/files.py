@@ -177,10 +177,10 @@ def _json_camera(record: Record, size: tuple[int, int]) -> Camera:
     values = record.values
     views = values.get("parameters")
     if isinstance(views, list) and views and isinstance(views[0], Mapping):  # Open3D's trajectory
-        found = {parse_calibration(record.where, view, size) for view in views}
-        if len(found) > 1:
-            raise record.error(f"holds {len(found)} cameras", expected="one")
-        return found.pop()
+        cameras = {parse_calibration(record.where, view, size) for view in views}
+        if len(cameras) > 1:
+            raise record.error(f"holds {len(cameras)} cameras", expected="one")
+        return cameras.pop()
     if any(key in values for key in ("intrinsic_matrix", "intrinsic", "camera_matrix", "K")):
         return parse_calibration(record.where, values, size)
     camera = camera_record(record)
@@ -190,7 +190,7 @@ def _json_camera(record: Record, size: tuple[int, int]) -> Camera:
 def _splat_cameras(path: Path, content: bytes) -> dict[str, Camera]:
     """Read 3D Gaussian Splatting's ``cameras.json``: a list of cameras with image names."""
     entries = parse_json(content, str(path), "a camera, or a list of cameras")
-    found: dict[str, Camera] = {}
+    cameras: dict[str, Camera] = {}
     for number, entry in enumerate(entries):
         record = Record(f"{path}: entry {number}", entry if isinstance(entry, Mapping) else {})
         fx, fy, width, height = (
@@ -198,17 +198,17 @@ def _splat_cameras(path: Path, content: bytes) -> dict[str, Camera]:
         )
         K = ((fx, 0, width / 2 - 0.5), (0, fy, height / 2 - 0.5), (0, 0, 1))
         name = str(record.value("img_name") or number)
-        found[name] = _opencv_camera(record.where, K, (), "", (int(width), int(height)))
-    return found
+        cameras[name] = _opencv_camera(record.where, K, (), "", (int(width), int(height)))
+    return cameras
 
 
 def _chosen(path: Path, cameras: Mapping[str, Camera], photo: str | None) -> Camera:
     """Return the only camera, or the one that matches a photo's path, file name or stem."""
     if len(set(cameras.values())) == 1:
         return next(iter(cameras.values()))
-    asked = None if photo is None else PurePosixPath(photo.replace("\\", "/"))
-    for part in () if asked is None else (str, lambda p: p.name, lambda p: p.stem):
-        fits = {c for name, c in cameras.items() if part(PurePosixPath(name)) == part(asked)}
+    wanted = None if photo is None else PurePosixPath(photo.replace("\\", "/"))
+    for part in () if wanted is None else (str, lambda p: p.name, lambda p: p.stem):
+        fits = {c for name, c in cameras.items() if part(PurePosixPath(name)) == part(wanted)}
         if len(fits) == 1:
             return fits.pop()
     raise InputError(
@@ -227,7 +227,7 @@ def read_text_cameras(path: Path) -> dict[int, Camera]:
 def _text_cameras(path: Path, content: bytes, named: bool = True) -> dict[str, Camera]:
     """Parse rows of ``CAMERA_ID MODEL WIDTH HEIGHT PARAMS...``, or hloc's rows with an image name instead of the id."""
     expected = "transforms.json or cameras.txt (COLMAP's model_converter makes it from cameras.bin)"
-    found: dict[str, Camera] = {}
+    cameras: dict[str, Camera] = {}
     for row in parse_rows(content, path, expected, "CAMERA_ID MODEL WIDTH HEIGHT and parameters"):
         words = row.words
         if len(words) < 5:
@@ -237,9 +237,9 @@ def _text_cameras(path: Path, content: bytes, named: bool = True) -> dict[str, C
         key = words[0] if named and not words[0].lstrip("-").isdecimal() else str(row.integer(words[0]))
         size = row.integer(words[2]), row.integer(words[3])
         camera = colmap_camera(row.where, words[1], *size, row.numbers(words[4:]))
-        if found.setdefault(key, camera) != camera:
+        if cameras.setdefault(key, camera) != camera:
             raise InputError(f"camera {key} is repeated", where=row.where, expected="each id once")
-    return found
+    return cameras
 
 
 def parse_calibration(where: str, values: Mapping[str, Any], size: tuple[int, int]) -> Camera:
@@ -262,8 +262,8 @@ def parse_calibration(where: str, values: Mapping[str, Any], size: tuple[int, in
         names = ("k1", "k2", "k3", "k4") if model.lower() in DISTORTIONS[FISHEYE] else ("k1", "k2", "p1", "p2", "k3")
         four, lens = ([values.get(f"{slam}.{x}", 0.0) for x in some] for some in (("fx", "fy", "cx", "cy"), names))
     if given is None and four is None:
-        found = f"no camera matrix ({', '.join(KEYS['K'][:3])} or K)"
-        raise InputError(found, where=where, expected=EXPECTED)
+        fault = f"no camera matrix ({', '.join(KEYS['K'][:3])} or K)"
+        raise InputError(fault, where=where, expected=EXPECTED)
     K = _array(where, four if given is None else given)
     if K.shape == (4,):
         K = np.array(((K[0], 0, K[2]), (0, K[1], K[3]), (0, 0, 1)))
@@ -301,8 +301,8 @@ def _first(values: Mapping[str, Any], what: str) -> Any:
 
 def _array(where: str, given: Any) -> np.ndarray:
     """Convert a list, or the ``data`` of an OpenCV or ROS matrix, to an array."""
-    found = given.get("data") if isinstance(given, Mapping) else given
+    values = given.get("data") if isinstance(given, Mapping) else given
     try:
-        return np.asarray(found, dtype=float)  # YAML reads 1e-05 as text
+        return np.asarray(values, dtype=float)  # YAML reads 1e-05 as text
     except (TypeError, ValueError) as error:
         raise InputError(f"{str(given)[:60]!r}", where=where, expected="numbers") from error

@@ -72,8 +72,8 @@ class Intrinsics:
         camera = Intrinsics(focal, focal, 0.0, 0.0, width, height)
         question_focal(focal, width, height)
         if focal > 1000 * max(width, height):  # a field of view of 0.06 degrees, as of a telescope
-            found = f"focal length is {focal} px for an image of {width}x{height}"
-            raise InputError(found, expected="at most 1000 times its longer side")
+            fault = f"focal length is {focal} px for an image of {width}x{height}"
+            raise InputError(fault, expected="at most 1000 times its longer side")
         return replace(camera, cx=width / 2, cy=height / 2)
 
     @staticmethod
@@ -217,7 +217,7 @@ class Intrinsics:
             cy, k = height - cy, _negated(k, 2, 10, 11, 12)
         if orientation.transposes:
             order = (0, 1, 3, 2, 4, 5, 6, 7, 10, 11, 8, 9, 12, 13)[: len(k)]
-            return Intrinsics(fy, fx, cy, cx, height, width, tuple(k[place] for place in order))
+            return Intrinsics(fy, fx, cy, cx, height, width, tuple(k[index] for index in order))
         return Intrinsics(fx, fy, cx, cy, width, height, k)
 
     def _distortion_at(self, points: Float[Tensor, "n 2"]) -> tuple[Tensor, Tensor]:
@@ -282,8 +282,8 @@ def check_number(what: str, value: Any, kind: type, least: float, most: float, e
         raise InputError(f"{what} is {value!r:.60}", expected=expected)
 
 
-def _negated(distortion: tuple[float, ...], *places: int) -> tuple[float, ...]:
-    return tuple(-value if place in places else value for place, value in enumerate(distortion))
+def _negated(distortion: tuple[float, ...], *indices: int) -> tuple[float, ...]:
+    return tuple(-value if index in indices else value for index, value in enumerate(distortion))
 
 
 def focal_length(pixels: int, angle: float) -> float:

@@ -108,8 +108,8 @@ class Lens(ABC):
         u, v = _lookup(self)
         method = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
         border = cv2.BORDER_CONSTANT if nearest else cv2.BORDER_REPLICATE
-        found: np.ndarray = cv2.remap(image, u, v, method, borderMode=border)
-        return found
+        resampled: np.ndarray = cv2.remap(image, u, v, method, borderMode=border)
+        return resampled
 
     def unseen(self) -> np.ndarray:
         """Return a mask of the pixels of the resampled image that the lens did not see."""
@@ -180,10 +180,10 @@ class CentralLens(Lens):
             stretch = 1 + self.coefficients[0] * radius**2
             return math.atan(radius / stretch) if stretch > 0 else WIDEST
         angles = np.linspace(0, math.pi, 2049)
-        found = self._fisheye_radius(angles)
-        falling = np.diff(found) <= 0
-        rising = int(falling.argmax()) if falling.any() else len(found) - 1
-        return float(np.interp(radius, found[: rising + 1], angles[: rising + 1])) if rising else math.nan
+        radii = self._fisheye_radius(angles)
+        falling = np.diff(radii) <= 0
+        rising = int(falling.argmax()) if falling.any() else len(radii) - 1
+        return float(np.interp(radius, radii[: rising + 1], angles[: rising + 1])) if rising else math.nan
 
     def _fisheye_radius(self, angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         k1, k2, k3, k4 = self.coefficients
@@ -200,8 +200,8 @@ class CentralLens(Lens):
             ratio = self._fisheye_radius(np.arctan(radius)) / np.maximum(radius, 1e-12)
             ratio = np.where(radius > 1e-9, ratio, 1.0)
         c = self.stored
-        found: np.ndarray = points * ratio[..., None] * (c.fx, c.fy) + (c.cx, c.cy)
-        return found
+        pixels: np.ndarray = points * ratio[..., None] * (c.fx, c.fy) + (c.cx, c.cy)
+        return pixels
 
     @property
     def sentence(self) -> str:
@@ -256,8 +256,8 @@ class PanoramaFace(Lens):
         u, v = _lookup(self)
         method = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
         wrapped = cv2.copyMakeBorder(image, 0, 0, 1, 1, cv2.BORDER_WRAP)
-        found: np.ndarray = cv2.remap(wrapped, u + 1, v, method, borderMode=cv2.BORDER_REPLICATE)
-        return found
+        resampled: np.ndarray = cv2.remap(wrapped, u + 1, v, method, borderMode=cv2.BORDER_REPLICATE)
+        return resampled
 
     @property
     def sentence(self) -> str:
@@ -273,15 +273,15 @@ def _lookup(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     """Return the column and row (OpenCV pixel convention) of the upright image that each resampled pixel shows."""
     flat, turn = lens.flat, lens.orientation
     columns, rows = (np.arange(size) + 0.5 for size in (flat.width, flat.height))
-    places = np.stack(np.meshgrid((columns - flat.cx) / flat.fx, (rows - flat.cy) / flat.fy), axis=-1)
-    u, v = np.moveaxis(lens.project(places), -1, 0)
+    points = np.stack(np.meshgrid((columns - flat.cx) / flat.fx, (rows - flat.cy) / flat.fy), axis=-1)
+    u, v = np.moveaxis(lens.project(points), -1, 0)
     u = lens.stored_size[0] - u if turn.mirrors_columns else u
     v = lens.stored_size[1] - v if turn.mirrors_rows else v
     u, v = (turn.upright(torch.from_numpy(np.ascontiguousarray(part))).numpy() for part in (u, v))
     if turn.transposes:
         u, v = v, u
-    found = [np.ascontiguousarray(np.nan_to_num(part - 0.5, nan=-9.0), dtype=np.float32) for part in (u, v)]
-    return found[0], found[1]
+    maps = [np.ascontiguousarray(np.nan_to_num(part - 0.5, nan=-9.0), dtype=np.float32) for part in (u, v)]
+    return maps[0], maps[1]
 
 
 def colmap_camera(where: str, model: str, width: int, height: int, parameters: Sequence[float]) -> Camera:
@@ -290,13 +290,13 @@ def colmap_camera(where: str, model: str, width: int, height: int, parameters: S
     A panorama becomes its front face. Raises ``InputError``, whose message begins with ``where``, if the number of
     parameters is wrong or a value is invalid.
     """
-    _, kind, places = MODELS[model]
+    _, kind, indices = MODELS[model]
     try:
-        if len(parameters) != max(places) + 1:
-            raise InputError(f"{model} has {len(parameters)} parameters", expected=max(places) + 1)
+        if len(parameters) != max(indices) + 1:
+            raise InputError(f"{model} has {len(parameters)} parameters", expected=max(indices) + 1)
         if kind == PANORAMA:
             return PanoramaFace("front", (width, height))
-        fx, fy, cx, cy, *rest = (0.0 if place < 0 else float(parameters[place]) for place in places)
+        fx, fy, cx, cy, *rest = (0.0 if index < 0 else float(parameters[index]) for index in indices)
         lens = tuple(rest) if any(rest) else ()
         flat = Intrinsics(fx, fy, cx, cy, width, height, lens if kind == PERSPECTIVE else ())
         return flat if kind == PERSPECTIVE else CentralLens(model, flat, tuple(rest))
@@ -311,7 +311,7 @@ def colmap_model(camera: Intrinsics) -> tuple[str, list[float]]:
     """
     k = camera.distortion
     if any(k[8:]):
-        found = "a camera with thin prism distortion or a tilted sensor"
-        raise InputError(found, expected="one that a COLMAP model describes")
+        fault = "a camera with thin prism distortion or a tilted sensor"
+        raise InputError(fault, expected="one that a COLMAP model describes")
     model, count = ("PINHOLE", 0) if not any(k) else ("OPENCV", 4) if not any(k[4:]) else ("FULL_OPENCV", 8)
     return model, [camera.fx, camera.fy, camera.cx, camera.cy, *(*k, *[0.0] * 8)[:count]]

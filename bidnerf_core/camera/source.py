@@ -91,8 +91,8 @@ class Raster:
         if same_aspect(given, self.upright_size):
             return image
         size = "x".join(map(str, self.upright_size))
-        found = f"{what} is {given[0]}x{given[1]}, but its image is {size};"
-        raise InputError(found, where=where, expected="the same aspect ratio")
+        fault = f"{what} is {given[0]}x{given[1]}, but its image is {size};"
+        raise InputError(fault, where=where, expected="the same aspect ratio")
 
 
 @dataclass(frozen=True)
@@ -136,11 +136,11 @@ class CameraSource:
         except InputError as error:
             raise InputError(error, where=where) from error
         if camera is None:
-            found = None if exif.has_focal_length else _assumed(raster, self.assumed)
+            resolved = None if exif.has_focal_length else _assumed(raster, self.assumed)
             # Where a crop lies in its photo is unknown. Only landmarks can correct its principal point, and there are
             # ``assumed`` cameras only where landmarks are matched.
-            found = found or camera_from_exif(str(where), raster, exif, may_be_cropped=bool(self.assumed))
-            return replace(found, approximate=True)
+            resolved = resolved or camera_from_exif(str(where), raster, exif, may_be_cropped=bool(self.assumed))
+            return replace(resolved, approximate=True)
         if isinstance(camera, Intrinsics | Lens):
             return _fitted(str(where), raster, camera, "camera as given")
         expected = "Intrinsics or the path of a camera file"
@@ -171,11 +171,11 @@ def folder_camera(
     if isinstance(given, Path) and not given.exists():
         raise InputError("no such file", where=given, expected=f"the camera of {folder}: {ways}")
     beside = next((file for name in ("camera.json", "cameras.txt") if (file := folder / name).is_file()), None)
-    found = given or beside or published
-    if found is None:
+    camera = given or beside or published
+    if camera is None:
         expected = f"its camera: camera.json or cameras.txt in the folder, or --camera with {ways} (camera= in Python)"
         raise InputError(f"{unknown};", where=folder, expected=expected)
-    return CameraSource(found)
+    return CameraSource(camera)
 
 
 def _described(camera: Intrinsics, origin: str) -> ResolvedCamera:
@@ -190,8 +190,8 @@ def _fitted(where: str, raster: Raster, given: Camera, origin: str) -> ResolvedC
         expected = "one with the same aspect ratio"
         if same_aspect((given.height, given.width), raster.size):
             expected = "images that are not turned by a quarter against their cameras: export them as stored"
-        found = f"image is {size}, but its camera is for {given.width}x{given.height}"
-        raise InputError(found, where=where, expected=expected)
+        fault = f"image is {size}, but its camera is for {given.width}x{given.height}"
+        raise InputError(fault, where=where, expected=expected)
     return ResolvedCamera(fitted, f"{origin}: {fitted.sentence}")
 
 
@@ -228,10 +228,10 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: boo
     else:
         raise InputError("no focal length in EXIF", where=where, expected=f"a camera: {WAYS_OF_PHOTO}")
     try:
-        found = _described(Intrinsics.from_focal(focal, *raster.upright_size), origin)
+        resolved = _described(Intrinsics.from_focal(focal, *raster.upright_size), origin)
     except InputError as error:
         raise InputError(f"EXIF: {error}; give its camera: {WAYS}", where=where) from error
-    return replace(found, description=found.description + part)
+    return replace(resolved, description=resolved.description + part)
 
 
 def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> ResolvedCamera | None:

@@ -165,21 +165,23 @@ def moved_cameras(cameras: Sequence[StoredCamera]) -> list[MovedCamera]:
     ]
 
 
-def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> list[str]:
+def pose_sentences(cameras: Sequence[StoredCamera], refinement: PoseRefinement) -> list[str]:
     """Return sentences on how consistent the given poses are and how far refinement moved them."""
     moved = sorted(moved_cameras(cameras), key=lambda m: m.pixels, reverse=True)
-    wrong = [m for m in moved if m.name in found.replaced]
+    wrong = [m for m in moved if m.name in refinement.replaced]
     motions = torch.tensor([camera.motion for camera in cameras if camera.motion], dtype=torch.float64)
     cause = "errors of the given poses" + (" and camera motion during readout" if len(motions) else "")
     result = "the other poses are kept" if wrong else "the poses are kept"
-    if found.refined and moved:
+    if refinement.refined and moved:
         metres, degrees, pixels = (
             median(getattr(m, name) for m in moved) for name in ("translation", "rotation_deg", "pixels")
         )
         result = (
             f"the poses are refined by {metres:.3g} and {degrees:.2g}° or {pixels:.1f} px (median), most for {moved[0]}"
         )
-    lines = [f"{cause} add {found.inconsistency:.2f} px to the {found.noise_after:.2f} px of keypoints; {result}"]
+    lines = [
+        f"{cause} add {refinement.inconsistency:.2f} px to the {refinement.noise_after:.2f} px of keypoints; {result}"
+    ]
     if len(motions):
         metres, radians = (median(part.norm(dim=-1).tolist()) for part in motions.split(3, dim=-1))
         lines.append(
@@ -199,7 +201,7 @@ def apply_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -
     Views whose pose was not refined are returned unchanged.
     """
     known = {(c.name, c.given_T_world_camera): c for c in cameras if c.given_T_world_camera}
-    found = [known.get((view.frame.name, _rows(view.T_ref_camera))) for view in views]
+    stored = [known.get((view.frame.name, _rows(view.T_ref_camera))) for view in views]
     return [
         view
         if c is None
@@ -208,7 +210,7 @@ def apply_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -
             T_ref_camera=c.pose,
             motion=None if c.motion is None else torch.tensor(c.motion, dtype=torch.float64),
         )
-        for view, c in zip(views, found, strict=True)
+        for view, c in zip(views, stored, strict=True)
     ]
 
 
@@ -265,7 +267,7 @@ def cameras_beside(path: Path, placement: Similarity) -> tuple[StoredCamera, ...
             rows = _rows(SE3(turned, placement.apply(position)))
             cameras.append(StoredCamera(str(entry["img_name"]), camera, rows))
     except (InputError, KeyError, TypeError, ValueError, RuntimeError) as error:
-        found = f"{file}: camera {len(cameras)} is not readable in Inria's layout ({error}); ignored"
-        warnings.warn(found, InputWarning, stacklevel=2)
+        message = f"{file}: camera {len(cameras)} is not readable in Inria's layout ({error}); ignored"
+        warnings.warn(message, InputWarning, stacklevel=2)
         return ()
     return tuple(cameras)

@@ -251,7 +251,7 @@ def _planes(normals: Float[Tensor, "n 3"] | None) -> list[tuple[Tensor, float, U
     down, around = torch.acos(1 - number / DIRECTIONS), math.pi * (1 + math.sqrt(5)) * number
     tried = torch.stack([around.cos() * down.sin(), around.sin() * down.sin(), down.cos()], dim=-1)
     share = ((some.float() @ tried.float().mT).abs() > 1 - CHANCE).double().mean(0)
-    found = list[tuple[Tensor, float, UpSource]]()
+    planes = list[tuple[Tensor, float, UpSource]]()
     for _ in range(6):
         start = axis = tried[int(share.argmax())]
         # Refine the axis to the mean of the normals near it, in ever smaller cones.
@@ -263,6 +263,6 @@ def _planes(normals: Float[Tensor, "n 3"] | None) -> list[tuple[Tensor, float, U
             axis = normalize((some[near] * torch.sign(along[near])[:, None]).sum(0), dim=0)
         support = float(((some @ axis).abs() > 1 - CHANCE).double().mean()) - CHANCE
         if support >= 3 * CHANCE:
-            found.append((axis, support, "planes"))
+            planes.append((axis, support, "planes"))
         share[(tried @ start).abs() > math.cos(2 * math.radians(ALIKE_DEG))] = 0
-    return found
+    return planes

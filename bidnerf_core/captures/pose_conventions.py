@@ -65,16 +65,16 @@ class PoseContradiction:
     @property
     def sentence(self) -> str:
         """Human-readable description of the problem and its remedy."""
-        found = (
+        statement = (
             f"the poses contradict the photos: they agree with the keypoints of {self.agreeing_as_given} of {self.pairs}"
             " pairs of photos"
         )
         if self.reading is None:
             return (
-                f"{found}, and no common mistake explains it; check that each pose belongs to its photo,"
+                f"{statement}, and no common mistake explains it; check that each pose belongs to its photo,"
                 " that the matrices are camera to world, and the camera's focal length and distortion"
             )
-        return f"{found}, but would agree with those of {self.agreeing} if {self.reading.clause}; {self.reading.remedy}"
+        return f"{statement}, but would agree with those of {self.agreeing} if {self.reading.clause}; {self.reading.remedy}"
 
 
 def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | None:
@@ -172,12 +172,12 @@ def _similar(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
     chosen = range(0, len(images), max(1, -(-len(images) // 60)))
     strongest = [images[i].keypoints.descriptors[:300] for i in chosen]
     pairs = itertools.combinations(range(len(chosen)), 2)
-    found = {(a, b): len(_unambiguous(strongest[a], strongest[b])[0]) for a, b in pairs}
-    kept = set[tuple[int, int]]()
+    counts = {(a, b): len(_unambiguous(strongest[a], strongest[b])[0]) for a, b in pairs}
+    selected = set[tuple[int, int]]()
     for number in range(len(chosen)):
-        own = sorted((pair for pair in found if number in pair), key=lambda pair: -found[pair])
-        kept |= {pair for pair in own[:2] if found[pair] >= 12}
-    return [(chosen[a], chosen[b]) for a, b in sorted(kept, key=lambda pair: -found[pair])]
+        own = sorted((pair for pair in counts if number in pair), key=lambda pair: -counts[pair])
+        selected |= {pair for pair in own[:2] if counts[pair] >= 12}
+    return [(chosen[a], chosen[b]) for a, b in sorted(selected, key=lambda pair: -counts[pair])]
 
 
 def _unambiguous(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
@@ -202,15 +202,15 @@ def match_pair(images: Sequence[ImageKeypoints], i: int, j: int) -> MatchedPair 
     first, second, focal = a.rays[rows], b.rays[partner], min(a.focal, b.focal)
     pixel = max(1.0, focal / USUAL_FOCAL) / focal  # one pixel on the plane z = 1, scaled up in large images
     cv2.setRNGSeed(0)
-    found, mask = cv2.findEssentialMat(
+    essential, mask = cv2.findEssentialMat(
         first[:, :2].numpy(), second[:, :2].numpy(), np.eye(3), cv2.RANSAC, prob=0.999, threshold=pixel
     )
-    if found is None or len(mask) != len(rows):
+    if essential is None or len(mask) != len(rows):
         return None
-    kept = torch.from_numpy(mask[:, 0].astype(bool))
-    if int(kept.sum()) < ENOUGH_MATCHES:
+    inliers = torch.from_numpy(mask[:, 0].astype(bool))
+    if int(inliers.sum()) < ENOUGH_MATCHES:
         return None
-    return MatchedPair(i, j, first[kept], second[kept], pixel)
+    return MatchedPair(i, j, first[inliers], second[inliers], pixel)
 
 
 @cache
@@ -330,10 +330,10 @@ def _of_quaternions() -> Iterator[Reading]:
 
     orders = (([3, 0, 1, 2], "x y z w", "w x y z"), ([1, 2, 3, 0], "w x y z", "x y z w"))
     both = (False, True)
-    for (order, found, expected), of_inverse, then_invert in itertools.product(orders, both, both):
+    for (order, given, expected), of_inverse, then_invert in itertools.product(orders, both, both):
         also = ", and the poses are inverses (world to camera)" if then_invert else ""
         yield from _in_file_axes(
-            f"their quaternions are in the order {found}, but {expected} is expected{also}",
+            f"their quaternions are in the order {given}, but {expected} is expected{also}",
             f"write the quaternions as {expected}{', and invert the poses' if then_invert else ''}",
             partial(understand, order=order, of_inverse=of_inverse, then_invert=then_invert),
         )
@@ -406,8 +406,8 @@ def _in_file_axes(clause: str, remedy: str, understand: Callable[[SE3], SE3]) ->
 def signed_permutations(determinant: int) -> list[Float[Tensor, "3 3"]]:
     """Return the 24 signed permutation matrices with a determinant of 1 or -1, starting with the identity if it is among them."""
     orders, signs = itertools.permutations(range(3)), list(itertools.product((1.0, -1.0), repeat=3))
-    found = (AS_GIVEN[list(order)] * torch.tensor([s]).mT for order in orders for s in signs)
-    return [A for A in found if round(float(torch.linalg.det(A))) == determinant]
+    candidates = (AS_GIVEN[list(order)] * torch.tensor([s]).mT for order in orders for s in signs)
+    return [A for A in candidates if round(float(torch.linalg.det(A))) == determinant]
 
 
 def _named(axes: Float[Tensor, "3 3"]) -> str:

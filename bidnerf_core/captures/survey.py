@@ -73,12 +73,14 @@ def survey_capture(
     grouped = bool((group >= 0).any())  # if no photos are linked at all, no photo is reported as unlinked
     photos = []
     for i, (view, image) in enumerate(zip(views, seen.images, strict=True)):
-        found, pose = posed.get(i), view.T_ref_camera.to("cpu", torch.float64)
-        problem = found.problem if found else None
+        relocation, pose = posed.get(i), view.T_ref_camera.to("cpu", torch.float64)
+        problem = relocation.problem if relocation else None
         # A photo of another group fits that group's landmarks; an isolated photo may still have been localized.
-        if problem is None and grouped and (group[i] > 0 or (group[i] < 0 and not found)):
+        if problem is None and grouped and (group[i] > 0 or (group[i] < 0 and not relocation)):
             problem = "apart" if group[i] > 0 else "isolated"
-        known = found if found and not found.mirrored else None  # a mirrored photo's pose cannot be compared
+        known = (
+            relocation if relocation and not relocation.mirrored else None
+        )  # a mirrored photo's pose cannot be compared
         metres, radians = (None, None) if known is None else known.update.view(2, 3).norm(dim=-1).tolist()
         photos.append(
             PhotoRecord(
@@ -123,13 +125,13 @@ def _by_own_landmarks(
     depth, image = seen.sightings.in_camera(positions)[:, 2], seen.image
     count = torch.bincount(image, minlength=len(views))
     usual = float(count[list(updates)].double().median())
-    found = {}
+    relocations = {}
     for number, update in updates.items():
         own = scatter * max(1.0, usual / float(count[number]))
         deviations = float((update @ torch.linalg.pinv(own, hermitian=True) @ update).clamp(min=0).sqrt())
         pixels = image_motion(update, views[number], float(depth[image == number].median()))
-        found[number] = Relocation(update, deviations, pixels)
-    return found
+        relocations[number] = Relocation(update, deviations, pixels)
+    return relocations
 
 
 def link_photos(seen: TrackedKeypoints) -> csr_array:
@@ -202,9 +204,9 @@ def suspects(seen: TrackedKeypoints, links: csr_array) -> list[int]:
     for number in range(int(group.max()) + 1):
         own = group == number
         doubtful |= own & (share < 0.5 * share[own].median())
-    found = [i for i in doubtful.nonzero()[:, 0].tolist() if not _has_support(seen.images, links, i)]
+    unsupported = [i for i in doubtful.nonzero()[:, 0].tolist() if not _has_support(seen.images, links, i)]
     # Of more than 32, an evenly spread selection is returned.
-    return [found[int(i * max(1.0, len(found) / 32))] for i in range(min(len(found), 32))]
+    return [unsupported[int(i * max(1.0, len(unsupported) / 32))] for i in range(min(len(unsupported), 32))]
 
 
 def _has_support(images: Sequence[ImageKeypoints], links: csr_array, number: int) -> bool:
@@ -239,18 +241,18 @@ def relocate_photos(
     answers: dict[int, Relocation] = {}
     for number in numbers:
         view, features = views[number], tracked.detector_of(views[number], number)
-        found = Loop([View(view.frame, SE3.identity())], matcher, features=features)()
+        answer = Loop([View(view.frame, SE3.identity())], matcher, features=features)()
         # Only these outcomes determine the pose, or the poses that look the same.
         telling = (Outcome.CONVERGED, Outcome.AMBIGUOUS, Outcome.MIRRORED)
-        if found is None or found.verdict.outcome not in telling:
+        if answer is None or answer.verdict.outcome not in telling:
             continue
-        mirrored = found.verdict.outcome is Outcome.MIRRORED
-        others = [found.posterior.place(g) for g, mode in enumerate(found.modes) if mode.name != MIRROR]
+        mirrored = answer.verdict.outcome is Outcome.MIRRORED
+        others = [answer.posterior.place(g) for g, mode in enumerate(answer.modes) if mode.name != MIRROR]
         given = view.T_ref_camera.to("cpu", torch.float64).inverse()
-        updates = [(given @ T).log() for T in (found.T_world_rig, *([] if mirrored else others))]
+        updates = [(given @ T).log() for T in (answer.T_world_rig, *([] if mirrored else others))]
         update = min(updates, key=lambda each: float(each[:3].norm()))
-        deviations = float((update @ torch.linalg.solve(found.covariance, update)).clamp(min=0).sqrt())
-        pixels = image_motion(update, view, found.distance)
+        deviations = float((update @ torch.linalg.solve(answer.covariance, update)).clamp(min=0).sqrt())
+        pixels = image_motion(update, view, answer.distance)
         answers[number] = Relocation(update, deviations, pixels, mirrored)
     return answers
 

@@ -101,18 +101,18 @@ def prepare_views(
             _check_poses(detect_keypoints(some, SIFT))
         return TrainingViews(seeing, tracked, stored_cameras(views), distances=shows_distances(views, tracked))
     tracked = _tracked(views, features, trust_poses, depth_unit)
-    found = training_poses(tracked, views, 0.0 if refinement == "always" else INCONSISTENT)
-    poses, motion = found.tracked.T_world_camera, found.tracked.motion
+    fit = training_poses(tracked, views, 0.0 if refinement == "always" else INCONSISTENT)
+    poses, motion = fit.tracked.T_world_camera, fit.tracked.motion
     moved = list(views)
-    if found.refined or found.replaced:
+    if fit.refined or fit.replaced:
         moved = [replace(view, T_ref_camera=poses[i]) for i, view in enumerate(views)]
         if bool(motion.any()):
             moved = [replace(view, motion=motion[i]) for i, view in enumerate(moved)]
-    cameras = record_refinement(views, stored_cameras(moved), found.pixels.tolist())
+    cameras = record_refinement(views, stored_cameras(moved), fit.pixels.tolist())
     summary = None
-    if found.consistency is not None:
-        names = tuple(views[number].frame.name for number in found.replaced)
-        summary = replace(found.consistency, refined=found.refined, replaced=names)
+    if fit.consistency is not None:
+        names = tuple(views[number].frame.name for number in fit.replaced)
+        summary = replace(fit.consistency, refined=fit.refined, replaced=names)
         for line in pose_sentences(cameras, summary):
             log.info(line)
     elif refinement == "always" or len(views) >= ENOUGH_IMAGES:
@@ -121,8 +121,8 @@ def prepare_views(
             f" {LEAST_VISIBLE_POINTS} triangulated points each; if these images overlap, check the order and"
             " the axes of their poses"
         )
-    seeing, distances = _with_landmarks(moved, found.tracked), shows_distances(views, tracked)
-    return TrainingViews(seeing, found.tracked, cameras, summary, distances)
+    seeing, distances = _with_landmarks(moved, fit.tracked), shows_distances(views, tracked)
+    return TrainingViews(seeing, fit.tracked, cameras, summary, distances)
 
 
 def track_landmarks(
@@ -162,8 +162,8 @@ def _tracked(views: Sequence[View], features: str, trust_poses: bool, depth_unit
 
 def _check_poses(images: Sequence[ImageKeypoints]) -> None:
     """Raise ``InputError`` if the poses contradict most pairs of images."""
-    if (found := pose_contradiction(images)) is not None:
-        raise InputError(f"{found.sentence} (--trust-poses, trust_poses in Python, trains with them anyway)")
+    if (contradiction := pose_contradiction(images)) is not None:
+        raise InputError(f"{contradiction.sentence} (--trust-poses, trust_poses in Python, trains with them anyway)")
 
 
 def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> None:
@@ -175,9 +175,9 @@ def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> 
     ratio = depth_ratio(seen, points)
     if ratio is None or abs(ratio - 1) < 0.05:  # within the errors of sensors and triangulation
         return
-    remark = f"measured depth is {ratio:.3g} times the depth that the poses and photos imply"
+    finding = f"measured depth is {ratio:.3g} times the depth that the poses and photos imply"
     if 1 / 2 < ratio < 2:
-        log.info(f"{remark}; training takes both as they are")
+        log.info(f"{finding}; training takes both as they are")
         return
     remedy = "check the unit of the depth images (depth_unit_scale_factor in a transforms.json)"
     if depth_unit is not None:
@@ -187,7 +187,7 @@ def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> 
             f" {right:.3g}, depth_unit in Python, or depth_unit_scale_factor in a transforms.json)"
         )
     raise InputError(
-        f"{remark};",
+        f"{finding};",
         expected=f"depth and poses in the same unit: {remedy}; otherwise scale the poses by {ratio:.3g}",
     )
 
@@ -303,12 +303,14 @@ def _deviations(updates: Float[Tensor, "v 6"]) -> tuple[float, float]:
     return max(1e-9, mad_deviation(updates[:, :3])), max(1e-9, mad_deviation(updates[:, 3:]))
 
 
-def _image_motion(seen: TrackedKeypoints, points: Float[Tensor, "n 3"], given: SE3, found: SE3) -> Float[Tensor, "v"]:
+def _image_motion(
+    seen: TrackedKeypoints, points: Float[Tensor, "n 3"], given: SE3, estimated: SE3
+) -> Float[Tensor, "v"]:
     """Return the median shift (pixels) of each image's points between its given and estimated pose."""
     shown, image = points[seen.point], seen.image
     focal = seen.sightings.focal[:, None]
-    places = [pinhole(T[image].inverse().apply(shown))[0] * focal for T in (given, found)]
-    away = torch.linalg.vector_norm(places[1] - places[0], dim=-1)
+    pixels = [pinhole(T[image].inverse().apply(shown))[0] * focal for T in (given, estimated)]
+    away = torch.linalg.vector_norm(pixels[1] - pixels[0], dim=-1)
     medians = torch.zeros(len(seen.images), dtype=torch.float64)
     for number in image.unique().tolist():
         medians[number] = away[image == number].median()

@@ -63,13 +63,13 @@ def carve_box(box: AxisBox, views: Sequence[View]) -> AxisBox:
     for _ in range(3):
         lower, upper = box
         cell = (upper - lower) / side
-        kept = occupied_cells(views, lower.tolist(), upper.tolist(), (side,) * 3).nonzero()
-        if len(kept) == 0:
+        occupied = occupied_cells(views, lower.tolist(), upper.tolist(), (side,) * 3).nonzero()
+        if len(occupied) == 0:
             return box
-        points = lower + (kept + 0.5) * cell
+        points = lower + (occupied + 0.5) * cell
         witnesses = torch.stack([_shows_something(view, points) for view in views]).sum(dim=0)
         for share in (0.5, 0.25, 0.1, 0.0):
-            cells = kept[witnesses >= share * witnesses.amax()]
+            cells = occupied[witnesses >= share * witnesses.amax()]
             box = grow(lower + cells.amin(dim=0) * cell, lower + (cells.amax(dim=0) + 1) * cell)
             near, far = intersect_box(origins, directions, *box)
             if (far >= near.clamp(min=0)).double().mean() >= 0.999:
@@ -122,7 +122,7 @@ def estimate_bounds(views: Sequence[View], background: tuple[float, float, float
     dense = sum(view.frame.has_dense_depth for view in measured)
     outlined = [view for view in views if has_outline(view)]
     seeing = [(v, v.landmarks) for v in views if v.landmarks is not None and len(v.landmarks.distance)]
-    places = torch.stack([view.T_ref_camera.translation.double() for view in views])
+    centres = torch.stack([view.T_ref_camera.translation.double() for view in views])
     contracted, beyond = 2 * len(outlined) < len(views), 0.0
     if measured and (2 * dense >= len(views) or not outlined):
         contracted = 2 * dense < len(views)
@@ -141,16 +141,16 @@ def estimate_bounds(views: Sequence[View], background: tuple[float, float, float
         beyond = distances[round((1 - OUTLIERS) * last)].item()
         shown = [(view, float(seen.distance.median())) for view, seen in seeing]
     else:
-        box = _guessed_box(views, places)
+        box = _guessed_box(views, centres)
         box = box if contracted else carve_box(box, outlined)
-        outside = torch.maximum(box[0] - places, places - box[1]).clamp(min=0)
+        outside = torch.maximum(box[0] - centres, centres - box[1]).clamp(min=0)
         nearest = torch.linalg.vector_norm(outside, dim=-1).amin().item()  # 0 if a camera is inside
-        near = max(nearest / 2, 0.01 * _farthest(places, box))
+        near = max(nearest / 2, 0.01 * _farthest(centres, box))
         middle, half = (box[0] + box[1]) / 2, float((box[1] - box[0]).amax()) / 2
-        away = torch.linalg.vector_norm(places - middle, dim=-1).clamp(min=half)
+        away = torch.linalg.vector_norm(centres - middle, dim=-1).clamp(min=half)
         shown = list(zip(views, away.tolist(), strict=True))
     # A camera may be slightly farther away than any of the views, and a contracted scene reaches well beyond its box.
-    far = max(beyond, _farthest(places, box)) * (2.0 if contracted else 1.1)
+    far = max(beyond, _farthest(centres, box)) * (2.0 if contracted else 1.1)
     cameras = [(view.frame.intrinsics, distance) for view, distance in shown]
     footprint = statistics.median(2 * distance / (camera.fx + camera.fy) for camera, distance in cameras)
     lower, upper = ((x, y, z) for x, y, z in (end.tolist() for end in box))
@@ -180,7 +180,7 @@ def measured_points(view: View, share: int) -> tuple[Float[Tensor, "n 3"], Float
     return view.T_ref_camera.to(torch.float64).apply(points), torch.linalg.vector_norm(points, dim=-1)
 
 
-def _guessed_box(views: Sequence[View], places: Float[Tensor, "v 3"]) -> AxisBox:
+def _guessed_box(views: Sequence[View], centres: Float[Tensor, "v 3"]) -> AxisBox:
     """Return the box suggested by the cameras alone, see ``estimate_bounds``."""
     corners = torch.stack([_corner_rays(view) for view in views])
     # The tangent of the farthest corner's angle to the optical axis
@@ -191,16 +191,16 @@ def _guessed_box(views: Sequence[View], places: Float[Tensor, "v 3"]) -> AxisBox
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
     normal = across.mean(dim=0)
     if torch.linalg.eigvalsh(normal)[0] >= 0.01:
-        middle = torch.linalg.solve(normal, (across @ places[:, :, None]).mean(dim=0))[:, 0]
-        ahead = ((middle - places) * axes).sum(dim=-1)
-        off = torch.linalg.vector_norm(middle - places - ahead[:, None] * axes, dim=-1)
-        if (off < ahead * tangents).double().mean() >= 0.8:
-            half = (torch.linalg.vector_norm(places - middle, dim=-1) * tangents).amax()
+        middle = torch.linalg.solve(normal, (across @ centres[:, :, None]).mean(dim=0))[:, 0]
+        ahead = ((middle - centres) * axes).sum(dim=-1)
+        distance = torch.linalg.vector_norm(middle - centres - ahead[:, None] * axes, dim=-1)
+        if (distance < ahead * tangents).double().mean() >= 0.8:
+            half = (torch.linalg.vector_norm(centres - middle, dim=-1) * tangents).amax()
             return middle - half, middle + half
-    extent = (places.amax(dim=0) - places.amin(dim=0)).amax()
+    extent = (centres.amax(dim=0) - centres.amin(dim=0)).amax()
     reach = 4 * (float(extent) or 1.0)
     poses = [view.T_ref_camera.to(torch.float64) for view in views]
-    points = torch.cat([places, *(T.apply(rays * reach) for T, rays in zip(poses, corners, strict=True))])
+    points = torch.cat([centres, *(T.apply(rays * reach) for T, rays in zip(poses, corners, strict=True))])
     return points.amin(dim=0), points.amax(dim=0)
 
 
@@ -211,7 +211,7 @@ def _corner_rays(view: View) -> Float[Tensor, "4 3"]:
     return camera.unproject(torch.tensor(corners, dtype=torch.float64))
 
 
-def _farthest(places: Float[Tensor, "v 3"], box: AxisBox) -> float:
+def _farthest(centres: Float[Tensor, "v 3"], box: AxisBox) -> float:
     """Return the largest distance (metres) between a corner of the box and a camera."""
-    across = torch.maximum((places - box[0]).abs(), (places - box[1]).abs())
+    across = torch.maximum((centres - box[0]).abs(), (centres - box[1]).abs())
     return torch.linalg.vector_norm(across, dim=-1).amax().item()

@@ -73,8 +73,8 @@ class FreeSpace:
         known = (points[2] > radius) & (deepest < self.reach) & (pixels < count)
         known &= (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
         # Integers in floats are exact, since these are below 2^24.
-        place = (pixels * height + rows) * width + columns
-        least = self.levels.flatten()[torch.where(known, place, 0).long()]
+        index = (pixels * height + rows) * width + columns
+        least = self.levels.flatten()[torch.where(known, index, 0).long()]
         return known & (deepest < least)
 
     def _footprint(self, points: Float[Tensor, "3 n"], radius: float) -> tuple[Tensor, Tensor, Tensor]:

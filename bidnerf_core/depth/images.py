@@ -52,8 +52,8 @@ class DepthImage:
     @property
     def dropped(self) -> str | None:
         """A phrase that lists the dropped values, or None if there were none."""
-        found = ", ".join(f"{count} x {what}" for what, count in self.replaced.items())
-        return f"treated as not measured: {found}" if found else None
+        counts = ", ".join(f"{count} x {what}" for what, count in self.replaced.items())
+        return f"treated as not measured: {counts}" if counts else None
 
 
 def read_depth_image(path: Path, unit: float | None) -> DepthImage:
@@ -77,8 +77,8 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
     values = to_numpy(raw)
     values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
     if values.ndim != 2 or not values.size or values.dtype.kind not in "uif":
-        found = f"{'x'.join(map(str, values.shape))} of {values.dtype.name}"
-        raise InputError(f"{what} is {found}", expected="one channel of integer or floating-point numbers")
+        shape = f"{'x'.join(map(str, values.shape))} of {values.dtype.name}"
+        raise InputError(f"{what} is {shape}", expected="one channel of integer or floating-point numbers")
     if unit is None:
         unit = 1.0 if values.dtype.kind == "f" else MILLIMETRE
     given: Any = unit
@@ -143,10 +143,10 @@ class DepthReader:
 
     def __call__(self, path: Path, unit: float) -> DepthImage:
         """Read an image as ``read_depth_image`` does. A kind of value not seen before causes an ``InputWarning``."""
-        found = read_depth_image(path, unit)
-        new = {name: count for name, count in found.replaced.items() if name not in self._mentioned}
+        image = read_depth_image(path, unit)
+        new = {name: count for name, count in image.replaced.items() if name not in self._mentioned}
         if new:
             self._mentioned |= new.keys()
-            dropped = replace(found, replaced=new).dropped
+            dropped = replace(image, replaced=new).dropped
             warnings.warn(f"{path}: depth: {dropped}, here and in the images that follow", InputWarning, stacklevel=2)
-        return found
+        return image

@@ -66,9 +66,9 @@ class DepthCamera:
         measured = depth > 0
         rays = camera.unproject(camera.pixel_centres(torch.float64)[measured])
         points = self.T_colour_depth.apply(rays * depth[measured].double()[:, None])
-        found = nearest_depth(points[_ahead(points, coarse)], coarse)
+        nearest = nearest_depth(points[_ahead(points, coarse)], coarse)
         # A small number of measurements may all lie outside.
-        if int(measured.sum()) >= 1000 and not bool((found > 0).any()):
+        if int(measured.sum()) >= 1000 and not bool((nearest > 0).any()):
             away = float(torch.linalg.vector_norm(self.T_colour_depth.translation))
             raise InputError(
                 f"no measurement falls into the colour image; {EXTRINSICS} puts the depth camera {away:.3g}"
@@ -76,15 +76,15 @@ class DepthCamera:
                 where=file,
                 expected="metres and OpenCV axes",
             )
-        return found if coarse == colour else resample_nearest(found, colour.width, colour.height)
+        return nearest if coarse == colour else resample_nearest(nearest, colour.width, colour.height)
 
 
 def nearest_depth(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Float[Tensor, "h w"]:
     """Return planar z (metres) of the nearest of the ``points`` (camera frame) in each pixel; 0 if there is none."""
     row, column, inside = camera.cells(points)
     empty = torch.full((camera.height * camera.width,), torch.inf)
-    place = (row * camera.width + column)[inside]
-    nearest = empty.scatter_reduce(0, place, points[inside, 2].float(), "amin")
+    cell = (row * camera.width + column)[inside]
+    nearest = empty.scatter_reduce(0, cell, points[inside, 2].float(), "amin")
     return torch.where(nearest.isfinite(), nearest, 0).reshape(camera.height, camera.width)
 
 

@@ -132,25 +132,25 @@ def estimate_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) ->
     # The inverse depth of a plane is linear in the image coordinates, whatever its slant. A deviation e of 1/z is a relative
     # deviation z e of z.
     x = x - x.mean(1, keepdim=True)
-    off = 1 / z - (1 / z).mean(-1, keepdim=True)
-    off = off - (x @ torch.linalg.solve(x.mT @ x, x.mT @ off[..., None]))[..., 0]
+    residual = 1 / z - (1 / z).mean(-1, keepdim=True)
+    residual = residual - (x @ torch.linalg.solve(x.mT @ x, x.mT @ residual[..., None]))[..., 0]
     middle, spare = z.median(-1).values, z.shape[-1] / (z.shape[-1] - 3)
     # A quarter of the windows is assumed to be planar (the others may show edges, curved surfaces and relief): the noise is that
     # quantile of their residuals, times the ratio of the two if all windows are planar and all pixels independent.
-    noise = 1.11 * MAD_TO_SIGMA * spare**0.5 * middle * off.abs().median(-1).values
+    noise = 1.11 * MAD_TO_SIGMA * spare**0.5 * middle * residual.abs().median(-1).values
     ranges = middle.argsort().tensor_split(min(8, len(z) // LEAST_WINDOWS))
     at = torch.stack([middle[some].median() for some in ranges]).numpy()
-    found = torch.stack([noise[some].quantile(0.25) for some in ranges]).numpy()
+    deviation = torch.stack([noise[some].quantile(0.25) for some in ranges]).numpy()
     # The noise is at least the rounding to the usual step of the values, unless they are continuous or few.
     measured = depth[(depth > 0) & depth.isfinite()]
     values = measured.unique()
     if len(values) >= LEAST_VALUES and len(measured) >= 4 * len(values):
-        found = np.maximum(found, float(values.diff().median()) / math.sqrt(12) / at)
+        deviation = np.maximum(deviation, float(values.diff().median()) / math.sqrt(12) / at)
     if at.max() < 1.5 * at.min():  # too small a range to estimate how the noise grows with depth
-        return DepthNoise(linear=float(np.median(found)))
+        return DepthNoise(linear=float(np.median(deviation)))
     from scipy.optimize import nnls  # imported here, since it takes as long as the rest of scipy
 
-    (linear, quadratic), _ = nnls(np.stack([np.ones_like(at), at], axis=-1), found)
+    (linear, quadratic), _ = nnls(np.stack([np.ones_like(at), at], axis=-1), deviation)
     return DepthNoise(linear=float(linear), quadratic=float(quadratic))
 
 
@@ -179,9 +179,9 @@ def noise_remark(depth: Float[Tensor, "h w"], intrinsics: Intrinsics, sensor: st
 
     Returns None if the noise cannot be estimated from the image.
     """
-    found = estimate_depth_noise(depth, intrinsics)
-    if found is None:
+    noise = estimate_depth_noise(depth, intrinsics)
+    if noise is None:
         return None
     z = float(depth[depth > 0].median())
-    estimated, expected = found.deviation(z) / z, find_depth_sensor(sensor).noise.deviation(z) / z
+    estimated, expected = noise.deviation(z) / z, find_depth_sensor(sensor).noise.deviation(z) / z
     return f"depth noise at {z:.3g} m is about {estimated:.2%}; {sensor!r} usually has {expected:.2%}"

@@ -47,13 +47,13 @@ class RaySpacing:
         beyond = (distance - self.exit[..., None]).clamp(min=0)
         return torch.minimum(distance, self.exit[..., None]) + beyond / (1 + beyond / self.radius)
 
-    def distance(self, place: Float[Tensor, "*r s"]) -> Float[Tensor, "*r s"]:
+    def distance(self, coordinate: Float[Tensor, "*r s"]) -> Float[Tensor, "*r s"]:
         """Convert the coordinate to distances along the rays (metres), the inverse of ``place``."""
         if self.radius == float("inf"):
-            return place
-        beyond = (place - self.exit[..., None]).clamp(min=0)
-        left = (1 - beyond / self.radius).clamp(min=torch.finfo(place.dtype).eps)
-        return torch.minimum(place, self.exit[..., None]) + beyond / left
+            return coordinate
+        beyond = (coordinate - self.exit[..., None]).clamp(min=0)
+        left = (1 - beyond / self.radius).clamp(min=torch.finfo(coordinate.dtype).eps)
+        return torch.minimum(coordinate, self.exit[..., None]) + beyond / left
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,8 +230,8 @@ def backward_derivatives(
     copies = 4 if positions.device.type != "cpu" and n <= 2**16 else 1
     with torch.enable_grad():
         leaves = [part.detach().repeat(copies, 1).requires_grad_() for part in (positions, directions)]
-        found = query(*leaves)
-        channels = [found.density, *found.rgb.unbind(-1)]
+        output = query(*leaves)
+        channels = [output.density, *output.rgb.unbind(-1)]
         if copies > 1:
             channels = [torch.cat([part[k * n : (k + 1) * n] for k, part in enumerate(channels)])]
         gradients = [
@@ -244,15 +244,15 @@ def backward_derivatives(
         torch.cat([part.unflatten(0, (copies, n)) for part in parts]).movedim(0, 1)
         for parts in zip(*gradients, strict=True)
     )
-    values = FieldValues(found.density.detach()[:n], found.rgb.detach()[:n])
+    values = FieldValues(output.density.detach()[:n], output.rgb.detach()[:n])
     return FieldDerivatives(values, by_position, by_direction)
 
 
 def device_of(field: RadianceField) -> torch.device:
     """Return the device of a field's parameters or buffers, or of the first field that a dataclass wraps; else the CPU."""
     tensors = (first for kind in ("parameters", "buffers") for first in _tensors_of(field, kind))
-    found = next(tensors, None)
-    return torch.device("cpu") if found is None else found.device
+    tensor = next(tensors, None)
+    return torch.device("cpu") if tensor is None else tensor.device
 
 
 def is_frozen(field: RadianceField) -> bool:
@@ -262,8 +262,8 @@ def is_frozen(field: RadianceField) -> bool:
 
 def _tensors_of(field: object, kind: str) -> Iterator[Tensor]:
     """Yield the parameters or the buffers of a module, or of the first field that a dataclass wraps."""
-    if (found := getattr(field, kind, None)) is not None:
-        yield from found()
+    if (listed := getattr(field, kind, None)) is not None:
+        yield from listed()
     elif is_dataclass(field):
         inner = (getattr(field, part.name) for part in fields(field))
         yield from _tensors_of(next((part for part in inner if isinstance(part, RadianceField)), None), kind)
@@ -305,9 +305,9 @@ class SceneBounds:
             ),
             (largest <= LARGEST_LENGTH, f"{largest:g} m is too large", f"at most {LARGEST_LENGTH:g} m"),
         )
-        for holds, found, expected in checks:
+        for holds, fault, expected in checks:
             if not holds:
-                raise InputError(found, where="scene bounds", expected=expected)
+                raise InputError(fault, where="scene bounds", expected=expected)
 
     @property
     def size(self) -> tuple[float, float, float]:

@@ -60,12 +60,12 @@ def query_network(
 def spherical_harmonics(directions: Float[Tensor, "*p 3"], count: int) -> Float[Tensor, "*p k"]:
     """Return the first ``count`` (1, 4, 9 or 16) real spherical harmonics at unit directions, without the Condon-Shortley phase."""
     x, y, z = directions.unbind(-1)
-    found = [torch.full_like(x, 0.28209479177387814)]
+    harmonics = [torch.full_like(x, 0.28209479177387814)]
     if count > 1:
-        found += [0.4886025119029199 * y, 0.4886025119029199 * z, 0.4886025119029199 * x]
+        harmonics += [0.4886025119029199 * y, 0.4886025119029199 * z, 0.4886025119029199 * x]
     if count > 4:
         xx, yy, zz = x * x, y * y, z * z
-        found += [
+        harmonics += [
             1.0925484305920792 * x * y,
             1.0925484305920792 * y * z,
             0.31539156525252005 * (3 * zz - 1),
@@ -73,7 +73,7 @@ def spherical_harmonics(directions: Float[Tensor, "*p 3"], count: int) -> Float[
             0.5462742152960396 * (xx - yy),
         ]
     if count > 9:
-        found += [
+        harmonics += [
             0.5900435899266435 * y * (3 * xx - yy),
             2.890611442640554 * x * y * z,
             0.4570457994644658 * y * (5 * zz - 1),
@@ -82,4 +82,4 @@ def spherical_harmonics(directions: Float[Tensor, "*p 3"], count: int) -> Float[
             1.445305721320277 * z * (xx - yy),
             0.5900435899266435 * x * (xx - 3 * yy),
         ]
-    return torch.stack(found, dim=-1)
+    return torch.stack(harmonics, dim=-1)

@@ -174,15 +174,15 @@ def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> Fiel
         directions = rays.directions[..., None, :].expand_as(positions)
         moving = torch.is_grad_enabled() and (rays.origins.requires_grad or rays.directions.requires_grad)
         if moving and not waiting and isinstance(field, DifferentiatedField) and is_frozen(field):
-            found = _Queried.apply(positions.reshape(-1, 3), directions.reshape(-1, 3), valid.reshape(-1), field)
-            density, rgb = found.view(*valid.shape, 4).split((1, 3), -1)
+            output = _Queried.apply(positions.reshape(-1, 3), directions.reshape(-1, 3), valid.reshape(-1), field)
+            density, rgb = output.view(*valid.shape, 4).split((1, 3), -1)
             return FieldValues(density[..., 0], rgb)
-        found = field.query(positions, directions)
-        return FieldValues(torch.where(valid, found.density, 0), found.rgb)
+        output = field.query(positions, directions)
+        return FieldValues(torch.where(valid, output.density, 0), output.rgb)
     index = valid.reshape(-1).nonzero()[:, 0]
-    found = field.query(*points_of(rays, samples, index))
-    density = found.density.new_zeros(valid.numel()).index_copy(0, index, found.density)
-    rgb = found.rgb.new_zeros((valid.numel(), 3)).index_copy(0, index, found.rgb)
+    output = field.query(*points_of(rays, samples, index))
+    density = output.density.new_zeros(valid.numel()).index_copy(0, index, output.density)
+    rgb = output.rgb.new_zeros((valid.numel(), 3)).index_copy(0, index, output.rgb)
     return FieldValues(density.reshape(valid.shape), rgb.reshape(*valid.shape, 3))
 
 
@@ -204,19 +204,19 @@ def query_packed(field: RadianceField, rays: Rays, samples: RaySamples, room: in
     valid = samples.valid.reshape(-1)
     total, room = valid.numel(), min(room, valid.numel())
     order = valid.cumsum(0)
-    kept = valid & (order <= room)
+    selected = valid & (order <= room)
     slot = torch.arange(room, device=valid.device)
     # An empty slot takes some sample of its own, since many gradients for the same point would be added one
     # after another.
     index = torch.cat([slot, slot[:1]]).index_copy(
-        0, torch.where(kept, order - 1, room), torch.arange(total, device=valid.device)
+        0, torch.where(selected, order - 1, room), torch.arange(total, device=valid.device)
     )[:room]
-    found = field.query(*points_of(rays, samples, index))
+    output = field.query(*points_of(rays, samples, index))
     target = torch.where(slot < order[-1:], index, total)
-    density = found.density.new_zeros(total + 1).index_copy(0, target, found.density)[:-1]
-    rgb = found.rgb.new_zeros((total + 1, 3)).index_copy(0, target, found.rgb)[:-1]
+    density = output.density.new_zeros(total + 1).index_copy(0, target, output.density)[:-1]
+    rgb = output.rgb.new_zeros((total + 1, 3)).index_copy(0, target, output.rgb)[:-1]
     values = FieldValues(density.view_as(samples.valid), rgb.view(*samples.valid.shape, 3))
-    return values, replace(samples, valid=kept.view_as(samples.valid))
+    return values, replace(samples, valid=selected.view_as(samples.valid))
 
 
 class _Queried(torch.autograd.Function):
@@ -230,9 +230,9 @@ class _Queried(torch.autograd.Function):
         wanted: Bool[Tensor, "p"],
         field: DifferentiatedField,
     ) -> Float[Tensor, "p 4"]:
-        found = field.jacobian(positions, directions, wanted)
-        ctx.save_for_backward(found.by_position, found.by_direction, wanted)
-        values = torch.cat([found.values.density[:, None], found.values.rgb], -1)
+        derivatives = field.jacobian(positions, directions, wanted)
+        ctx.save_for_backward(derivatives.by_position, derivatives.by_direction, wanted)
+        values = torch.cat([derivatives.values.density[:, None], derivatives.values.rgb], -1)
         return torch.where(wanted[:, None], values, constant((0.0,), values))
 
     @staticmethod

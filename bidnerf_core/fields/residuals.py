@@ -35,8 +35,8 @@ def truncated_depth_residual(rendering: Rendering, observed: Observations) -> Fl
     away the surface is; in the paper's residual it counts with its full distance.
     """
     limit = 0.3
-    off = (rendering.samples.middles - observed.distance[..., None]).clamp(-limit, limit)
-    return (rendering.weights * off).sum(-1) + (1 - rendering.opacity) * limit
+    offset = (rendering.samples.middles - observed.distance[..., None]).clamp(-limit, limit)
+    return (rendering.weights * offset).sum(-1) + (1 - rendering.opacity) * limit
 
 
 def first_surface_residual(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p"]:

@@ -117,15 +117,18 @@ def inverse_transform(
     """
     cdf = torch.cumsum(weights, dim=-1)
     cdf = cdf / cdf[..., -1:].clamp(min=torch.finfo(cdf.dtype).tiny)
-    places = (torch.arange(count, dtype=cdf.dtype, device=cdf.device) + 0.5) / count
-    places = places.expand(*cdf.shape[:-1], count).contiguous()
+    quantiles = (torch.arange(count, dtype=cdf.dtype, device=cdf.device) + 0.5) / count
+    quantiles = quantiles.expand(*cdf.shape[:-1], count).contiguous()
     if jitter is not None:
-        places = places + (torch.rand(places.shape, generator=jitter, device=jitter.device).to(places) - 0.5) / count
-    index = torch.searchsorted(cdf, places).clamp(max=cdf.shape[-1] - 1)
+        quantiles = (
+            quantiles
+            + (torch.rand(quantiles.shape, generator=jitter, device=jitter.device).to(quantiles) - 0.5) / count
+        )
+    index = torch.searchsorted(cdf, quantiles).clamp(max=cdf.shape[-1] - 1)
     below = torch.cat([torch.zeros_like(cdf[..., :1]), cdf], dim=-1).gather(-1, index)
     width = (cdf.gather(-1, index) - below).clamp(min=torch.finfo(cdf.dtype).tiny)
     start, end = samples.starts.gather(-1, index), samples.ends.gather(-1, index)
-    distances = start + (end - start) * ((places - below) / width).clamp(0, 1)
+    distances = start + (end - start) * ((quantiles - below) / width).clamp(0, 1)
     return torch.minimum(distances, end), index
 
 
@@ -141,7 +144,7 @@ def gather_valid(samples: RaySamples) -> RaySamples:
     return RaySamples(starts, torch.maximum(starts, torch.minimum(ends, following)), valid)
 
 
-def _cut(rough: RaySamples, places: Float[Tensor, "*r n"], owner: Int[Tensor, "*r n"]) -> RaySamples:
+def _cut(rough: RaySamples, distances: Float[Tensor, "*r n"], owner: Int[Tensor, "*r n"]) -> RaySamples:
     """Return the gathered intervals ``rough``, split at ``places``, which lie in the intervals ``owner``.
 
     A part begins at the start of an interval or at a place inside the interval, and ends at the next place or at
@@ -151,7 +154,7 @@ def _cut(rough: RaySamples, places: Float[Tensor, "*r n"], owner: Int[Tensor, "*
     owner = torch.cat([owner, first], dim=-1)
     valid = rough.valid.gather(-1, owner)
     # Places go first: if a place and a start coincide, the piece from the start is the longer one.
-    starts, order = torch.cat([places, rough.starts], dim=-1).where(valid, torch.inf).sort(dim=-1, stable=True)
+    starts, order = torch.cat([distances, rough.starts], dim=-1).where(valid, torch.inf).sort(dim=-1, stable=True)
     owner, valid = owner.gather(-1, order), valid.gather(-1, order)
     following = torch.cat([starts[..., 1:], torch.full_like(starts[..., :1], torch.inf)], dim=-1)
     ends = torch.minimum(rough.ends.gather(-1, owner), following)
@@ -200,14 +203,14 @@ class Concentrated:
         unchanged = [part[..., : self.count] for part in rough.parts]
         # Selecting the rays in ``many`` makes the host wait for the device. Where it may not, all rays are concentrated.
         if not may_wait(many.device):
-            found = self._concentrated(rays, rough, jitter)
-            pairs = zip(found.parts, unchanged, strict=True)
+            samples = self._concentrated(rays, rough, jitter)
+            pairs = zip(samples.parts, unchanged, strict=True)
             return RaySamples(*(torch.where(many[..., None], new, old) for new, old in pairs))
         index = many.reshape(-1).nonzero()[:, 0]
-        found = self._concentrated(rows_of(rays, index), rows_of(rough, index), jitter)
+        samples = self._concentrated(rows_of(rays, index), rows_of(rough, index), jitter)
         merged = (
             old.reshape(-1, self.count).index_copy(0, index, new)
-            for new, old in zip(found.parts, unchanged, strict=True)
+            for new, old in zip(samples.parts, unchanged, strict=True)
         )
         return RaySamples(*merged).unflattened(many.shape)
 
@@ -285,17 +288,17 @@ class ScaledField(nn.Module):
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         """Return density and colour at ``positions`` in the scaled world."""
-        found = self.trained.query(positions / self.scale, directions)
-        return replace(found, density=found.density / self.scale)
+        values = self.trained.query(positions / self.scale, directions)
+        return replace(values, density=values.density / self.scale)
 
     def jacobian(
         self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"], wanted: Bool[Tensor, "p"] | None = None
     ) -> FieldDerivatives:
-        found = derivatives_of(self.trained, positions / self.scale, directions, wanted)
+        derivatives = derivatives_of(self.trained, positions / self.scale, directions, wanted)
         unit = positions.new_full((4, 1), 1.0)
         unit[0] /= self.scale
-        values = replace(found.values, density=found.values.density / self.scale)
-        return FieldDerivatives(values, found.by_position * unit / self.scale, found.by_direction * unit)
+        values = replace(derivatives.values, density=derivatives.values.density / self.scale)
+        return FieldDerivatives(values, derivatives.by_position * unit / self.scale, derivatives.by_direction * unit)
 
 
 class ScaledHitField(ScaledField):
@@ -304,8 +307,8 @@ class ScaledHitField(ScaledField):
     def hits(self, rays: Rays) -> RayHits:
         """Return the hits of rays in the scaled world."""
         trained: HitField = self.trained
-        found = trained.hits(shrunk(rays, self.scale))
-        return replace(found, distance=found.distance * self.scale)
+        hits = trained.hits(shrunk(rays, self.scale))
+        return replace(hits, distance=hits.distance * self.scale)
 
 
 class ScaledSplatField(ScaledHitField):
@@ -314,8 +317,8 @@ class ScaledSplatField(ScaledHitField):
     def splats(self) -> Splats:
         """Return the primitives in the scaled world."""
         trained: SplatField = self.trained
-        found = trained.splats()
-        return replace(found, positions=found.positions * self.scale, radius=found.radius * self.scale)
+        splats = trained.splats()
+        return replace(splats, positions=splats.positions * self.scale, radius=splats.radius * self.scale)
 
 
 def scale_field(field: RadianceField, scale: float) -> ScaledField:
@@ -339,8 +342,8 @@ class ScaledSampler:
 
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
         """Return the samples of rays in the scaled world."""
-        found = self.sampler(shrunk(rays, self.scale), jitter)
-        return replace(found, starts=found.starts * self.scale, ends=found.ends * self.scale)
+        samples = self.sampler(shrunk(rays, self.scale), jitter)
+        return replace(samples, starts=samples.starts * self.scale, ends=samples.ends * self.scale)
 
 
 def trained_field(field: RadianceField) -> RadianceField:

@@ -109,8 +109,8 @@ class Frame:
         where, camera = f"frame {self.name}", self.intrinsics
         _check_camera(where, camera)
         if camera.distortion and not _has_rays(replace(camera, distortion=tuple(camera.distortion))):
-            found = f"distortion is {camera.distortion}, which maps no ray to some of its pixels;"
-            raise InputError(found, where=where, expected="coefficients of a real lens")
+            fault = f"distortion is {camera.distortion}, which maps no ray to some of its pixels;"
+            raise InputError(fault, where=where, expected="coefficients of a real lens")
         for what in IMAGES:
             image = self.__dict__[what]
             if image is not None or what == "rgb":
@@ -124,8 +124,8 @@ class Frame:
         if self.hidden is None:
             return
         if self.hidden.device.type == "cpu" and bool(self.hidden.all()):
-            found = "hidden is all true"
-            raise WhollyHidden(found, where=where, expected="booleans that leave something visible")
+            fault = "hidden is all true"
+            raise WhollyHidden(fault, where=where, expected="booleans that leave something visible")
         if self.depth is not None:
             hidden = self.hidden.to(self.depth.device)
             # A depth image that needs no change stays in its store; the host does not wait for an accelerator.
@@ -193,32 +193,32 @@ class Frame:
         path, behind = Path(path), BLACK if background is None else background_colour(background)
         header, exif = read_header(path), read_exif(path)
         raster = Raster(header.width, header.height, exif.orientation)
-        found = camera.find(path, raster, exif)
+        resolved = camera.find(path, raster, exif)
         measured = None if depth is None else read_depth_image(Path(depth), depth_unit)
-        found = found.at_most(largest)
-        size = (found.camera.width, found.camera.height)
+        resolved = resolved.at_most(largest)
+        size = (resolved.camera.width, resolved.camera.height)
         if size == raster.upright_size:
             rgb, alpha = read_compact_image(path, behind)
         else:
             rgb, alpha = read_image(path, behind, exif.orientation.upright_size(*size))
         metres = None
         if measured is not None and depth is not None:
-            if remark := measured.remark(depth_unit is None):
-                warnings.warn(f"{depth}: {remark}", InputWarning, stacklevel=3)
+            if notice := measured.remark(depth_unit is None):
+                warnings.warn(f"{depth}: {notice}", InputWarning, stacklevel=3)
             metres = (
                 fit_depth(measured, raster, size, f"{depth}: depth")
                 if sensor is None
-                else sensor.registered(measured.metres, pinhole_of(found.camera, Path(depth)), Path(depth))
+                else sensor.registered(measured.metres, pinhole_of(resolved.camera, Path(depth)), Path(depth))
             )
         return Frame.taken(
             path.stem,
-            found.camera,
+            resolved.camera,
             exif.orientation.upright(rgb),
             metres,
             None if alpha is None else exif.orientation.upright(alpha),
             None if mask is None else read_mask(mask.path, raster, size, mask.hides),
-            camera_source=found.description,
-            focal_is_approximate=found.approximate,
+            camera_source=resolved.description,
+            focal_is_approximate=resolved.approximate,
             orientation=exif.orientation,
             awaits_background=background is None and alpha is not None,
         )
@@ -301,23 +301,23 @@ class Frame:
                 )
             values = pixel_array(alpha, f"{where}: alpha")
             if values.shape != (*colour.shape[:2], 1):
-                found, size = ("x".join(map(str, shape)) for shape in (values.shape, colour.shape[:2]))
-                raise InputError(f"alpha is {found}", where=where, expected=f"{size} as rgb (rows x columns)")
+                actual, size = ("x".join(map(str, shape)) for shape in (values.shape, colour.shape[:2]))
+                raise InputError(f"alpha is {actual}", where=where, expected=f"{size} as rgb (rows x columns)")
             cover = values[..., 0]
         raster = Raster(colour.shape[1], colour.shape[0])
         intrinsics = raster.upright(camera)
         if intrinsics is None:
-            found, expected = f"{raster.width}x{raster.height}", f"{camera.width}x{camera.height}"
+            actual, expected = f"{raster.width}x{raster.height}", f"{camera.width}x{camera.height}"
             raise InputError(
-                f"rgb is {found}, but its camera expects {expected} or a size of the same aspect ratio",
+                f"rgb is {actual}, but its camera expects {expected} or a size of the same aspect ratio",
                 where=where,
             )
         metres = None
         if depth is not None:
             measured = depth_image(depth, depth_unit, f"{where}: depth")
             metres = fit_depth(measured, raster, raster.size, f"{where}: depth")
-            if remark := measured.remark(depth_unit is None):
-                warnings.warn(f"{where}: {remark}", InputWarning, stacklevel=2)
+            if notice := measured.remark(depth_unit is None):
+                warnings.warn(f"{where}: {notice}", InputWarning, stacklevel=2)
         laid = composite(colour, cover, BLACK if background is None else background_colour(background))
         unused = None if hidden is None else torch.as_tensor(hidden)
         awaits = background is None and cover is not None
@@ -393,13 +393,13 @@ def _check_image(where: str, what: str, image: object, camera: Intrinsics) -> No
             where=where,
             expected="a tensor; Frame.from_numpy takes arrays",
         )
-    found, wanted = tuple(image.shape), (camera.height, camera.width, *((3,) if what == "rgb" else ()))
-    if len(found) != len(wanted) or found[2:] != wanted[2:]:
+    shape, wanted = tuple(image.shape), (camera.height, camera.width, *((3,) if what == "rgb" else ()))
+    if len(shape) != len(wanted) or shape[2:] != wanted[2:]:
         expected = "(height, width, 3); Frame.from_numpy takes grey and RGBA" if what == "rgb" else "(height, width)"
-        raise InputError(f"{what} has shape {found}", where=where, expected=expected)
-    if found != wanted:
+        raise InputError(f"{what} has shape {shape}", where=where, expected=expected)
+    if shape != wanted:
         expects = f"{camera.width}x{camera.height}"
-        raise InputError(f"{what} is {found[1]}x{found[0]}, but its camera expects {expects}", where=where)
+        raise InputError(f"{what} is {shape[1]}x{shape[0]}, but its camera expects {expects}", where=where)
     if image.layout != torch.strided or (image.is_meta and type(image) is Tensor):
         raise InputError(f"{what} is a sparse tensor or has no values", where=where, expected="a dense one")
     if image.dtype == {"rgb": torch.uint8, "hidden": torch.bool}.get(what):

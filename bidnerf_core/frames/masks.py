@@ -70,8 +70,8 @@ def _white(raw: np.ndarray) -> Bool[np.ndarray, "h w"]:
     brightness: np.ndarray = colours.max(-1)
     full = float(np.iinfo(brightness.dtype).max) if brightness.dtype.kind in "ui" else 1.0
     is_dark = float(brightness.max(initial=0)) < full / 2
-    found: np.ndarray = brightness > 0 if is_dark else brightness >= full / 2
-    return found
+    white: np.ndarray = brightness > 0 if is_dark else brightness >= full / 2
+    return white
 
 
 class MaskFolder:
@@ -107,10 +107,10 @@ class MaskFolder:
 
     def file_of(self, name: str) -> Path | None:
         """Return the mask of the frame named ``name``; None if there is none. Raises ``InputError`` if there are several."""
-        found = self._by_name.get(name, [])
-        if len(found) > 1:
-            raise InputError(f"{found[0]} and {found[1]} both match {name} by name", expected="one mask")
-        return found[0] if found else None
+        files = self._by_name.get(name, [])
+        if len(files) > 1:
+            raise InputError(f"{files[0]} and {files[1]} both match {name} by name", expected="one mask")
+        return files[0] if files else None
 
     def require_any(self, names: Sequence[str]) -> None:
         """Raise ``InputError`` if none of the frames ``names`` has a mask."""

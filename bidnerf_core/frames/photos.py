@@ -71,4 +71,4 @@ def _is_photo(file: Path) -> bool:
 def natural_order(name: str) -> list[tuple[int, str]]:
     """Return a sort key that ignores case and compares runs of digits as numbers."""
     parts = re.split(r"(\d+)", name.lower())
-    return [(int(part), "") if place % 2 else (-1, part) for place, part in enumerate(parts)]
+    return [(int(part), "") if number % 2 else (-1, part) for number, part in enumerate(parts)]

@@ -102,8 +102,8 @@ def measured_middle(views: Sequence[View]) -> Float[Tensor, "3"] | None:
         number = (view.frame.depth.flatten()[::4] > 0).nonzero()[:, 0]
         number = 4 * number[:: max(1, len(number) // 200_000)]
         width = view.frame.intrinsics.width
-        places = torch.stack([number % width, number // width], dim=-1)
-        pixels = observe(view, places, torch.float64, "cpu")
+        sampled = torch.stack([number % width, number // width], dim=-1)
+        pixels = observe(view, sampled, torch.float64, "cpu")
         points.append(pixels.points[pixels.measured])
     together = torch.cat(points) if points else torch.zeros((0, 3))
     return together.median(0).values if len(together) else None
@@ -156,14 +156,14 @@ def among(choose: Callable[[Frame], Int[Tensor, "n 2"]]) -> PixelDrawer:
     """
 
     def draw(frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]:
-        found: Tensor | None = frame.__dict__.get(choose.__name__)
-        if found is None or found.device != generator.device:
-            found = choose(frame)
-            found = found[visible_at(frame, found)].to(generator.device)
-            frame.__dict__[choose.__name__] = found
-        if len(found) == 0:
+        candidates: Tensor | None = frame.__dict__.get(choose.__name__)
+        if candidates is None or candidates.device != generator.device:
+            candidates = choose(frame)
+            candidates = candidates[visible_at(frame, candidates)].to(generator.device)
+            frame.__dict__[choose.__name__] = candidates
+        if len(candidates) == 0:
             return uniform(frame, count, generator)
-        return found[torch.randint(len(found), (count,), generator=generator, device=found.device)]
+        return candidates[torch.randint(len(candidates), (count,), generator=generator, device=candidates.device)]
 
     return draw
 

@@ -53,8 +53,8 @@ class PixelStore:
         if start + size > len(self._block):
             self._block, start = self._new_block(size), 0
         self._used = start + size
-        found = self._block[start : start + size].view(image.dtype).view(image.shape)
-        return found.copy_(image)
+        copy = self._block[start : start + size].view(image.dtype).view(image.shape)
+        return copy.copy_(image)
 
     def _new_block(self, least: int) -> Tensor:
         size = max(least, min(BLOCK, self._expected + ALIGNMENT))
@@ -69,11 +69,11 @@ class PixelStore:
                     os.truncate(file.fileno(), size)
                 return torch.from_numpy(np.memmap(file, np.uint8, "r+", shape=(size,)))
         except OSError as error:
-            place = self._folder or tempfile.gettempdir()
+            folder = self._folder or tempfile.gettempdir()
             raise InputError(
                 f"no room for {self._expected / 1e6:.0f} MB of images ({error.strerror or error}), free that"
                 " much, or read them smaller (--largest, largest=)",
-                where=place,
+                where=folder,
             ) from error
 
 

@@ -41,8 +41,8 @@ def rotation_vector(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"
     sine, cosine = math.sqrt(float(axis @ axis)), 0.5 * (float(np.trace(rotation)) - 1)
     angle = math.atan2(sine, cosine)
     if angle > 2.5:  # beyond this angle, the skew part does not determine the axis well
-        found: np.ndarray = Rotation.from_matrix(rotation).as_rotvec()
-        return found
+        vector: np.ndarray = Rotation.from_matrix(rotation).as_rotvec()
+        return vector
     return axis * (1 + angle**2 / 6 if angle < SERIES_ANGLE else angle / sine)
 
 

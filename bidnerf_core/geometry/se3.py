@@ -75,14 +75,14 @@ class SE3:
         back = self.rotation.mT
         # Keeps 0 / 0 from being NaN without changing any other ratio.
         least = torch.finfo(back.dtype).tiny ** 0.5
-        R, off = back @ other.rotation, _matvec(back, other.translation - self.translation)
+        R, offset = back @ other.rotation, _matvec(back, other.translation - self.translation)
         twice = torch.stack([R[..., i, j] - R[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1)
         sine = twice.square().sum(-1).sqrt() / 2 + least
         angle = torch.atan2(sine, (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2) + least
         phi = (angle / (2 * sine))[..., None] * twice
         c = (1 - angle / 2 / (angle / 2).tan()) / angle.square()
-        once = torch.linalg.cross(phi, off)
-        return torch.cat([off - once / 2 + c[..., None] * torch.linalg.cross(phi, once), phi], -1)
+        once = torch.linalg.cross(phi, offset)
+        return torch.cat([offset - once / 2 + c[..., None] * torch.linalg.cross(phi, once), phi], -1)
 
     def matrix(self) -> Float[Tensor, "*b 4 4"]:
         top = torch.cat([self.rotation, self.translation[..., None]], dim=-1)
@@ -96,9 +96,9 @@ class SE3:
         Blender, nerfstudio). Raises ``InputError`` for any other value.
         """
         _check_order(order)
-        found = torch.nn.functional.normalize(rotation_matrix_to_quaternion(self.rotation), dim=-1)
-        found = torch.where(found[..., :1] < 0, -found, found)
-        return found if order == "wxyz" else found.roll(-1, dims=-1)
+        quaternion = torch.nn.functional.normalize(rotation_matrix_to_quaternion(self.rotation), dim=-1)
+        quaternion = torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+        return quaternion if order == "wxyz" else quaternion.roll(-1, dims=-1)
 
     @staticmethod
     def from_quaternion(
@@ -174,9 +174,9 @@ class SE3:
     def is_rigid(self, tolerance: float = 1e-3) -> Bool[Tensor, "*b"]:
         """Return whether the transform is finite and its rotation orthonormal to ``tolerance``, with determinant 1."""
         eye = torch.eye(3, dtype=self.rotation.dtype, device=self.rotation.device)
-        off = (self.rotation.mT @ self.rotation - eye).abs().amax(dim=(-1, -2))
+        deviation = (self.rotation.mT @ self.rotation - eye).abs().amax(dim=(-1, -2))
         finite = torch.isfinite(self.translation).all(dim=-1)
-        return finite & (off <= tolerance) & (torch.linalg.det(self.rotation) > 0)
+        return finite & (deviation <= tolerance) & (torch.linalg.det(self.rotation) > 0)
 
     def detach(self) -> SE3:
         return SE3(self.rotation.detach(), self.translation.detach())

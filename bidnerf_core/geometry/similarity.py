@@ -52,8 +52,8 @@ def rigid_pose(matrix: Float[Tensor, "3 4"], where: object, what: str = "the rot
     """
     given = SE3(matrix[:3, :3], matrix[:3, 3])
     if not given.is_rigid(RIGID_TO):
-        off = (given.rotation.mT @ given.rotation - torch.eye(3, dtype=torch.float64)).abs().max().item()
-        fault = f"off orthonormal by {off:.2g}" if not off <= RIGID_TO else "a mirror image"
+        deviation = (given.rotation.mT @ given.rotation - torch.eye(3, dtype=torch.float64)).abs().max().item()
+        fault = f"off orthonormal by {deviation:.2g}" if not deviation <= RIGID_TO else "a mirror image"
         raise InputError(f"{what} is {fault}", where=where, expected="a rigid transform")
     return given.normalized()
 
@@ -104,13 +104,13 @@ def covariance_in(
         raise InputError(
             f"convention is {convention!r}", expected=f"one of {', '.join(get_args(CovarianceConvention))}"
         )
-    found = covariance.detach().cpu().double()
+    ours = covariance.detach().cpu().double()
     if convention == "gtsam":
-        return found.roll((3, 3), (0, 1))
+        return ours.roll((3, 3), (0, 1))
     if convention == "ros":
         turn = torch.block_diag(*2 * [T_world_camera.rotation.detach().cpu().double()])
-        return turn @ found @ turn.mT
-    return found
+        return turn @ ours @ turn.mT
+    return ours
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,5 +157,5 @@ def fit_similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -
 
 def spread(points: Float[Tensor, "n 3"]) -> float:
     """Return the points' root mean square distance from their mean, or 0 if they all coincide up to rounding."""
-    found = float((points - points.mean(0)).square().sum(-1).mean().sqrt())
-    return found if found > 1e-12 * float(points.abs().amax()) else 0.0
+    deviation = float((points - points.mean(0)).square().sum(-1).mean().sqrt())
+    return deviation if deviation > 1e-12 * float(points.abs().amax()) else 0.0

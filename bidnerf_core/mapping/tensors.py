@@ -60,14 +60,14 @@ TRACK_KINDS = {
 def surface_tensors(surface: SurfaceMap) -> dict[str, Tensor]:
     """Return copies of a surface's tensors, by name and in the dtypes of ``SURFACE_KINDS``."""
     index, grid = surface.index, surface.grid
-    found: dict[str, Any] = {name: getattr(surface.surfels, name) for name in SURFELS}
-    found |= {"keyframes": surface.keyframes, "lower": grid.lower, "cell": grid.cell, "shape": grid.shape}
-    found |= {name: getattr(index, name) for name in ("first", "level", "entries")}
-    return _copies(found, SURFACE_KINDS)
+    values: dict[str, Any] = {name: getattr(surface.surfels, name) for name in SURFELS}
+    values |= {"keyframes": surface.keyframes, "lower": grid.lower, "cell": grid.cell, "shape": grid.shape}
+    values |= {name: getattr(index, name) for name in ("first", "level", "entries")}
+    return _copies(values, SURFACE_KINDS)
 
 
-def _copies(found: dict[str, Any], kinds: Mapping[str, TensorKind]) -> dict[str, Tensor]:
-    return pack_tensors({name: torch.as_tensor(found[name], dtype=kind.dtype) for name, kind in kinds.items()})
+def _copies(values: dict[str, Any], kinds: Mapping[str, TensorKind]) -> dict[str, Tensor]:
+    return pack_tensors({name: torch.as_tensor(values[name], dtype=kind.dtype) for name, kind in kinds.items()})
 
 
 def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
@@ -98,11 +98,11 @@ def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
 def landmark_tensors(landmarks: LandmarkMap) -> dict[str, Tensor]:
     """Return copies of the tensors of ``landmarks``, by name and in the dtypes of ``LANDMARK_KINDS``."""
     values = {name: getattr(landmarks, name) for name in LANDMARK_KINDS} | {"trial": astuple(landmarks.trial)}
-    found = _copies(values, LANDMARK_KINDS)
+    copies = _copies(values, LANDMARK_KINDS)
     if (tracks := landmarks.tracks) is not None:
         parts = (tracks.landmark, tracks.image, tracks.pixel)
-        found |= _copies(dict(zip(TRACK_KINDS, parts, strict=True)), TRACK_KINDS)
-    return found
+        copies |= _copies(dict(zip(TRACK_KINDS, parts, strict=True)), TRACK_KINDS)
+    return copies
 
 
 def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
@@ -117,8 +117,8 @@ def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
         raise ValueError("pose_covariance is not symmetric and positive semidefinite")
     parts: dict[str, Any] = {name: tensors[name] for name in LANDMARK_KINDS}
     parts |= {name: float(tensors[name]) for name in ("noise", "correlation", "usual_matches", "moving")}
-    images, found, translation, rotation_deg = tensors["trial"].tolist()
-    parts["trial"] = HeldOutTrial(int(images), int(found), translation, rotation_deg)
+    images, localized, translation, rotation_deg = tensors["trial"].tolist()
+    parts["trial"] = HeldOutTrial(int(images), int(localized), translation, rotation_deg)
     if tracks:
         parts["tracks"] = Tracks(*(tensors[name] for name in tracks))
     return LandmarkMap(**parts)

@@ -254,8 +254,8 @@ def _restore(
     if beside is not None:
         beside.load_state_dict(_below("beside.", state.optimizer))
     for number, parameter in enumerate(_parameters(optimizer)):
-        if found := _below(f"{number}.", state.optimizer):
-            optimizer.state[parameter] = {k: v.to(parameter.device, copy=True) for k, v in found.items()}
+        if moments := _below(f"{number}.", state.optimizer):
+            optimizer.state[parameter] = {k: v.to(parameter.device, copy=True) for k, v in moments.items()}
     return state.step
 
 

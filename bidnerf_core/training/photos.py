@@ -46,8 +46,8 @@ def relative_detail(views: Sequence[View]) -> Float[Tensor, "v"]:
 
     The value is 1 for all photos except blurred outliers.
     """
-    found = torch.tensor([sharpness(_grey(v.frame), v.frame.hidden) for v in views])
-    lacking = -excess(found, nearby_photos(views))
+    sharp = torch.tensor([sharpness(_grey(v.frame), v.frame.hidden) for v in views])
+    lacking = -excess(sharp, nearby_photos(views))
     return torch.where(are_blurred(lacking), torch.exp2(-lacking), 1.0)
 
 
@@ -120,8 +120,8 @@ def nearby_photos(views: Sequence[View], group: Int[Tensor, "v"] | None = None) 
 def excess(values: Float[Tensor, "v"], near: Nearby) -> Float[Tensor, "v"]:
     """Return how much each photo's value exceeds the median of the photos near it; 0 if there are no such photos."""
     photo, other = near.unbind(1)
-    found = torch.bincount(photo, minlength=len(values)) > 0
-    return torch.where(found, values - _medians(values[other], photo, len(values)), 0.0)
+    known = torch.bincount(photo, minlength=len(values)) > 0
+    return torch.where(known, values - _medians(values[other], photo, len(values)), 0.0)
 
 
 def exposures(views: Sequence[View], seen: TrackedKeypoints) -> Float[Tensor, "v"]:
@@ -141,12 +141,12 @@ def exposures(views: Sequence[View], seen: TrackedKeypoints) -> Float[Tensor, "v
         linear = 2.2 * np.log2(np.maximum(smooth[rows, columns], 2 / 255))
         light[own] = torch.from_numpy(linear).double()
     enough = torch.bincount(image, minlength=count) >= 10
-    found = torch.zeros(count, dtype=torch.float64)
+    exposure = torch.zeros(count, dtype=torch.float64)
     for _ in range(20 if bool(enough.any()) else 0):  # alternations
-        of_points = _medians(light - found[image], point, seen.count)
+        of_points = _medians(light - exposure[image], point, seen.count)
         own = _medians(light - of_points[point], image, count)
-        found = own - own[enough].median()
-    return torch.where(enough, found, torch.nan)
+        exposure = own - own[enough].median()
+    return torch.where(enough, exposure, torch.nan)
 
 
 def _medians(values: Float[Tensor, "m"], index: Int[Tensor, "m"], count: int) -> Float[Tensor, "n"]:

@@ -162,7 +162,7 @@ class _PixelRays:
     """The pixel rays of many cameras, most of which usually have equal intrinsics; pixels are numbered row by row."""
 
     def __init__(self, cameras: Sequence[Intrinsics], device: torch.device) -> None:
-        number = {kind: place for place, kind in enumerate(dict.fromkeys(cameras))}
+        number = {kind: index for index, kind in enumerate(dict.fromkeys(cameras))}
         kinds = list(number)
         size = torch.tensor([[kind.width, kind.height] for kind in kinds])
         sizes, grid = size.prod(1), None

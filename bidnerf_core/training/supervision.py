@@ -48,9 +48,9 @@ class Supervision:
         self.side = bounds.side
         learned = config.exposure and not self.bank.has_alpha
         self.colours = ColourTransforms(len(views)).to(device) if learned else None
-        kept = relative_detail(views) if config.sharpness else None
+        detail = relative_detail(views) if config.sharpness else None
         # None if no image is blurred, so that the loss is then unweighted.
-        self.image_weight = None if kept is None or bool((kept == 1).all()) else kept.float().to(device)
+        self.image_weight = None if detail is None or bool((detail == 1).all()) else detail.float().to(device)
 
     def fit(
         self,

@@ -134,8 +134,8 @@ def linearize(
     local = (rotation @ (state.points[point] - T.translation)[..., None])[..., 0]
     flat, depth, front = pinhole(local)
     scale = torch.where(front, sightings.focal / noise, 0)[:, None]
-    off = (flat - sightings.image) * scale
-    squared = off.square().sum(-1)
+    residual = (flat - sightings.image) * scale
+    squared = residual.square().sum(-1)
     weight = inlier_weight(squared, RESIDUAL_SCALE) / correlation
     cost = cauchy_loss(squared.numpy(), RESIDUAL_SCALE) / correlation
     by_local = by_camera_point(flat, depth) * scale[..., None]
@@ -146,7 +146,7 @@ def linearize(
     views, count = len(state.motion), len(state.points)
     view_weighted, point_weighted = (by.mT * weight[:, None, None] for by in (by_view, by_point))
     prior_cost, pull, precision = _prior_term(state, prior)
-    column = off[..., None]
+    column = residual[..., None]
     return AdjustmentSystem(
         cost + prior_cost,
         sum_by((view_weighted @ column)[..., 0], view, views) + pull,
@@ -167,16 +167,16 @@ def _prior_term(state: Adjustment, prior: PosePrior) -> tuple[float, Float[Tenso
     given, T = prior.T_world_camera, state.T_world_camera
     away = (T.rotation.mT @ (T.translation - given.translation)[..., None])[..., 0]  # in the camera's frame
     turned = SE3(given.rotation.mT @ T.rotation, torch.zeros_like(away)).log()[:, 3:]
-    off = torch.cat([away, turned], dim=-1)
-    deviations = torch.tensor([prior.translation] * 3 + [prior.rotation] * 3, dtype=off.dtype)
-    squared = (off / deviations).square().sum(-1)
+    difference = torch.cat([away, turned], dim=-1)
+    deviations = torch.tensor([prior.translation] * 3 + [prior.rotation] * 3, dtype=difference.dtype)
+    squared = (difference / deviations).square().sum(-1)
     precision = deviations**-2 * inlier_weight(squared, PRIOR_SCALE)[:, None]
     cost = cauchy_loss(squared.numpy(), PRIOR_SCALE)
     if prior.motion != STILL:
         of_motion = (prior.motion.deviations**-2).expand_as(state.motion)
         cost += 0.5 * float((of_motion * state.motion.square()).sum())
-        off, precision = torch.cat([off, state.motion], dim=-1), torch.cat([precision, of_motion], dim=-1)
-    return cost, precision * off, precision
+        difference, precision = torch.cat([difference, state.motion], dim=-1), torch.cat([precision, of_motion], dim=-1)
+    return cost, precision * difference, precision
 
 
 def _damped(blocks: Float[Tensor, "b k k"], damping: float) -> Float[Tensor, "b k k"]:

@@ -79,12 +79,12 @@ def _normal_equations(
     sightings: Sightings, points: Float[Tensor, "n 3"], scale: float
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]]:
     flat, depth, front = pinhole(sightings.in_camera(points))
-    off = (flat - sightings.image) * sightings.focal[:, None]
-    weight = front * inlier_weight(off.square().sum(-1), scale)
+    residual = (flat - sightings.image) * sightings.focal[:, None]
+    weight = front * inlier_weight(residual.square().sum(-1), scale)
     jacobian = by_camera_point(flat, depth / sightings.focal) @ sightings.rotation
     weighted = jacobian.mT * weight[:, None, None]
     matrix = sum_by(weighted @ jacobian, sightings.point, len(points))
-    return matrix, sum_by((weighted @ off[..., None])[..., 0], sightings.point, len(points))
+    return matrix, sum_by((weighted @ residual[..., None])[..., 0], sightings.point, len(points))
 
 
 def parallax(sightings: Sightings, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
@@ -93,9 +93,9 @@ def parallax(sightings: Sightings, points: Float[Tensor, "n 3"]) -> Float[Tensor
     d = away / torch.linalg.vector_norm(away, dim=-1, keepdim=True).clamp(min=1e-300)
     mean = sum_by(d, sightings.point, len(points))
     mean = mean / torch.linalg.vector_norm(mean, dim=-1, keepdim=True).clamp(min=1e-300)
-    off = torch.linalg.vector_norm(torch.linalg.cross(d, mean[sightings.point]), dim=-1)
+    sine = torch.linalg.vector_norm(torch.linalg.cross(d, mean[sightings.point]), dim=-1)
     largest = torch.zeros(len(points), dtype=d.dtype)
-    return 2 * largest.scatter_reduce(0, sightings.point, off, "amax").clamp(max=1).asin()
+    return 2 * largest.scatter_reduce(0, sightings.point, sine, "amax").clamp(max=1).asin()
 
 
 def fits_points(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:

@@ -161,8 +161,8 @@ class TrackedViews:
 
     def landmarks(self, config: LandmarkConfig, report: Callable[[str], None] = lambda sentence: None) -> LandmarkMap:
         """Return the landmarks built from the tracks. Raises ``InputError`` if there are none."""
-        found = _located(self.observations, config, self.points)
-        if not len(found):
+        landmarks = _located(self.observations, config, self.points)
+        if not len(landmarks):
             images = len(self.observations.images)
             raise InputError(
                 f"no landmarks found in {images} images:",
@@ -171,20 +171,20 @@ class TrackedViews:
         moving = float((self.motion != 0).any(1).double().mean())
         name = self.features if isinstance(self.features, str) else ""
         name = USUAL_FEATURES if isinstance(self.features, Sift) else name
-        if len(found) > config.most:
-            report(f"{len(found)} landmarks found, {config.most} kept: those seen in the most images")
-            found = found[found.views.argsort(descending=True, stable=True)[: config.most].sort().values]
-        return replace(found, moving=moving, features=name)
+        if len(landmarks) > config.most:
+            report(f"{len(landmarks)} landmarks found, {config.most} kept: those seen in the most images")
+            landmarks = landmarks[landmarks.views.argsort(descending=True, stable=True)[: config.most].sort().values]
+        return replace(landmarks, moving=moving, features=name)
 
     def seen(self, config: LandmarkConfig) -> list[SeenLandmarks]:
         """Return the triangulated landmarks seen in each image; training uses their depth where none was measured."""
-        kept, positions, covariance = _triangulated(self.observations, radians(config.parallax))
-        return seen_landmarks(kept, positions, noise(kept.sightings, positions) ** 2 * covariance)
+        inliers, positions, covariance = _triangulated(self.observations, radians(config.parallax))
+        return seen_landmarks(inliers, positions, noise(inliers.sightings, positions) ** 2 * covariance)
 
     def triangulated(self, config: LandmarkConfig) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"]]:
         """Return the inlier keypoints of the triangulated points, and these points (metres, world)."""
-        kept, positions, _ = _triangulated(self.observations, radians(config.parallax))
-        return kept, positions
+        inliers, positions, _ = _triangulated(self.observations, radians(config.parallax))
+        return inliers, positions
 
     @property
     def T_world_camera(self) -> SE3:
@@ -271,8 +271,8 @@ def _joined(
     """Match the keypoints of the pairs of images, and join the matches into tracks, starting with ``known`` ones of ambiguity 0."""
     listed = pairs.tolist()
     matches = _mapped(lambda ij: epipolar_matches(images[ij[0]], images[ij[1]]), listed, step)
-    found = [(i, j, m) for (i, j), m in zip(listed, matches, strict=True)]
-    label = link_tracks([*known, *found], [len(image.keypoints) for image in images])
+    matched = [(i, j, m) for (i, j), m in zip(listed, matches, strict=True)]
+    label = link_tracks([*known, *matched], [len(image.keypoints) for image in images])
     return TrackedKeypoints(images, label, torch.arange(len(label)))
 
 
@@ -283,21 +283,21 @@ def detect_keypoints(views: Sequence[View], features: Features) -> list[ImageKey
 
 def _located(observations: TrackedKeypoints, config: LandmarkConfig, known: Float[Tensor, "p 3"] | None) -> LandmarkMap:
     """Return the triangulated or ``known`` landmarks, followed by landmarks from the measured depth of the remaining keypoints."""
-    kept, positions, covariance = _triangulated(observations, radians(config.parallax), known)
-    pixel_noise = noise(kept.sightings, positions)
-    triangulated = fuse_landmarks(kept, positions, pixel_noise**2 * covariance, pixel_noise)
+    inliers, positions, covariance = _triangulated(observations, radians(config.parallax), known)
+    pixel_noise = noise(inliers.sightings, positions)
+    triangulated = fuse_landmarks(inliers, positions, pixel_noise**2 * covariance, pixel_noise)
     # With 200 images, the deviations are known to 7 %.
-    scatter = update_scatter(list(pose_updates(kept, positions, 200).values()))
-    relative = keypoint_depth_noise(kept, positions)
-    left = ~torch.isin(observations.number, kept.number)
+    scatter = update_scatter(list(pose_updates(inliers, positions, 200).values()))
+    relative = keypoint_depth_noise(inliers, positions)
+    left = ~torch.isin(observations.number, inliers.number)
     rest = observations[left & (_tracked(observations) | config.singles)]
-    rest, places, covariance = back_project(rest, relative, pixel_noise)
-    landmarks = concatenate([triangulated, fuse_landmarks(rest, places, covariance, pixel_noise)])
+    rest, measured, covariance = back_project(rest, relative, pixel_noise)
+    landmarks = concatenate([triangulated, fuse_landmarks(rest, measured, covariance, pixel_noise)])
     if scatter is None and len(
         landmarks
     ):  # unknown: a prior assumes that each pose is as accurate as a single keypoint
-        depth = torch.cat([kept.sightings.in_camera(positions)[:, 2], rest.sightings.in_camera(places)[:, 2]])
-        angle = pixel_noise / float(torch.cat([kept.sightings.focal, rest.sightings.focal]).median())
+        depth = torch.cat([inliers.sightings.in_camera(positions)[:, 2], rest.sightings.in_camera(measured)[:, 2]])
+        angle = pixel_noise / float(torch.cat([inliers.sightings.focal, rest.sightings.focal]).median())
         scatter = MotionPrior(angle * float(depth.median()), angle).deviations.square().diag()
     return landmarks if scatter is None else replace(landmarks, pose_covariance=scatter)
 

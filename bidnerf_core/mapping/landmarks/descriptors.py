@@ -96,8 +96,8 @@ def nearest_centre(descriptors: Tensor, centres: Float[Tensor, "c d"]) -> Int[Te
 
 def smallest(distances: Float[Tensor, "q n"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
     """Return the ``count`` smallest values of each row (all, if there are fewer), ascending, and their columns."""
-    found = distances.topk(min(count, distances.shape[1]), dim=1, largest=False)
-    return found.values, found.indices
+    nearest = distances.topk(min(count, distances.shape[1]), dim=1, largest=False)
+    return nearest.values, nearest.indices
 
 
 class HalfPrecisionSearch:
@@ -113,7 +113,7 @@ class HalfPrecisionSearch:
 
     def nearest(self, descriptors: UInt8[Tensor, "q d"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
         """Return the exact squared distances and the indices of the nearest landmarks, on the CPU."""
-        found, n = [], len(self._half)
+        parts, n = [], len(self._half)
         # At most 2^26 products are computed at a time, which bounds the memory.
         for part in descriptors.split(max(1, 2**26 // max(1, n))):
             alike = 2 * (self._unit(part) @ self._half.T).float() - self._squares
@@ -121,8 +121,8 @@ class HalfPrecisionSearch:
             index = alike.topk(min(count + 4, n)).indices
             exact = (part[:, None].float() - self._descriptors[index].float()).square().sum(-1)
             distance, best = exact.topk(min(count, n), largest=False)
-            found.append(torch.stack([distance.long(), index.gather(1, best)]))
-        distances, indices = torch.cat(found, 1).cpu()
+            parts.append(torch.stack([distance.long(), index.gather(1, best)]))
+        distances, indices = torch.cat(parts, 1).cpu()
         return distances.float(), indices
 
 
@@ -161,7 +161,7 @@ class InvertedFile:
             partial = torch.addmm(self._squares[first:last], values[query[begin:end]], others.T, alpha=-2)
             flat[begins[begin:end] + columns[: last - first]] = partial
         best, column = smallest(candidates, count)
-        place = torch.searchsorted(ends, column, right=True).clamp(max=probed.shape[1] - 1)
-        index = self._first[probed.gather(1, place)] + column - (ends - counts).gather(1, place)
+        rank = torch.searchsorted(ends, column, right=True).clamp(max=probed.shape[1] - 1)
+        index = self._first[probed.gather(1, rank)] + column - (ends - counts).gather(1, rank)
         squares = values.square().sum(-1, keepdim=True)
         return (best + squares).clamp_(min=0), self._order[index.clamp(max=len(self._order) - 1)]

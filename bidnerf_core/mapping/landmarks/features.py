@@ -96,12 +96,12 @@ class Sift(Settings):
         if size != (width, height):
             scale = np.array([size[0] / width, size[1] / height], dtype=np.float32)
             grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-        found, descriptors = sift.detectAndCompute(grey, None)
-        if descriptors is None or not len(found):
+        detections, descriptors = sift.detectAndCompute(grey, None)
+        if descriptors is None or not len(detections):
             return Keypoints(torch.zeros(0, 2), torch.zeros(0), torch.zeros((0, 128), dtype=torch.uint8))
-        order = np.argsort([-keypoint.response for keypoint in found], kind="stable")
-        pixels = (np.asarray(cv2.KeyPoint.convert(found), dtype=np.float32) + FIRST_CENTRE)[order] / scale
-        sizes = np.array([found[i].size for i in order], dtype=np.float32) / scale.mean()
+        order = np.argsort([-keypoint.response for keypoint in detections], kind="stable")
+        pixels = (np.asarray(cv2.KeyPoint.convert(detections), dtype=np.float32) + FIRST_CENTRE)[order] / scale
+        sizes = np.array([detections[i].size for i in order], dtype=np.float32) / scale.mean()
         raw = torch.from_numpy(np.asarray(descriptors, dtype=np.float32)[order])
         total = raw.sum(-1, keepdim=True).clamp(min=torch.finfo(raw.dtype).tiny)
         # Euclidean distances of the roots are Hellinger distances.
@@ -130,15 +130,15 @@ def detect(features: Features, rgb: Shaped[Tensor, "h w 3"]) -> Keypoints:
 
     Raises ``PluginError`` unless the detector returns ``Keypoints`` that lie inside the image.
     """
-    found = features(rgb if isinstance(features, ByteFeatures) else as_floats(rgb))
+    keypoints = features(rgb if isinstance(features, ByteFeatures) else as_floats(rgb))
     who = f"detector {getattr(features, '__name__', type(features).__name__)}"
-    if not isinstance(found, Keypoints):
+    if not isinstance(keypoints, Keypoints):
         raise PluginError(
-            f"returned a {type(found).__name__}", where=who, expected="Keypoints(pixels, sizes, descriptors)"
+            f"returned a {type(keypoints).__name__}", where=who, expected="Keypoints(pixels, sizes, descriptors)"
         )
-    parts = (found.pixels, found.sizes, found.descriptors)
+    parts = (keypoints.pixels, keypoints.sizes, keypoints.descriptors)
     kinds = [f"{p.dtype} {list(p.shape)}" if isinstance(p, Tensor) else type(p).__name__ for p in parts]
-    fits = all(isinstance(part, Tensor) for part in parts) and found.descriptors.dtype == torch.uint8
+    fits = all(isinstance(part, Tensor) for part in parts) and keypoints.descriptors.dtype == torch.uint8
     if not fits or [list(p.shape) for p in parts] != [[n := len(parts[2]), 2], [n], [n, parts[2].shape[-1]]]:
         raise PluginError(
             f"pixels, sizes and descriptors are {enumeration(kinds)}",
@@ -146,11 +146,11 @@ def detect(features: Features, rgb: Shaped[Tensor, "h w 3"]) -> Keypoints:
             expected="tensors (n, 2), (n) and (n, d), the last in torch.uint8; quantize converts floats",
         )
     size = torch.tensor([rgb.shape[1], rgb.shape[0]])
-    if not bool(((found.pixels >= 0) & (found.pixels <= size)).all()):
+    if not bool(((keypoints.pixels >= 0) & (keypoints.pixels <= size)).all()):
         raise PluginError(
             f"keypoints lie outside the image of {size[0]}x{size[1]} pixels", where=who, expected="all inside"
         )
-    return found
+    return keypoints
 
 
 @dataclass(frozen=True)
@@ -160,8 +160,8 @@ class _Strongest:
     takes_bytes: ClassVar[bool] = True
 
     def __call__(self, rgb: Shaped[Tensor, "h w 3"]) -> Keypoints:
-        found = detect(self.features, rgb)
-        return found[torch.arange(min(self.count, len(found)))]
+        detections = detect(self.features, rgb)
+        return detections[torch.arange(min(self.count, len(detections)))]
 
 
 def limit_features(features: Features, count: int) -> Features:

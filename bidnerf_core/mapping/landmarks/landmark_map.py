@@ -85,10 +85,10 @@ class LandmarkCells:
         centres = np.add.reduceat(points, first) / counts[:, None].astype(np.float32)
         mean = torch.nn.functional.normalize(torch.from_numpy(np.add.reduceat(towards, first)), dim=-1)
         rounding = 1e-6 * np.abs(points).max()
-        apart = 1.001 * np.linalg.norm(points - centres[cell], axis=-1) + rounding
+        reach = 1.001 * np.linalg.norm(points - centres[cell], axis=-1) + rounding
         angle = np.arccos((towards * mean.numpy()[cell]).sum(-1).clip(-1, 1)) + cones.numpy()[order]
         radii, widest, largest = (
-            torch.from_numpy(np.maximum.reduceat(of, first)) for of in (apart, angle, sizes.numpy()[order])
+            torch.from_numpy(np.maximum.reduceat(of, first)) for of in (reach, angle, sizes.numpy()[order])
         )
         return LandmarkCells(
             torch.from_numpy(order),
@@ -118,9 +118,9 @@ class LandmarkCells:
         swing = (self.radii / distance.clamp(min=1e-12)).clamp(max=1).asin()
         facing = (angle <= self.cones + oblique + swing + 1e-3) | (distance <= self.radii)
         large = self.sizes >= size * (local[:, 2] - self.radii)
-        kept = (inside & facing & large).nonzero()[:, 0]
-        counts = self.counts[kept]
-        start = self.first[kept] - counts.cumsum(0) + counts
+        visible = (inside & facing & large).nonzero()[:, 0]
+        counts = self.counts[visible]
+        start = self.first[visible] - counts.cumsum(0) + counts
         return self.order[torch.arange(int(counts.sum())) + start.repeat_interleave(counts)]
 
 

@@ -108,9 +108,9 @@ def matches_of_points(
         rows.append(torch.stack([points[shown], torch.full_like(shown, number), partner], dim=-1))
     if not rows:
         return []
-    found = torch.cat(rows)
-    found = found[found[:, 0].argsort(stable=True)]  # images of a point in turn
-    first, second = found[:-1], found[1:]
+    seen = torch.cat(rows)
+    seen = seen[seen[:, 0].argsort(stable=True)]  # images of a point in turn
+    first, second = seen[:-1], seen[1:]
     same = first[:, 0] == second[:, 0]
     i, j, ends = first[same, 1], second[same, 1], torch.stack([first[same, 2], second[same, 2]], dim=-1)
     pairs, pair = (i * len(images) + j).unique(return_inverse=True)
@@ -200,8 +200,8 @@ class TrackedKeypoints:
 
     def compacted(self) -> tuple[TrackedKeypoints, Int[Tensor, "n"]]:
         """Renumber the remaining points from 0, and also return their former numbers."""
-        found, point = self.point.unique(return_inverse=True)
-        return TrackedKeypoints(self.images, point, self.number), found
+        numbers, point = self.point.unique(return_inverse=True)
+        return TrackedKeypoints(self.images, point, self.number), numbers
 
     @property
     def count(self) -> int:
@@ -328,8 +328,8 @@ def keypoint_depth_noise(observations: TrackedKeypoints, points: Float[Tensor, "
     known = depth > 0
     if int(known.sum()) < ENOUGH_DEPTHS:
         return UNKNOWN.noise.linear
-    off = depth[known] / observations.sightings.in_camera(points)[known, 2] - 1
-    return max(1e-4, mad_deviation(off))
+    errors = depth[known] / observations.sightings.in_camera(points)[known, 2] - 1
+    return max(1e-4, mad_deviation(errors))
 
 
 def depth_ratio(observations: TrackedKeypoints, points: Float[Tensor, "n 3"]) -> float | None:
@@ -358,13 +358,13 @@ def back_project(
     information = (torch.eye(3, dtype=d.dtype) - along) * sideways[:, None, None]
     information = along * ((relative * depth) ** -2)[:, None, None] + information
     mean, _ = _weighted(world, information, observations.point)
-    off = (world - mean[observations.point])[..., None]
-    agree = (off.mT @ information @ off)[:, 0, 0] <= 3**2  # three standard deviations
+    difference = (world - mean[observations.point])[..., None]
+    agree = (difference.mT @ information @ difference)[:, 0, 0] <= 3**2  # three standard deviations
     tracks = torch.bincount(observations.point)
     majority = 2 * torch.bincount(observations.point[agree], minlength=len(tracks)) > tracks
-    kept = agree & majority[observations.point]
-    observations, _ = observations[kept].compacted()
-    return observations, *_weighted(world[kept], information[kept], observations.point)
+    inliers = agree & majority[observations.point]
+    observations, _ = observations[inliers].compacted()
+    return observations, *_weighted(world[inliers], information[inliers], observations.point)
 
 
 def _weighted(

@@ -56,12 +56,12 @@ def pool_views(
     At most 48 cameras, at regular intervals, are pooled, except those that see fewer than eight landmarks.
     """
     word = vocabulary.nearest(landmarks.descriptors)
-    found = []
+    vectors = []
     for camera, pose in cameras[:: max(1, math.ceil(len(cameras) / 48))]:
         seen = visible(landmarks, camera, pose)
         if len(seen) >= 8:
-            found.append(vocabulary.pooled(landmarks.descriptors[seen], word[seen]))
-    return torch.stack([*found, vocabulary.pooled(landmarks.descriptors, word)])
+            vectors.append(vocabulary.pooled(landmarks.descriptors[seen], word[seen]))
+    return torch.stack([*vectors, vocabulary.pooled(landmarks.descriptors, word)])
 
 
 def visible(landmarks: LandmarkMap, camera: Intrinsics, T_world_camera: SE3) -> Int[Tensor, "m"]:

@@ -103,9 +103,9 @@ def bake(
     for number, posed in enumerate(images):
         solid = posed.solid(config.opacity)
         seen = posed.points(solid)
-        kept = confirm_points(seen, number, images, tolerance, config.agreement)
-        parts.append(seen[kept])
-        colours.append(posed.image.rgb[solid][kept])
+        confirmed = confirm_points(seen, number, images, tolerance, config.agreement)
+        parts.append(seen[confirmed])
+        colours.append(posed.image.rgb[solid][confirmed])
     points, rgb = torch.cat(parts), torch.cat(colours)
     inside = VoxelGrid.covering(bounds, cell).contains(points)
     if not bool(inside.any()):
@@ -129,8 +129,8 @@ def surface_of_points(
     points, rgb = points[inside].float(), rgb[inside].float()
     if len(points) < 2:
         raise InputError(f"no surface to bake: {len(points)} points within the bounds of the scene")
-    places = points.numpy()
-    away, _ = cKDTree(places).query(places[:: max(1, len(points) // 5000)], k=2)
+    coordinates = points.numpy()
+    away, _ = cKDTree(coordinates).query(coordinates[:: max(1, len(points) // 5000)], k=2)
     spread = float(np.median(np.asarray(away)[:, 1]))
     finest = max(spread, VoxelGrid.filling(bounds, config.cells).cell)
     return _fused(points, rgb, bounds, (finest, 4 * finest), [T for _, T in cameras], config)

@@ -67,10 +67,10 @@ class PosedDepthImage:
         """Return ``beyond`` with depth interpolated between four pixels; NaN where one of them shows no surface."""
         local = self.T_world_camera.to(torch.float32).inverse().apply(points)
         height, width = self.image.depth.shape
-        place = 2 * self.intrinsics.project(local) / local.new_tensor([width, height]) - 1
-        place = place.nan_to_num(2.0).clamp(-2, 2)[None, None]
+        grid = 2 * self.intrinsics.project(local) / local.new_tensor([width, height]) - 1
+        grid = grid.nan_to_num(2.0).clamp(-2, 2)[None, None]
         channels = torch.stack([self.image.depth, self.solid(opacity).float()])[None]
-        depth, solid = grid_sample(channels, place, align_corners=False)[0, :, 0]
+        depth, solid = grid_sample(channels, grid, align_corners=False)[0, :, 0]
         return torch.where(solid > 0.999, depth - local[:, 2], torch.nan)
 
 
@@ -189,12 +189,12 @@ def _spread(
     Differences of more than five times the median are occlusions or gross errors. The result is at most two standard deviations
     of an unknown sensor, since images that differ by more are inconsistent.
     """
-    found = [torch.zeros(0)]
+    parts = [torch.zeros(0)]
     for number in range(0, len(images), max(1, math.ceil(len(images) / 40))):
         points = images[number].points(images[number].solid(opacity))
         points = points[:: max(1, len(points) // 400)]
-        found += [beyond(images[other], points).abs() for other in witnesses(number, images)]
-    differences = torch.cat(found)
+        parts += [beyond(images[other], points).abs() for other in witnesses(number, images)]
+    differences = torch.cat(parts)
     differences = differences[differences.isfinite()]
     if not len(differences):
         return 0.0
@@ -244,8 +244,8 @@ def surface_bytes(points: Float[Tensor, "p 3"], grid: VoxelGrid) -> float:
 
 def _depths(images: Sequence[PosedDepthImage], opacity: float) -> list[tuple[PosedDepthImage, Float[Tensor, "p"]]]:
     """Return the images that show a surface, with the depths (metres) of the pixels that show it."""
-    found = [(posed, posed.image.depth[posed.solid(opacity)]) for posed in images]
-    return [(posed, depths) for posed, depths in found if len(depths)]
+    shown = [(posed, posed.image.depth[posed.solid(opacity)]) for posed in images]
+    return [(posed, depths) for posed, depths in shown if len(depths)]
 
 
 def _median(values: Sequence[float]) -> float:

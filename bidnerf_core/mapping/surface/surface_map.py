@@ -37,11 +37,12 @@ def surfel_bytes(count: int) -> int:
 
 def merge_cells(cells: Int[Tensor, "p"], *values: Float[Tensor, "p _"]) -> tuple[Int[Tensor, "n"], list[Tensor]]:
     """Return the occupied cells, in ascending order, and the means of the points' ``values`` in each."""
-    found, place, counts = cells.unique(return_inverse=True, return_counts=True)
+    occupied, index, counts = cells.unique(return_inverse=True, return_counts=True)
     means = [
-        torch.zeros((len(found), v.shape[-1]), dtype=v.dtype).index_add_(0, place, v) / counts[:, None] for v in values
+        torch.zeros((len(occupied), v.shape[-1]), dtype=v.dtype).index_add_(0, index, v) / counts[:, None]
+        for v in values
     ]
-    return found, means
+    return occupied, means
 
 
 def fuse_surfels(positions: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"]) -> Surfels:
@@ -61,10 +62,10 @@ def fuse_surfels(positions: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"]) -> 
     spread = flat.mT @ flat
     size = spread.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=torch.finfo(flat.dtype).tiny)
     # Any weight along the normal makes the gradient 0 there; a little weight everywhere regularizes thin strips.
-    held = normals[:, :, None] * normals[:, None] + 0.02 * torch.eye(3)
+    regularization = normals[:, :, None] * normals[:, None] + 0.02 * torch.eye(3)
     colours, colour = rgb[near], rgb[near].mean(1)
     seen = flat.mT @ (colours - colour[:, None]) / size[:, None, None]
-    gradient = torch.linalg.solve(spread / size[:, None, None] + held, seen).mT
+    gradient = torch.linalg.solve(spread / size[:, None, None] + regularization, seen).mT
     return Surfels(positions, normals, colour, gradient)
 
 
@@ -216,6 +217,6 @@ def trace(
     It is infinite if the ray never does. ``directions`` are unit vectors.
     """
     shape, (origins, directions) = directions.shape[:-1], (x.reshape(-1, 3) for x in (origins, directions))
-    found = cast(surface, origins, directions, steps, surface.grid.cell)
-    within = found.met & (found.along < surface.grid.rays(origins, directions).far)
-    return torch.where(within, found.along, torch.inf).reshape(shape)
+    hits = cast(surface, origins, directions, steps, surface.grid.cell)
+    within = hits.met & (hits.along < surface.grid.rays(origins, directions).far)
+    return torch.where(within, hits.along, torch.inf).reshape(shape)

@@ -65,9 +65,9 @@ class SurfelIndex:
         """
         offset, rate, cells, base = self._numbering
         flat = points.detach().reshape(-1, 3).T
-        places = torch.addmm(offset.to(flat.dtype), rate.to(flat.dtype), flat)
-        places = places.nan_to_num_(0.0).clamp_(0, len(cells) // 3 - 1).int().add_(base)
-        x, y, z = cells.index_select(0, places.view(-1)).view(3, -1)
+        slots = torch.addmm(offset.to(flat.dtype), rate.to(flat.dtype), flat)
+        slots = slots.nan_to_num_(0.0).clamp_(0, len(cells) // 3 - 1).int().add_(base)
+        x, y, z = cells.index_select(0, slots.view(-1)).view(3, -1)
         number = x.add_(y).add_(z)
         start, shift = self._blocks
         block = number >> 9  # number = 512 block + Morton number of the cell in it
@@ -92,9 +92,9 @@ class SurfelIndex:
         parts, strides = [], (y * z, z, 1)
         for axis, count in enumerate(self.grid.shape):
             cell = (torch.arange(longest) - 1).clamp(0, count - 1)
-            place = torch.zeros((longest, 3), dtype=torch.int64)
-            place[:, axis] = cell % BLOCK_SIDE
-            parts.append(cell // BLOCK_SIDE * strides[axis] * CELLS_OF_BLOCK + _morton(place))
+            within = torch.zeros((longest, 3), dtype=torch.int64)
+            within[:, axis] = cell % BLOCK_SIDE
+            parts.append(cell // BLOCK_SIDE * strides[axis] * CELLS_OF_BLOCK + _morton(within))
         rate = torch.eye(3) / self.grid.cell
         offset = 1 - torch.tensor(self.grid.lower, dtype=torch.float64) / self.grid.cell
         base = longest * torch.arange(3, dtype=torch.int32)[:, None]
@@ -137,9 +137,9 @@ def index_bytes(level: UInt8[Tensor, "x y z"]) -> int:
     return 4 * int((CELLS_OF_BLOCK >> 3 * level.long()).sum()) + 13 * level.numel()
 
 
-def _morton(place: Int[Tensor, "*c 3"]) -> Int[Tensor, "*c"]:
+def _morton(cells: Int[Tensor, "*c 3"]) -> Int[Tensor, "*c"]:
     """Return the Morton numbers of cells of a block, with z in the lowest bit."""
-    spread = (place & 1) | (place & 2) << 2 | (place & 4) << 4
+    spread = (cells & 1) | (cells & 2) << 2 | (cells & 4) << 4
     return (spread[..., 0] << 2) | (spread[..., 1] << 1) | spread[..., 2]
 
 
@@ -147,7 +147,7 @@ def _nearest_to_middles(tree: cKDTree, grid: VoxelGrid, level: UInt8[Tensor, "x 
     """Return, for each entry, the surfel nearest to the middle of the cells that share the entry."""
     corners = torch.cartesian_prod(*3 * [torch.arange(BLOCK_SIDE)])
     corners = corners[_morton(corners).argsort()]
-    levels, found = level.view(-1).long(), []
+    levels, parts = level.view(-1).long(), []
     step = 2**20 // CELLS_OF_BLOCK  # at most a million entries are computed at once
     for at in range(0, len(levels), step):
         number = torch.arange(at, min(at + step, len(levels)))
@@ -160,5 +160,5 @@ def _nearest_to_middles(tree: cKDTree, grid: VoxelGrid, level: UInt8[Tensor, "x 
         middle = cell + 0.5 * (1 << shift)[:, None]
         points = torch.tensor(grid.lower, dtype=torch.float64) + middle.double() * grid.cell
         _, nearest = tree.query(points.numpy(), workers=-1)
-        found.append(torch.from_numpy(np.asarray(nearest, dtype=np.int32)))
-    return torch.cat(found)
+        parts.append(torch.from_numpy(np.asarray(nearest, dtype=np.int32)))
+    return torch.cat(parts)
