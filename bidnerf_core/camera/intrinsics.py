@@ -13,6 +13,7 @@ from functools import lru_cache
 from numbers import Integral, Real
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -126,8 +127,7 @@ class Intrinsics:
     def unproject(self, pixels: Float[Tensor, "*p 2"]) -> Float[Tensor, "*p 3"]:
         """Return the points on the plane z = 1 that appear at ``pixels`` (u, v); they are not unit vectors."""
         if self.distortion:
-            exact = pixels.reshape(-1, 2).double()
-            flat = undistort_points(exact, *self._distortion_at(exact), num_iters=20)
+            flat = self._undistorted(pixels.reshape(-1, 2).double())
             pixels = flat.to(pixels.dtype).reshape(pixels.shape)
         x = (pixels[..., 0] - self.cx) / self.fx
         y = (pixels[..., 1] - self.cy) / self.fy
@@ -219,6 +219,17 @@ class Intrinsics:
             order = (0, 1, 3, 2, 4, 5, 6, 7, 10, 11, 8, 9, 12, 13)[: len(k)]
             return Intrinsics(fy, fx, cy, cx, height, width, tuple(k[index] for index in order))
         return Intrinsics(fx, fy, cx, cy, width, height, k)
+
+    def _undistorted(self, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
+        """Return the pixels of the same points without distortion (float64)."""
+        if not len(pixels) or pixels.device.type != "cpu" or pixels.requires_grad:
+            return undistort_points(pixels, *self._distortion_at(pixels), num_iters=20)
+        # The same iteration, several times as fast; both agree to rounding.
+        criteria = (cv2.TERM_CRITERIA_COUNT, 20, 0.0)
+        flat = cv2.undistortImagePoints(
+            pixels.numpy()[:, None], self.matrix().numpy(), np.array(self.distortion), None, criteria
+        )
+        return torch.from_numpy(flat[:, 0])
 
     def _distortion_at(self, points: Float[Tensor, "n 2"]) -> tuple[Tensor, Tensor]:
         """Return the camera matrix (3 3) and the distortion coefficients on the device of ``points``."""

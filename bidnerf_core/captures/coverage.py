@@ -21,7 +21,7 @@ from torch.nn.functional import normalize
 from bidnerf_core.captures.report import Arrangement, CoverageRecord, Gap
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.mapping import DEFAULT_LANDMARKS, TrackedKeypoints, TrackedViews
+from bidnerf_core.mapping import DEFAULT_LANDMARKS, TrackedKeypoints, TrackedViews, viewing_cones
 
 UpSource = Literal["gravity", "planes", "cameras"]
 """What an upward direction was derived from."""
@@ -185,12 +185,7 @@ def shows_distances(views: Sequence[View], tracked: TrackedViews | None) -> bool
 
 def _cones_deg(seen: TrackedKeypoints) -> Float[Tensor, "n"]:
     """Return, for each point, twice the largest angle (degrees) between one of its rays and their mean."""
-    sightings, count = seen.sightings, seen.count
-    rays = sightings.directions()
-    mean = torch.zeros((count, 3), dtype=rays.dtype).index_add_(0, sightings.point, rays)
-    cosine = (normalize(mean, dim=-1)[sightings.point] * rays).sum(-1).clamp(-1, 1)
-    least = torch.ones(count, dtype=rays.dtype).scatter_reduce(0, sightings.point, cosine, "amin")
-    return 2 * least.acos().rad2deg()
+    return 2 * viewing_cones(seen.sightings.directions(), seen.sightings.point, seen.count)[1].rad2deg()
 
 
 def _median(values: Float[Tensor, "n"]) -> float:

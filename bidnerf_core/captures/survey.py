@@ -35,7 +35,7 @@ from bidnerf_core.mapping import (
     pose_updates,
     robust_covariance,
 )
-from bidnerf_core.training import are_blurred, are_outliers, excess, exposures, nearby_photos, photo_measures
+from bidnerf_core.training import BLURRED, are_outliers, excess, exposures, nearby_photos, photo_measures
 
 LEAST_GROUP = 3
 """Smallest number of linked photos that form a group."""
@@ -69,7 +69,10 @@ def survey_capture(
     # Training corrects differences of less than a stop.
     if bool(compared.any()):
         is_badly_exposed[compared] |= are_outliers(exposure[compared].abs(), 1.0)
-    defects: dict[PhotoProblem, Tensor] = {"blurred": are_blurred(-sharpness), "badly exposed": is_badly_exposed}
+    defects: dict[PhotoProblem, Tensor] = {
+        "blurred": are_outliers(-sharpness, BLURRED),
+        "badly exposed": is_badly_exposed,
+    }
     grouped = bool((group >= 0).any())  # if no photos are linked at all, no photo is reported as unlinked
     photos = []
     for i, (view, image) in enumerate(zip(views, seen.images, strict=True)):

@@ -17,6 +17,7 @@ from torch import Tensor
 from bidnerf_core.camera import (
     UPRIGHT,
     Camera,
+    CameraBatch,
     CameraSource,
     Intrinsics,
     Lens,
@@ -424,7 +425,9 @@ def _is_finite(image: Tensor) -> bool:
 def _has_rays(camera: Intrinsics) -> bool:
     """Return whether the corners, the middles of the sides and the centre of the image have rays."""
     u, v = torch.linspace(0, camera.width, 3), torch.linspace(0, camera.height, 3)
-    return bool(camera.unproject(torch.cartesian_prod(u.double(), v.double())).isfinite().all())
+    pixels = torch.cartesian_prod(u.double(), v.double())
+    # Unlike ``Intrinsics.unproject``, a batch does not replace the rays of a lens that has none.
+    return bool(CameraBatch.of([camera]).unproject(pixels, torch.zeros(9, dtype=torch.long)).isfinite().all())
 
 
 @dataclass(frozen=True, eq=False)

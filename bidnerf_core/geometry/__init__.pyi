@@ -5,7 +5,6 @@ from .robust import Robust as Robust
 from .robust import RobustName as RobustName
 from .robust import cauchy_loss as cauchy_loss
 from .robust import chi_squared_quantile as chi_squared_quantile
-from .robust import independent as independent
 from .robust import inlier_weight as inlier_weight
 from .robust import mad_deviation as mad_deviation
 from .rotations import retract as retract

@@ -106,8 +106,3 @@ KEYPOINTS_PER_INDEPENDENT = 10.0
 """Number of keypoints that count as one independent measurement if a map does not store a number of its own."""
 CORNERS_PER_INDEPENDENT = 4.0
 """Number of corners tracked between frames that count as one independent measurement."""
-
-
-def independent(drawn: float, most: float) -> float:
-    """Return how many independent measurements ``drawn`` correlated measurements are worth: at most ``most``."""
-    return drawn * most / (drawn + most - 1)

@@ -3,6 +3,7 @@ from .geometry.bundle_adjustment import PosePrior as PosePrior
 from .geometry.bundle_adjustment import adjust_bundle as adjust_bundle
 from .geometry.triangulation import Sightings as Sightings
 from .geometry.triangulation import noise as noise
+from .geometry.triangulation import viewing_cones as viewing_cones
 from .landmarks.building import DEFAULT_LANDMARKS as DEFAULT_LANDMARKS
 from .landmarks.building import ENOUGH_IMAGES as ENOUGH_IMAGES
 from .landmarks.building import LEAST_VISIBLE_POINTS as LEAST_VISIBLE_POINTS

@@ -11,7 +11,7 @@ from .loss import ColourTransforms as ColourTransforms
 from .loss import fit_colours as fit_colours
 from .loss import ray_termination as ray_termination
 from .loss import supervised_loss as supervised_loss
-from .photos import are_blurred as are_blurred
+from .photos import BLURRED as BLURRED
 from .photos import are_outliers as are_outliers
 from .photos import excess as excess
 from .photos import exposures as exposures

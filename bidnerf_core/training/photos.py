@@ -18,6 +18,8 @@ from bidnerf_core.mapping import TrackedKeypoints, likely_pairs
 
 LARGEST = 800
 """Longer side (pixels) to which photos are downscaled to measure sharpness: finer detail is of no use to a map."""
+BLURRED = 0.5
+"""Smallest lack of fine detail (octaves of energy), compared with nearby photos, of a blurred photo."""
 COARSE = 4
 """Standard deviation (pixels) of the Gaussian at the coarser of the two scales whose energies are compared. At the finer scale
 it is one pixel, which suppresses noise that would be mistaken for detail.
@@ -48,12 +50,7 @@ def relative_detail(views: Sequence[View]) -> Float[Tensor, "v"]:
     """
     sharp = torch.tensor([sharpness(_grey(v.frame), v.frame.hidden) for v in views])
     lacking = -excess(sharp, nearby_photos(views))
-    return torch.where(are_blurred(lacking), torch.exp2(-lacking), 1.0)
-
-
-def are_blurred(lacking: Float[Tensor, "v"]) -> Bool[Tensor, "v"]:
-    """Return which photos are outliers in ``lacking``, the fine detail (octaves of energy) that they lack compared with nearby photos."""
-    return are_outliers(lacking, 0.5)
+    return torch.where(are_outliers(lacking, BLURRED), torch.exp2(-lacking), 1.0)
 
 
 def are_outliers(values: Float[Tensor, "v"], least: float) -> Bool[Tensor, "v"]:
@@ -131,11 +128,12 @@ def exposures(views: Sequence[View], seen: TrackedKeypoints) -> Float[Tensor, "v
     The two are estimated alternately, as medians.
     """
     image, point, count = seen.image, seen.point, len(views)
+    pixels = seen.keypoints.pixels
     light = torch.zeros(len(image), dtype=torch.float64)  # log2 of the linear light around each keypoint
     for index in image.unique().tolist():
         own = image == index
         smooth = cv2.blur(_grey(views[index].frame), (5, 5))
-        u, v = seen.pixels[own].floor().long().unbind(-1)
+        u, v = pixels[own].floor().long().unbind(-1)
         rows, columns = v.clamp(0, smooth.shape[0] - 1).numpy(), u.clamp(0, smooth.shape[1] - 1).numpy()
         # The exponent is approximately that of sRGB. Quantization makes the darkest pixels incomparable, so they count as equal.
         linear = 2.2 * np.log2(np.maximum(smooth[rows, columns], 2 / 255))

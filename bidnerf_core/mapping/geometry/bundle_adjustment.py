@@ -18,7 +18,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import STILL, MotionPrior, poses_of_rows
 from bidnerf_core.geometry import SE3, cauchy_loss, inlier_weight
-from bidnerf_core.mapping.geometry.triangulation import Sightings, sum_by
+from bidnerf_core.mapping.geometry.triangulation import Sightings, damped, sum_by
 from bidnerf_core.mapping.resection.states import by_camera_point, by_update, pinhole
 
 SMALL_DECREASE = 1e-4
@@ -101,10 +101,10 @@ class AdjustmentSystem:
 
     def step(self, damping: float) -> tuple[Float[Tensor, "v k"], Float[Tensor, "n 3"]]:
         """Solve the damped normal equations for the updates of image poses and points, by the Schur complement."""
-        inverse = torch.linalg.inv(_damped(self.point_blocks, damping))
+        inverse = torch.linalg.inv(damped(self.point_blocks, damping, 1e-9))
         eliminated = self.mixed_blocks @ inverse[self.point]
         mixed, product = self._sparse(self.mixed_blocks), self._sparse(eliminated)
-        reduced = block_diag(_damped(self.image_blocks, damping).numpy(), format="csc")
+        reduced = block_diag(damped(self.image_blocks, damping, 1e-9).numpy(), format="csc")
         reduced = csc_array(reduced - (product @ mixed.T).tocsc())
         right = product @ self.point_gradient.numpy().ravel() - self.image_gradient.numpy().ravel()
         factors = splu(reduced, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
@@ -177,10 +177,3 @@ def _prior_term(state: Adjustment, prior: PosePrior) -> tuple[float, Float[Tenso
         cost += 0.5 * float((of_motion * state.motion.square()).sum())
         difference, precision = torch.cat([difference, state.motion], dim=-1), torch.cat([precision, of_motion], dim=-1)
     return cost, precision * difference, precision
-
-
-def _damped(blocks: Float[Tensor, "b k k"], damping: float) -> Float[Tensor, "b k k"]:
-    """Return the blocks with damping added, which makes even the blocks of points without parallax invertible."""
-    diagonal = blocks.diagonal(dim1=-2, dim2=-1)
-    least = 1e-9 * diagonal.mean(-1, keepdim=True).clamp(min=1e-30)
-    return blocks + torch.diag_embed(damping * diagonal + least)

@@ -57,7 +57,7 @@ def triangulate(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
     across = torch.eye(3, dtype=d.dtype) - d[:, :, None] * d[:, None]
     matrix = sum_by(across, sightings.point, count)
     right = sum_by((across @ sightings.centre[..., None])[..., 0], sightings.point, count)
-    return torch.linalg.solve(_damped(matrix), right)
+    return torch.linalg.solve(damped(matrix), right)
 
 
 def refine_points(
@@ -70,9 +70,9 @@ def refine_points(
     """
     for _ in range(steps):
         matrix, gradient = _normal_equations(sightings, points, scale)
-        points = points - torch.linalg.solve(_damped(matrix), gradient)
+        points = points - torch.linalg.solve(damped(matrix), gradient)
     matrix, _ = _normal_equations(sightings, points, scale)
-    return points, torch.linalg.inv(_damped(matrix))
+    return points, torch.linalg.inv(damped(matrix))
 
 
 def _normal_equations(
@@ -98,6 +98,17 @@ def parallax(sightings: Sightings, points: Float[Tensor, "n 3"]) -> Float[Tensor
     return 2 * largest.scatter_reduce(0, sightings.point, sine, "amax").clamp(max=1).asin()
 
 
+def viewing_cones(
+    directions: Float[Tensor, "m 3"], point: Int[Tensor, "m"], count: int
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+    """Return the mean of each point's ``directions`` (unit), and the largest angle (radians) between it and one of them."""
+    mean = sum_by(directions, point, count) / torch.bincount(point, minlength=count).clamp(min=1)[:, None]
+    mean = mean / torch.linalg.vector_norm(mean, dim=-1, keepdim=True).clamp(min=1e-300)
+    cosine = (directions * mean[point]).sum(-1).clamp(-1, 1)
+    least = torch.ones(count, dtype=cosine.dtype).scatter_reduce(0, point, cosine, "amin")
+    return mean, least.acos()
+
+
 def fits_points(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:
     """Return a mask of the observations within ``tolerance`` pixels of the projection of their point."""
     return torch.linalg.vector_norm(sightings.residuals(points), dim=-1) <= tolerance
@@ -113,7 +124,10 @@ def noise(sightings: Sightings, points: Float[Tensor, "n 3"]) -> float:
     return mad_deviation(residual)
 
 
-def _damped(matrix: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
-    """Return the matrices with damping added, so that they are invertible even for rays without parallax."""
-    size = matrix.diagonal(dim1=-2, dim2=-1).mean(-1).clamp(min=1e-30)
-    return matrix + 1e-6 * size[:, None, None] * torch.eye(3, dtype=matrix.dtype)
+def damped(blocks: Float[Tensor, "b k k"], damping: float = 0.0, least: float = 1e-6) -> Float[Tensor, "b k k"]:
+    """Return the blocks with their diagonals enlarged, so that even those of points without parallax are invertible.
+
+    ``damping`` is relative to each entry of a diagonal, and ``least`` to its mean.
+    """
+    diagonal = blocks.diagonal(dim1=-2, dim2=-1)
+    return blocks + torch.diag_embed(damping * diagonal + least * diagonal.mean(-1, keepdim=True).clamp(min=1e-30))

@@ -15,9 +15,9 @@ from bidnerf_core.camera import poses_of_rows
 from bidnerf_core.depth import UNKNOWN
 from bidnerf_core.frames import SeenLandmarks
 from bidnerf_core.geometry import SE3, mad_deviation
-from bidnerf_core.mapping.geometry.triangulation import Sightings, sum_by
+from bidnerf_core.mapping.geometry.triangulation import Sightings, sum_by, viewing_cones
 from bidnerf_core.mapping.landmarks.descriptors import MANY, byte_of_zero, mutual_nearest, squared_distances
-from bidnerf_core.mapping.landmarks.features import ImageKeypoints
+from bidnerf_core.mapping.landmarks.features import ImageKeypoints, Keypoints
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, Tracks
 
 EPIPOLAR_BAND = 2.0
@@ -231,23 +231,15 @@ class TrackedKeypoints:
         return Sightings(self.point, image, T.rotation.mT, T.translation, rays[:, :2], focal[image], times)
 
     @property
-    def sizes(self) -> Float[Tensor, "m"]:
-        """The diameters of the keypoints, pixels."""
-        return torch.cat([p.keypoints.sizes for p in self.images])[self.number]
-
-    @property
-    def pixels(self) -> Float[Tensor, "m 2"]:
-        """The pixel coordinates of the keypoints in their images."""
-        return torch.cat([p.keypoints.pixels for p in self.images])[self.number]
+    def keypoints(self) -> Keypoints:
+        """The keypoints, in the images in which they were detected."""
+        pixels, sizes, descriptors = zip(*(vars(image.keypoints).values() for image in self.images), strict=True)
+        return Keypoints(torch.cat(pixels), torch.cat(sizes), torch.cat(descriptors))[self.number]
 
     @property
     def depth(self) -> Float[Tensor, "m"]:
         """The depth measured at each keypoint, metres; 0 where none was measured."""
         return torch.cat([p.depth for p in self.images])[self.number]
-
-    @property
-    def descriptors(self) -> UInt8[Tensor, "m d"]:
-        return torch.cat([p.keypoints.descriptors for p in self.images])[self.number]
 
 
 def fuse_landmarks(
@@ -263,24 +255,22 @@ def fuse_landmarks(
     count, sightings = len(positions), observations.sightings
     away = sightings.centre - positions[sightings.point]
     towards = away / torch.linalg.vector_norm(away, dim=-1, keepdim=True).clamp(min=1e-300)
-    mean = _mean(towards, sightings.point, count)
-    directions = mean / torch.linalg.vector_norm(mean, dim=-1, keepdim=True).clamp(min=1e-300)
-    cosine = (towards * directions[sightings.point]).sum(-1).clamp(-1, 1)
-    least = torch.ones(count, dtype=cosine.dtype).scatter_reduce(0, sightings.point, cosine, "amin")
+    directions, cones = viewing_cones(towards, sightings.point, count)
+    keypoints, views = observations.keypoints, torch.bincount(sightings.point, minlength=count)
     along = (directions[:, None] @ covariance @ directions[..., None])[:, 0, 0]
     across = (covariance.diagonal(dim1=-2, dim2=-1).sum(-1) - along) / 2  # the variances of both axes averaged
-    metres = observations.sizes * sightings.in_camera(positions)[:, 2].clamp(min=0) / sightings.focal
+    metres = keypoints.sizes * sightings.in_camera(positions)[:, 2].clamp(min=0) / sightings.focal
     return LandmarkMap(
         positions.float(),
         torch.stack([across, along], dim=-1).clamp(min=0).sqrt().float(),
-        _mean_descriptors(observations.descriptors, sightings.point, count),
+        _mean_descriptors(keypoints.descriptors, sightings.point, count),
         directions.float(),
-        least.acos().float(),
-        _mean(metres[:, None], sightings.point, count)[:, 0].float(),
-        torch.bincount(sightings.point, minlength=count).int(),
+        cones.float(),
+        (sum_by(metres, sightings.point, count) / views.clamp(min=1)).float(),
+        views.int(),
         noise,
         torch.zeros((6, 6), dtype=torch.float64),
-        tracks=Tracks(sightings.point.int(), sightings.view.int(), observations.pixels.float()),
+        tracks=Tracks(sightings.point.int(), sightings.view.int(), keypoints.pixels.float()),
     )
 
 
@@ -293,7 +283,7 @@ def seen_landmarks(
     distance = torch.linalg.vector_norm(away, dim=-1)
     ray = away / distance[:, None].clamp(min=1e-300)
     variance = (ray[:, None] @ covariance[sightings.point] @ ray[..., None])[:, 0, 0]
-    parts = observations.pixels.float(), distance.float(), variance.clamp(min=0).sqrt().float()
+    parts = observations.keypoints.pixels.float(), distance.float(), variance.clamp(min=0).sqrt().float()
     return [SeenLandmarks(*(part[image == i] for part in parts)) for i in range(len(observations.images))]
 
 
@@ -309,10 +299,6 @@ def _mean_descriptors(descriptors: UInt8[Tensor, "m d"], point: Int[Tensor, "m"]
     mean, length = total / number, lengths / number
     scaled = mean * length / torch.linalg.vector_norm(mean, dim=-1, keepdim=True).clamp(min=1e-9)
     return (scaled + zero).round().clamp(0, 255).to(torch.uint8)
-
-
-def _mean(values: Float[Tensor, "m c"], index: Int[Tensor, "m"], count: int) -> Float[Tensor, "n c"]:
-    return sum_by(values, index, count) / torch.bincount(index, minlength=count).clamp(min=1)[:, None]
 
 
 ENOUGH_DEPTHS = 30

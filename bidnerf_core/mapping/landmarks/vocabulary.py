@@ -38,14 +38,10 @@ class Vocabulary:
 
     def pooled(self, descriptors: UInt8[Tensor, "n d"], word: Tensor | None = None) -> Float[Tensor, "p"]:
         """Return the VLAD vector of descriptors, of unit length; ``word`` holds each descriptor's nearest word, if known."""
-        word = self.nearest(descriptors) if word is None else word
+        word = nearest_centre(descriptors, self.words) if word is None else word
         sums = torch.zeros_like(self.words).index_add_(0, word, descriptors.float() - self.words[word])
         roots = sums.sign() * sums.abs().sqrt()  # so that repeated structures do not dominate
         return normalize(normalize(roots, dim=1).flatten(), dim=0)
-
-    def nearest(self, descriptors: UInt8[Tensor, "n d"]) -> Tensor:
-        """Return the index of the word nearest to each descriptor."""
-        return nearest_centre(descriptors, self.words)
 
 
 def pool_views(
@@ -55,7 +51,7 @@ def pool_views(
 
     At most 48 cameras, at regular intervals, are pooled, except those that see fewer than eight landmarks.
     """
-    word = vocabulary.nearest(landmarks.descriptors)
+    word = nearest_centre(landmarks.descriptors, vocabulary.words)
     vectors = []
     for camera, pose in cameras[:: max(1, math.ceil(len(cameras) / 48))]:
         seen = visible(landmarks, camera, pose)

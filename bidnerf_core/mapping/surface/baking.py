@@ -20,13 +20,14 @@ from bidnerf_core.frames import Frame, View, draw, uniform
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping.surface.posed_depth import (
     WITNESSES,
+    PosedDepthImage,
     choose_grid,
-    comparison_noise,
     confirm_points,
+    depth_noise,
     finest_cell,
+    footprint,
     posed_measurement,
     render_posed,
-    spacing,
 )
 from bidnerf_core.mapping.surface.surface_map import SurfaceMap, fuse_surfels, merge_cells
 from bidnerf_core.mapping.surface.surfel_index import MOST_CELLS, SurfelIndex
@@ -98,7 +99,7 @@ def bake(
         images.append(render_posed(field, bounds, intrinsics, T, config.rays / total))
         count(len(views) + number, total)
     cell = max(finest_cell(images, config.opacity), VoxelGrid.filling(bounds, config.cells).cell)
-    tolerance = 2 * max(cell, comparison_noise(images, config.opacity))
+    tolerance = 2 * max(cell, depth_noise(images, config.opacity, PosedDepthImage.beyond))
     parts, colours = [], []
     for number, posed in enumerate(images):
         solid = posed.solid(config.opacity)
@@ -110,7 +111,7 @@ def bake(
     inside = VoxelGrid.covering(bounds, cell).contains(points)
     if not bool(inside.any()):
         raise InputError("no surface to bake: no point that several views agree on")
-    coarsest, keyframes = spacing(images, config.opacity), [image.T_world_camera for image in images]
+    coarsest, keyframes = footprint(images, config.opacity, subsampled=True), [image.T_world_camera for image in images]
     return _fused(points[inside], rgb[inside], bounds, (cell, coarsest), keyframes, config)
 
 

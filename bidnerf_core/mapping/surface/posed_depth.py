@@ -19,7 +19,7 @@ from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.fields import RadianceField, RenderedImage, SceneBounds, VoxelGrid, render_image
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, mad_deviation
-from bidnerf_core.mapping.surface.surface_map import surfel_bytes
+from bidnerf_core.mapping.surface.surface_map import SURFEL_BYTES
 from bidnerf_core.mapping.surface.surfel_index import BLOCK_SIDE, MOST_CELLS, block_levels, index_bytes
 
 WITNESSES = 8
@@ -152,43 +152,32 @@ def finest_cell(images: Sequence[PosedDepthImage], opacity: float) -> float:
     return max(0.7 * footprint(images, opacity), 2 * depth_noise(measured, opacity))
 
 
-def footprint(images: Sequence[PosedDepthImage], opacity: float) -> float:
-    """Return the footprint (side, metres) of a full-resolution pixel at the median distance; 0 if no surface is visible."""
-    return _median([float(d.median()) / posed.full_focal for posed, d in _depths(images, opacity)])
+def footprint(images: Sequence[PosedDepthImage], opacity: float, subsampled: bool = False) -> float:
+    """Return the side (metres) of a pixel's footprint at the median distance; 0 if no surface is visible.
 
-
-def spacing(images: Sequence[PosedDepthImage], opacity: float) -> float:
-    """Return the footprint (side, metres) of a pixel of the subsampled images at the median distance."""
-    return _median([float(d.median()) / posed.focal for posed, d in _depths(images, opacity)])
-
-
-def depth_noise(images: Sequence[PosedDepthImage], opacity: float) -> float:
-    """Return the standard deviation (metres) of an image's depth, from differences between images of the same points.
-
-    The value includes pose errors, and is 0 if no two images show the same points.
+    The pixel is one of the full resolution or, if ``subsampled``, of the images as they are here.
     """
-    return _spread(images, opacity, lambda posed, points: posed.smoothly_beyond(points, opacity))
+    sides = [
+        float(d.median()) / (posed.focal if subsampled else posed.full_focal) for posed, d in _depths(images, opacity)
+    ]
+    return _median(sides)
 
 
-def comparison_noise(images: Sequence[PosedDepthImage], opacity: float) -> float:
-    """Return the standard deviation (metres), per image, of the depth differences to which ``agreed`` applies its tolerance.
-
-    Like ``depth_noise``, but depth is read from the nearest pixel instead of interpolated, as ``agreed`` does, so the result
-    includes the discretization error of the subsampled images.
-    """
-    return _spread(images, opacity, PosedDepthImage.beyond)
-
-
-def _spread(
+def depth_noise(
     images: Sequence[PosedDepthImage],
     opacity: float,
-    beyond: Callable[[PosedDepthImage, Float[Tensor, "p 3"]], Float[Tensor, "p"]],
+    beyond: Callable[[PosedDepthImage, Float[Tensor, "p 3"]], Float[Tensor, "p"]] | None = None,
 ) -> float:
-    """Return the robust deviation of the differences at a few hundred points of each of up to 40 images.
+    """Return the robust standard deviation (metres) of an image's depth, from differences between images of the same points.
+
+    The differences are those of ``beyond``, by default of depth that is interpolated between pixels. With depth of the nearest
+    pixel, they include the discretization error of the subsampled images. Up to 40 images are compared with others, each at a
+    few hundred points. The result includes pose errors, and is 0 if no two images show the same points.
 
     Differences of more than five times the median are occlusions or gross errors. The result is at most two standard deviations
     of an unknown sensor, since images that differ by more are inconsistent.
     """
+    beyond = beyond or (lambda posed, points: posed.smoothly_beyond(points, opacity))
     parts = [torch.zeros(0)]
     for number in range(0, len(images), max(1, math.ceil(len(images) / 40))):
         points = images[number].points(images[number].solid(opacity))
@@ -239,7 +228,7 @@ def surface_bytes(points: Float[Tensor, "p 3"], grid: VoxelGrid) -> float:
     if math.prod(-(-count // BLOCK_SIDE) * BLOCK_SIDE for count in grid.shape) > MOST_CELLS:
         return math.inf
     surfels = len(grid.numbers(points).unique())
-    return surfel_bytes(surfels) + index_bytes(block_levels(points, grid))
+    return SURFEL_BYTES * surfels + index_bytes(block_levels(points, grid))
 
 
 def _depths(images: Sequence[PosedDepthImage], opacity: float) -> list[tuple[PosedDepthImage, Float[Tensor, "p"]]]:

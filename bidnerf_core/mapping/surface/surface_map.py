@@ -30,9 +30,8 @@ class Surfels:
         return len(self.positions)
 
 
-def surfel_bytes(count: int) -> int:
-    """Return the memory (bytes) of ``count`` surfels: 18 numbers of 4 bytes each."""
-    return 72 * count
+SURFEL_BYTES = 72
+"""Memory (bytes) of a surfel: 18 numbers of 4 bytes each."""
 
 
 def merge_cells(cells: Int[Tensor, "p"], *values: Float[Tensor, "p _"]) -> tuple[Int[Tensor, "n"], list[Tensor]]:
@@ -102,7 +101,7 @@ class SurfaceMap(Resident):
     @property
     def mebibytes(self) -> float:
         """Memory of the surfels and their index, in MiB."""
-        return (surfel_bytes(len(self.surfels)) + index_bytes(self.index.level)) / 2**20
+        return (SURFEL_BYTES * len(self.surfels) + index_bytes(self.index.level)) / 2**20
 
     @property
     def stored_cells(self) -> int:
