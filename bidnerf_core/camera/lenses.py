@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import cv2
 import numpy as np
@@ -66,6 +66,7 @@ class Lens(ABC):
 
     stored_size: tuple[int, int]  # width and height of the stored image in pixels
     orientation: Orientation
+    wraps: ClassVar[bool] = False  # whether the left and right edges of the image are joined
 
     @property
     def width(self) -> int:
@@ -103,11 +104,13 @@ class Lens(ABC):
         """Resample an upright image (h, w) or (h, w, c) to the ``pinhole`` camera.
 
         Values are interpolated, and replicated beyond the borders. With ``nearest``, the nearest pixel's value
-        is taken, and 0 beyond the borders.
+        is taken, and 0 beyond the borders, if the lens has any.
         """
         u, v = _lookup(self)
         method = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
-        border = cv2.BORDER_CONSTANT if nearest else cv2.BORDER_REPLICATE
+        border = cv2.BORDER_CONSTANT if nearest and not self.wraps else cv2.BORDER_REPLICATE
+        if self.wraps:
+            image, u = cv2.copyMakeBorder(image, 0, 0, 1, 1, cv2.BORDER_WRAP), u + 1
         resampled: np.ndarray = cv2.remap(image, u, v, method, borderMode=border)
         return resampled
 
@@ -216,6 +219,7 @@ class PanoramaFace(Lens):
     face: str
     stored_size: tuple[int, int]
     orientation: Orientation = UPRIGHT
+    wraps: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if not same_aspect(self.stored_size, (2, 1)):
@@ -250,14 +254,6 @@ class PanoramaFace(Lens):
         x, y, z = np.moveaxis(rays, -1, 0)
         longitude, latitude = np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))  # downwards
         return np.stack([longitude / (2 * math.pi) + 0.5, latitude / math.pi + 0.5], axis=-1) * self.stored_size
-
-    def resampled(self, image: np.ndarray, nearest: bool = False) -> np.ndarray:
-        """Resample a panorama to this face; the panorama's left and right edges are joined."""
-        u, v = _lookup(self)
-        method = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
-        wrapped = cv2.copyMakeBorder(image, 0, 0, 1, 1, cv2.BORDER_WRAP)
-        resampled: np.ndarray = cv2.remap(wrapped, u + 1, v, method, borderMode=cv2.BORDER_REPLICATE)
-        return resampled
 
     @property
     def sentence(self) -> str:

@@ -194,8 +194,6 @@ def _unambiguous(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tuple[Int[
 def match_pair(images: Sequence[ImageKeypoints], i: int, j: int) -> MatchedPair | None:
     """Return the matches of two images that are inliers of an essential matrix; None if there are too few."""
     a, b = images[i], images[j]
-    if min(len(a.keypoints), len(b.keypoints)) < ENOUGH_MATCHES:
-        return None
     rows, partner = _unambiguous(a.keypoints.descriptors, b.keypoints.descriptors)
     if len(rows) < ENOUGH_MATCHES:
         return None

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 import torch
@@ -218,13 +219,10 @@ def _has_support(images: Sequence[ImageKeypoints], links: csr_array, number: int
     Matches are found without using the poses, so a wrong pose agrees with none of the linked photos.
     """
     poses, needed = SE3.stack([image.T_ref_camera for image in images]), LEAST_GROUP - 1
-    for other in links.indices[links.indptr[number] : links.indptr[number + 1]].tolist():
-        pair = match_pair(images, number, other)
-        if pair is not None and bool(pair.agreeing(poses[None])[0]):
-            needed -= 1
-        if not needed:
-            return True
-    return False
+    others = links.indices[links.indptr[number] : links.indptr[number + 1]].tolist()
+    pairs = (match_pair(images, number, other) for other in others)
+    agreeing = (pair for pair in pairs if pair is not None and bool(pair.agreeing(poses[None])[0]))
+    return len(list(islice(agreeing, needed))) == needed
 
 
 def relocate_photos(

@@ -182,7 +182,9 @@ def measured_points(view: View, share: int) -> tuple[Float[Tensor, "n 3"], Float
 
 def _guessed_box(views: Sequence[View], centres: Float[Tensor, "v 3"]) -> AxisBox:
     """Return the box suggested by the cameras alone, see ``estimate_bounds``."""
-    corners = torch.stack([_corner_rays(view) for view in views])
+    cameras = [view.frame.intrinsics for view in views]
+    pixels = [torch.cartesian_prod(*torch.tensor([[0.0, c.width], [0.0, c.height]]).double()) for c in cameras]
+    corners = torch.stack([c.unproject(ends) for c, ends in zip(cameras, pixels, strict=True)])  # at z = 1
     # The tangent of the farthest corner's angle to the optical axis
     tangents = torch.linalg.vector_norm(corners[..., :2], dim=-1).amax(dim=-1)
     # The point nearest to all optical axes (least squares) counts if most cameras see it, and from different sides: the mean
@@ -202,13 +204,6 @@ def _guessed_box(views: Sequence[View], centres: Float[Tensor, "v 3"]) -> AxisBo
     poses = [view.T_ref_camera.to(torch.float64) for view in views]
     points = torch.cat([centres, *(T.apply(rays * reach) for T, rays in zip(poses, corners, strict=True))])
     return points.amin(dim=0), points.amax(dim=0)
-
-
-def _corner_rays(view: View) -> Float[Tensor, "4 3"]:
-    """Return the points at z = 1 (camera frame) that the corners of the image show."""
-    camera = view.frame.intrinsics
-    corners = [[x, y] for x in (0, camera.width) for y in (0, camera.height)]
-    return camera.unproject(torch.tensor(corners, dtype=torch.float64))
 
 
 def _farthest(centres: Float[Tensor, "v 3"], box: AxisBox) -> float:

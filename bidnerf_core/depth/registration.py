@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics, Raster, read_camera
@@ -66,7 +66,13 @@ class DepthCamera:
         measured = depth > 0
         rays = camera.unproject(camera.pixel_centres(torch.float64)[measured])
         points = self.T_colour_depth.apply(rays * depth[measured].double()[:, None])
-        nearest = nearest_depth(points[_ahead(points, coarse)], coarse)
+        # A polynomial lens model also maps some points outside of the image's frustum into the image.
+        centres = coarse.pixel_centres(torch.float64)
+        border = torch.cat([centres[[0, -1]].reshape(-1, 2), centres[:, [0, -1]].reshape(-1, 2)])
+        edge, pixel = coarse.unproject(border)[:, :2], torch.tensor([1 / coarse.fx, 1 / coarse.fy], dtype=torch.float64)
+        x = points[:, :2] / points[:, 2:].clamp(min=1e-9)
+        ahead = ((x >= edge.amin(0) - pixel) & (x <= edge.amax(0) + pixel)).all(-1)
+        nearest = nearest_depth(points[ahead], coarse)
         # A small number of measurements may all lie outside.
         if int(measured.sum()) >= 1000 and not bool((nearest > 0).any()):
             away = float(torch.linalg.vector_norm(self.T_colour_depth.translation))
@@ -86,13 +92,3 @@ def nearest_depth(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Float[Ten
     cell = (row * camera.width + column)[inside]
     nearest = empty.scatter_reduce(0, cell, points[inside, 2].float(), "amin")
     return torch.where(nearest.isfinite(), nearest, 0).reshape(camera.height, camera.width)
-
-
-def _ahead(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Bool[Tensor, "n"]:
-    """Return which points lie within the image's frustum; a polynomial lens model also maps some points outside it into the image."""
-    centres = camera.pixel_centres(torch.float64)
-    border = torch.cat([centres[[0, -1]].reshape(-1, 2), centres[:, [0, -1]].reshape(-1, 2)])
-    edge = camera.unproject(border)[:, :2]
-    pixel = torch.tensor([1 / camera.fx, 1 / camera.fy], dtype=torch.float64)
-    x = points[:, :2] / points[:, 2:].clamp(min=1e-9)
-    return ((x >= edge.amin(0) - pixel) & (x <= edge.amax(0) + pixel)).all(-1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import overload
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -19,6 +19,8 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError, unknown_name
 from bidnerf_core.geometry import MAD_TO_SIGMA
+
+Depth = TypeVar("Depth", float, Tensor)
 
 
 @dataclass(frozen=True)
@@ -33,11 +35,7 @@ class DepthNoise:
         if not all(0 <= value < math.inf for value in (self.constant, self.linear, self.quadratic)):
             raise InputError(f"the depth noise is {self}", expected="finite coefficients of 0 or more")
 
-    @overload
-    def deviation(self, depth: float) -> float: ...
-    @overload
-    def deviation(self, depth: Float[Tensor, "*p"]) -> Float[Tensor, "*p"]: ...
-    def deviation(self, depth: float | Float[Tensor, "*p"]) -> float | Float[Tensor, "*p"]:
+    def deviation(self, depth: Depth) -> Depth:
         """Return the standard deviation (metres) of measured depths (metres)."""
         return self.constant + (self.linear + self.quadratic * depth) * depth
 
@@ -124,7 +122,9 @@ def estimate_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) ->
     rows, columns = _lines_of_sensor(depth.detach().cpu())
     image = intrinsics.unproject(intrinsics.pixel_centres(torch.float64)[rows][:, columns])[..., :2]
     depth = depth.detach().cpu()[rows][:, columns].double()
-    z, x = (_windows(part) for part in (depth, image))
+    # Adjacent windows, one per row; left-over rows and columns of the image are not used.
+    parts = (part.unfold(0, WINDOW_SIDE, WINDOW_SIDE).unfold(1, WINDOW_SIDE, WINDOW_SIDE) for part in (depth, image))
+    z, x = (part.flatten(0, 1).flatten(-2) for part in parts)
     whole = ((z > 0) & z.isfinite()).all(-1)
     z, x = z[whole], x[whole].mT
     if len(z) < LEAST_WINDOWS:
@@ -152,12 +152,6 @@ def estimate_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) ->
 
     (linear, quadratic), _ = nnls(np.stack([np.ones_like(at), at], axis=-1), deviation)
     return DepthNoise(linear=float(linear), quadratic=float(quadratic))
-
-
-def _windows(image: Float[Tensor, "h w *c"]) -> Float[Tensor, "n *c p"]:
-    """Return the pixels of adjacent windows, one window per row; left-over rows and columns of the image are not used."""
-    parts = image.unfold(0, WINDOW_SIDE, WINDOW_SIDE).unfold(1, WINDOW_SIDE, WINDOW_SIDE)
-    return parts.flatten(0, 1).flatten(-2)
 
 
 def _lines_of_sensor(depth: Float[Tensor, "h w"]) -> tuple[Int[Tensor, "r"], Int[Tensor, "c"]]:

@@ -61,8 +61,8 @@ def surface_tensors(surface: SurfaceMap) -> dict[str, Tensor]:
     """Return copies of a surface's tensors, by name and in the dtypes of ``SURFACE_KINDS``."""
     index, grid = surface.index, surface.grid
     values: dict[str, Any] = {name: getattr(surface.surfels, name) for name in SURFELS}
-    values |= {"keyframes": surface.keyframes, "lower": grid.lower, "cell": grid.cell, "shape": grid.shape}
-    values |= {name: getattr(index, name) for name in ("first", "level", "entries")}
+    of_grid = {"keyframes": surface.keyframes, "lower": grid.lower, "cell": grid.cell, "shape": grid.shape}
+    values |= of_grid | {name: getattr(index, name) for name in ("first", "level", "entries")}
     return _copies(values, SURFACE_KINDS)
 
 

@@ -73,14 +73,12 @@ class Silent:
     def resume(self) -> TrainingState | None:
         return None
 
-    def step(self, progress: TrainingStep) -> None:
-        pass
+    def step(self, progress: TrainingStep) -> None: ...
 
     def due(self, step: int) -> bool:
         return False
 
-    def save(self, state: TrainingState) -> None:
-        pass
+    def save(self, state: TrainingState) -> None: ...
 
 
 class TrainingStopped(Exception):
@@ -230,9 +228,8 @@ def _state(
     moments = {"generator": generator.get_state()}
     if beside is not None:
         moments |= {f"beside.{name}": value for name, value in beside.state_dict().items()}
-    for number, parameter in enumerate(_parameters(optimizer)):
-        for name, value in optimizer.state.get(parameter, {}).items():
-            moments[f"{number}.{name}"] = value
+    states = (optimizer.state.get(parameter, {}) for parameter in _parameters(optimizer))
+    moments |= {f"{number}.{name}": value for number, state in enumerate(states) for name, value in state.items()}
     return TrainingState(step, dict(field.state_dict()), moments)
 
 

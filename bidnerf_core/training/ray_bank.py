@@ -73,11 +73,9 @@ class RayBank:
         self._cameras = _PixelRays([frame.intrinsics for frame in frames], home)
         rotation = torch.stack([view.T_ref_camera.rotation for view in views]).float()
         origin = torch.stack([view.T_ref_camera.translation for view in views]).float()
-        motion = None
-        if any(view.motion is not None for view in views):
-            rows = [AT_REST if view.motion is None else view.motion for view in views]
-            motion = torch.stack(rows).float()
-        self.offsets, self._visible, self._rotation, self._origin, self._motion = move_to(
+        rows = torch.stack([AT_REST if view.motion is None else view.motion for view in views]).float()
+        motion = None if all(view.motion is None for view in views) else rows
+        self.offsets, self._visible, self._rotation, self._origin, self._motion = moved(
             (offsets, visible, rotation, origin, motion), home
         )
         self._drawn = self.count if visible is None else int(visible[-1])

@@ -63,9 +63,7 @@ class Supervision:
         seed: int = 0,
     ) -> None:
         """Call ``training.fit``, also learning the per-image parameters, which are saved and restored with the field."""
-        learned: list[dict[str, Any]] = []
-        if self.colours is not None:
-            learned = [{"params": list(self.colours.parameters()), "lr": 2e-3}]
+        learned = [] if self.colours is None else [{"params": list(self.colours.parameters()), "lr": 2e-3}]
         if isinstance(outcome, Replayable) and self.bank.home != self.bank.device:
             outcome = outcome.__call__  # batches are copied, which cannot be replayed
         fit(field, [*groups, *learned], outcome, steps, report, schedule, seed, beside=self.colours)

@@ -18,7 +18,6 @@ from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.frames import SeenLandmarks, View
 from bidnerf_core.geometry import SE3, chi_squared_quantile, inlier_weight
 from bidnerf_core.mapping.geometry.triangulation import (
-    Sightings,
     fits_points,
     noise,
     parallax,
@@ -323,21 +322,17 @@ def _triangulated(
     for tolerance in (10.0, 4.0, 2.0) if known is None else (2.0,):
         scale, steps = tolerance / 2, 8 if known is None else 0
         points, covariance = refine_points(observations.sightings, points, scale, steps)
-        observations = observations[_inliers(observations.sightings, points, tolerance)]
+        # A point needs at least two keypoints that fit it; if it has only two, both must fit to within 1.5 pixels.
+        sightings = observations.sightings
+        fits = fits_points(sightings, points, tolerance)
+        views = torch.bincount(sightings.point[fits], minlength=len(points))[sightings.point]
+        fits &= (views != 2) | fits_points(sightings, points, min(tolerance, 1.5))
+        observations = observations[
+            fits & (torch.bincount(sightings.point[fits], minlength=len(points)) >= 2)[sightings.point]
+        ]
     wide = parallax(observations.sightings, points) >= least
     observations, numbers = observations[wide[observations.point]].compacted()
     return observations, points[numbers], covariance[numbers]
-
-
-def _inliers(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:
-    """Return a mask of the keypoints that fit their points, for points with at least two such keypoints.
-
-    If a point has only two, both must fit to within 1.5 pixels.
-    """
-    fit = fits_points(sightings, points, tolerance)
-    seen = torch.bincount(sightings.point[fit], minlength=len(points))
-    fit &= (seen[sightings.point] != 2) | fits_points(sightings, points, min(tolerance, 1.5))
-    return fit & (torch.bincount(sightings.point[fit], minlength=len(points)) >= 2)[sightings.point]
 
 
 def _mapped(

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -237,8 +238,7 @@ class LandmarkMap:
     @property
     def megabytes(self) -> float:
         """The size of the landmarks' tensors in megabytes (10^6 bytes)."""
-        parts = [getattr(self, name) for name in PER_LANDMARK]
-        return sum(part.numel() * part.element_size() for part in parts) / 1e6
+        return sum(getattr(self, name).nbytes for name in PER_LANDMARK) / 1e6
 
 
 PER_LANDMARK = ("positions", "deviations", "descriptors", "directions", "cones", "sizes", "views")
@@ -248,11 +248,9 @@ PER_LANDMARK = ("positions", "deviations", "descriptors", "directions", "cones",
 def concatenate(maps: list[LandmarkMap]) -> LandmarkMap:
     """Return the landmarks of all ``maps`` (descriptors of the same length), with the other fields of the first map."""
     joined: dict[str, Any] = {name: torch.cat([getattr(m, name) for m in maps]) for name in PER_LANDMARK}
-    tracks, first = list[Tracks](), 0
-    for m in maps:
-        if m.tracks is not None:
-            tracks.append(m.tracks.renumbered(torch.arange(len(m)) + first))
-        first += len(m)
+    firsts = accumulate(map(len, maps), initial=0)
+    numbered = [(m.tracks, torch.arange(len(m)) + first) for m, first in zip(maps, firsts, strict=False)]
+    tracks = [part.renumbered(numbers) for part, numbers in numbered if part is not None]
     if tracks:
         parts = (torch.cat([getattr(part, name) for part in tracks]) for name in ("landmark", "image", "pixel"))
         joined["tracks"] = Tracks(*parts)

@@ -52,11 +52,8 @@ def pool_views(
     At most 48 cameras, at regular intervals, are pooled, except those that see fewer than eight landmarks.
     """
     word = nearest_centre(landmarks.descriptors, vocabulary.words)
-    vectors = []
-    for camera, pose in cameras[:: max(1, math.ceil(len(cameras) / 48))]:
-        seen = visible(landmarks, camera, pose)
-        if len(seen) >= 8:
-            vectors.append(vocabulary.pooled(landmarks.descriptors[seen], word[seen]))
+    shown = [visible(landmarks, *camera) for camera in cameras[:: max(1, math.ceil(len(cameras) / 48))]]
+    vectors = [vocabulary.pooled(landmarks.descriptors[seen], word[seen]) for seen in shown if len(seen) >= 8]
     return torch.stack([*vectors, vocabulary.pooled(landmarks.descriptors, word)])
 
 
