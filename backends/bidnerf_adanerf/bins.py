@@ -54,7 +54,7 @@ class Sparse:
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
         whole = self.bins(rays, jitter)
         scores = torch.where(whole.valid, ray_logits(self.oracle, self.bins, rays).sigmoid().to(whole.starts), -1.0)
-        return chosen(whole, scores, self.threshold, self.most)
+        return choose_samples(whole, scores, self.threshold, self.most)
 
 
 def ray_logits(oracle: Oracle, bins: Bins, rays: Rays) -> Float[Tensor, "*r n"]:
@@ -62,14 +62,14 @@ def ray_logits(oracle: Oracle, bins: Bins, rays: Rays) -> Float[Tensor, "*r n"]:
     shape = rays.near.shape
     whole = bins.through(rays)
     spacing = bins.bounds.spacing(whole)
-    near, far = spacing.place(torch.stack([whole.near, whole.far], dim=-1)).split(1, dim=-1)
+    near, far = spacing.coordinate(torch.stack([whole.near, whole.far], dim=-1)).split(1, dim=-1)
     along = spacing.distance(torch.lerp(near, far, oracle.places.to(near)))
     points = bins.bounds.normalized(whole.at(along)).reshape(shape.numel(), len(oracle.places), 3)
     logits: Tensor = oracle(points.to(oracle.places))
     return logits.reshape(*shape, logits.shape[-1])
 
 
-def chosen(samples: RaySamples, scores: Float[Tensor, "*r n"], threshold: float, most: int) -> RaySamples:
+def choose_samples(samples: RaySamples, scores: Float[Tensor, "*r n"], threshold: float, most: int) -> RaySamples:
     """Return, for each ray, up to ``most`` samples with the highest scores above ``threshold``.
 
     The best sample of a ray is kept even below the threshold, provided that it is valid.

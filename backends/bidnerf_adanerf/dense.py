@@ -19,14 +19,14 @@ def dense_samples(
     samples = field.bins(rays, generator)
     if room is None:
         return samples, torch.zeros_like(samples.valid)
-    held = room.holds(rays.at(samples.middles))
+    occupied = room.holds(rays.at(samples.middles))
     # A sixteenth of the bins known to be empty is shaded anyway, so that the field learns that they are empty.
     probed = (
         samples.valid
-        & ~held
-        & (torch.rand(held.shape, generator=generator, device=generator.device) < 1 / 16).to(held.device)
+        & ~occupied
+        & (torch.rand(occupied.shape, generator=generator, device=generator.device) < 1 / 16).to(occupied.device)
     )
-    return replace(samples, valid=samples.valid & held | probed), probed
+    return replace(samples, valid=samples.valid & occupied | probed), probed
 
 
 def soft_weights(scores: Float[Tensor, "r n"], threshold: float) -> Float[Tensor, "r n"]:

@@ -67,7 +67,7 @@ class HashGridField(nn.Module):
         self.config = config
         self.bounds = bounds
         self.side = max(bounds.size)
-        self.encoding = HashEncoding(_resolving(config, bounds))
+        self.encoding = HashEncoding(_encoding_config(config, bounds))
         self.geometry = nn.Sequential(
             nn.Linear(self.encoding.width, config.width),
             nn.ReLU(),
@@ -87,7 +87,7 @@ class HashGridField(nn.Module):
 
     @property
     def sampler(self) -> RaySampler:
-        return limited(self.occupancy, self.config.samples_per_ray)
+        return limit_samples(self.occupancy, self.config.samples_per_ray)
 
     @property
     def levels(self) -> tuple[CoarseField, HashGridField]:
@@ -118,8 +118,8 @@ class HashGridField(nn.Module):
         if (kernel := None if moving else self._kernel(active)) is not None:
             density, rgb = fused.query(points, along, False, None, *kernel)[0].split((1, 3), -1)
         else:
-            found = self.values_of(self.encode(points, active), along)
-            density, rgb = found.density, found.rgb
+            values = self.values_of(self.encode(points, active), along)
+            density, rgb = values.density, values.rgb
         return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
 
     def values_of(self, encoded: Float[Tensor, "p f"], directions: Float[Tensor, "p 3"]) -> FieldValues:
@@ -180,7 +180,7 @@ class HashGridField(nn.Module):
         return encoded
 
 
-def _resolving(config: FieldConfig, bounds: SceneBounds) -> HashEncodingConfig:
+def _encoding_config(config: FieldConfig, bounds: SceneBounds) -> HashEncodingConfig:
     """Return an encoding as fine as the images: finer levels would only cause collisions in their tables."""
     encoding = config.encoding
     finest = encoding.finest_resolution
@@ -195,7 +195,7 @@ def _hidden(widths: Sequence[int]) -> list[nn.Module]:
     return [part for a, b in pairwise(widths) for part in (nn.Linear(a, b), nn.ReLU())]
 
 
-def limited(grid: OccupancyGrid, count: int) -> RaySampler:
+def limit_samples(grid: OccupancyGrid, count: int) -> RaySampler:
     """Return a sampler of at most ``count`` intervals per ray, concentrated where the grid has observed density.
 
     If the count is 0, or the grid has observed nothing, the sampler is the grid itself, which samples all occupied cells.
@@ -211,7 +211,7 @@ class CoarseField:
 
     @property
     def sampler(self) -> RaySampler:
-        return limited(self.fine.coarse_sampler, self.fine.config.samples_per_ray)
+        return limit_samples(self.fine.coarse_sampler, self.fine.config.samples_per_ray)
 
     @property
     def occupancy(self) -> OccupancyGrid:

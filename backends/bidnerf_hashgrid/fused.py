@@ -47,7 +47,7 @@ def _power_of_two(size: int) -> int:
     return max(16, 1 << (size - 1).bit_length())
 
 
-def _launched(levels: Sequence[Level], tables: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+def _launch(levels: Sequence[Level], tables: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     """Return the levels' constants, the first table, and the offset of each table from the first, in elements."""
     columns = zip(*((a.resolution, a.entries, int(a.hashed), *a.strides[1:]) for a in levels), strict=True)
     first, size = tables[0].data_ptr(), tables[0].element_size()
@@ -85,7 +85,7 @@ class Encode(torch.autograd.Function):
                 points,
                 values,
                 slopes,
-                *_launched(levels, tables),
+                *_launch(levels, tables),
                 n,
                 width,
                 LEVELS=len(levels),
@@ -116,7 +116,7 @@ class Encode(torch.autograd.Function):
             scatter_kernel[_blocks(n, POINTS)](
                 points,
                 gradient.contiguous(),
-                *_launched(levels, parts),
+                *_launch(levels, parts),
                 n,
                 width,
                 LEVELS=len(levels),
@@ -125,8 +125,8 @@ class Encode(torch.autograd.Function):
                 SMOOTH=ctx.smooth,
                 BLOCK=POINTS,
             )
-        found = [part if wanted else None for part, wanted in zip(parts, needed, strict=True)]
-        return to_points, None, None, None, None, *found
+        gradients = [part if wanted else None for part, wanted in zip(parts, needed, strict=True)]
+        return to_points, None, None, None, None, *gradients
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,18 +162,18 @@ class PackedNetworks:
             (first, out_of, into, *between, last),
         )
         biases = [pad(layer.bias, (0, size - len(layer.bias))) for layer, size in zip(layers, sizes, strict=True)]
-        rest = torch.cat([_padded(part, rows, columns).flatten() for part, rows, columns in parts])
+        rest = torch.cat([_pad(part, rows, columns).flatten() for part, rows, columns in parts])
         return PackedNetworks(first.weight, rest, torch.cat(biases), width, features, len(between), {})
 
     def weights(self, inputs: int) -> Float[Tensor, " w"]:
         """Return the weights of all layers; those of the first layer are for its first ``inputs`` inputs only."""
         if inputs not in self.by_inputs:
-            into = _padded(self.first[:, :inputs].t(), _power_of_two(inputs), self.width)
+            into = _pad(self.first[:, :inputs].t(), _power_of_two(inputs), self.width)
             self.by_inputs[inputs] = torch.cat([into.flatten(), self.rest])
         return self.by_inputs[inputs]
 
 
-def _padded(matrix: Float[Tensor, "i o"], rows: int, columns: int) -> Float[Tensor, "r c"]:
+def _pad(matrix: Float[Tensor, "i o"], rows: int, columns: int) -> Float[Tensor, "r c"]:
     return pad(matrix, (0, columns - matrix.shape[1], 0, rows - matrix.shape[0]))
 
 
@@ -205,9 +205,9 @@ def query(
     inputs = len(levels) * features
     index = count = torch.empty(0, dtype=torch.long, device=values.device)
     if wanted is not None:  # the wanted points' numbers in order; the host does not wait to count them
-        place = wanted.long().cumsum(0)
-        index, count = place.new_empty(n + 1), place[-1:]
-        index.scatter_(0, torch.where(wanted, place - 1, n), torch.arange(n, device=place.device))
+        slot = wanted.long().cumsum(0)
+        index, count = slot.new_empty(n + 1), slot[-1:]
+        index.scatter_(0, torch.where(wanted, slot - 1, n), torch.arange(n, device=slot.device))
     block = POINTS if derivatives else 2 * POINTS
     # Products of derivatives are rounded to TF32; those of values are as exact as single precision.
     with torch.cuda.device_of(values):
@@ -218,7 +218,7 @@ def query(
             by_both,
             index,
             count,
-            *_launched(levels, tables),
+            *_launch(levels, tables),
             packed.weights(inputs),
             packed.biases,
             box,
@@ -240,7 +240,7 @@ def query(
     return values, by_both
 
 
-def sampled(
+def sample(
     rays: Rays,
     bounds: SceneBounds,
     occupied: Bool[Tensor, "n n n"],

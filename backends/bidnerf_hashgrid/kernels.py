@@ -65,7 +65,7 @@ def _columns(meta, tables, offsets, LEVELS: tl.constexpr, F: tl.constexpr, C: tl
 
 
 @triton.jit
-def _encoded(
+def _encode(
     x, y, z, inside, table, resolution, entries, hashed, stride_y, stride_z, F: tl.constexpr, SMOOTH: tl.constexpr
 ):
     """Return the features at positions (points, 1) in the unit cube, and their derivatives by x, y and z, with eight reads per column."""
@@ -119,7 +119,7 @@ def encode_kernel(
     y = tl.load(points + n + row, mask=there, other=0.0)
     z = tl.load(points + 2 * n + row, mask=there, other=0.0)
     table, resolution, entries, hashed, stride_y, stride_z, used = _columns(meta, tables, offsets, LEVELS, F, C)
-    value, by_x, by_y, by_z = _encoded(
+    value, by_x, by_y, by_z = _encode(
         x, y, z, there & used, table, resolution, entries, hashed, stride_y, stride_z, F, SMOOTH
     )
     at = row.to(tl.int64) * width + tl.arange(0, C)[None, :]
@@ -175,15 +175,15 @@ def scatter_kernel(
 @triton.jit
 def _harmonics(x, y, z, column):
     """Return the nine real spherical harmonics of unit directions (points, 1) in columns 0 to 8, and 0 in the others."""
-    found = tl.where(column == 0, 0.28209479177387814, 0.0)
-    found = tl.where(column == 1, 0.4886025119029199 * y, found)
-    found = tl.where(column == 2, 0.4886025119029199 * z, found)
-    found = tl.where(column == 3, 0.4886025119029199 * x, found)
-    found = tl.where(column == 4, 1.0925484305920792 * x * y, found)
-    found = tl.where(column == 5, 1.0925484305920792 * y * z, found)
-    found = tl.where(column == 6, 0.31539156525252005 * (3 * z * z - 1), found)
-    found = tl.where(column == 7, 1.0925484305920792 * x * z, found)
-    return tl.where(column == 8, 0.5462742152960396 * (x * x - y * y), found)
+    basis = tl.where(column == 0, 0.28209479177387814, 0.0)
+    basis = tl.where(column == 1, 0.4886025119029199 * y, basis)
+    basis = tl.where(column == 2, 0.4886025119029199 * z, basis)
+    basis = tl.where(column == 3, 0.4886025119029199 * x, basis)
+    basis = tl.where(column == 4, 1.0925484305920792 * x * y, basis)
+    basis = tl.where(column == 5, 1.0925484305920792 * y * z, basis)
+    basis = tl.where(column == 6, 0.31539156525252005 * (3 * z * z - 1), basis)
+    basis = tl.where(column == 7, 1.0925484305920792 * x * z, basis)
+    return tl.where(column == 8, 0.5462742152960396 * (x * x - y * y), basis)
 
 
 @triton.jit
@@ -191,19 +191,19 @@ def _harmonics_along(x, y, z, column, AXIS: tl.constexpr):
     """Return the derivatives of ``_harmonics`` by x (``AXIS`` 0), y or z."""
     a, b, c, d = 0.4886025119029199, 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
     if AXIS == 0:
-        found = tl.where(column == 3, a, 0.0)
-        found = tl.where(column == 4, b * y, found)
-        found = tl.where(column == 7, b * z, found)
-        return tl.where(column == 8, 2 * d * x, found)
+        slope = tl.where(column == 3, a, 0.0)
+        slope = tl.where(column == 4, b * y, slope)
+        slope = tl.where(column == 7, b * z, slope)
+        return tl.where(column == 8, 2 * d * x, slope)
     if AXIS == 1:
-        found = tl.where(column == 1, a, 0.0)
-        found = tl.where(column == 4, b * x, found)
-        found = tl.where(column == 5, b * z, found)
-        return tl.where(column == 8, -2 * d * y, found)
-    found = tl.where(column == 2, a, 0.0)
-    found = tl.where(column == 5, b * y, found)
-    found = tl.where(column == 6, 6 * c * z, found)
-    return tl.where(column == 7, b * x, found)
+        slope = tl.where(column == 1, a, 0.0)
+        slope = tl.where(column == 4, b * x, slope)
+        slope = tl.where(column == 5, b * z, slope)
+        return tl.where(column == 8, -2 * d * y, slope)
+    slope = tl.where(column == 2, a, 0.0)
+    slope = tl.where(column == 5, b * y, slope)
+    slope = tl.where(column == 6, 6 * c * z, slope)
+    return tl.where(column == 7, b * x, slope)
 
 
 @triton.jit
@@ -291,7 +291,7 @@ def field_kernel(
     x = tl.minimum(tl.maximum(ux, 0.0), 1.0)
     y = tl.minimum(tl.maximum(uy, 0.0), 1.0)
     z = tl.minimum(tl.maximum(uz, 0.0), 1.0)
-    encoded, by_x, by_y, by_z = _encoded(
+    encoded, by_x, by_y, by_z = _encode(
         x, y, z, there & used, table, resolution, entries, hashed, stride_y, stride_z, F, SMOOTH
     )
     column = tl.arange(0, 16)[None, :]

@@ -12,17 +12,17 @@ import triton.language as tl
 
 
 @triton.jit
-def _distance(place, leave, radius, CONTRACTED: tl.constexpr):
+def _distance(coordinate, leave, radius, CONTRACTED: tl.constexpr):
     """Return the distance along a ray at a coordinate of ``RaySpacing``."""
     if CONTRACTED:
-        beyond = tl.maximum(place - leave, 0.0)
+        beyond = tl.maximum(coordinate - leave, 0.0)
         left = tl.maximum(1 - beyond / radius, 1.1920929e-07)
-        return tl.minimum(place, leave) + beyond / left
-    return place
+        return tl.minimum(coordinate, leave) + beyond / left
+    return coordinate
 
 
 @triton.jit
-def _placed(distance, leave, radius, CONTRACTED: tl.constexpr):
+def _coordinate(distance, leave, radius, CONTRACTED: tl.constexpr):
     """Return the coordinate of ``RaySpacing`` at a distance along a ray, the inverse of ``_distance``."""
     if CONTRACTED:
         beyond = tl.maximum(distance - leave, 0.0)
@@ -56,7 +56,7 @@ def _limits(rays, grid, ray, n, CONTRACTED: tl.constexpr):
     enter = tl.maximum(tl.maximum(ax, ay), az)
     leave = tl.minimum(tl.minimum(bx, by), bz)
     leave = tl.where(leave > enter, tl.maximum(leave, 0.0), 0.0)
-    near, far = _placed(near, leave, half, CONTRACTED), _placed(far, leave, half, CONTRACTED)
+    near, far = _coordinate(near, leave, half, CONTRACTED), _coordinate(far, leave, half, CONTRACTED)
     return ox, oy, oz, dx, dy, dz, near, far, leave, enter
 
 
@@ -101,20 +101,20 @@ def march_kernel(
     first = tl.load(offset + ray)
     if not CONTRACTED:  # steps are counted from ``near``, and those before the grid are skipped
         first += tl.maximum(tl.floor((tl.minimum(tl.maximum(enter, 0.0), 1e9) - near) / step), 0.0)
-    found = 0
+    count = 0
     last = ((far - near) / step).to(tl.int32) + 1
     if not CONTRACTED:
         last = tl.minimum(last, STEPS)
     for chunk in range(0, last, CHUNK):
-        place = near + (first + chunk + tl.arange(0, CHUNK)) * step
-        distance = _distance(place, leave, tl.load(grid + 3), CONTRACTED)
+        coordinate = near + (first + chunk + tl.arange(0, CHUNK)) * step
+        distance = _distance(coordinate, leave, tl.load(grid + 3), CONTRACTED)
         cell, inside = _cell_at(ox + distance * dx, oy + distance * dy, oz + distance * dz, grid, CONTRACTED)
-        inside = inside & (place < far)
+        inside = inside & (coordinate < far)
         matter = (tl.load(occupied + cell, mask=inside, other=0) != 0).to(tl.int32)
-        at = found + tl.cumsum(matter, 0) - 1
-        tl.store(middles + ray * MOST + at, place, mask=(matter != 0) & (at < MOST))
-        found += tl.sum(matter, 0)
-    tl.store(counts + ray, found)
+        at = count + tl.cumsum(matter, 0) - 1
+        tl.store(middles + ray * MOST + at, coordinate, mask=(matter != 0) & (at < MOST))
+        count += tl.sum(matter, 0)
+    tl.store(counts + ray, count)
 
 
 @triton.jit
@@ -122,15 +122,15 @@ def _interval(middles, at, count, near, far, leave, grid, MOST: tl.constexpr, CO
     """Return start and end (metres along the ray) of the one-step intervals around a ray's steps ``at``, and which exist."""
     step, radius = tl.load(grid + 4), tl.load(grid + 3)
     there = (at >= 0) & (at < count)
-    place = tl.load(middles + at, mask=there, other=0.0)
-    start, end = tl.maximum(place - step / 2, near), tl.minimum(place + step / 2, far)
+    coordinate = tl.load(middles + at, mask=there, other=0.0)
+    start, end = tl.maximum(coordinate - step / 2, near), tl.minimum(coordinate + step / 2, far)
     if CONTRACTED:  # the remainder at the far end is short in the coordinate, but long in metres
         end = tl.where((at == count - 1) & (far - end < step), far, end)
     return _distance(start, leave, radius, CONTRACTED), _distance(end, leave, radius, CONTRACTED), there
 
 
 @triton.jit
-def _joined(middles, at, count, near, far, leave, grid, MOST: tl.constexpr, CONTRACTED: tl.constexpr):
+def _join(middles, at, count, near, far, leave, grid, MOST: tl.constexpr, CONTRACTED: tl.constexpr):
     """Return the result of ``_interval`` without the overlaps that rounding causes, see ``gathered``."""
     start, end, there = _interval(middles, at, count, near, far, leave, grid, MOST, CONTRACTED)
     following, _end, more = _interval(middles, at + 1, count, near, far, leave, grid, MOST, CONTRACTED)
@@ -139,7 +139,7 @@ def _joined(middles, at, count, near, far, leave, grid, MOST: tl.constexpr, CONT
 
 
 @triton.jit
-def _absorbed(start, end, there, ox, oy, oz, dx, dy, dz, grid, density, thickest, CONTRACTED: tl.constexpr):
+def _absorb(start, end, there, ox, oy, oz, dx, dy, dz, grid, density, thickest, CONTRACTED: tl.constexpr):
     """Return the optical thickness of intervals according to the grid's densities, limited to ``thickest``."""
     middle = (start + end) / 2
     cell, _inside = _cell_at(ox + middle * dx, oy + middle * dy, oz + middle * dz, grid, CONTRACTED)
@@ -188,19 +188,19 @@ def concentrate_kernel(
     stored = j < COUNT
     out = ray * COUNT + j
     if count <= COUNT:
-        own_start, own_end, own = _joined(middles, j, count, near, far, leave, grid, MOST, CONTRACTED)
+        own_start, own_end, own = _join(middles, j, count, near, far, leave, grid, MOST, CONTRACTED)
         last = _distance(far, leave, tl.load(grid + 3), CONTRACTED)
         tl.store(starts + out, tl.where(own, own_start, last), mask=stored)
         tl.store(ends + out, tl.where(own, own_end, last), mask=stored)
         tl.store(valid + out, own, mask=stored)
     else:
         i = tl.arange(0, S)
-        start, end, there = _joined(middles, i, count, near, far, leave, grid, MOST, CONTRACTED)
-        thickness = _absorbed(start, end, there, ox, oy, oz, dx, dy, dz, grid, density, thickest, CONTRACTED)
-        a, b, there_a = _joined(middles, i - 1, count, near, far, leave, grid, MOST, CONTRACTED)
-        before_own = _absorbed(a, b, there_a, ox, oy, oz, dx, dy, dz, grid, density, thickest, CONTRACTED)
-        a, b, there_b = _joined(middles, i + 1, count, near, far, leave, grid, MOST, CONTRACTED)
-        behind_own = _absorbed(a, b, there_b, ox, oy, oz, dx, dy, dz, grid, density, thickest, CONTRACTED)
+        start, end, there = _join(middles, i, count, near, far, leave, grid, MOST, CONTRACTED)
+        thickness = _absorb(start, end, there, ox, oy, oz, dx, dy, dz, grid, density, thickest, CONTRACTED)
+        a, b, there_a = _join(middles, i - 1, count, near, far, leave, grid, MOST, CONTRACTED)
+        before_own = _absorb(a, b, there_a, ox, oy, oz, dx, dy, dz, grid, density, thickest, CONTRACTED)
+        a, b, there_b = _join(middles, i + 1, count, near, far, leave, grid, MOST, CONTRACTED)
+        behind_own = _absorb(a, b, there_b, ox, oy, oz, dx, dy, dz, grid, density, thickest, CONTRACTED)
         passed = tl.cumsum(thickness, 0)
         weight = tl.exp(thickness - passed) * (1 - tl.exp(-thickness))
         weight = tl.maximum(weight, tl.exp(thickness - passed + before_own) * (1 - tl.exp(-before_own)))
@@ -235,9 +235,9 @@ def concentrate_kernel(
         lower, upper = at - half, at + half
         # Neither rounding nor an interval that spans a gap may make two of them overlap.
         joint = (_neighbour(upper, -1, J) + lower) / 2
-        apart = (upper + _neighbour(lower, 1, J)) / 2
+        halfway = (upper + _neighbour(lower, 1, J)) / 2
         lower = tl.where(j > 0, tl.maximum(lower, joint), lower)
-        upper = tl.maximum(lower, tl.where(j < COUNT - 1, tl.minimum(upper, apart), upper))
+        upper = tl.maximum(lower, tl.where(j < COUNT - 1, tl.minimum(upper, halfway), upper))
         tl.store(starts + out, lower, mask=stored)
         tl.store(ends + out, upper, mask=stored)
         tl.store(valid + out, half > 0, mask=stored)

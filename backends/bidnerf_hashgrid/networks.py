@@ -39,8 +39,8 @@ def log_density_and_rgb(
     parts = [list(network.parameters()) for network in (geometry, colour)]
     inputs = [encoded, harmonics, *parts[0], *parts[1]]
     differentiable = torch.is_grad_enabled() and any(part.requires_grad for part in inputs)
-    found: tuple[Tensor, Tensor] = _Evaluate.apply(differentiable, len(parts[0]) // 2, *inputs)
-    return found
+    output: tuple[Tensor, Tensor] = _Evaluate.apply(differentiable, len(parts[0]) // 2, *inputs)
+    return output
 
 
 def _networks(flat: Sequence[Tensor], geometry_layers: int) -> tuple[Layers, Layers]:
@@ -85,7 +85,7 @@ class _Evaluate(torch.autograd.Function):
         geometry, colour = _networks(flat, geometry_layers)
         chunks = slices(len(encoded), NETWORK_CHUNK)
         log_density, rgb = encoded.new_empty(len(encoded)), encoded.new_empty(len(encoded), 3)
-        kept: list[list[Tensor]] = [[] for _ in chunks]
+        stored: list[list[Tensor]] = [[] for _ in chunks]
 
         def evaluate(chunk: slice, keep: list[Tensor]) -> None:
             of_geometry, features = _forward(encoded[chunk], geometry)
@@ -94,10 +94,10 @@ class _Evaluate(torch.autograd.Function):
             if differentiable:
                 keep.extend([*of_geometry[1:], *of_colour])
 
-        tasks = [partial(evaluate, chunk, keep) for chunk, keep in zip(chunks, kept, strict=True)]
+        tasks = [partial(evaluate, chunk, keep) for chunk, keep in zip(chunks, stored, strict=True)]
         concurrently(tasks, threads_for(len(encoded), encoded.device))
         ctx.geometry_layers = geometry_layers
-        ctx.save_for_backward(encoded, rgb, *flat, *(part for keep in kept for part in keep))
+        ctx.save_for_backward(encoded, rgb, *flat, *(part for keep in stored for part in keep))
         return log_density, rgb
 
     @staticmethod
@@ -128,8 +128,8 @@ class _Evaluate(torch.autograd.Function):
                 to_geometry, to_colour = _networks(rows, ctx.geometry_layers)
             gradient = _backward(to_rgb[at] * (rgb[at] * (1 - rgb[at])), own[split:], colour, to_colour)
             to_features = torch.cat([to_log_density[at, None], gradient[:, :passed]], dim=-1)
-            found = _backward(to_features, [encoded[at], *own[:split]], geometry, to_geometry)
-            for target, part in ((to_encoded, found), (to_harmonics, gradient[:, passed:])):
+            gradients = _backward(to_features, [encoded[at], *own[:split]], geometry, to_geometry)
+            for target, part in ((to_encoded, gradients), (to_harmonics, gradient[:, passed:])):
                 if target is not None:
                     target[at] = part
 

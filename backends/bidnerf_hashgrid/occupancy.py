@@ -57,7 +57,7 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("near_occupied", torch.ones(shape, dtype=torch.bool), persistent=False)
         # A contracted scene is too large for equal steps, even at the beginning.
         self.observed = bounds.contracted
-        self.register_load_state_dict_post_hook(lambda module, _: module._loaded())
+        self.register_load_state_dict_post_hook(lambda module, _: module._on_load())
 
     @torch.no_grad()
     def restrict(self, allowed: Bool[Tensor, "n n n"]) -> None:
@@ -94,8 +94,8 @@ class OccupancyGrid(nn.Module):
     @torch.no_grad()
     def prune(self, threshold: float, grow: bool = True) -> None:
         """Recompute which cells are occupied: those whose peak is above ``threshold`` and, with ``grow``, their neighbours."""
-        self.occupied.copy_(_dilated(self.peak > threshold, 1 if grow else 0))
-        self.near_occupied.copy_(_dilated(self.occupied, self._reach))
+        self.occupied.copy_(_dilate(self.peak > threshold, 1 if grow else 0))
+        self.near_occupied.copy_(_dilate(self.occupied, self._reach))
 
     @torch.no_grad()
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
@@ -104,11 +104,11 @@ class OccupancyGrid(nn.Module):
         If the host must not wait, only the first ``MOST`` intervals of a ray are kept, except in training, when empty cells are
         still marked as occupied.
         """
-        if (found := self.by_kernel(rays, self._most, jitter)) is not None:
-            return found
+        if (samples := self.by_kernel(rays, self._most, jitter)) is not None:
+            return samples
         flat = rays.flattened()
         spacing = self.bounds.spacing(flat)
-        near, far = spacing.place(torch.stack([flat.near, flat.far], dim=-1)).unbind(-1)
+        near, far = spacing.coordinate(torch.stack([flat.near, flat.far], dim=-1)).unbind(-1)
         offset = torch.full_like(near, 0.5)  # of the middle of the first step from ``near``, in steps
         if jitter is not None:
             offset = torch.rand(near.shape, generator=jitter, device=jitter.device).to(near)
@@ -128,7 +128,7 @@ class OccupancyGrid(nn.Module):
         device = rays.near.device
         if may_wait(device) or not fused.available(device) or count > MOST:
             return None
-        return fused.sampled(
+        return fused.sample(
             rays.flattened(), self.bounds, self.occupied, self.density, self.step, count, self._most, jitter
         ).unflattened(rays.near.shape)
 
@@ -161,15 +161,15 @@ class OccupancyGrid(nn.Module):
         ray, block = ((starts < far[:, None]) & near_matter).nonzero(as_tuple=True)
         start = starts.view(-1).index_select(0, ray * count + block)
         steps = torch.arange(BLOCK, dtype=near.dtype, device=near.device) * self.step
-        place = start[:, None] + steps + (offset.index_select(0, ray) * self.step)[:, None]
-        positions = _at(rays, spacing.rows(ray).distance(place), ray)
-        kept = self._occupied_at(positions) & (place < far.index_select(0, ray)[:, None])
-        block, step = kept.nonzero(as_tuple=True)
-        place = place.view(-1).index_select(0, block * BLOCK + step)
+        coordinate = start[:, None] + steps + (offset.index_select(0, ray) * self.step)[:, None]
+        positions = _at(rays, spacing.rows(ray).distance(coordinate), ray)
+        occupied = self._occupied_at(positions) & (coordinate < far.index_select(0, ray)[:, None])
+        block, step = occupied.nonzero(as_tuple=True)
+        coordinate = coordinate.view(-1).index_select(0, block * BLOCK + step)
         counts = torch.bincount(ray.index_select(0, block), minlength=len(near))
         width = int(counts.amax()) if len(counts) else 0
         valid = torch.arange(width, device=counts.device) < counts[:, None]
-        return far[:, None].expand(-1, width).masked_scatter(valid, place), valid
+        return far[:, None].expand(-1, width).masked_scatter(valid, coordinate), valid
 
     def _first_steps(
         self,
@@ -184,13 +184,13 @@ class OccupancyGrid(nn.Module):
         # Steps are counted from ``near``, as everywhere. Those before the grid are skipped; a contracted grid has none.
         skipped = ((box.near - near) / self.step).floor().clamp(min=0) * (not self.bounds.contracted)
         steps, most = torch.arange(self._steps, dtype=near.dtype, device=near.device), self._most
-        place = near[:, None] + (skipped[:, None] + steps + offset[:, None]) * self.step
-        kept = self._occupied_at(rays.at(spacing.distance(place))) & (place < far[:, None])
-        order = (~kept).sort(dim=-1, stable=True).indices[:, :most]
-        place, kept = place.gather(-1, order), kept.gather(-1, order)
-        missing = most - kept.shape[-1]
-        middles = torch.cat([torch.where(kept, place, far[:, None]), far[:, None].expand(-1, missing)], dim=-1)
-        return middles, pad(kept, (0, missing))
+        coordinate = near[:, None] + (skipped[:, None] + steps + offset[:, None]) * self.step
+        occupied = self._occupied_at(rays.at(spacing.distance(coordinate))) & (coordinate < far[:, None])
+        order = (~occupied).sort(dim=-1, stable=True).indices[:, :most]
+        coordinate, occupied = coordinate.gather(-1, order), occupied.gather(-1, order)
+        missing = most - occupied.shape[-1]
+        middles = torch.cat([torch.where(occupied, coordinate, far[:, None]), far[:, None].expand(-1, missing)], dim=-1)
+        return middles, pad(occupied, (0, missing))
 
     def _occupied_at(self, positions: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
         """Return whether positions (metres, world) lie in an occupied cell of the grid."""
@@ -200,9 +200,9 @@ class OccupancyGrid(nn.Module):
             grid = replace(grid, contracted=None)
         return grid.at(self.occupied, positions) & grid.contains(positions)
 
-    def _loaded(self) -> None:
+    def _on_load(self) -> None:
         self.observed = self.bounds.contracted or bool(self.density.any())
-        self.near_occupied.copy_(_dilated(self.occupied, self._reach))
+        self.near_occupied.copy_(_dilate(self.occupied, self._reach))
 
 
 @dataclass(frozen=True)
@@ -228,8 +228,8 @@ class ConcentratedInGrid(Concentrated):
 
     @torch.no_grad()
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
-        found = self.guide.grid.by_kernel(rays, self.count, jitter)
-        return super().__call__(rays, jitter) if found is None else found
+        samples = self.guide.grid.by_kernel(rays, self.count, jitter)
+        return super().__call__(rays, jitter) if samples is None else samples
 
 
 def _at(rays: Rays, distance: Float[Tensor, "b s"], ray: Int[Tensor, "b"] | None = None) -> Float[Tensor, "b s 3"]:
@@ -243,7 +243,7 @@ def _at(rays: Rays, distance: Float[Tensor, "b s"], ray: Int[Tensor, "b"] | None
     return (origins[..., None] + distance * directions[..., None]).movedim(0, -1)
 
 
-def _dilated(cells: Bool[Tensor, "n n n"], reach: int) -> Bool[Tensor, "n n n"]:
+def _dilate(cells: Bool[Tensor, "n n n"], reach: int) -> Bool[Tensor, "n n n"]:
     """Return the cells at most ``reach`` cells away from any of ``cells`` along each axis; the cube is dilated one axis at a time."""
     grown = cells.clone()
     for axis in range(3):

@@ -74,7 +74,7 @@ class HashGridConfig(FieldConfig, SupervisionConfig):
             )
 
 
-def adapted(config: HashGridConfig, bounds: SceneBounds) -> HashGridConfig:
+def adapt(config: HashGridConfig, bounds: SceneBounds) -> HashGridConfig:
     """Return the config with slower pruning, and half the learning rate, if the scene is contracted.
 
     In a contracted scene, a ray crosses many cells, hardly any of which depth or silhouettes have shown to be empty, and a
@@ -99,7 +99,7 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
         field.occupancy.restrict(allowed)
         coarse = adaptive_max_pool3d(allowed[None].float(), field.coarse_sampler.grid.shape)[0]
         field.coarse_sampler.restrict(coarse > 0)
-    config = adapted(config, field.bounds)
+    config = adapt(config, field.bounds)
     supervision = Supervision(views, field.bounds, config, device_of(field))
     groups = [
         {"params": list(field.encoding.parameters()), "lr": config.learning_rate},
@@ -172,9 +172,11 @@ def _update(
 ) -> None:
     """Update the occupancy grid with the densities of one step's samples, and their rendering weights."""
     # The weights are scaled to samples of one grid step, since concentrated samples are longer or shorter.
-    place = grid.bounds.spacing(rays).place
+    coordinate = grid.bounds.spacing(rays).coordinate
     weights = (
-        rendering_weights(density, samples) * grid.step / (place(samples.ends) - place(samples.starts)).clamp(min=1e-9)
+        rendering_weights(density, samples)
+        * grid.step
+        / (coordinate(samples.ends) - coordinate(samples.starts)).clamp(min=1e-9)
     )
     valid = samples.valid.reshape(-1)
     index = torch.arange(valid.numel(), device=valid.device)
@@ -203,11 +205,11 @@ def _visible(
     density = density.view_as(samples.valid)
     weights = rendering_weights(density, samples).reshape(-1).index_select(0, index)
     some = (weights > least).nonzero()[:, 0]
-    found = field.values_of(encoded.index_select(0, some), directions.index_select(0, some))
+    output = field.values_of(encoded.index_select(0, some), directions.index_select(0, some))
     index = index.index_select(0, some)
     values = FieldValues(
-        density.new_zeros(valid.numel()).index_copy(0, index, found.density).view_as(density),
-        density.new_zeros(valid.numel(), 3).index_copy(0, index, found.rgb).view(*density.shape, 3),
+        density.new_zeros(valid.numel()).index_copy(0, index, output.density).view_as(density),
+        density.new_zeros(valid.numel(), 3).index_copy(0, index, output.rgb).view(*density.shape, 3),
     )
     seen = torch.zeros_like(valid).index_fill(0, index, True).view_as(samples.valid)
     return values, replace(samples, valid=seen), density

@@ -40,7 +40,7 @@ class RaySpacing:
         """Return the ``RaySpacing`` of the rays with these indices. ``exit`` must have shape (r,)."""
         return RaySpacing(self.exit.index_select(0, numbers), self.radius)
 
-    def place(self, distance: Float[Tensor, "*r s"]) -> Float[Tensor, "*r s"]:
+    def coordinate(self, distance: Float[Tensor, "*r s"]) -> Float[Tensor, "*r s"]:
         """Convert distances along the rays (metres) to the coordinate."""
         if self.radius == float("inf"):
             return distance
@@ -48,7 +48,7 @@ class RaySpacing:
         return torch.minimum(distance, self.exit[..., None]) + beyond / (1 + beyond / self.radius)
 
     def distance(self, coordinate: Float[Tensor, "*r s"]) -> Float[Tensor, "*r s"]:
-        """Convert the coordinate to distances along the rays (metres), the inverse of ``place``."""
+        """Convert the coordinate to distances along the rays (metres), the inverse of ``coordinate``."""
         if self.radius == float("inf"):
             return coordinate
         beyond = (coordinate - self.exit[..., None]).clamp(min=0)

@@ -52,7 +52,7 @@ class Stratified:
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
         limits = torch.stack([rays.near.detach(), rays.far.detach()], dim=-1)
         spacing = None if self.bounds is None else self.bounds.spacing(rays)
-        near, far = (limits if spacing is None else spacing.place(limits)).split(1, dim=-1)
+        near, far = (limits if spacing is None else spacing.coordinate(limits)).split(1, dim=-1)
         borders = _levels(self.count + 1, near, jitter)
         distances = near + (far - near) * borders
         if spacing is not None:

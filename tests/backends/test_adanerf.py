@@ -14,7 +14,7 @@ from bidnerf.scenes import views as seen_from
 from bidnerf.testing import SCENE_BOUNDS as BOUNDS
 from bidnerf.testing import BackendContract, Recorder, awkward_rays, colour_error, rgbd_views
 from bidnerf_adanerf import AdaNerfConfig, AdaNerfField, backend
-from bidnerf_adanerf.bins import Bins, chosen
+from bidnerf_adanerf.bins import Bins, choose_samples
 from bidnerf_adanerf.dense import dense_samples, render_softly, soft_weights
 from bidnerf_adanerf.oracle_loss import ENOUGH, by_depth, by_weight, oracle_loss
 from bidnerf_adanerf.recipe import Phase, phase_at, room_for_matter, sparsity
@@ -111,10 +111,10 @@ def test_the_best_bins_are_chosen_nearest_first() -> None:
     edges = torch.linspace(0, 6, 7)
     samples = RaySamples(edges[None, :-1], edges[None, 1:], torch.ones(1, 6, dtype=torch.bool))
     scores = torch.tensor([[0.1, 0.9, 0.2, 0.05, 0.8, 0.3]])
-    found = chosen(samples, scores, threshold=0.15, most=3)
+    found = choose_samples(samples, scores, threshold=0.15, most=3)
     assert found.starts[found.valid].tolist() == [1.0, 4.0, 5.0]
-    assert chosen(samples, scores, threshold=0.85, most=3).valid.sum() == 1
-    few = chosen(samples, scores, threshold=0.95, most=3)
+    assert choose_samples(samples, scores, threshold=0.85, most=3).valid.sum() == 1
+    few = choose_samples(samples, scores, threshold=0.95, most=3)
     assert few.starts[few.valid].tolist() == [1.0]
 
 

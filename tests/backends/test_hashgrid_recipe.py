@@ -11,7 +11,7 @@ from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.fields import RaySamples, SceneBounds, query_samples, render_values, rendering_weights
 from bidnerf_core.training import Silent
 from bidnerf_hashgrid import HashGridConfig, HashGridField, backend
-from bidnerf_hashgrid.recipe import _visible, adapted
+from bidnerf_hashgrid.recipe import _visible, adapt
 from bidnerf_hashgrid.threads import THREADED, pools_only, threads_for
 
 BOX = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 6.0)
@@ -72,13 +72,13 @@ def test_the_finest_level_follows_the_images(footprint: float, contracted: bool,
 
 def test_contracted_scenes_are_pruned_later_and_learned_more_slowly() -> None:
     usual = HashGridConfig()
-    slower = adapted(usual, replace(BOX, contracted=True))
+    slower = adapt(usual, replace(BOX, contracted=True))
     assert slower.learning_rate == usual.learning_rate / 2
     assert usual.prune_fade < slower.prune_fade < 1
     assert slower.prune_threshold < usual.prune_threshold
     assert slower.grow_until > usual.grow_until
     kept = replace(usual, grow_until=1.0)
-    assert adapted(kept, replace(BOX, contracted=True)).grow_until == 1.0
+    assert adapt(kept, replace(BOX, contracted=True)).grow_until == 1.0
 
 
 def test_only_samples_that_are_seen_are_shaded(generator: torch.Generator) -> None:

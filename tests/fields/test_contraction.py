@@ -35,7 +35,7 @@ def test_contraction_has_the_derivative_that_differences_show() -> None:
 def test_the_coordinate_along_rays_is_inverted_and_ascends(radius: float) -> None:
     spacing = RaySpacing(torch.tensor([0.0, 2.5], dtype=torch.float64), radius)
     distance = torch.linspace(0, 300, 4000, dtype=torch.float64).expand(2, -1)
-    place = spacing.place(distance)
+    place = spacing.coordinate(distance)
     assert bool((place.diff(dim=-1) > 0).all())
     torch.testing.assert_close(spacing.distance(place), distance)
 
@@ -44,14 +44,14 @@ def test_the_coordinate_is_the_distance_in_the_box_and_slows_down_beyond() -> No
     rays = OPEN.rays(torch.tensor([[0.5, -0.5, 1.75]]), torch.tensor([[1.0, 0.0, 0.0]]))
     spacing = OPEN.spacing(rays)
     assert float(spacing.exit[0]) == pytest.approx(1.5)
-    place = spacing.place(torch.tensor([[1.0, 1.5, 3.0, 1e6]]))
+    place = spacing.coordinate(torch.tensor([[1.0, 1.5, 3.0, 1e6]]))
     torch.testing.assert_close(place, torch.tensor([[1.0, 1.5, 2.25, 3.0]]), rtol=1e-5, atol=1e-5)
 
 
 def test_equal_steps_of_the_coordinate_are_equal_steps_of_contracted_space() -> None:
     rays = OPEN.rays(torch.tensor([[0.5, -0.5, 1.75]]), torch.tensor([[0.0, 1.0, 0.0]]))
     spacing = OPEN.spacing(rays)
-    limits = spacing.place(torch.stack([rays.near, rays.far], -1))
+    limits = spacing.coordinate(torch.stack([rays.near, rays.far], -1))
     steps = torch.linspace(float(limits[0, 0]), float(limits[0, 1]), 100)[None]
     moved = OPEN.normalized(rays.at(spacing.distance(steps))).diff(dim=-2).norm(dim=-1)
     torch.testing.assert_close(moved, moved.mean().expand_as(moved), rtol=1e-2, atol=1e-6)

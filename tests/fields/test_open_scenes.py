@@ -84,7 +84,7 @@ def test_an_occupancy_grid_of_contracted_space_samples_its_occupied_cells_only()
     samples = grid(rays)
     at = rays.at(samples.middles)
     # Within an interval the coordinate is not linear: its middle may lie in the cell beside that of the coordinate's.
-    place = OPEN.spacing(rays).place
+    place = OPEN.spacing(rays).coordinate
     middle = OPEN.spacing(rays).distance((place(samples.starts) + place(samples.ends)) / 2)
     inner = samples.valid & ((samples.ends - samples.starts) > 0)
     inner &= (samples.starts > rays.near[:, None] + 1e-3) & (samples.ends < rays.far[:, None] * 0.99)

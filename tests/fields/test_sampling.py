@@ -206,7 +206,7 @@ def test_stratified_samples_of_an_open_scene_are_even_in_its_coordinate() -> Non
         torch.nn.functional.normalize(torch.randn(5, 3, generator=Generator().manual_seed(2)), dim=-1),
     )
     samples = Stratified(40, bounds)(where)
-    widths = bounds.spacing(where).place(samples.ends) - bounds.spacing(where).place(samples.starts)
+    widths = bounds.spacing(where).coordinate(samples.ends) - bounds.spacing(where).coordinate(samples.starts)
     torch.testing.assert_close(widths, widths.mean(-1, keepdim=True).expand_as(widths), rtol=1e-2, atol=1e-4)
     torch.testing.assert_close(samples.starts[:, 0], where.near)
     torch.testing.assert_close(samples.ends[:, -1], where.far, rtol=1e-3, atol=0)
