@@ -340,10 +340,14 @@ def test_rooms_are_learnt_from_within() -> None:
 # Settings.
 
 
-def test_settings_are_judged() -> None:
-    with pytest.raises(InputError, match="bins is 0, expected 1 to"):
-        AdaNerfConfig(bins=0)
-    with pytest.raises(InputError, match=r"sum to 1\.2, expected at most 1"):
-        AdaNerfConfig(dense_part=0.7, soft_part=0.5)
-    with pytest.raises(InputError, match="learning_rate is 0, expected more than 0"):
-        AdaNerfConfig(learning_rate=0)
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"bins": 0}, "bins is 0, expected 1 to"),
+        ({"dense_part": 0.7, "soft_part": 0.5}, r"sum to 1\.2, expected at most 1"),
+        ({"learning_rate": 0}, "learning_rate is 0, expected more than 0"),
+    ],
+)
+def test_settings_out_of_range_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        AdaNerfConfig(**settings)

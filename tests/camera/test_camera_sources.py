@@ -176,7 +176,7 @@ def test_exif_of_a_phone_is_near_what_calibration_found(data_dir: Path) -> None:
 def test_focal_length_and_field_of_view_agree() -> None:
     camera = found(hfov=70.0)
     assert math.degrees(2 * math.atan(camera.width / 2 / camera.fx)) == pytest.approx(70)
-    assert found(focal=camera.fx) == camera
+    assert found(Exif(equivalent_mm=26), focal=camera.fx) == camera  # what the user gives goes before EXIF
     assert camera == Intrinsics.from_hfov(70.0, *SIZE)
     assert found(focal=3000.0, raster=PORTRAIT).width == 3024
 
@@ -293,7 +293,3 @@ def test_files_that_hold_no_camera(content: str, where: str, why: str, expected:
     path.write_text(content)
     with refused(where=f"{path}{where}", found=why, expected=expected):
         found(camera=path)
-
-
-def test_what_the_user_gives_goes_before_exif() -> None:
-    assert found(Exif(equivalent_mm=26), focal=1234.0).fx == 1234

@@ -71,11 +71,3 @@ def test_a_tilted_sensor_cannot_be_transposed() -> None:
     with refused(found="tilted sensor cannot be rotated", expected="an upright image"):
         camera.upright(Orientation.from_exif(6))
     assert camera.upright(Orientation.from_exif(3)).distortion[12:] == (-0.1, -0.2)
-
-
-def test_turning_by_a_quarter_four_times_changes_nothing() -> None:
-    camera = turned = Intrinsics(11.0, 12.0, 4.0, 3.4, WIDTH, HEIGHT, LENSES["thin prism"])
-    for _ in range(4):
-        turned = turned.upright(Orientation.from_exif(6))
-    assert turned.distortion == camera.distortion
-    assert (turned.fx, turned.cx, turned.cy) == pytest.approx((camera.fx, camera.cx, camera.cy))

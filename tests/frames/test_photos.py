@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -184,20 +185,21 @@ def test_files_and_arrays_make_the_same_frame(photo: Path, tmp_path: Path) -> No
 def test_arrays_that_do_not_fit_are_refused() -> None:
     rgb, where = noise(HEIGHT, WIDTH), "frame image"
     assert Frame.from_numpy(rgb, CAMERA.scaled(2)).intrinsics.fx == pytest.approx(CAMERA.fx)
-    with refused(where=where, found="rgb is 40x30, but its camera expects 30x40"):
-        Frame.from_numpy(rgb, Intrinsics(33.0, 34.0, 19.0, 16.0, HEIGHT, WIDTH))
-    with refused(found="frame b: depth is 30x40, but its image is 40x30", expected="the same aspect ratio"):
-        Frame.from_numpy(rgb, CAMERA, depth=np.ones((WIDTH, HEIGHT)), depth_unit=1.0, name="b")
-    with refused(found="rgb has floats from 0 to 255", expected="[0, 1]"):
-        Frame.from_numpy(rgb.astype(float), CAMERA)
     spoilt = rgb / 255
     spoilt[0, 0] = np.nan
-    with refused(found="rgb has floats from nan to nan", expected="[0, 1]"):
-        Frame.from_numpy(spoilt, CAMERA)
-    with refused(where=where, found="rgb has an alpha channel, and alpha is given", expected="only one"):
-        Frame.from_numpy(noise(HEIGHT, WIDTH, 4), CAMERA, alpha=rgb[..., 0])
-    with refused(where=where, found="alpha is 40x30x1", expected="30x40 as rgb"):
-        Frame.from_numpy(rgb, CAMERA, alpha=rgb[..., 0].T)
+    portrait = Intrinsics(33.0, 34.0, 19.0, 16.0, HEIGHT, WIDTH)
+    turned = {"depth": np.ones((WIDTH, HEIGHT)), "depth_unit": 1.0}
+    wrong: list[tuple[np.ndarray, Intrinsics, dict[str, Any], str | None, str, str | None]] = [
+        (rgb, portrait, {}, where, "rgb is 40x30, but its camera expects 30x40", None),
+        (rgb, CAMERA, turned, None, "frame image: depth is 30x40, but its image is 40x30", "the same aspect ratio"),
+        (rgb.astype(float), CAMERA, {}, None, "rgb has floats from 0 to 255", "[0, 1]"),
+        (spoilt, CAMERA, {}, None, "rgb has floats from nan to nan", "[0, 1]"),
+        (noise(HEIGHT, WIDTH, 4), CAMERA, {"alpha": rgb[..., 0]}, where, "rgb has an alpha channel", "only one"),
+        (rgb, CAMERA, {"alpha": rgb[..., 0].T}, where, "alpha is 40x30x1", "30x40 as rgb"),
+    ]
+    for image, camera, given, there, found, expected in wrong:
+        with refused(where=there, found=found, expected=expected):
+            Frame.from_numpy(image, camera, **given)
 
 
 # Folders.

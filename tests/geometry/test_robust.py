@@ -30,8 +30,6 @@ def test_laws_of_a_loss(name: RobustName) -> None:
     sizes = torch.tensor([0.01, 0.1, 0.29, 0.31, 1.0, 30.0], dtype=torch.float64)
     both = torch.cat([-sizes, sizes]).requires_grad_()
     assert torch.autograd.gradcheck(lambda r: rho(r).sum(), both, eps=1e-6, atol=1e-8)
-    (slope,) = torch.autograd.grad(rho(both).sum(), both)
-    torch.testing.assert_close(rho.weight(both) * both, slope)
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "l1"])
