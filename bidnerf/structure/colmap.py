@@ -226,7 +226,7 @@ def similar_pairs(descriptors: Sequence[np.ndarray]) -> Pairs:
     count, tensors = len(descriptors), [torch.from_numpy(own) for own in descriptors]
     pairs = {(i, j) for i in range(count) for j in range(i + 1, min(count, i + NEIGHBOURS + 1))}
     vocabulary = Vocabulary.of(tensors)
-    vectors = torch.stack([vocabulary.pooled(own) for own in tensors])
+    vectors = torch.stack([vocabulary.pool(own) for own in tensors])
     for i, vector in enumerate(vectors):
         similarity = vectors @ vector
         similarity[i] = -torch.inf

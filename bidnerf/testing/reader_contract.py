@@ -86,7 +86,7 @@ class ReaderContract(Named):
     def test_axes_are_those_of_opencv(self) -> None:
         tracked = self._tracked()
         other = pose_contradiction(tracked.observations.images)
-        count = tracked.triangulated(DEFAULT_LANDMARKS)[0].count
+        count = tracked.triangulate(DEFAULT_LANDMARKS)[0].count
         require(
             self._who,
             (other is None, "" if other is None else other.sentence),
@@ -102,7 +102,7 @@ class ReaderContract(Named):
         tracked = self._tracked()
         if not bool((tracked.observations.depth > 0).any()):
             return
-        ratio = depth_ratio(*tracked.triangulated(DEFAULT_LANDMARKS))
+        ratio = depth_ratio(*tracked.triangulate(DEFAULT_LANDMARKS))
         require(
             self._who,
             (

@@ -162,7 +162,7 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
     content = read_file(path, "a camera file (JSON, YAML, COLMAP's cameras.txt or a list of images)")
     start = content.lstrip(b"\xef\xbb\xbf \t\r\n")
     if start[:1] == b"[" and start[1:].lstrip()[:1] == b"{":
-        return _chosen(path, _splat_cameras(path, content), photo)
+        return _choose(path, _splat_cameras(path, content), photo)
     if start[:1] in (b"{", b"["):
         return _json_camera(parse_record(str(path), content), size)
     if start.startswith((b"%YAML", b"---")) or path.suffix.lower() in (".yaml", ".yml"):
@@ -170,7 +170,7 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
         if not isinstance(values, Mapping):
             raise InputError(where=path, expected=EXPECTED)
         return parse_calibration(str(path), values, size)
-    return _chosen(path, _text_cameras(path, content), photo)
+    return _choose(path, _text_cameras(path, content), photo)
 
 
 def _json_camera(record: Record, size: tuple[int, int]) -> Camera:
@@ -202,7 +202,7 @@ def _splat_cameras(path: Path, content: bytes) -> dict[str, Camera]:
     return cameras
 
 
-def _chosen(path: Path, cameras: Mapping[str, Camera], photo: str | None) -> Camera:
+def _choose(path: Path, cameras: Mapping[str, Camera], photo: str | None) -> Camera:
     """Return the only camera, or the one that matches a photo's path, file name or stem."""
     if len(set(cameras.values())) == 1:
         return next(iter(cameras.values()))

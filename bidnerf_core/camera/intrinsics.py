@@ -127,7 +127,7 @@ class Intrinsics:
     def unproject(self, pixels: Float[Tensor, "*p 2"]) -> Float[Tensor, "*p 3"]:
         """Return the points on the plane z = 1 that appear at ``pixels`` (u, v); they are not unit vectors."""
         if self.distortion:
-            flat = self._undistorted(pixels.reshape(-1, 2).double())
+            flat = self._undistort(pixels.reshape(-1, 2).double())
             pixels = flat.to(pixels.dtype).reshape(pixels.shape)
         x = (pixels[..., 0] - self.cx) / self.fx
         y = (pixels[..., 1] - self.cy) / self.fy
@@ -212,15 +212,15 @@ class Intrinsics:
         fx, fy, cx, cy, k = self.fx, self.fy, self.cx, self.cy, self.distortion
         width, height = self.width, self.height
         if orientation.mirrors_columns:
-            cx, k = width - cx, _negated(k, 3, 8, 9, 13)
+            cx, k = width - cx, _negate(k, 3, 8, 9, 13)
         if orientation.mirrors_rows:
-            cy, k = height - cy, _negated(k, 2, 10, 11, 12)
+            cy, k = height - cy, _negate(k, 2, 10, 11, 12)
         if orientation.transposes:
             order = (0, 1, 3, 2, 4, 5, 6, 7, 10, 11, 8, 9, 12, 13)[: len(k)]
             return Intrinsics(fy, fx, cy, cx, height, width, tuple(k[index] for index in order))
         return Intrinsics(fx, fy, cx, cy, width, height, k)
 
-    def _undistorted(self, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
+    def _undistort(self, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
         """Return the pixels of the same points without distortion (float64)."""
         if not len(pixels) or pixels.device.type != "cpu" or pixels.requires_grad:
             return undistort_points(pixels, *self._distortion_at(pixels), num_iters=20)
@@ -293,7 +293,7 @@ def check_number(what: str, value: Any, kind: type, least: float, most: float, e
         raise InputError(f"{what} is {value!r:.60}", expected=expected)
 
 
-def _negated(distortion: tuple[float, ...], *indices: int) -> tuple[float, ...]:
+def _negate(distortion: tuple[float, ...], *indices: int) -> tuple[float, ...]:
     return tuple(-value if index in indices else value for index, value in enumerate(distortion))
 
 

@@ -100,7 +100,7 @@ class Lens(ABC):
     def project(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         """Return the pixels (u, v) of the stored image that show points of the plane z = 1 of the pinhole camera."""
 
-    def resampled(self, image: np.ndarray, nearest: bool = False) -> np.ndarray:
+    def resample(self, image: np.ndarray, nearest: bool = False) -> np.ndarray:
         """Resample an upright image (h, w) or (h, w, c) to the ``pinhole`` camera.
 
         Values are interpolated, and replicated beyond the borders. With ``nearest``, the nearest pixel's value

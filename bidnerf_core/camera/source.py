@@ -80,7 +80,7 @@ class Raster:
             return camera.resized(*self.size).upright(self.orientation)
         return camera.resized(*self.upright_size) if same_aspect(given, self.upright_size) else None
 
-    def turned(self, image: Shaped[Tensor, "mh mw"], what: str, where: object = None) -> Shaped[Tensor, "h w"]:
+    def turn(self, image: Shaped[Tensor, "mh mw"], what: str, where: object = None) -> Shaped[Tensor, "h w"]:
         """Return the image's mask or depth upright, at its own resolution; it is turned if it has the stored image's aspect ratio.
 
         Raises ``InputError``, which names ``what`` and ``where``, if the aspect ratio fits neither orientation.
@@ -130,25 +130,25 @@ class CameraSource:
             raise InputError("several cameras are given", where=where, expected=f"one of {WAYS}")
         try:
             if focal is not None:
-                return _described(Intrinsics.from_focal(focal, *size), f"focal length {focal:g} px, as given")
+                return _describe(Intrinsics.from_focal(focal, *size), f"focal length {focal:g} px, as given")
             if hfov is not None:
-                return _described(Intrinsics.from_hfov(hfov, *size), f"horizontal field of view {hfov:g} deg")
+                return _describe(Intrinsics.from_hfov(hfov, *size), f"horizontal field of view {hfov:g} deg")
         except InputError as error:
             raise InputError(error, where=where) from error
         if camera is None:
-            resolved = None if exif.has_focal_length else _assumed(raster, self.assumed)
+            resolved = None if exif.has_focal_length else _assume(raster, self.assumed)
             # Where a crop lies in its photo is unknown. Only landmarks can correct its principal point, and there are
             # ``assumed`` cameras only where landmarks are matched.
             resolved = resolved or camera_from_exif(str(where), raster, exif, may_be_cropped=bool(self.assumed))
             return replace(resolved, approximate=True)
         if isinstance(camera, Intrinsics | Lens):
-            return _fitted(str(where), raster, camera, "camera as given")
+            return _fit(str(where), raster, camera, "camera as given")
         expected = "Intrinsics or the path of a camera file"
         if getattr(camera, "shape", None) == (3, 3):
             expected += "; Intrinsics.from_opencv(K, distortion, (width, height)) makes them from a matrix"
         if not isinstance(camera, str | Path):
             raise InputError(f"camera is a {type(camera).__name__}", where=where, expected=expected)
-        return _fitted(str(where), raster, read_camera(Path(camera), size, str(where)), f"camera of {camera}")
+        return _fit(str(where), raster, read_camera(Path(camera), size, str(where)), f"camera of {camera}")
 
     def at(self, image: Path) -> Callable[[int, int], Camera]:
         """Return a function that finds the camera of the file ``image`` from its width and height, without EXIF."""
@@ -178,12 +178,12 @@ def folder_camera(
     return CameraSource(camera)
 
 
-def _described(camera: Intrinsics, origin: str) -> ResolvedCamera:
+def _describe(camera: Intrinsics, origin: str) -> ResolvedCamera:
     centred = "(the principal point is assumed to be the image centre)"
     return ResolvedCamera(camera, f"{origin}: {camera.sentence} {centred}")
 
 
-def _fitted(where: str, raster: Raster, given: Camera, origin: str) -> ResolvedCamera:
+def _fit(where: str, raster: Raster, given: Camera, origin: str) -> ResolvedCamera:
     fitted = raster.upright(given)
     if fitted is None:
         size = "x".join(map(str, raster.upright_size))
@@ -228,13 +228,13 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: boo
     else:
         raise InputError("no focal length in EXIF", where=where, expected=f"a camera: {WAYS_OF_PHOTO}")
     try:
-        resolved = _described(Intrinsics.from_focal(focal, *raster.upright_size), origin)
+        resolved = _describe(Intrinsics.from_focal(focal, *raster.upright_size), origin)
     except InputError as error:
         raise InputError(f"EXIF: {error}; give its camera: {WAYS}", where=where) from error
     return replace(resolved, description=resolved.description + part)
 
 
-def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> ResolvedCamera | None:
+def _assume(raster: Raster, cameras: Sequence[Intrinsics]) -> ResolvedCamera | None:
     """Return the camera with the median focal length among the cameras of the same size, or else of the same aspect
     ratio, or else among centre crops.
 
@@ -250,4 +250,4 @@ def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> ResolvedCamera | 
     origin = f"camera unknown, assumed to be that of {'' if whole else 'centre crops of '}the map's images"
     if not others:
         return ResolvedCamera(likely, f"{origin}: {likely.sentence}")
-    return _described(Intrinsics.from_focal(math.sqrt(likely.fx * likely.fy), *size), origin)
+    return _describe(Intrinsics.from_focal(math.sqrt(likely.fx * likely.fy), *size), origin)

@@ -49,15 +49,15 @@ class StoredCamera:
 
     def translated(self, offset: Float[Tensor, "3"]) -> StoredCamera:
         """Return the camera with ``offset`` (metres, world) added to its position."""
-        return self._mapped(lambda rows: _rows(_pose(rows).translated(offset)))
+        return self._map_poses(lambda rows: _rows(_pose(rows).translated(offset)))
 
     def scaled(self, factor: float) -> StoredCamera:
         """Return the camera with all lengths (positions and motion) multiplied by ``factor``."""
         motion = self.motion and (*scale_point(self.motion[:3], factor), *self.motion[3:])
-        scaled = self._mapped(lambda rows: (*((a, b, c, t * factor) for a, b, c, t in rows[:3]), rows[3]))
+        scaled = self._map_poses(lambda rows: (*((a, b, c, t * factor) for a, b, c, t in rows[:3]), rows[3]))
         return replace(scaled, motion=motion)
 
-    def _mapped(self, change: Callable[[MatrixRows], MatrixRows]) -> StoredCamera:
+    def _map_poses(self, change: Callable[[MatrixRows], MatrixRows]) -> StoredCamera:
         given = self.given_T_world_camera
         return replace(
             self,

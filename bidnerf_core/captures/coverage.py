@@ -180,7 +180,7 @@ def shows_distances(views: Sequence[View], tracked: TrackedViews | None) -> bool
     if tracked is None or not tracked.matched.count:
         return True
     angle = _median(_cones_deg(tracked.matched))
-    return angle >= DEFAULT_LANDMARKS.parallax or len(tracked.triangulated(DEFAULT_LANDMARKS)[1]) >= 50
+    return angle >= DEFAULT_LANDMARKS.parallax or len(tracked.triangulate(DEFAULT_LANDMARKS)[1]) >= 50
 
 
 def _cones_deg(seen: TrackedKeypoints) -> Float[Tensor, "n"]:

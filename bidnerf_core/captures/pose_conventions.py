@@ -244,13 +244,13 @@ def _of_axes() -> Iterator[Reading]:
     rotations = signed_permutations(1)  # as given first, then with y and z reversed
     for axes in rotations[2:]:
         yield Reading(
-            f"their cameras have other axes: {_named(axes)}",
+            f"their cameras have other axes: {_name_axes(axes)}",
             "permute and reverse the first three columns of each accordingly",
             partial(reinterpret, axes=axes),
         )
     for number, axes in enumerate(rotations):
         yield Reading(
-            f"they are inverses (world to camera){'' if number < 2 else f', of cameras whose {_named(axes)}'}",
+            f"they are inverses (world to camera){'' if number < 2 else f', of cameras whose {_name_axes(axes)}'}",
             f"invert each, and if they are then rejected again, {SWAP}",
             partial(reinterpret, axes=axes, inverted=True),
         )
@@ -343,7 +343,7 @@ def _of_worlds() -> Iterator[Reading]:
     for axes in sorted(signed_permutations(-1), key=lambda axes: not torch.equal(axes, mirror)):
         yield Reading(
             "their axes are left-handed, as in Unity",
-            f"multiply each from the left by diag(1, 1, -1, 1); {_named(axes)} then",
+            f"multiply each from the left by diag(1, 1, -1, 1); {_name_axes(axes)} then",
             partial(reinterpret, axes=axes, positions=mirror, mirror=mirror),
         )
 
@@ -408,7 +408,7 @@ def signed_permutations(determinant: int) -> list[Float[Tensor, "3 3"]]:
     return [A for A in candidates if round(float(torch.linalg.det(A))) == determinant]
 
 
-def _named(axes: Float[Tensor, "3 3"]) -> str:
+def _name_axes(axes: Float[Tensor, "3 3"]) -> str:
     """Describe where the true camera's axes point, in terms of the given camera's axes."""
     names = ("right", "down", "forward"), ("left", "up", "backward")
     words = [names[int(column.sum() < 0)][int(column.abs().argmax())] for column in axes.mT]

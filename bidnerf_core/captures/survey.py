@@ -55,7 +55,7 @@ def survey_capture(
     and mirrored; this distinguishes a wrong pose from a photo of something else. ``trial`` holds the errors of
     held-out photos, and ``up`` is the upward direction of the scene, if known.
     """
-    seen, positions = tracked.triangulated(config)
+    seen, positions = tracked.triangulate(config)
     links = link_photos(seen)
     sharp, overexposed, underexposed = photo_measures(views)
     group = groups(links)
@@ -244,8 +244,8 @@ def relocate_photos(
         view, features = views[number], tracked.detector_of(views[number], number)
         answer = Loop([View(view.frame, SE3.identity())], matcher, features=features)()
         # Only these outcomes determine the pose, or the poses that look the same.
-        telling = (Outcome.CONVERGED, Outcome.AMBIGUOUS, Outcome.MIRRORED)
-        if answer is None or answer.verdict.outcome not in telling:
+        conclusive = (Outcome.CONVERGED, Outcome.AMBIGUOUS, Outcome.MIRRORED)
+        if answer is None or answer.verdict.outcome not in conclusive:
             continue
         mirrored = answer.verdict.outcome is Outcome.MIRRORED
         others = [answer.posterior.place(g) for g, mode in enumerate(answer.modes) if mode.name != MIRROR]

@@ -62,7 +62,7 @@ INCONSISTENT = 0.25
 refined. Poses from structure from motion or a renderer add less than a tenth of a pixel.
 """
 ROUNDS = 3
-"""Largest number of bundle adjustments. After each one, the keypoints are rematched, which finds matches that
+"""Largest number of bundle adjustments. After each one, the keypoints are rematch, which finds matches that
 wrong poses prevented."""
 MOST_EVIDENCE = 10.0
 """Largest contribution of an image to the log evidence for or against a motion, so that a few images cannot decide."""
@@ -100,7 +100,7 @@ def prepare_views(
             some = [view for number, view in enumerate(views) if number % every < 5]
             _check_poses(detect_keypoints(some, SIFT))
         return TrainingViews(seeing, tracked, stored_cameras(views), distances=shows_distances(views, tracked))
-    tracked = _tracked(views, features, trust_poses, depth_unit)
+    tracked = _track(views, features, trust_poses, depth_unit)
     fit = training_poses(tracked, views, 0.0 if refinement == "always" else INCONSISTENT)
     poses, motion = fit.tracked.T_world_camera, fit.tracked.motion
     moved = list(views)
@@ -138,7 +138,7 @@ def track_landmarks(
     """
     if not any(map(_lacks_distances, views)):
         return None, list(views)
-    tracked = _tracked(views, features, trust_poses, depth_unit)
+    tracked = _track(views, features, trust_poses, depth_unit)
     return tracked, _with_landmarks(views, tracked)
 
 
@@ -147,7 +147,7 @@ def _lacks_distances(view: View) -> bool:
     return not (view.frame.has_dense_depth or has_outline(view))
 
 
-def _tracked(views: Sequence[View], features: str, trust_poses: bool, depth_unit: float | None) -> TrackedViews:
+def _track(views: Sequence[View], features: str, trust_poses: bool, depth_unit: float | None) -> TrackedViews:
     """Track the keypoints of the views. Raises ``InputError`` if poses contradict the images or depth is in another unit.
 
     The unit is checked last, since triangulated distances are meaningless under wrong poses.
@@ -171,7 +171,7 @@ def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> 
 
     ``depth_unit`` is the unit with which depth images were read, or None if the user cannot set another.
     """
-    seen, points = tracked.triangulated(DEFAULT_LANDMARKS)
+    seen, points = tracked.triangulate(DEFAULT_LANDMARKS)
     ratio = depth_ratio(seen, points)
     if ratio is None or abs(ratio - 1) < 0.05:  # within the errors of sensors and triangulation
         return
@@ -196,7 +196,7 @@ def _with_landmarks(views: Sequence[View], tracked: TrackedViews) -> list[View]:
     """Return the views with the landmarks visible in each, or unchanged if no view needs landmarks for distances."""
     if not any(map(_lacks_distances, views)):
         return list(views)
-    seen = tracked.seen(DEFAULT_LANDMARKS)
+    seen = tracked.landmarks_by_image(DEFAULT_LANDMARKS)
     count = sum(len(part.distance) for part in seen)
     log.info(f"{count} sightings of landmarks in {len(views)} views")
     return [replace(view, landmarks=part) for view, part in zip(views, seen, strict=True)]
@@ -225,14 +225,14 @@ def training_poses(
     landmarks of the other photos. All poses are refined if errors of the given poses add at least ``least`` pixels to the
     standard deviation of the keypoints; otherwise they are kept.
     """
-    seen, _ = tracked.triangulated(config)
+    seen, _ = tracked.triangulate(config)
     elsewhere = relocate_photos(tracked, views, suspects(seen, link_photos(seen)), config)
     wrong = {i: photo for i, photo in elsewhere.items() if photo.problem in ("badly posed", "turned")}
     if wrong:
         updates = torch.zeros(len(views), 6, dtype=torch.float64)
         for number, photo in wrong.items():
             updates[number] = photo.update
-        tracked = tracked.at(tracked.T_world_camera.retract(updates)).matched_anew(config)
+        tracked = tracked.at(tracked.T_world_camera.retract(updates)).rematch(config)
     fit = adjust_poses(tracked, config, least)
     pixels, refined = torch.zeros(len(views), dtype=torch.float64), False
     if fit is not None and fit[2].inconsistency >= least:
@@ -242,7 +242,7 @@ def training_poses(
         for number in wrong:
             poses.rotation[number] = better.rotation[number]
             poses.translation[number] = better.translation[number]
-        tracked = tracked.at(poses).matched_anew(config)
+        tracked = tracked.at(poses).rematch(config)
     for number, photo in wrong.items():
         pixels[number] = photo.pixels
     return TrainingPoses(tracked, pixels, list(wrong), refined, None if fit is None else fit[2])
@@ -253,7 +253,7 @@ def adjust_poses(
 ) -> tuple[TrackedViews, Float[Tensor, "v"], PoseRefinement] | None:
     """Bundle-adjust the poses and points of the ``tracked`` images; None if there are too few images or points.
 
-    Returns the tracks with the adjusted poses, rematched using these; the median shift (pixels) of the points in each
+    Returns the tracks with the adjusted poses, rematch using these; the median shift (pixels) of the points in each
     image, 0 without points; and how well the given and the adjusted poses fit the keypoints.
 
     The errors of the given poses are assumed to be independent, and as large as resection of the images
@@ -267,7 +267,7 @@ def adjust_poses(
         return max(LEAST_NOISE, noise(seen.sightings, points))
 
     given = tracked.T_world_camera
-    seen, points = tracked.triangulated(config)
+    seen, points = tracked.triangulate(config)
     before = noise_of(seen, points)
     updates = list(pose_updates(seen, points).values())
     if len(updates) < ENOUGH_IMAGES:
@@ -282,7 +282,7 @@ def adjust_poses(
         deviations = max(deviations[0], moved[0]), max(deviations[1], moved[1])
         pixels = _image_motion(seen, fit.points, given, fit.T_world_camera)
         tracked, noticed = tracked.at(fit.T_world_camera, fit.motion), False
-        seen, points = tracked.triangulated(config)
+        seen, points = tracked.triangulate(config)
         # A motion found in the last round could not be estimated any more.
         if motion == STILL and number < ROUNDS - 1:
             motion = common_motion(seen, points, KEYPOINTS_PER_INDEPENDENT)
@@ -290,8 +290,8 @@ def adjust_poses(
         consistency = PoseRefinement(before, noise_of(seen, points))
         if number == 0 and not noticed and consistency.inconsistency < least:
             break
-        tracked = tracked.matched_anew(config)
-        seen, points = tracked.triangulated(config)
+        tracked = tracked.rematch(config)
+        seen, points = tracked.triangulate(config)
         consistency = PoseRefinement(before, noise_of(seen, points))
         if float(step.max()) <= 0.25 and not noticed:  # pixels
             break

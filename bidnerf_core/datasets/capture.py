@@ -143,7 +143,7 @@ class Shot:
             metres = (
                 fit_depth(measured, raster, size, f"{where}: depth")
                 if self.depth.sensor is None
-                else self.depth.sensor.registered(measured.metres, pinhole_of(camera, where), where)
+                else self.depth.sensor.register(measured.metres, pinhole_of(camera, where), where)
             )
         if self.border:
             width = max(1, round(self.border * size[0] / raster.width))
@@ -186,7 +186,7 @@ def _hidden(mask: MaskFile, frame: Frame) -> Bool[Tensor, "h w"] | None:
     hidden = read_mask(mask.path, Raster(*stored, orientation), size, mask.hides)
     if lens is None:
         return hidden
-    return torch.from_numpy(lens.resampled(hidden.byte().numpy(), nearest=True)) > 0
+    return torch.from_numpy(lens.resample(hidden.byte().numpy(), nearest=True)) > 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,7 +43,7 @@ class DepthCamera:
         T = rigid_pose(torch.tensor(rows, dtype=torch.float64), path, f"the rotation of {EXTRINSICS}")
         return DepthCamera(camera, T)
 
-    def registered(self, depth: Float[Tensor, "dh dw"], colour: Intrinsics, file: Path | str) -> Float[Tensor, "h w"]:
+    def register(self, depth: Float[Tensor, "dh dw"], colour: Intrinsics, file: Path | str) -> Float[Tensor, "h w"]:
         """Register depth to the colour camera (planar z, metres); error messages begin with ``file``.
 
         Each measurement is transformed to the colour camera's frame and written to the pixel into which it

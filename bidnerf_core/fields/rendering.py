@@ -82,7 +82,7 @@ class Observations:
 
     def __getitem__(self, index: Tensor | slice | None) -> Observations:
         """Select rays by an index along the first axis or by a mask; None adds an axis of length 1."""
-        return self._changed(lambda part: part[index])
+        return self._map(lambda part: part[index])
 
     @property
     def measured(self) -> Bool[Tensor, "*p"]:
@@ -96,11 +96,11 @@ class Observations:
 
     def gathered(self, index: Int[Tensor, "k m"]) -> Observations:
         """Select m rays from each row of rays of shape (k p), by ``index`` along the second axis."""
-        return self._changed(lambda part: part.take_along_dim(index.reshape(*index.shape, *(1,) * (part.ndim - 2)), 1))
+        return self._map(lambda part: part.take_along_dim(index.reshape(*index.shape, *(1,) * (part.ndim - 2)), 1))
 
     def flattened(self) -> Observations:
         """Return these rays flattened to one axis."""
-        return self._changed(lambda part: part.reshape(-1, *part.shape[self.distance.ndim :]))
+        return self._map(lambda part: part.reshape(-1, *part.shape[self.distance.ndim :]))
 
     def drawn(
         self,
@@ -117,7 +117,7 @@ class Observations:
 
     def to(self, device: torch.device | str | None, dtype: torch.dtype) -> Observations:
         """Return these rays on another device and in another floating-point type."""
-        return self._changed(lambda part: part.to(device, dtype if part.is_floating_point() else part.dtype))
+        return self._map(lambda part: part.to(device, dtype if part.is_floating_point() else part.dtype))
 
     def rays(self, T_world_ref: SE3, bounds: SceneBounds) -> Rays:
         """Return the rays in the world, clipped to the scene's bounds; differentiable with respect to the transform.
@@ -131,7 +131,7 @@ class Observations:
             T = SE3(T.rotation.reshape(*batch, *ones, 3, 3), T.translation.reshape(*batch, *ones, 3))
         return bounds.rays(T.apply(self.origins), T.rotate(self.directions))
 
-    def _changed(self, change: Callable[[Tensor], Tensor]) -> Observations:
+    def _map(self, change: Callable[[Tensor], Tensor]) -> Observations:
         return Observations(*(change(part) for part in vars(self).values()))
 
 
@@ -363,7 +363,7 @@ def render_image(
     radians), see ``rolling_shutter``; without it, the camera is static.
     """
     pixels = intrinsics.pixel_centres().reshape(-1, 2)
-    return _image_of(_rendered(field, intrinsics, T_world_camera, bounds, pixels, chunk, motion), intrinsics)
+    return _image_of(_render_pixels(field, intrinsics, T_world_camera, bounds, pixels, chunk, motion), intrinsics)
 
 
 @torch.no_grad()
@@ -379,7 +379,7 @@ def render_picture(
     first = torch.zeros((height, width), dtype=torch.bool)
     first[::2, ::2] = True
     values = torch.zeros((height, width, 5))
-    values[first] = _rendered(field, intrinsics, T_world_camera, bounds, pixels[first.reshape(-1)], chunk)
+    values[first] = _render_pixels(field, intrinsics, T_world_camera, bounds, pixels[first.reshape(-1)], chunk)
     coarse = values[::2, ::2].movedim(-1, 0)[None]
     size = 2 * coarse.shape[2] - 1, 2 * coarse.shape[3] - 1  # of what lies between the first pixels
     between = interpolate(coarse, size=size, mode="bilinear", align_corners=True)[0].movedim(0, -1)
@@ -392,11 +392,11 @@ def render_picture(
     again[: size[0], : size[1]] &= differs[: size[0], : size[1]]
     filled = ~first & ~again
     values[filled] = between[:height, :width][filled[: size[0], : size[1]]]
-    values[again] = _rendered(field, intrinsics, T_world_camera, bounds, pixels[again.reshape(-1)], chunk)
+    values[again] = _render_pixels(field, intrinsics, T_world_camera, bounds, pixels[again.reshape(-1)], chunk)
     return _image_of(values.reshape(-1, 5), intrinsics)
 
 
-def _rendered(
+def _render_pixels(
     field: RadianceField,
     intrinsics: Intrinsics,
     T_world_camera: SE3,

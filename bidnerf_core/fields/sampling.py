@@ -203,18 +203,18 @@ class Concentrated:
         unchanged = [part[..., : self.count] for part in rough.parts]
         # Selecting the rays in ``many`` makes the host wait for the device. Where it may not, all rays are concentrated.
         if not may_wait(many.device):
-            samples = self._concentrated(rays, rough, jitter)
+            samples = self._concentrate(rays, rough, jitter)
             pairs = zip(samples.parts, unchanged, strict=True)
             return RaySamples(*(torch.where(many[..., None], new, old) for new, old in pairs))
         index = many.reshape(-1).nonzero()[:, 0]
-        samples = self._concentrated(rows_of(rays, index), rows_of(rough, index), jitter)
+        samples = self._concentrate(rows_of(rays, index), rows_of(rough, index), jitter)
         merged = (
             old.reshape(-1, self.count).index_copy(0, index, new)
             for new, old in zip(samples.parts, unchanged, strict=True)
         )
         return RaySamples(*merged).unflattened(many.shape)
 
-    def _concentrated(self, rays: Rays, rough: RaySamples, jitter: Generator | None) -> RaySamples:
+    def _concentrate(self, rays: Rays, rough: RaySamples, jitter: Generator | None) -> RaySamples:
         length = (rough.ends - rough.starts).clamp(min=torch.finfo(rough.ends.dtype).tiny)
         density = torch.minimum(query_samples(self.guide, rays, rough).density, LARGEST_THICKNESS / length)
         return concentrate(rough, rendering_weights(density, rough), self.count, jitter)
@@ -232,7 +232,7 @@ def concentrate(
     cdf = pad(mass.cumsum(-1) / mass.sum(-1, keepdim=True).clamp(min=1e-30), (1, 0))
     even = max(2, round(EVEN_SHARE * (count + 1)))
     dense = TAIL + (1 - 2 * TAIL) * _levels(count + 1 - even, laid, jitter)
-    by_weight = _interpolated(dense, cdf, laid)
+    by_weight = _interpolate(dense, cdf, laid)
     by_length = _levels(even, laid, jitter) * laid[..., -1:]
     border = torch.cat([by_weight, by_length], dim=-1).sort(dim=-1).values
     middle, half = (border[..., 1:] + border[..., :-1]) / 2, border.diff(dim=-1) / 2
@@ -255,7 +255,7 @@ def _levels(count: int, like: Float[Tensor, "*r b"], jitter: Generator | None) -
     return levels
 
 
-def _interpolated(
+def _interpolate(
     at: Float[Tensor, "*r n"], x: Float[Tensor, "*r s"], y: Float[Tensor, "*r s"]
 ) -> Float[Tensor, "*r n"]:
     """Evaluate at ``at`` the piecewise linear function through the points (x, y), x ascending."""

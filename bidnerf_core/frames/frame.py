@@ -209,7 +209,7 @@ class Frame:
             metres = (
                 fit_depth(measured, raster, size, f"{depth}: depth")
                 if sensor is None
-                else sensor.registered(measured.metres, pinhole_of(resolved.camera, Path(depth)), Path(depth))
+                else sensor.register(measured.metres, pinhole_of(resolved.camera, Path(depth)), Path(depth))
             )
         return Frame.taken(
             path.stem,
@@ -244,12 +244,12 @@ class Frame:
             about = {"camera_source": camera.sentence} | about | {"lens": camera}
             unseen = torch.from_numpy(camera.unseen())
             if hidden is not None:
-                unseen |= torch.from_numpy(camera.resampled(hidden.byte().numpy(), nearest=True)) > 0
-            rgb, hidden = torch.from_numpy(camera.resampled(rgb.numpy())), unseen
+                unseen |= torch.from_numpy(camera.resample(hidden.byte().numpy(), nearest=True)) > 0
+            rgb, hidden = torch.from_numpy(camera.resample(rgb.numpy())), unseen
             if depth is not None:
-                depth = torch.from_numpy(camera.resampled(depth.numpy(), nearest=True))
+                depth = torch.from_numpy(camera.resample(depth.numpy(), nearest=True))
             if alpha is not None:
-                alpha = torch.from_numpy(camera.resampled(alpha.numpy()))
+                alpha = torch.from_numpy(camera.resample(alpha.numpy()))
         return Frame(name, rgb, camera.pinhole, depth, alpha, hidden=hidden, **about)
 
     def over(self, background: tuple[float, float, float]) -> Frame:

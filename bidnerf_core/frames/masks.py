@@ -48,7 +48,7 @@ def read_mask(path: Path, raster: Raster, size: tuple[int, int], hides: HiddenCo
     channel is the mask. Raises ``InputError`` if the file is not an image or has another aspect ratio, and
     ``WhollyHidden`` if it hides everything.
     """
-    white = raster.turned(torch.from_numpy(_white(decode(path))), "mask", path)
+    white = raster.turn(torch.from_numpy(_white(decode(path))), "mask", path)
     if tuple(white.shape) != size[::-1]:
         white = resample_nearest(white, *size)
     hidden = white if hides == "white" else ~white

@@ -35,7 +35,7 @@ def fit_depth(measured: DepthImage, raster: Raster, size: tuple[int, int], what:
     Depth whose shape fits the stored image is turned with it. Raises ``InputError``, whose message begins
     with ``what``, if the aspect ratio differs from the image's.
     """
-    metres = raster.turned(measured.metres, what)
+    metres = raster.turn(measured.metres, what)
     return metres if tuple(metres.shape) == size[::-1] else resample_nearest(metres, *size)
 
 

@@ -38,15 +38,15 @@ class PixelStore:
         self._mapped, self._folder, self._expected = expected > BLOCK, folder, expected
         self._block, self._used = torch.empty(0, dtype=torch.uint8), 0
 
-    def stored(self, frame: Frame) -> Frame:
+    def store(self, frame: Frame) -> Frame:
         """Return the frame with its images in the store."""
         images = {
-            name: None if image is None else self.copied(image if name == "hidden" else image.float())
+            name: None if image is None else self.copy(image if name == "hidden" else image.float())
             for name, image in (("depth", frame.depth), ("alpha", frame.alpha), ("hidden", frame.hidden))
         }
-        return frame.replace(rgb=self.copied(frame.rgb_bytes), **images)
+        return frame.replace(rgb=self.copy(frame.rgb_bytes), **images)
 
-    def copied(self, image: Shaped[Tensor, "*n"]) -> Shaped[Tensor, "*n"]:
+    def copy(self, image: Shaped[Tensor, "*n"]) -> Shaped[Tensor, "*n"]:
         """Copy an image into the store and return the copy."""
         size = image.numel() * image.element_size()
         start = -(-self._used // ALIGNMENT) * ALIGNMENT
@@ -119,7 +119,7 @@ class ImagePixels:
         present = {i: image.cpu().contiguous() for i, image in present.items()}
         if len({_block(image) for image in present.values()}) > MOST_BLOCKS:
             store = PixelStore(sum(image.nbytes + ALIGNMENT for image in present.values()))
-            present = {i: store.copied(image) for i, image in present.items()}
+            present = {i: store.copy(image) for i, image in present.items()}
         blocks = {_block(image): image for image in present.values()}
         numbers = {key: number for number, key in enumerate(blocks)}
         for i, image in present.items():

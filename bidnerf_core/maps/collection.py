@@ -143,7 +143,7 @@ class MapCollection:
         for key, vocabulary in self._vocabularies.items():
             descriptors = detect(find_features(key[0]), frame.rgb).descriptors if frame.has_colour else None
             if descriptors is not None and len(descriptors) and descriptors.shape[1] == key[1]:
-                vectors[key] = vocabulary.pooled(descriptors)
+                vectors[key] = vocabulary.pool(descriptors)
         found = dict.fromkeys(self._maps, -1.0)
         for name, own in self._key.items():
             if own in vectors:

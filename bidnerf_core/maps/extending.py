@@ -228,7 +228,7 @@ def _extend(
     seeing = list(given)
     with contextlib.suppress(InputError):  # one photo, or photos without overlap
         # Photos without dense depth get the landmarks they show, from which training takes distances.
-        parts = zip(given, tracked.seen(DEFAULT_LANDMARKS), strict=True)
+        parts = zip(given, tracked.landmarks_by_image(DEFAULT_LANDMARKS), strict=True)
         seeing = [v if v.frame.has_dense_depth else replace(v, landmarks=part) for v, part in parts]
     new, weighted = (seeing[len(old) :], seeing) if complete else (seeing, [*old, *seeing])
     if old and not complete:  # renderings have fewer pixels than photos, but should count as much

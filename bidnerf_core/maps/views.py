@@ -179,7 +179,7 @@ def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path |
                         f"{where}: {amount(len(shots), 'image')} of {before} read at {after},"
                         f" {len(shots) * bytes_of(small) / 1e6:.0f} MB; --largest (largest=) sets another size"
                     )
-            views.append(replace(view, frame=store.stored(view.frame.at_most(limit))))
+            views.append(replace(view, frame=store.store(view.frame.at_most(limit))))
         count(number, len(shots))
     if left_out := len(shots) - len(views):
         log.info(f"{where}: {amount(left_out, 'image')} left out, being entirely hidden; {INVERTED}")

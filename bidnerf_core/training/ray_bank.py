@@ -68,8 +68,8 @@ class RayBank:
         self._depth = ImagePixels.of([frame.depth for frame in frames], 1, 0.0, home)
         self._hidden = ImagePixels.of([frame.hidden for frame in frames], 1, 0.0, home)
         visible = _visible_pixels(frames)
-        self._few = self._few_measured(frames, offsets).to(home)
-        self._landmarks = move_to(_landmark_pixels(views, offsets), home)
+        self._few = self._sparse_depth(frames, offsets).to(home)
+        self._landmarks = moved(_landmark_pixels(views, offsets), home)
         self._cameras = _PixelRays([frame.intrinsics for frame in frames], home)
         rotation = torch.stack([view.T_ref_camera.rotation for view in views]).float()
         origin = torch.stack([view.T_ref_camera.translation for view in views]).float()
@@ -138,7 +138,7 @@ class RayBank:
         passed = (~hidden).cumsum(1) <= (rank - self._visible[block])[:, None]
         return block * HIDDEN_BLOCK + passed.sum(1)
 
-    def _few_measured(self, frames: Sequence[Frame], offsets: Int[Tensor, "v"]) -> Int[Tensor, "m"]:
+    def _sparse_depth(self, frames: Sequence[Frame], offsets: Int[Tensor, "v"]) -> Int[Tensor, "m"]:
         """Return the indices of the pixels with depth if depth is sparse (structure from motion); otherwise no indices."""
         none = torch.zeros(0, dtype=torch.long)
         measured = sum(int((frame.depth > 0).sum()) for frame in frames if frame.depth is not None)

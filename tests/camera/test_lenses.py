@@ -100,7 +100,7 @@ def test_fisheye_is_opencvs_and_resampling_its_undistortion() -> None:
     D, size = np.array(PARAMETERS["OPENCV_FISHEYE"][4:]), (flat.width, flat.height)
     maps = cv2.fisheye.initUndistortRectifyMap(K, D, np.eye(3), P, size, cv2.CV_32FC1)
     expected = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    assert np.abs(lens.resampled(image).astype(int) - expected).max() <= 1
+    assert np.abs(lens.resample(image).astype(int) - expected).max() <= 1
 
 
 @pytest.mark.parametrize("model", PARAMETERS)
@@ -123,8 +123,8 @@ def test_turned_photos_are_undistorted_alike(code: int) -> None:
     lens, orientation = lens_of("OPENCV_FISHEYE"), Orientation.from_exif(code)
     image = torch.from_numpy(photo_of(lens))
     upright = lens.upright(orientation)
-    expected = orientation.upright(torch.from_numpy(lens.resampled(image.numpy())))
-    found = torch.from_numpy(upright.resampled(orientation.upright(image).contiguous().numpy()))
+    expected = orientation.upright(torch.from_numpy(lens.resample(image.numpy())))
+    found = torch.from_numpy(upright.resample(orientation.upright(image).contiguous().numpy()))
     assert found.shape == expected.shape == (upright.pinhole.height, upright.pinhole.width, 3)
     assert int((found.int() - expected.int()).abs().max()) <= 1
     assert upright.pinhole == lens.pinhole.upright(orientation)

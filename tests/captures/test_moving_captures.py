@@ -69,7 +69,7 @@ def corrected(scale: float, pose_error: float = 0.004) -> tuple[TrainingPoses, l
 
 
 def evidence_prior(tracked: TrackedViews) -> object:
-    return common_motion(*tracked.triangulated(LandmarkConfig()), 1.0)
+    return common_motion(*tracked.triangulate(LandmarkConfig()), 1.0)
 
 
 def last_row(T: SE3, motion: Tensor) -> Tensor:
@@ -140,8 +140,8 @@ def test_known_motions_leave_only_the_noise_of_keypoints() -> None:
     """What is built from the same tracks, landmarks and the scatter of poses, takes the motions into account."""
     tracked, _, true = tracks(1.0)
     known = tracked.at(true, motions(1.0))
-    seen, positions = known.triangulated(LandmarkConfig())
-    blind, elsewhere = tracked.triangulated(LandmarkConfig())
+    seen, positions = known.triangulate(LandmarkConfig())
+    blind, elsewhere = tracked.triangulate(LandmarkConfig())
     off, before = (
         torch.stack([update[3:].norm() for update in pose_updates(*pair).values()]).median()
         for pair in ((seen, positions), (blind, elsewhere))

@@ -85,7 +85,7 @@ def test_a_wrong_pose_is_put_right_and_the_others_are_kept(turn: float) -> None:
     found, _, true = refined(0.4, off)
     assert found.replaced == [WRONG]
     assert not found.refined
-    again = found.tracked.matched_anew(LandmarkConfig())  # as a resumed training matches them
+    again = found.tracked.rematch(LandmarkConfig())  # as a resumed training matches them
     assert torch.equal(found.tracked.observations.point, again.observations.point)
     poses = found.tracked.T_world_camera
     translation, rotation = (true[WRONG].inverse() @ poses[WRONG]).log().split(3)

@@ -28,7 +28,7 @@ def captured() -> list[View]:
     """Views of the landmark scene with the landmarks that they see."""
     points = Points()
     views = ring(points)
-    seen = track_views(views, points).seen(LandmarkConfig())
+    seen = track_views(views, points).landmarks_by_image(LandmarkConfig())
     return [replace(view, landmarks=part) for view, part in zip(views, seen, strict=True)]
 
 

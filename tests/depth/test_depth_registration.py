@@ -72,7 +72,7 @@ def test_registered_depth_is_what_the_colour_camera_would_measure(camera: Intrin
     """Occlusions included: depth of the wall never shows through the box, and what the box hides stays empty."""
     sensor = DepthCamera(DEPTH.resized(*size), T_COLOUR_DEPTH)
     measured = seen(sensor.camera, SE3.identity())
-    found, expected = sensor.registered(measured, camera, "depth"), seen(camera, T_COLOUR_DEPTH.inverse())
+    found, expected = sensor.register(measured, camera, "depth"), seen(camera, T_COLOUR_DEPTH.inverse())
     known, radius = visible(expected, camera), 320 // size[0]
     plain = uniform(expected, radius) & uniform(known, radius)
     full, empty = known & plain, ~known & plain
@@ -89,8 +89,8 @@ def test_registered_depth_is_what_the_colour_camera_would_measure(camera: Intrin
 def test_what_was_not_measured_stays_empty() -> None:
     measured = seen(DEPTH, SE3.identity())
     measured[50:62, 110:126] = 0
-    found = SENSOR.registered(measured, COLOUR, "depth")
-    whole = SENSOR.registered(seen(DEPTH, SE3.identity()), COLOUR, "depth")
+    found = SENSOR.register(measured, COLOUR, "depth")
+    whole = SENSOR.register(seen(DEPTH, SE3.identity()), COLOUR, "depth")
     changed = found != whole
     assert bool((found[changed] == 0).all())
     scale = COLOUR.fx / DEPTH.fx
@@ -103,7 +103,7 @@ def test_a_lens_does_not_fold_points_beside_the_image_into_it() -> None:
     wide = Intrinsics(30.0, 30.0, 80.0, 60.0, 160, 120)
     depth = torch.zeros(120, 160)
     depth[60, 150:160] = 1.0
-    assert not bool(DepthCamera(wide, SE3.identity()).registered(depth, folding, "depth").any())
+    assert not bool(DepthCamera(wide, SE3.identity()).register(depth, folding, "depth").any())
     far = folding.project(torch.tensor([[1.55, 0.0, 1.0]], dtype=torch.float64))
     assert 0 < float(far[0, 0]) < 100  # it would be in the image
 
@@ -122,7 +122,7 @@ def test_a_folder_of_images_is_registered_from_a_file(tmp_path: Path) -> None:
     iio.imwrite(tmp_path / "photos" / "a.depth.png", depth.numpy().astype(np.uint16))
     sensor = write_sensor(tmp_path / "sensor.json")
     (timed,) = open_sequence(tmp_path / "photos", camera=COLOUR, register_depth=sensor)
-    torch.testing.assert_close(timed.frame.depth, SENSOR.registered(depth / 1000, COLOUR, "depth"))
+    torch.testing.assert_close(timed.frame.depth, SENSOR.register(depth / 1000, COLOUR, "depth"))
     (plain,) = open_sequence(tmp_path / "photos", camera=COLOUR, register_depth=False)
     torch.testing.assert_close(plain.frame.depth, depth / 1000)
 
@@ -145,7 +145,7 @@ def test_a_recording_like_tums_is_registered_from_a_sensor(recording: Path, tmp_
     assert stored is not None
     sensor = write_sensor(tmp_path / "sensor.json")
     found = first(recording, camera=COLOUR, register_depth=str(sensor))
-    torch.testing.assert_close(found.frame.depth, SENSOR.registered(stored, COLOUR, "depth"))
+    torch.testing.assert_close(found.frame.depth, SENSOR.register(stored, COLOUR, "depth"))
     (view,) = open_dataset(recording, camera=COLOUR, register_depth=SENSOR).views("test")
     assert found.frame.depth is not None
     assert torch.equal(view.frame.depth, found.frame.depth)  # type: ignore[arg-type]
@@ -179,4 +179,4 @@ def test_a_transform_that_loses_all_depth_is_named() -> None:
     there = SE3(torch.eye(3, dtype=torch.float64), torch.tensor([500.0, 0.0, 0.0], dtype=torch.float64))
     depth = seen(DEPTH, SE3.identity())
     with pytest.raises(InputError, match=r"d\.png: no measurement falls .* 500 m from"):
-        DepthCamera(DEPTH, there).registered(depth, COLOUR, "d.png")
+        DepthCamera(DEPTH, there).register(depth, COLOUR, "d.png")

@@ -112,7 +112,7 @@ def test_a_store_returns_what_is_put_into_it(expected: int, tmp_path: Path, monk
     frames += [view.frame for view in views[1:]]
     store = PixelStore(expected, tmp_path)
     for frame in frames:
-        kept = store.stored(frame)
+        kept = store.store(frame)
         for name in ("rgb", "depth", "alpha", "hidden"):
             a, b = getattr(frame, name), getattr(kept, name)
             assert (a is None) == (b is None)
@@ -126,7 +126,7 @@ def test_a_full_disk_is_an_error_in_a_line(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(storage.os, "posix_fallocate", full)
     with pytest.raises(InputError, match=rf"^{tmp_path}: no room for 5000 MB of images \(No space left on device\)"):
-        PixelStore(5_000_000_000, tmp_path).stored(byte_frame())
+        PixelStore(5_000_000_000, tmp_path).store(byte_frame())
 
 
 @pytest.mark.parametrize("most", [1, 64])

@@ -57,7 +57,7 @@ def test_errors_are_as_large_as_the_deviations_say() -> None:
 def test_each_image_sees_landmarks_as_far_away_as_they_are() -> None:
     points = Points(noise=0.4)
     views = ring(points)
-    seen, off = track_views(views, points).seen(LandmarkConfig()), []
+    seen, off = track_views(views, points).landmarks_by_image(LandmarkConfig()), []
     assert len(seen) == len(views)
     for view, part in zip(views, seen, strict=True):
         local = view.T_ref_camera.inverse().apply(points.positions)

@@ -84,7 +84,7 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Model:
         View(Frame.open(folder / "images" / f"{number:03d}.png", camera=CAMERA), T) for number, T in enumerate(poses)
     ]
     tracked = track_views(views)
-    seen, positions = tracked.triangulated(DEFAULT_LANDMARKS)
+    seen, positions = tracked.triangulate(DEFAULT_LANDMARKS)
     images, keypoints = [f"# {COUNT}"], [image.keypoints for image in tracked.observations.images]
     first = np.cumsum([0, *map(len, keypoints)])
     point_of = dict(zip(seen.number.tolist(), seen.point.tolist(), strict=True))

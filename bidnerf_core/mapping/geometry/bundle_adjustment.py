@@ -18,7 +18,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import STILL, MotionPrior, poses_of_rows
 from bidnerf_core.geometry import SE3, cauchy_loss, inlier_weight
-from bidnerf_core.mapping.geometry.triangulation import Sightings, damped, sum_by
+from bidnerf_core.mapping.geometry.triangulation import Sightings, damp, sum_by
 from bidnerf_core.mapping.resection.states import by_camera_point, by_update, pinhole
 
 SMALL_DECREASE = 1e-4
@@ -100,11 +100,11 @@ class AdjustmentSystem:
     point: Int[Tensor, "m"]
 
     def step(self, damping: float) -> tuple[Float[Tensor, "v k"], Float[Tensor, "n 3"]]:
-        """Solve the damped normal equations for the updates of image poses and points, by the Schur complement."""
-        inverse = torch.linalg.inv(damped(self.point_blocks, damping, 1e-9))
+        """Solve the damp normal equations for the updates of image poses and points, by the Schur complement."""
+        inverse = torch.linalg.inv(damp(self.point_blocks, damping, 1e-9))
         eliminated = self.mixed_blocks @ inverse[self.point]
         mixed, product = self._sparse(self.mixed_blocks), self._sparse(eliminated)
-        reduced = block_diag(damped(self.image_blocks, damping, 1e-9).numpy(), format="csc")
+        reduced = block_diag(damp(self.image_blocks, damping, 1e-9).numpy(), format="csc")
         reduced = csc_array(reduced - (product @ mixed.T).tocsc())
         right = product @ self.point_gradient.numpy().ravel() - self.image_gradient.numpy().ravel()
         factors = splu(reduced, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})

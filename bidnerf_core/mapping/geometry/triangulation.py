@@ -57,7 +57,7 @@ def triangulate(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
     across = torch.eye(3, dtype=d.dtype) - d[:, :, None] * d[:, None]
     matrix = sum_by(across, sightings.point, count)
     right = sum_by((across @ sightings.centre[..., None])[..., 0], sightings.point, count)
-    return torch.linalg.solve(damped(matrix), right)
+    return torch.linalg.solve(damp(matrix), right)
 
 
 def refine_points(
@@ -70,9 +70,9 @@ def refine_points(
     """
     for _ in range(steps):
         matrix, gradient = _normal_equations(sightings, points, scale)
-        points = points - torch.linalg.solve(damped(matrix), gradient)
+        points = points - torch.linalg.solve(damp(matrix), gradient)
     matrix, _ = _normal_equations(sightings, points, scale)
-    return points, torch.linalg.inv(damped(matrix))
+    return points, torch.linalg.inv(damp(matrix))
 
 
 def _normal_equations(
@@ -124,7 +124,7 @@ def noise(sightings: Sightings, points: Float[Tensor, "n 3"]) -> float:
     return mad_deviation(residual)
 
 
-def damped(blocks: Float[Tensor, "b k k"], damping: float = 0.0, least: float = 1e-6) -> Float[Tensor, "b k k"]:
+def damp(blocks: Float[Tensor, "b k k"], damping: float = 0.0, least: float = 1e-6) -> Float[Tensor, "b k k"]:
     """Return the blocks with their diagonals enlarged, so that even those of points without parallax are invertible.
 
     ``damping`` is relative to each entry of a diagonal, and ``least`` to its mean.

@@ -43,9 +43,9 @@ from bidnerf_core.mapping.landmarks.tracks import (
     epipolar_matches,
     fuse_landmarks,
     keypoint_depth_noise,
+    landmarks_by_image,
     likely_pairs,
     link_tracks,
-    seen_landmarks,
 )
 from bidnerf_core.mapping.resection.reprojection import resections
 from bidnerf_core.progress import counter
@@ -160,7 +160,7 @@ class TrackedViews:
 
     def landmarks(self, config: LandmarkConfig, report: Callable[[str], None] = lambda sentence: None) -> LandmarkMap:
         """Return the landmarks built from the tracks. Raises ``InputError`` if there are none."""
-        landmarks = _located(self.observations, config, self.points)
+        landmarks = _build(self.observations, config, self.points)
         if not len(landmarks):
             images = len(self.observations.images)
             raise InputError(
@@ -175,14 +175,14 @@ class TrackedViews:
             landmarks = landmarks[landmarks.views.argsort(descending=True, stable=True)[: config.most].sort().values]
         return replace(landmarks, moving=moving, features=name)
 
-    def seen(self, config: LandmarkConfig) -> list[SeenLandmarks]:
+    def landmarks_by_image(self, config: LandmarkConfig) -> list[SeenLandmarks]:
         """Return the triangulated landmarks seen in each image; training uses their depth where none was measured."""
-        inliers, positions, covariance = _triangulated(self.observations, radians(config.parallax))
-        return seen_landmarks(inliers, positions, noise(inliers.sightings, positions) ** 2 * covariance)
+        inliers, positions, covariance = _triangulate(self.observations, radians(config.parallax))
+        return landmarks_by_image(inliers, positions, noise(inliers.sightings, positions) ** 2 * covariance)
 
-    def triangulated(self, config: LandmarkConfig) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"]]:
+    def triangulate(self, config: LandmarkConfig) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"]]:
         """Return the inlier keypoints of the triangulated points, and these points (metres, world)."""
-        inliers, positions, _ = _triangulated(self.observations, radians(config.parallax))
+        inliers, positions, _ = _triangulate(self.observations, radians(config.parallax))
         return inliers, positions
 
     @property
@@ -193,7 +193,7 @@ class TrackedViews:
     @property
     def matched(self) -> TrackedKeypoints:
         """The keypoints that were matched with keypoints of other images."""
-        return self.observations[_tracked(self.observations)].compacted()[0]
+        return self.observations[_is_tracked(self.observations)].compact()[0]
 
     @property
     def motion(self) -> Float[Tensor, "v 6"]:
@@ -215,11 +215,11 @@ class TrackedViews:
         ]
         return replace(self, observations=replace(self.observations, images=images))
 
-    def matched_anew(self, config: LandmarkConfig) -> TrackedViews:
+    def rematch(self, config: LandmarkConfig) -> TrackedViews:
         """Match the same keypoints again, with the current poses, and return the new tracks."""
         images = self.observations.images
         pairs = likely_pairs([image.T_ref_camera for image in images], config.neighbours)
-        return replace(self, observations=_joined(images, pairs, _counter("poses", "image pairs", len(pairs))))
+        return replace(self, observations=_link_keypoints(images, pairs, _counter("poses", "image pairs", len(pairs))))
 
     def without(self, images: Sequence[int]) -> TrackedViews:
         """Return the tracks without the keypoints of ``images``, and without known points, whose positions may come from these images."""
@@ -251,17 +251,17 @@ def track_views(
         raise InputError("nothing to build landmarks from:", expected="at least one view")
     pairs = likely_pairs([view.T_ref_camera for view in views], config.neighbours)
     step = _counter("landmarks", "steps", len(views) + len(pairs))
-    images = _mapped(lambda view: image_keypoints(view, detector), views, step)
+    images = _map_in_threads(lambda view: image_keypoints(view, detector), views, step)
     lengths = sorted({image.keypoints.descriptors.shape[1] for image in images})
     if len(lengths) > 1:
         raise PluginError(
             f"descriptors have {enumeration([*map(str, lengths)])} channels in different images",
             expected="the same number",
         )
-    return TrackedViews(_joined(images, pairs, step, known(images)), features)
+    return TrackedViews(_link_keypoints(images, pairs, step, known(images)), features)
 
 
-def _joined(
+def _link_keypoints(
     images: Sequence[ImageKeypoints],
     pairs: Int[Tensor, "p 2"],
     step: Callable[[], None],
@@ -269,7 +269,7 @@ def _joined(
 ) -> TrackedKeypoints:
     """Match the keypoints of the pairs of images, and join the matches into tracks, starting with ``known`` ones of ambiguity 0."""
     listed = pairs.tolist()
-    matches = _mapped(lambda ij: epipolar_matches(images[ij[0]], images[ij[1]]), listed, step)
+    matches = _map_in_threads(lambda ij: epipolar_matches(images[ij[0]], images[ij[1]]), listed, step)
     matched = [(i, j, m) for (i, j), m in zip(listed, matches, strict=True)]
     label = link_tracks([*known, *matched], [len(image.keypoints) for image in images])
     return TrackedKeypoints(images, label, torch.arange(len(label)))
@@ -277,19 +277,19 @@ def _joined(
 
 def detect_keypoints(views: Sequence[View], features: Features) -> list[ImageKeypoints]:
     """Detect the keypoints of ``views`` without matching them."""
-    return _mapped(lambda view: image_keypoints(view, features), views)
+    return _map_in_threads(lambda view: image_keypoints(view, features), views)
 
 
-def _located(observations: TrackedKeypoints, config: LandmarkConfig, known: Float[Tensor, "p 3"] | None) -> LandmarkMap:
+def _build(observations: TrackedKeypoints, config: LandmarkConfig, known: Float[Tensor, "p 3"] | None) -> LandmarkMap:
     """Return the triangulated or ``known`` landmarks, followed by landmarks from the measured depth of the remaining keypoints."""
-    inliers, positions, covariance = _triangulated(observations, radians(config.parallax), known)
+    inliers, positions, covariance = _triangulate(observations, radians(config.parallax), known)
     pixel_noise = noise(inliers.sightings, positions)
     triangulated = fuse_landmarks(inliers, positions, pixel_noise**2 * covariance, pixel_noise)
     # With 200 images, the deviations are known to 7 %.
     scatter = update_scatter(list(pose_updates(inliers, positions, 200).values()))
     relative = keypoint_depth_noise(inliers, positions)
     left = ~torch.isin(observations.number, inliers.number)
-    rest = observations[left & (_tracked(observations) | config.singles)]
+    rest = observations[left & (_is_tracked(observations) | config.singles)]
     rest, measured, covariance = back_project(rest, relative, pixel_noise)
     landmarks = concatenate([triangulated, fuse_landmarks(rest, measured, covariance, pixel_noise)])
     if scatter is None and len(
@@ -301,12 +301,12 @@ def _located(observations: TrackedKeypoints, config: LandmarkConfig, known: Floa
     return landmarks if scatter is None else replace(landmarks, pose_covariance=scatter)
 
 
-def _tracked(observations: TrackedKeypoints) -> Bool[Tensor, "m"]:
+def _is_tracked(observations: TrackedKeypoints) -> Bool[Tensor, "m"]:
     """Return a mask of the keypoints whose point is observed by at least one other keypoint."""
     return torch.bincount(observations.point)[observations.point] > 1
 
 
-def _triangulated(
+def _triangulate(
     observations: TrackedKeypoints, least: float, known: Float[Tensor, "p 3"] | None = None
 ) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Return the inlier keypoints, their points (metres, world), and the points' covariance for a noise of one pixel.
@@ -314,7 +314,7 @@ def _triangulated(
     ``least`` is the minimum parallax (radians) of a point. If ``known`` positions are given, by number, they are used instead of
     triangulated ones.
     """
-    observations, former = observations[_tracked(observations)].compacted()
+    observations, former = observations[_is_tracked(observations)].compact()
     count = observations.count
     covariance = torch.zeros((count, 3, 3), dtype=torch.float64)
     points = triangulate(observations.sightings, count) if known is None else known[former]
@@ -331,11 +331,11 @@ def _triangulated(
             fits & (torch.bincount(sightings.point[fits], minlength=len(points)) >= 2)[sightings.point]
         ]
     wide = parallax(observations.sightings, points) >= least
-    observations, numbers = observations[wide[observations.point]].compacted()
+    observations, numbers = observations[wide[observations.point]].compact()
     return observations, points[numbers], covariance[numbers]
 
 
-def _mapped(
+def _map_in_threads(
     work: Callable[[_Item], Result], items: Sequence[_Item], step: Callable[[], None] = lambda: None
 ) -> list[Result]:
     """Apply ``work`` to each item, with as many threads as torch uses, and call ``step`` after each."""

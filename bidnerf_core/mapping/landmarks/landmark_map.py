@@ -49,7 +49,7 @@ class Tracks:
     image: Int[Tensor, "m"]  # number of the image among the cameras of the map, int32
     pixel: Float[Tensor, "m 2"]  # in the image
 
-    def renumbered(self, landmarks: Int[Tensor, "n"] | None = None, images: Int[Tensor, "v"] | None = None) -> Tracks:
+    def renumber(self, landmarks: Int[Tensor, "n"] | None = None, images: Int[Tensor, "v"] | None = None) -> Tracks:
         """Renumber the landmarks and images, given the new number for each old one; keypoints whose new number is -1 are dropped."""
         landmark = self.landmark if landmarks is None else landmarks.int()[self.landmark.long()]
         image = self.image if images is None else images.int()[self.image.long()]
@@ -174,7 +174,7 @@ class LandmarkMap:
             chosen = torch.arange(len(self), device=there)[index]
             numbers = torch.full((len(self),), -1, device=there)
             numbers[chosen] = torch.arange(len(chosen), device=there)
-            tracks = tracks.renumbered(numbers)
+            tracks = tracks.renumber(numbers)
         return replace(self, tracks=tracks, **{name: getattr(self, name)[index] for name in PER_LANDMARK})
 
     def scaled(self, factor: float) -> LandmarkMap:
@@ -250,7 +250,7 @@ def concatenate(maps: list[LandmarkMap]) -> LandmarkMap:
     joined: dict[str, Any] = {name: torch.cat([getattr(m, name) for m in maps]) for name in PER_LANDMARK}
     firsts = accumulate(map(len, maps), initial=0)
     numbered = [(m.tracks, torch.arange(len(m)) + first) for m, first in zip(maps, firsts, strict=False)]
-    tracks = [part.renumbered(numbers) for part, numbers in numbered if part is not None]
+    tracks = [part.renumber(numbers) for part, numbers in numbered if part is not None]
     if tracks:
         parts = (torch.cat([getattr(part, name) for part in tracks]) for name in ("landmark", "image", "pixel"))
         joined["tracks"] = Tracks(*parts)

@@ -198,7 +198,7 @@ class TrackedKeypoints:
     def __getitem__(self, index: Tensor) -> TrackedKeypoints:
         return TrackedKeypoints(self.images, self.point[index], self.number[index])
 
-    def compacted(self) -> tuple[TrackedKeypoints, Int[Tensor, "n"]]:
+    def compact(self) -> tuple[TrackedKeypoints, Int[Tensor, "n"]]:
         """Renumber the remaining points from 0, and also return their former numbers."""
         numbers, point = self.point.unique(return_inverse=True)
         return TrackedKeypoints(self.images, point, self.number), numbers
@@ -274,7 +274,7 @@ def fuse_landmarks(
     )
 
 
-def seen_landmarks(
+def landmarks_by_image(
     observations: TrackedKeypoints, positions: Float[Tensor, "n 3"], covariance: Float[Tensor, "n 3 3"]
 ) -> list[SeenLandmarks]:
     """Return the landmarks, at ``positions`` (metres, world), seen in each image, with the standard deviation of their distance."""
@@ -333,7 +333,7 @@ def back_project(
     ``relative`` is the relative noise of the depth, and ``pixel_noise`` the noise of the keypoints (pixels). Tracks without a
     majority of inliers are dropped.
     """
-    observations, _ = observations[observations.depth > 0].compacted()
+    observations, _ = observations[observations.depth > 0].compact()
     sightings, depth = observations.sightings, observations.depth
     ray = torch.cat([sightings.image, torch.ones_like(sightings.image[:, :1])], dim=-1) * depth[:, None]
     world = (sightings.rotation.mT @ ray[..., None])[..., 0] + sightings.centre
@@ -343,17 +343,17 @@ def back_project(
     sideways = (pixel_noise * depth / sightings.focal) ** -2
     information = (torch.eye(3, dtype=d.dtype) - along) * sideways[:, None, None]
     information = along * ((relative * depth) ** -2)[:, None, None] + information
-    mean, _ = _weighted(world, information, observations.point)
+    mean, _ = _weighted_mean(world, information, observations.point)
     difference = (world - mean[observations.point])[..., None]
     agree = (difference.mT @ information @ difference)[:, 0, 0] <= 3**2  # three standard deviations
     tracks = torch.bincount(observations.point)
     majority = 2 * torch.bincount(observations.point[agree], minlength=len(tracks)) > tracks
     inliers = agree & majority[observations.point]
-    observations, _ = observations[inliers].compacted()
-    return observations, *_weighted(world[inliers], information[inliers], observations.point)
+    observations, _ = observations[inliers].compact()
+    return observations, *_weighted_mean(world[inliers], information[inliers], observations.point)
 
 
-def _weighted(
+def _weighted_mean(
     values: Float[Tensor, "m 3"], information: Float[Tensor, "m 3 3"], point: Int[Tensor, "m"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Return the weighted mean of each point's values, and the covariance of that mean."""

@@ -36,7 +36,7 @@ class Vocabulary:
         some = torch.cat([one[torch.randperm(len(one), generator=generator)[:share]] for one in descriptors])
         return Vocabulary(k_means(some, min(32, len(some)), generator))
 
-    def pooled(self, descriptors: UInt8[Tensor, "n d"], word: Tensor | None = None) -> Float[Tensor, "p"]:
+    def pool(self, descriptors: UInt8[Tensor, "n d"], word: Tensor | None = None) -> Float[Tensor, "p"]:
         """Return the VLAD vector of descriptors, of unit length; ``word`` holds each descriptor's nearest word, if known."""
         word = nearest_centre(descriptors, self.words) if word is None else word
         sums = torch.zeros_like(self.words).index_add_(0, word, descriptors.float() - self.words[word])
@@ -53,8 +53,8 @@ def pool_views(
     """
     word = nearest_centre(landmarks.descriptors, vocabulary.words)
     shown = [visible(landmarks, *camera) for camera in cameras[:: max(1, math.ceil(len(cameras) / 48))]]
-    vectors = [vocabulary.pooled(landmarks.descriptors[seen], word[seen]) for seen in shown if len(seen) >= 8]
-    return torch.stack([*vectors, vocabulary.pooled(landmarks.descriptors, word)])
+    vectors = [vocabulary.pool(landmarks.descriptors[seen], word[seen]) for seen in shown if len(seen) >= 8]
+    return torch.stack([*vectors, vocabulary.pool(landmarks.descriptors, word)])
 
 
 def visible(landmarks: LandmarkMap, camera: Intrinsics, T_world_camera: SE3) -> Int[Tensor, "m"]:

@@ -112,7 +112,7 @@ def bake(
     if not bool(inside.any()):
         raise InputError("no surface to bake: no point that several views agree on")
     coarsest, keyframes = footprint(images, config.opacity, subsampled=True), [image.T_world_camera for image in images]
-    return _fused(points[inside], rgb[inside], bounds, (cell, coarsest), keyframes, config)
+    return _fuse(points[inside], rgb[inside], bounds, (cell, coarsest), keyframes, config)
 
 
 def surface_of_points(
@@ -134,10 +134,10 @@ def surface_of_points(
     away, _ = cKDTree(coordinates).query(coordinates[:: max(1, len(points) // 5000)], k=2)
     spread = float(np.median(np.asarray(away)[:, 1]))
     finest = max(spread, VoxelGrid.filling(bounds, config.cells).cell)
-    return _fused(points, rgb, bounds, (finest, 4 * finest), [T for _, T in cameras], config)
+    return _fuse(points, rgb, bounds, (finest, 4 * finest), [T for _, T in cameras], config)
 
 
-def _fused(
+def _fuse(
     points: Float[Tensor, "p 3"],
     rgb: Float[Tensor, "p 3"],
     bounds: SceneBounds,
