@@ -26,7 +26,7 @@ from bidnerf.results.pose_files import PosedImage, pose_format, write_poses
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import UpDirection, given_cameras
 from bidnerf_core.datasets import Query, QuerySource
-from bidnerf_core.depth import noise_remark
+from bidnerf_core.depth import describe_depth_noise
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3, LengthUnit, fit_similarity, symbol
@@ -447,6 +447,6 @@ def _log_depth(query: Query, sensor: str) -> None:
         log.info("%s: no measured depth; colour only", ", ".join(bare))
     shown = query.frame
     if sensor != "unknown" and shown.depth is not None and shown.has_depth:
-        remark = noise_remark(shown.depth, shown.intrinsics, sensor)
+        remark = describe_depth_noise(shown.depth, shown.intrinsics, sensor)
         if remark is not None:
             log.info("%s: %s", query.name, remark)

@@ -11,6 +11,6 @@ from .sensors import UNKNOWN as UNKNOWN
 from .sensors import UNKNOWN_SENSOR as UNKNOWN_SENSOR
 from .sensors import DepthNoise as DepthNoise
 from .sensors import DepthSensorModel as DepthSensorModel
+from .sensors import describe_depth_noise as describe_depth_noise
 from .sensors import estimate_depth_noise as estimate_depth_noise
 from .sensors import find_depth_sensor as find_depth_sensor
-from .sensors import noise_remark as noise_remark

@@ -39,7 +39,7 @@ class DepthImage:
         measured = self.metres[self.metres > 0]
         return float(measured.median()) if measured.numel() else None
 
-    def remark(self, unit_assumed: bool) -> str | None:
+    def notice(self, unit_assumed: bool) -> str | None:
         """Return one line on the assumed unit, missing depth and dropped values, or None if there is nothing to report."""
         parts = []
         if self.median is None:

@@ -168,7 +168,7 @@ def _lines_of_sensor(depth: Float[Tensor, "h w"]) -> tuple[Int[Tensor, "r"], Int
     return rows.nonzero()[:, 0], columns.nonzero()[:, 0]
 
 
-def noise_remark(depth: Float[Tensor, "h w"], intrinsics: Intrinsics, sensor: str) -> str | None:
+def describe_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics, sensor: str) -> str | None:
     """Return one line that compares the noise estimated from a depth image (metres) with the noise of ``sensor``.
 
     Returns None if the noise cannot be estimated from the image.

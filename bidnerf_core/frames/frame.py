@@ -204,7 +204,7 @@ class Frame:
             rgb, alpha = read_image(path, behind, exif.orientation.upright_size(*size))
         metres = None
         if measured is not None and depth is not None:
-            if notice := measured.remark(depth_unit is None):
+            if notice := measured.notice(depth_unit is None):
                 warnings.warn(f"{depth}: {notice}", InputWarning, stacklevel=3)
             metres = (
                 fit_depth(measured, raster, size, f"{depth}: depth")
@@ -317,7 +317,7 @@ class Frame:
         if depth is not None:
             measured = depth_image(depth, depth_unit, f"{where}: depth")
             metres = fit_depth(measured, raster, raster.size, f"{where}: depth")
-            if notice := measured.remark(depth_unit is None):
+            if notice := measured.notice(depth_unit is None):
                 warnings.warn(f"{where}: {notice}", InputWarning, stacklevel=2)
         laid = composite(colour, cover, BLACK if background is None else background_colour(background))
         unused = None if hidden is None else torch.as_tensor(hidden)

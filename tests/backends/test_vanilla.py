@@ -161,7 +161,7 @@ def carve(field: VanillaField, views: Sequence[View]) -> None:
     field.room.cells.copy_(occupied_voxels(views, field.room.grid))
 
 
-def test_nothing_is_asked_where_there_is_no_room() -> None:
+def test_no_point_is_queried_outside_the_room() -> None:
     field = built()
     carve(field, rgbd_views())
     rays = rays_of_view()

@@ -170,7 +170,7 @@ def test_what_is_no_camera_of_opencv(arguments: tuple[Any, ...], found: str, exp
         Intrinsics.from_opencv(*arguments)
 
 
-def test_a_bare_matrix_is_told_how_to_become_a_camera(tmp_path: Path) -> None:
+def test_a_bare_matrix_is_refused_with_the_remedy(tmp_path: Path) -> None:
     path: Any = write_photo(tmp_path / "a.png", noise(480, 640))
     for make, image, where in ((Frame.open, path, path), (Frame.from_numpy, noise(480, 640), None)):
         with refused(where=where, found="ndarray", expected="Intrinsics.from_opencv(K, distortion"):

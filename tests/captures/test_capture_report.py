@@ -204,7 +204,7 @@ def test_photos_from_one_place_have_no_parallax() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_few_photos_are_recorded_and_more_are_asked_for(count: int) -> None:
+def test_few_photos_are_recorded_and_more_are_recommended(count: int) -> None:
     report = survey(list(photos()[:count]))
     assert len(report.photos) == count
     assert not any(photo.problems for photo in report.photos)
@@ -241,7 +241,7 @@ def test_blur_in_any_direction_costs_sharpness(size: tuple[int, int], hidden: bo
     assert after < before - 0.3
 
 
-def test_the_exposure_of_a_photo_without_landmarks_is_unknown_and_said_to_be() -> None:
+def test_the_exposure_of_a_photo_without_landmarks_is_unknown() -> None:
     views = list(photos())
     changed(views, 3, torch.full((120, 160, 3), 0.5))
     report = survey(views)

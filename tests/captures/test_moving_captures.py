@@ -77,7 +77,7 @@ def last_row(T: SE3, motion: Tensor) -> Tensor:
     return PINHOLE.project((T @ SE3.exp(0.5 * motion))[:, None].inverse().apply(Points().positions))
 
 
-def test_cameras_that_moved_are_told_from_those_at_rest() -> None:
+def test_cameras_that_moved_are_distinguished_from_those_at_rest() -> None:
     for scale, expected in ((0.0, True), (1.0, False)):
         assert (evidence_prior(tracks(scale)[0]) == STILL) == expected
 

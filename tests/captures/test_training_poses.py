@@ -138,7 +138,7 @@ def test_poses_that_are_not_refined_are_checked_by_at_most_sixty_views(
     assert min(count, 30) <= len(checked) <= 60
 
 
-def test_stored_cameras_hold_both_poses_and_how_far_they_are_apart() -> None:
+def test_stored_cameras_have_both_poses_and_the_distance_between_them() -> None:
     found, views, _ = inaccurate()
     poses = found.tracked.T_world_camera
     moved = [replace(view, T_ref_camera=poses[i]) for i, view in enumerate(views)]
@@ -210,7 +210,7 @@ def test_another_unit_of_depth_is_named_where_it_can_be_given() -> None:
 
 
 @pytest.mark.parametrize(("ratio", "said"), [(1.08, True), (0.94, True), (1.02, False)])
-def test_a_scale_of_depth_that_is_a_few_percent_off_is_told(
+def test_a_scale_of_depth_that_is_a_few_percent_wrong_is_logged(
     ratio: float, said: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO", "bidnerf")

@@ -100,7 +100,7 @@ def walls(*distances: float, rows: int = 48) -> list[View]:
 
 
 @pytest.mark.parametrize("rows", [48, 1])
-def test_measured_depth_tells_what_a_pixel_shows(rows: int) -> None:
+def test_measured_depth_determines_what_a_pixel_shows(rows: int) -> None:
     """The mean focal length is 60 px, and the middle one of three walls is two metres away."""
     assert estimate_bounds(walls(1.0, 2.0, 9.0, rows=rows)).footprint == pytest.approx(2 / 60)
 

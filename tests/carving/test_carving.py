@@ -308,7 +308,7 @@ def test_a_flat_scene_gets_some_thickness() -> None:
     assert bounds.near == pytest.approx(1.5, rel=0.05)
 
 
-def test_too_little_to_go_by_is_said() -> None:
+def test_too_little_information_is_refused() -> None:
     with pytest.raises(InputError, match="no views"):
         estimate_bounds([])
 

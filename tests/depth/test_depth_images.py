@@ -38,7 +38,7 @@ def test_floats_that_stand_for_nothing(value: float, name: str, kind: str) -> No
     found = depth_image(raw, 1.0, "depth")
     assert found.metres.tolist() == [[1.5, 2.5], [0, 0]]
     assert found.replaced == {name: 1}
-    assert found.remark(unit_assumed=False) == f"treated as not measured: 1 x {name}"
+    assert found.notice(unit_assumed=False) == f"treated as not measured: 1 x {name}"
     blender = np.array([[1500, 1e10]], dtype=kind)
     assert depth_image(blender, 0.001, "depth").metres.tolist() == [[1.5, 0]]  # in any unit
 
@@ -52,13 +52,13 @@ def test_the_largest_integer_stands_for_nothing(kind: str) -> None:
 
 
 @pytest.mark.parametrize(("kind", "unit"), [("uint16", 0.001), ("int32", 0.001), ("float32", 1.0)])
-def test_a_unit_that_is_missing_is_assumed_and_said(kind: str, unit: float) -> None:
+def test_a_missing_unit_is_assumed_with_a_notice(kind: str, unit: float) -> None:
     found = depth_image(np.array([[0, 1000, 2000, 3000]], dtype=kind), None, "depth")
     assert found.unit == unit
     assert found.median == pytest.approx(2000 * unit)
     expected = f"depth_unit is not given, {unit:g} m per step is assumed: median depth {2000 * unit:g} m"
-    assert found.remark(unit_assumed=True) == expected
-    assert found.remark(unit_assumed=False) is None
+    assert found.notice(unit_assumed=True) == expected
+    assert found.notice(unit_assumed=False) is None
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -16,8 +16,8 @@ from bidnerf_core.depth import (
     DEPTH_SENSORS,
     UNKNOWN,
     DepthNoise,
+    describe_depth_noise,
     find_depth_sensor,
-    noise_remark,
 )
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization import AutoConfig, settings_of
@@ -69,10 +69,10 @@ def test_another_name_is_an_error_that_lists_the_names() -> None:
 def test_localize_compares_a_named_sensor_with_the_image(generator: Generator) -> None:
     camera = Intrinsics.from_focal(100.0, 120, 90)
     depth = torch.linspace(1.0, 1.3, 120).expand(90, 120) * (1 + 0.02 * torch.randn((90, 120), generator=generator))
-    remark = noise_remark(depth, camera, "kinect")
-    assert remark is not None
-    assert re.search(r"is about (1\.[6-9]|2\.[0-4])\d%; 'kinect' usually has 0\.\d+%", remark)
-    assert noise_remark(torch.zeros_like(depth), camera, "kinect") is None
+    sentence = describe_depth_noise(depth, camera, "kinect")
+    assert sentence is not None
+    assert re.search(r"is about (1\.[6-9]|2\.[0-4])\d%; 'kinect' usually has 0\.\d+%", sentence)
+    assert describe_depth_noise(torch.zeros_like(depth), camera, "kinect") is None
 
 
 def test_the_covariance_of_a_pose_by_depth_grows_with_the_scale_of_the_sensor() -> None:

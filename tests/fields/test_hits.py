@@ -93,7 +93,7 @@ def test_rays_that_meet_nothing_see_the_background() -> None:
     assert torch.allclose(found.rgb, torch.tensor([0.1, 0.2, 0.3]).double().expand_as(found.rgb))
 
 
-def test_the_contract_accepts_them_and_tells_what_is_wrong() -> None:
+def test_the_contract_accepts_them_and_names_what_is_wrong() -> None:
     check_hits(Sheets())
     changes: dict[str, Callable[[RayHits], RayHits]] = {
         r"outside of \[0, 1\]": lambda hits: replace(hits, alpha=1.5 * hits.alpha / ALPHA),

@@ -152,7 +152,7 @@ def test_depth_of_another_resolution_takes_the_nearest(photo: Path, tmp_path: Pa
         Frame.open(photo, depth=other, depth_unit=0.001)
 
 
-def test_what_was_assumed_of_depth_is_said_in_one_line(photo: Path, tmp_path: Path) -> None:
+def test_the_assumptions_about_depth_are_one_line(photo: Path, tmp_path: Path) -> None:
     steps = np.full((HEIGHT, WIDTH), 1420, dtype=np.uint16)
     steps[0, :5] = 65535
     path = save_depth(tmp_path / "d.png", steps)

@@ -48,7 +48,7 @@ def test_barrons_general_form(name: RobustName, alpha: float) -> None:
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, math.nan, math.inf])
-def test_a_scale_that_is_none_is_told(scale: float) -> None:
+def test_a_scale_that_is_not_positive_is_refused(scale: float) -> None:
     with refused(found=f"is {scale}", expected="a positive number"):
         Robust("huber", scale)
 

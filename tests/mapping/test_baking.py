@@ -111,7 +111,7 @@ def test_a_field_shows_its_surface() -> None:
     assert surface.index.entries.device.type == "cpu"
 
 
-def test_the_grid_has_no_more_cells_than_were_asked_for() -> None:
+def test_the_grid_has_at_most_the_given_number_of_cells() -> None:
     for bounds in (baked.BOUNDS, replace(baked.BOUNDS, lower=(-1.0, -0.9, 0.599), upper=(1.0, 1.0, 0.601))):
         surface = bake(baked.FIELD, bounds, [], ball_views(), replace(baked.CONFIG, cells=5000))
         assert math.prod(surface.grid.shape) <= 5000

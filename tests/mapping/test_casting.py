@@ -31,7 +31,7 @@ def test_a_square_is_met_where_a_plane_is(generator: Generator) -> None:
     assert float(torch.linalg.vector_norm(touched - aims, dim=-1).max()) < 2 * surface.surfel_radius + surface.cell
 
 
-def test_what_passes_by_is_told_where_and_of_what() -> None:
+def test_a_ray_that_misses_ends_at_its_closest_point() -> None:
     """Along x, half a metre above the square: closest to its near edge as an angle, from 2 m before it."""
     surface = baked.patch()
     found = cast(surface, torch.tensor([[-2.5, 0.02, 0.55]]), torch.tensor([[1.0, 0.0, 0.0]]))

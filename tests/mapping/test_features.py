@@ -50,7 +50,7 @@ def test_a_spot_is_found_at_its_centre(centre: tuple[float, float]) -> None:
     assert float(off.min()) < 0.06
 
 
-def test_at_most_as_many_as_asked_for_and_always_the_same() -> None:
+def test_at_most_the_given_count_and_always_the_same_keypoints() -> None:
     image = textured(0)
     assert 30 <= len(Sift(count=30)(image)) <= 31  # of equal contrast, OpenCV keeps both
     with ThreadPoolExecutor(4) as pool:
@@ -136,7 +136,7 @@ UNUSABLE: list[tuple[Any, str]] = [
 
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(("found", "said"), UNUSABLE, ids=range(len(UNUSABLE)))
-def test_a_detector_that_returns_no_keypoints_of_the_image_is_told(found: Any, said: str) -> None:
+def test_a_detector_that_returns_no_keypoints_of_the_image_is_refused(found: Any, said: str) -> None:
     def stranger(rgb: torch.Tensor) -> Any:
         return found
 
@@ -148,7 +148,7 @@ def test_a_detector_that_returns_no_keypoints_of_the_image_is_told(found: Any, s
         limit_features(stranger, 3)(image)
 
 
-def test_descriptors_of_different_lengths_are_told() -> None:
+def test_descriptors_of_different_lengths_are_refused() -> None:
     lengths = iter((8, 8, 9))
 
     def stranger(rgb: torch.Tensor) -> Keypoints:

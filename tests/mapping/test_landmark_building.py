@@ -105,7 +105,7 @@ def test_without_parallax_measured_depth_places_the_points() -> None:
     assert float((found.positions - truth(points, found)).norm(dim=-1).median()) < 1e-3
 
 
-def test_keypoints_of_one_image_become_landmarks_only_if_asked_for() -> None:
+def test_keypoints_of_one_image_become_landmarks_only_by_request() -> None:
     points = Points()
     view = points.view(looking_in(0.0), depth=1.0)
     assert len(build_landmarks([view], points)) > 100

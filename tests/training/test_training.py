@@ -122,7 +122,7 @@ def test_occupancy_changed_on_the_way(uninterrupted: TrainingState) -> None:
         assert uninterrupted.field[f"{name}.peak"].unique().numel() > 5
 
 
-def test_a_stop_that_is_asked_for_in_the_last_step_is_the_end(scene: tuple[list[View], SceneBounds]) -> None:
+def test_a_stop_requested_in_the_last_step_is_the_end(scene: tuple[list[View], SceneBounds]) -> None:
     report = Kept(stop=3)
     trained(scene, report, steps=3)
     assert [state.step for state in report.saved] == [3]
