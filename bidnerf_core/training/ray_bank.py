@@ -69,13 +69,13 @@ class RayBank:
         self._hidden = ImagePixels.of([frame.hidden for frame in frames], 1, 0.0, home)
         visible = _visible_pixels(frames)
         self._few = self._sparse_depth(frames, offsets).to(home)
-        self._landmarks = moved(_landmark_pixels(views, offsets), home)
+        self._landmarks = move_to(_landmark_pixels(views, offsets), home)
         self._cameras = _PixelRays([frame.intrinsics for frame in frames], home)
         rotation = torch.stack([view.T_ref_camera.rotation for view in views]).float()
         origin = torch.stack([view.T_ref_camera.translation for view in views]).float()
         rows = torch.stack([AT_REST if view.motion is None else view.motion for view in views]).float()
         motion = None if all(view.motion is None for view in views) else rows
-        self.offsets, self._visible, self._rotation, self._origin, self._motion = moved(
+        self.offsets, self._visible, self._rotation, self._origin, self._motion = move_to(
             (offsets, visible, rotation, origin, motion), home
         )
         self._drawn = self.count if visible is None else int(visible[-1])
