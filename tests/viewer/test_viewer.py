@@ -123,6 +123,13 @@ def test_an_accepted_pose_passes_its_figures(found: dict[str, Any]) -> None:
     assert found["depth"] is not None
 
 
+def test_the_answer_is_described_once_and_its_field_rendered_afterwards(localizer: Localizer, query: Query) -> None:
+    before = list[Any]()
+    answer = answer_query(localizer, query, follow=lambda record, shown: before.append(shown))
+    assert before[0] is None  # the search begins
+    assert {key for key in answer if answer[key] is not before[1][key]} == {"rendered", "depth"}
+
+
 def test_a_refused_pose_fails_a_figure_and_shows_its_search(refused: dict[str, Any]) -> None:
     assert not refused["accepted"]
     assert any(figure.passed is False for figure in refused["figures"])
