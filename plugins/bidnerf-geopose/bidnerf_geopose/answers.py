@@ -53,9 +53,9 @@ def answer(
     if anchor is not None and request.priorPoses:
         start = _geographic_pose(request.priorPoses[-1].geopose).in_map(anchor)
         parameters["start"] = json.dumps({"T_world_camera": start.matrix().tolist()})
-    found, plain = localize(Upload(parameters, {"photo": _image(reading)}))
-    localization = found.found
-    if not found.accepted:
+    answer, plain = localize(Upload(parameters, {"photo": _image(reading)}))
+    localization = answer.localization
+    if not answer.accepted:
         reason = f"not localized: {localization.outcome}: {localization.reason}"
         raise Refused(422, reason, localization=plain)
     return {
