@@ -41,6 +41,7 @@ from bidnerf.results import pose_error
 from bidnerf.scenes import closed_form_data
 from bidnerf_core.datasets import DatasetOptions
 from refusals import refused
+from trial_results import timeless
 
 QUICK = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--workers", "1"]
 BLOBS = "demo:blobs"
@@ -59,12 +60,6 @@ def evaluate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Evaluate:
         return status, capsys.readouterr().err
 
     return run
-
-
-def timeless(path: Path) -> list[dict[str, Any]]:
-    """The lines in order, without what two runs differ in."""
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    return [{k: v for k, v in line.items() if k not in ("seconds", "peak_memory_bytes")} for line in lines]
 
 
 def blob_trial(seed: int = 0, steps: int = 2) -> Trial:
@@ -198,7 +193,7 @@ def test_an_evaluation_killed_at_random_moments_equals_one_never_killed(tmp_path
     assert kills >= 3
     assert known
     assert run(killed) == 0
-    assert timeless(killed) == timeless(whole)
+    assert timeless(read_results([killed])) == timeless(read_results([whole]))
 
 
 def _written(path: Path, *seeds: int) -> list[TrialResult]:

@@ -31,6 +31,7 @@ from bidnerf.evaluation import (
     open_scene,
     peak_memory_bytes,
     read_results,
+    read_runs,
     reset_peak_memory,
     run_trial,
 )
@@ -45,6 +46,7 @@ from bidnerf_core.io import from_plain
 from bidnerf_core.localization import find_method
 from bidnerf_core.progress import Progress
 from refusals import refused
+from trial_results import timeless
 
 QUICK: dict[str, Any] = {
     "method": "bid",
@@ -61,11 +63,6 @@ pytestmark = pytest.mark.usefixtures("small_images")
 def quick(**more: Any) -> Plan:
     """A plan of few rays and steps."""
     return Plan(**QUICK | more)
-
-
-def timeless(rows: Any) -> list[TrialResult]:
-    """The results without what two runs differ in."""
-    return [dataclasses.replace(row, seconds=0.0, peak_memory_bytes=0) for row in rows]
 
 
 def placeless(rows: Any) -> list[TrialResult]:
@@ -368,60 +365,39 @@ def trial(shared: Path) -> Trial:
 def test_a_line_has_what_localize_prints_and_more(
     trial: Trial, shared: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    line = run_trial(trial).plain()
-    capsys.readouterr()
-    assert (
-        main(
-            [
-                "localize",
-                str(shared / "map"),
-                str(shared / "data"),
-                "--frame",
-                "t_0001",
-                "--json",
-                "--method",
-                "bid",
-                "--perturb",
-                "0.1",
-                "5",
-                "--max-steps",
-                "2",
-                "--rays",
-                "32",
-            ]
-        )
-        == 0
+    result = run_trial(trial)
+    line, portable = result.plain(), result.trial
+    assert portable == trial.portable == trial.portable.portable
+    assert hash(portable) == hash(trial.portable)
+    error = pose_error(
+        SE3.from_matrix(torch.tensor(line["T_world_camera"]).double()), tiny.views(3, seed=1)[1].T_ref_camera
     )
+    assert line["error"]["translation"] == pytest.approx(float(error.translation), abs=1e-6)
+    capsys.readouterr()
+    words = [
+        "localize",
+        str(shared / "map"),
+        str(shared / "data"),
+        "--frame",
+        "t_0001",
+        "--json",
+        "--perturb",
+        "0.1",
+        "5",
+    ]
+    assert main([*words, "--method", "bid", "--max-steps", "2", "--rays", "32"]) == 0
     assert json.loads(capsys.readouterr().out).keys() <= line.keys()
     assert json.loads(json.dumps(line, allow_nan=False)) == line
-    assert line["frame"] == "t_0001"
-    assert line["seed"] == 3
-    assert line["steps"] == 4
+    assert (line["frame"], line["seed"], line["steps"]) == ("t_0001", 3, 4)
     assert line["start_error"]["translation"] == pytest.approx(0.5, rel=0.01)  # exp bends it a little
     assert line["start_error"]["rotation_deg"] == pytest.approx(math.degrees(0.2))
     for kind in ("translation", "rotation_deg"):
         assert len(line["errors"][kind]) == 5
         assert line["errors"][kind][0] == pytest.approx(line["start_error"][kind])
         assert line["errors"][kind][-1] == pytest.approx(line["error"][kind])
-    assert line["settings"]["rays"] == 64
-    assert line["settings"]["depth_weight"] == 1.0
+    assert (line["settings"]["rays"], line["settings"]["depth_weight"]) == (64, 1.0)
     assert line["weights"].startswith("weights-")
     assert line["peak_memory_bytes"] > 10**7
-
-
-def test_its_trial_has_the_names_of_folders_alone(trial: Trial) -> None:
-    found = run_trial(trial).trial
-    assert found == trial.portable == trial.portable.portable
-    assert hash(found) == hash(trial.portable)
-
-
-def test_its_error_is_that_of_its_pose(trial: Trial, shared: Path) -> None:
-    result = run_trial(trial)
-    matrix = torch.tensor(result.T_world_camera, dtype=torch.float64)
-    truth = tiny.views(3, seed=1)[1].T_ref_camera
-    error = pose_error(SE3.from_matrix(matrix), truth)
-    assert result.error is not None
-    assert result.error.translation == pytest.approx(float(error.translation), abs=1e-6)
 
 
 def test_the_same_trial_gives_the_same_line(trial: Trial) -> None:
@@ -480,12 +456,9 @@ def test_two_dask_workers_give_the_results_of_one_process(tmp_path: Path) -> Non
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, **options) as cluster:
         words = ["evaluate", "demo:blobs", "--out", str(together), "--dask", cluster.scheduler_address]
         assert main([*words, *six, *WORDS[:-2]]) == 0
-    lines = [[json.loads(line) for line in path.read_text().splitlines()] for path in (alone, together)]
-    for line in (*lines[0], *lines[1]):
-        del line["seconds"], line["peak_memory_bytes"]
-    assert lines[0] == lines[1]
-    (run,) = json.loads(together.with_suffix(".meta.json").read_text())["runs"]
-    assert run["workers"] == "dask, 2 threads"
+    assert timeless(read_results([alone])) == timeless(read_results([together]))
+    (run,) = read_runs(together)
+    assert run.workers == "dask, 2 threads"
 
 
 def test_a_scheduler_that_is_not_there_is_named(

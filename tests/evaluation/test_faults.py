@@ -52,17 +52,10 @@ def places(fault: str, seed: int) -> torch.Tensor:
     return torch.stack([alpha_of(faulty(View(f, SE3.identity()), fault, seed)) for f in frames], -1) * size
 
 
-def same(a: Frame, b: Frame, tolerance: float = 0.0) -> bool:
-    """Whether two frames have equal images and cameras; depth is compared exactly."""
-    assert a.depth is not None
-    assert b.depth is not None
-    assert (a.alpha is None) == (b.alpha is None)
-    if a.rgb.shape != b.rgb.shape:
-        return False
-    alike = [torch.allclose(a.rgb, b.rgb, rtol=0, atol=tolerance), torch.equal(a.depth, b.depth)]
-    if a.alpha is not None and b.alpha is not None:
-        alike.append(torch.allclose(a.alpha, b.alpha, rtol=0, atol=tolerance))
-    return all(alike) and a.intrinsics == b.intrinsics
+def same(a: Frame, b: Frame) -> bool:
+    """Whether two frames have equal images and cameras."""
+    pairs = [(getattr(a, name), getattr(b, name)) for name in ("rgb", "depth", "alpha")]
+    return a.intrinsics == b.intrinsics and all(x is y is None or torch.equal(x, y) for x, y in pairs)
 
 
 def depth_of(view: View) -> torch.Tensor:
@@ -258,16 +251,13 @@ def test_misregistered_depth_is_moved_by_its_size() -> None:
         assert math.hypot(*moves) == pytest.approx(6.5, abs=0.75)  # each axis is rounded to whole pixels
 
 
-def test_only_a_window_or_rows_remain() -> None:
-    full = plain(3.0)
+@pytest.mark.parametrize(
+    ("fault", "height", "width"), [("depth-window:25", 25, 25), ("depth-rows:3", 3, 80), ("depth-window:70", 60, 70)]
+)
+def test_only_a_window_or_rows_remain(fault: str, height: int, width: int) -> None:
     for seed in range(5):
-        kept = depth_of(faulty(full, "depth-window:25", seed)) > 0
-        rows, columns = kept.any(1), kept.any(0)
-        assert (int(rows.sum()), int(columns.sum()), int(kept.sum())) == (25, 25, 625)
-        lines = depth_of(faulty(full, "depth-rows:3", seed)) > 0
-        assert int(lines.any(1).sum()) == 3
-        assert int(lines.sum()) == 3 * CAMERA.width
-    assert int((depth_of(faulty(full, "depth-window:70", 0)) > 0).sum()) == 60 * 70
+        mask = depth_of(faulty(plain(3.0), fault, seed)) > 0
+        assert (int(mask.any(1).sum()), int(mask.any(0).sum()), int(mask.sum())) == (height, width, height * width)
 
 
 def test_only_the_largest_plane_remains() -> None:
@@ -285,36 +275,40 @@ def test_only_the_largest_plane_remains() -> None:
 # The camera.
 
 
-def test_wrong_intrinsics_leave_the_image_alone(view: View) -> None:
+@pytest.mark.parametrize(
+    ("fault", "factors"),
+    [("focal:1.05", (1.05, 1.05)), ("stretch:1.1", (1.1, 1.0)), ("principal-point:10", (1.0, 1.0))],
+)
+def test_wrong_intrinsics_leave_the_image_alone(fault: str, factors: tuple[float, float], view: View) -> None:
     own = view.frame.intrinsics
-    long = faulty(view, "focal:1.05", 0).frame
-    assert long.rgb_bytes is view.frame.rgb_bytes
-    assert (long.intrinsics.fx, long.intrinsics.fy) == (own.fx * 1.05, own.fy * 1.05)
-    assert dataclasses.replace(long.intrinsics, fx=own.fx, fy=own.fy) == own
-    wide = faulty(view, "stretch:1.1", 0).frame
-    assert wide.rgb_bytes is view.frame.rgb_bytes
-    assert wide.intrinsics == dataclasses.replace(own, fx=1.1 * own.fx)
-    for frame in (faulty(view, "focal:0.5+nominal", 0).frame, faulty(view, "nominal+focal:0.5", 0).frame):
-        assert frame.rgb_bytes is view.frame.rgb_bytes
-        assert frame.focal_is_approximate
-        focal = 0.5 * math.sqrt(own.fx * own.fy)
-        assert frame.intrinsics.fx == pytest.approx(focal)
-        expected = Intrinsics.from_focal(frame.intrinsics.fx, own.width, own.height)
-        assert frame.intrinsics == expected
     for seed in range(3):
-        part = faulty(view, "crop:0.25", seed).frame
-        width, height = round(0.75 * own.width), round(0.75 * own.height)
-        assert part.rgb.shape == (height, width, 3)
-        assert (part.intrinsics.cx - width / 2, part.intrinsics.cy - height / 2) == (
-            own.cx - own.width / 2,
-            own.cy - own.height / 2,
-        )
-        corners = [(y, x) for y in (0, own.height - height) for x in (0, own.width - width)]
-        whole = [view.frame.rgb[y : y + height, x : x + width] for y, x in corners]
-        assert any(torch.equal(part.rgb, expected) for expected in whole)
-        camera = faulty(view, "principal-point:10", seed).frame.intrinsics
-        assert math.hypot(camera.cx - own.cx, camera.cy - own.cy) == pytest.approx(10)
-        assert dataclasses.replace(camera, cx=own.cx, cy=own.cy) == own
+        frame = faulty(view, fault, seed).frame
+        assert frame.rgb_bytes is view.frame.rgb_bytes
+        camera = frame.intrinsics
+        assert (camera.fx, camera.fy) == (own.fx * factors[0], own.fy * factors[1])
+        moved = 10 if fault.startswith("principal") else 0
+        assert math.hypot(camera.cx - own.cx, camera.cy - own.cy) == pytest.approx(moved)
+        assert dataclasses.replace(camera, fx=own.fx, fy=own.fy, cx=own.cx, cy=own.cy) == own
+
+
+@pytest.mark.parametrize("fault", ["focal:0.5+nominal", "nominal+focal:0.5"])
+def test_a_nominal_camera_has_only_a_focal_length(fault: str, view: View) -> None:
+    own, frame = view.frame.intrinsics, faulty(view, fault, 0).frame
+    assert frame.rgb_bytes is view.frame.rgb_bytes
+    assert frame.focal_is_approximate
+    assert frame.intrinsics.fx == pytest.approx(0.5 * math.sqrt(own.fx * own.fy))
+    assert frame.intrinsics == Intrinsics.from_focal(frame.intrinsics.fx, own.width, own.height)
+
+
+def test_a_crop_keeps_a_corner_and_the_offset_of_the_principal_point(view: View) -> None:
+    own, width, height = view.frame.intrinsics, round(0.75 * LENS.width), round(0.75 * LENS.height)
+    corners = [(y, x) for y in (0, own.height - height) for x in (0, own.width - width)]
+    parts = [view.frame.rgb[y : y + height, x : x + width] for y, x in corners]
+    for seed in range(3):
+        frame = faulty(view, "crop:0.25", seed).frame
+        assert any(torch.equal(frame.rgb, part) for part in parts)
+        offset = frame.intrinsics.cx - width / 2, frame.intrinsics.cy - height / 2
+        assert offset == (own.cx - own.width / 2, own.cy - own.height / 2)
 
 
 def test_of_the_smallest_image_a_crop_leaves_a_pixel() -> None:
@@ -390,8 +384,7 @@ def test_jpeg_loses_more_at_a_lower_quality(view: View) -> None:
 
 def test_grey_has_one_value(view: View) -> None:
     grey = faulty(view, "grey:1", 0).frame.rgb
-    assert torch.allclose(grey[..., 0], grey[..., 1], atol=1e-6)
-    assert torch.allclose(grey[..., 0], grey[..., 2], atol=1e-6)
+    assert torch.allclose(grey[..., :1].expand_as(grey), grey, atol=1e-6)
     half = faulty(view, "grey:0.5", 0).frame.rgb
     torch.testing.assert_close(half, (grey + view.frame.rgb) / 2, atol=0.75 * BYTE, rtol=0)  # grey is rounded, too
 
@@ -400,8 +393,7 @@ def test_vignetting_darkens_corners() -> None:
     rgb = faulty(plain(rgb=0.8), "vignetting:0.6", 0).frame.rgb
     assert float(rgb[29:31, 39:41].min()) == pytest.approx(0.8, rel=0.01)
     assert float(rgb[0, 0, 0]) == pytest.approx(0.8 * 0.4, rel=0.05)
-    assert torch.allclose(rgb, rgb.flip([0]))
-    assert torch.allclose(rgb, rgb.flip([1]))
+    assert all(torch.allclose(rgb, rgb.flip([axis])) for axis in (0, 1))
 
 
 # The scene.
@@ -475,14 +467,12 @@ def test_what_vanishes_in_a_room_uncovers_what_is_around_and_behind() -> None:
 # The whole image.
 
 
-def test_mirrored_images(view: View) -> None:
-    frame = view.frame
-    left = faulty(view, "mirror", 0).frame
-    assert torch.equal(left.rgb, frame.rgb.flip(1))
-    assert torch.equal(depth_of(View(left, view.T_ref_camera)), depth_of(view).flip(1))
-    top = faulty(view, "flip", 0).frame
-    assert torch.equal(top.rgb, frame.rgb.flip(0))
-    assert same(faulty(faulty(view, "mirror", 0), "mirror", 0).frame, frame)
+@pytest.mark.parametrize(("fault", "axis"), [("mirror", 1), ("flip", 0)])
+def test_mirrored_images(fault: str, axis: int, view: View) -> None:
+    mirrored = faulty(view, fault, 0)
+    assert torch.equal(mirrored.frame.rgb, view.frame.rgb.flip(axis))
+    assert torch.equal(depth_of(mirrored), depth_of(view).flip(axis))
+    assert same(faulty(mirrored, fault, 0).frame, view.frame)
 
 
 def test_an_image_upside_down_shows_the_same_points_from_its_own_pose(view: View) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -36,3 +36,8 @@ def trial_result(trial: Trial, distances: Sequence[float], angles: Sequence[floa
         trial,
     )
     return replace(made, **changes)
+
+
+def timeless(rows: Iterable[TrialResult]) -> list[TrialResult]:
+    """Return results without the values in which two runs differ."""
+    return [replace(row, seconds=0.0, peak_memory_bytes=0) for row in rows]
