@@ -52,10 +52,10 @@ def factor_of_distance(scene: Map, first: Place, second: Place, metres: float) -
     """
     if not 0 < metres < math.inf:
         raise InputError(f"distance is {metres} m", expected="a positive length")
-    apart = float(torch.linalg.vector_norm(locate_point(scene, first) - locate_point(scene, second)))
-    if not apart > 0:
+    distance = float(torch.linalg.vector_norm(locate_point(scene, first) - locate_point(scene, second)))
+    if not distance > 0:
         raise InputError(f"{first} and {second} are the same place", expected="two different places")
-    return metres / apart
+    return metres / distance
 
 
 def factor_of_poses(scene: Map, known: Mapping[str, SE3 | Position]) -> ScaleFit:
