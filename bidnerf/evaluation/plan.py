@@ -142,7 +142,7 @@ def _read_options(options: DatasetOptions | dict[str, Any]) -> DatasetOptions:
     return options if isinstance(options, DatasetOptions) else DatasetOptions(**options)
 
 
-Images = Annotated[
+StoredOptions = Annotated[
     DatasetOptions,
     # pydantic cannot resolve the annotations of ``DatasetOptions``, which names types that it does not import.
     GetPydanticSchema(lambda kind, handler: core_schema.no_info_plain_validator_function(_read_options)),
@@ -157,7 +157,7 @@ class Setup:
     protocol: str = "none"  # how starts are chosen
     method: str = "auto"
     config: str = "{}"  # JSON of the method's settings that differ from its defaults
-    images: Images = TEST_IMAGES  # how the dataset is read; only names, paths and numbers, since trials are JSON
+    images: StoredOptions = TEST_IMAGES  # how the dataset is read; only names, paths and numbers, since trials are JSON
     device: str = "cpu"  # of a map that is read from a folder
     depth: bool = True  # whether the method receives the measured depth
 

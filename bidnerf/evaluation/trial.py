@@ -33,15 +33,13 @@ from bidnerf_core.frames import View
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.localization import Localizer
-from bidnerf_core.maps import DESCRIPTION, Map, load_map
+from bidnerf_core.maps import DESCRIPTION, Images, Map, load_map
 from bidnerf_core.registry import registered_names, require_registered
 from bidnerf_core.settings import to_flat
 
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
 MapSource: TypeAlias = Map | str | Path
 """A map in memory, the folder of a map, or demo:NAME."""
-DataSource: TypeAlias = Capture | Sequence[View] | str | Path
-"""A dataset in memory, posed images (T_world_camera), the folder of a dataset, or demo:NAME."""
 Scene: TypeAlias = tuple[Map, Capture]
 """A map, and a dataset of the same scene."""
 
@@ -191,8 +189,8 @@ def open_map(name: str, device: str = "cpu") -> Map:
     return closed_form_map(name) if is_closed_form(name) else load_map(Path(name), where)
 
 
-def open_data(data: DataSource, options: DatasetOptions, stored: Map | None = None) -> Capture:
-    """Return a dataset, read from its folder unless it is in memory; ``stored`` gives the background colour.
+def open_data(data: Images, options: DatasetOptions, stored: Map | None = None) -> Capture:
+    """Return a dataset, read from its folder unless it is in memory or demo:NAME; ``stored`` gives the background colour.
 
     Raises ``InputError`` for ``data`` of another type, and for options about files with data that has no files.
     """
@@ -216,7 +214,7 @@ def open_data(data: DataSource, options: DatasetOptions, stored: Map | None = No
     return capture if options.mask_folder is None else capture.with_masks(options.mask_folder)
 
 
-def open_scene(source: MapSource, data: DataSource, setup: Setup = USUAL) -> Scene:
+def open_scene(source: MapSource, data: Images, setup: Setup = USUAL) -> Scene:
     """Return a map and a dataset, each read from its folder unless it is in memory.
 
     If both are in folders, they are read once per process unless the map has changed since.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,9 +15,6 @@ from scipy.stats import chi2
 
 import tiny
 from bidnerf.evaluation import FAULTS, NO_FAULT
-
-# Inside: queries are answered in this process
-from bidnerf.evaluation.run import InThisProcess
 from bidnerf_core.registry import registered
 
 
@@ -108,9 +106,9 @@ def test_an_interrupted_run_goes_on_with_rows_of_the_same_content(
 
     def run(jobs: int, *names: str) -> dict[str, Any]:
         words = [scene, "--faults", *names, "--rgbd", "--frames", "3", "--jobs", str(jobs)]
-        with faults.RowStore(tmp_path / "rows.jsonl") as store:
-            found: dict[str, Any] = faults.measure(given(faults, monkeypatch, *words), store, InThisProcess())
-            return found
+        with faults.RowStore(tmp_path / "rows.jsonl") as store, ThreadPoolExecutor(1) as executor:
+            measured: dict[str, Any] = faults.measure(given(faults, monkeypatch, *words), store, executor)
+            return measured
 
     assert run(1, "none")["all"]["n"] == 3
     assert len(answered) == 3
