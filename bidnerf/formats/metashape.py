@@ -13,6 +13,7 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree import ElementTree
 
+from bidnerf.formats.reality_capture import file_heads
 from bidnerf_core.camera import Camera, PanoramaFace, colmap_camera
 from bidnerf_core.datasets import (
     IMAGE_ENDINGS,
@@ -28,7 +29,7 @@ from bidnerf_core.datasets import (
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import is_file, open_binary, read_file
+from bidnerf_core.io import is_file, read_file
 
 
 def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
@@ -69,15 +70,9 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
 
 
 def _find(path: Path) -> Path | None:
-    for file in sorted(path.glob("[!.]*.xml")):
-        try:
-            with open_binary(file, "cameras of Metashape") as opened:
-                head = opened.read(4096)  # in which the root and the chunk begin
-        except InputError:
-            continue
-        if b"<document" in head and b"<chunk" in head:
-            return file
-    return None
+    """Return the first XML file in whose first bytes the root and a chunk begin."""
+    heads = file_heads(path, "[!.]*.xml", "cameras of Metashape")
+    return next((file for file, head in heads if b"<document" in head and b"<chunk" in head), None)
 
 
 def _chunk(file: Path) -> ElementTree.Element:

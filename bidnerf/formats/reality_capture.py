@@ -10,6 +10,8 @@ distortion in OpenCV's convention. Photos are in the folder, or in ``images``.
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -45,15 +47,18 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
 
 
 def _find(path: Path) -> Path | None:
-    for file in sorted(path.glob("*.csv")):
-        try:
-            with open_binary(file, "a list of cameras") as opened:
-                names = column_names(opened.readline(2000).decode("utf-8-sig", "replace"))
-        except InputError:
-            continue
+    for file, head in file_heads(path, "*.csv", "a list of cameras"):
+        names = column_names(head.partition(b"\n")[0].decode("utf-8-sig", "replace"))
         if names[:1] == ["name"] and set(POSE) <= set(names):
             return file
     return None
+
+
+def file_heads(path: Path, pattern: str, expected: str) -> Iterator[tuple[Path, bytes]]:
+    """Yield the readable files of a folder whose names match a pattern, each with its first bytes."""
+    for file in sorted(path.glob(pattern)):
+        with contextlib.suppress(InputError), open_binary(file, expected) as opened:
+            yield file, opened.read(4096)
 
 
 def _shot(row: Row, values: dict[str, str], image: Path) -> Shot:

@@ -51,24 +51,24 @@ class Recording:
     def depth(self, number: int, size: tuple[int, int]) -> DepthImage:
         """Read the depth of a frame of ``size`` (width, height). Raises ``InputError`` if the number of bytes does not match."""
         depth, confidence = (f"rgbd/{number}.{kind}" for kind in ("depth", "conf"))
-        values = self._unpacked(depth, "<f4", size)
+        values = self._unpack(depth, "<f4", size)
         metres = np.where(np.isfinite(values) & (values > 0), values, 0)
-        sure = self._unpacked(confidence, "u1", size).astype(np.int64) if confidence in self else None
+        sure = self._unpack(confidence, "u1", size).astype(np.int64) if confidence in self else None
         measured = depth_image(metres, 1.0, f"{self.path}/{depth}: depth")
         return self._lidar.sure(measured, sure, f"{self.path}/{confidence}")
 
-    def _unpacked(self, name: str, kind: str, size: tuple[int, int]) -> np.ndarray:
+    def _unpack(self, name: str, kind: str, size: tuple[int, int]) -> np.ndarray:
         where, packed = f"{self.path}/{name}", self.read(name)
         decompress = _lzfse(self.path)
         try:
-            found = decompress(packed)
+            content = decompress(packed)
         except Exception as error:  # a C library raises it
             why = f"not readable as LZFSE ({error})"
             raise InputError(why, where=where, expected="a complete file") from error
-        if len(found) != (count := np.dtype(kind).itemsize * math.prod(size)):
+        if len(content) != (count := np.dtype(kind).itemsize * math.prod(size)):
             expected = f"{count} according to metadata (dw, dh)"
-            raise InputError(f"unpacks to {len(found)} bytes", where=where, expected=expected)
-        return np.frombuffer(found, kind).reshape(size[::-1])
+            raise InputError(f"unpacks to {len(content)} bytes", where=where, expected=expected)
+        return np.frombuffer(content, kind).reshape(size[::-1])
 
 
 def _read(path: Path, metadata_file: Path, options: DatasetOptions) -> Capture:

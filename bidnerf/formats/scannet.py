@@ -30,9 +30,9 @@ from bidnerf_core.frames import photos_in
 from bidnerf_core.io import read_header, read_rows
 
 
-def _read(path: Path, found: tuple[list[Path], Path], options: DatasetOptions) -> Capture:
+def _read(path: Path, match: tuple[list[Path], Path], options: DatasetOptions) -> Capture:
     """Read the cameras and poses. Raises ``InputError`` if one is invalid."""
-    images, intrinsics = found
+    images, intrinsics = match
     depth = _intrinsics(path, "depth")
     measured = {file.stem: file for file in photos_in(path / "depth")[0]} if (path / "depth").is_dir() else {}
     camera = _camera(intrinsics, images[0])

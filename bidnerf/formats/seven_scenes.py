@@ -66,7 +66,9 @@ def _read(path: Path, folders: dict[int, Path], options: DatasetOptions) -> Capt
     unit, read_depth = options.depth_unit or MILLIMETRE, DepthReader(documented=("65535",))
     T_depth_colour = SE3.identity() if sensor is None else sensor.T_colour_depth.inverse()
     lists = {"train": path / "TrainSplit.txt", "test": path / "TestSplit.txt"}
-    numbers = {split: _listed(file, folders) for split, file in lists.items() if -1 not in folders and file.is_file()}
+    numbers = {
+        split: _read_split(file, folders) for split, file in lists.items() if -1 not in folders and file.is_file()
+    }
     shots = list[Shot]()
     for number in dict.fromkeys(n for group in numbers.values() for n in group) or sorted(folders):
         splits = tuple(split for split, group in numbers.items() if number in group)
@@ -115,7 +117,7 @@ def frames_of(
     return shots
 
 
-def _listed(file: Path, folders: dict[int, Path]) -> list[int]:
+def _read_split(file: Path, folders: dict[int, Path]) -> list[int]:
     """Return the numbers of the sequences in a split file. Raises ``InputError`` if it lists none or an unknown one."""
     numbers = list[int]()
     for row in read_rows(file, "a list of sequences", "a sequence such as sequence1"):

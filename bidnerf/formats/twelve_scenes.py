@@ -25,9 +25,9 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import read_rows
 
 
-def _read(path: Path, found: tuple[Path, Path], options: DatasetOptions) -> Capture:
+def _read(path: Path, match: tuple[Path, Path], options: DatasetOptions) -> Capture:
     """Read the poses and splits. Raises ``InputError`` if a metadata file is invalid."""
-    folder, info = found
+    folder, info = match
     values: dict[str, list[float]] = {}
     for row in read_rows(info, "12-Scenes' info.txt", "name = numbers"):
         name, _, text = row.text.partition("=")
@@ -52,7 +52,7 @@ def _read(path: Path, found: tuple[Path, Path], options: DatasetOptions) -> Capt
 
 def _find(path: Path) -> tuple[Path, Path] | None:
     """Return the folder of the frames and the file with their cameras."""
-    folder = next((place for place in (path / "data", path) if images_of(place)), None)
+    folder = next((each for each in (path / "data", path) if images_of(each)), None)
     info = first_file(path, "info.txt", "_info.txt", "../info.txt", "../_info.txt")
     return None if folder is None or info is None else (folder, info)
 

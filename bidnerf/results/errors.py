@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from statistics import NormalDist
 from typing import Any, TypeAlias
 
@@ -288,10 +289,5 @@ def relative_errors(estimated: SE3, true: SE3) -> PoseError:
 
 def spans(flags: Sequence[bool]) -> list[tuple[int, int]]:
     """Return each run of true flags as its first and last index, both inclusive."""
-    runs: list[tuple[int, int]] = []
-    for index, flag in enumerate(flags):
-        if flag and runs and runs[-1][1] == index - 1:
-            runs[-1] = (runs[-1][0], index)
-        elif flag:
-            runs.append((index, index))
-    return runs
+    runs = (list(group) for flag, group in groupby(range(len(flags)), flags.__getitem__) if flag)
+    return [(run[0], run[-1]) for run in runs]

@@ -23,6 +23,7 @@ from bidnerf_core.captures import write_inria_cameras
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.io import output_folder, write_file
 from bidnerf_core.localization import origin_of
+from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.maps import Map, load_map
 from bidnerf_core.registry import Plugins, interface_defects
 
@@ -87,7 +88,7 @@ def export_clouds(scene: Map, out: Path) -> list[Path]:
         files.append(out / "surface.ply")
         write_file(files[-1], ply(columns, head(scene, images, amount(len(parts), "surfel"))))
     if scene.landmarks is not None:
-        files.append(_write_landmarks(scene, images, out))
+        files.append(_write_landmarks(scene, scene.landmarks, images, out))
     if images:
         corners, length = list[Tensor](), 0.03 * scene.bounds.side
         for image in images:  # each is drawn as a pyramid
@@ -108,16 +109,14 @@ def export_clouds(scene: Map, out: Path) -> list[Path]:
 
 def export_colmap(scene: Map, out: Path) -> list[Path]:
     """A COLMAP text model: the cameras, the landmarks as 3D points, and as their tracks the keypoints they were built from."""
-    images, landmarks = _needed_images(scene, "colmap"), scene.landmarks
+    images, landmarks = _images(scene, "colmap"), scene.landmarks
     folder = os.path.commonpath([os.path.dirname(image.name) for image in images])
     upright = [replace(image, name=os.path.relpath(image.name, folder or ".")) for image in images]
     images = [image.as_stored for image in upright]
     points, keypoints = list[str](), [list[str]() for _ in images]
     if landmarks is not None:
-        places, tracks = (
-            landmarks.positions.double() + origin_of(scene),
-            [list[str]() for _ in range(len(landmarks))],
-        )
+        positions = landmarks.positions.double() + origin_of(scene)
+        tracks = [list[str]() for _ in range(len(landmarks))]
         total, count = torch.zeros(2, len(landmarks), dtype=torch.float64)
         if landmarks.tracks is None:
             log.info(f"{scene.name}: its landmarks have no tracks; 'bidnerf bake MAP --data DATA' finds them")
@@ -125,7 +124,7 @@ def export_colmap(scene: Map, out: Path) -> list[Path]:
             for number, (before, after) in enumerate(zip(upright, images, strict=True)):
                 own = landmarks.tracks.image == number
                 seen, pixels = landmarks.tracks.landmark[own].long(), landmarks.tracks.pixel[own].double()
-                projected = before.intrinsics.project(before.pose.inverse().apply(places[seen]))
+                projected = before.intrinsics.project(before.pose.inverse().apply(positions[seen]))
                 total.index_add_(0, seen, (projected - pixels).norm(dim=-1))
                 count.index_add_(0, seen, torch.ones(len(seen), dtype=torch.float64))
                 if after is not before:
@@ -137,11 +136,11 @@ def export_colmap(scene: Map, out: Path) -> list[Path]:
         # The error of a point is the mean distance of its projections from its keypoints. With a single keypoint,
         # the error is unknown, for which COLMAP has the value -1.
         errors = torch.where(count > 1, total / count.clamp(min=1), -1).tolist()
-        colours = (_colours(scene).clamp(0, 1) * 255).round().long().tolist()
+        colours = (_colours(scene, landmarks).clamp(0, 1) * 255).round().long().tolist()
         digits = 16 if any(scene.origin) else 9
         points = [
             f"{number + 1} {x:.{digits}g} {y:.{digits}g} {z:.{digits}g} {r} {g} {b} {errors[number]:.3f}{''.join(tracks[number])}"
-            for number, ((x, y, z), (r, g, b)) in enumerate(zip(places.tolist(), colours, strict=True))
+            for number, ((x, y, z), (r, g, b)) in enumerate(zip(positions.tolist(), colours, strict=True))
         ]
     write_colmap_model(out / "images.txt", images, points, keypoints)
     return [out / "cameras.txt", out / "images.txt", out / "points3D.txt"]
@@ -149,17 +148,18 @@ def export_colmap(scene: Map, out: Path) -> list[Path]:
 
 def export_transforms(scene: Map, out: Path) -> list[Path]:
     """A transforms.json: the cameras as nerfstudio reads them, with the landmarks as sparse points."""
-    images, files = _needed_images(scene, "transforms.json"), [out / "transforms.json"]
+    images, files = _images(scene, "transforms.json"), [out / "transforms.json"]
     more = {}
     if scene.landmarks is not None:
-        files.append(_write_landmarks(scene, images, out))
+        files.append(_write_landmarks(scene, scene.landmarks, images, out))
         more["ply_file_path"] = files[-1].name
     write_pose_transforms(files[0], images, **more)
     return files
 
 
-def _images(scene: Map) -> list[PosedImage]:
-    return [
+def _images(scene: Map, needed_by: str = "") -> list[PosedImage]:
+    """Return the images of a map. Raises ``InputError`` for a map without images if the format ``needed_by`` needs some."""
+    images = [
         PosedImage(
             camera.file or camera.name,
             number,
@@ -170,6 +170,9 @@ def _images(scene: Map) -> list[PosedImage]:
         )
         for number, camera in enumerate(scene.info.cameras)
     ]
+    if needed_by and not images:
+        raise InputError(f"has no cameras, but {needed_by} needs some; ply does not", where=scene.name)
+    return images
 
 
 def _in_world(scene: Map, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -177,19 +180,10 @@ def _in_world(scene: Map, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3
     return positions.double() + origin_of(scene) if any(scene.origin) else positions
 
 
-def _needed_images(scene: Map, to: str) -> list[PosedImage]:
-    images = _images(scene)
-    if not images:
-        raise InputError(f"has no cameras, but {to} needs some; ply does not", where=scene.name)
-    return images
-
-
-def _write_landmarks(scene: Map, images: list[PosedImage], out: Path) -> Path:
-    landmarks = scene.landmarks
-    assert landmarks is not None
+def _write_landmarks(scene: Map, landmarks: LandmarkMap, images: list[PosedImage], out: Path) -> Path:
     columns = {
         "x y z": _in_world(scene, landmarks.positions),
-        "red green blue": _colours(scene),
+        "red green blue": _colours(scene, landmarks),
         "photos": landmarks.views,
     }
     write_file(out / "landmarks.ply", ply(columns, head(scene, images, amount(len(landmarks), "landmark"))))
@@ -237,10 +231,8 @@ def head(scene: Map, images: Sequence[PosedImage], what: str) -> list[str]:
     return [*lines, frame_of(images)] if images else lines
 
 
-def _colours(scene: Map) -> Float[Tensor, "n 3"]:
+def _colours(scene: Map, landmarks: LandmarkMap) -> Float[Tensor, "n 3"]:
     """Return the colours of the landmarks, taken from the nearest surfels; grey without a surface."""
-    landmarks = scene.landmarks
-    assert landmarks is not None
     if scene.surface is None:
-        return torch.full((len(landmarks), 3), 0.5)  # grey
+        return torch.full((len(landmarks), 3), 0.5)
     return scene.surface.surfels.rgb[scene.surface.nearest(landmarks.positions)]

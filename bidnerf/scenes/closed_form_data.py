@@ -42,8 +42,8 @@ class RenderedShot(Shot):
     def frame(self, background: tuple[float, float, float] = BLACK, side: int | None = None) -> Frame:
         """Render this frame; ``background`` is ignored, since the scene has its own."""
         assert self.T_world_camera is not None  # the pose of every frame is known
-        found = self.render(self.T_world_camera, self.name)
-        return found if side is None else found.at_most(side)
+        frame = self.render(self.T_world_camera, self.name)
+        return frame if side is None else frame.at_most(side)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class ClosedFormData(Capture):
         listed = super().select(split)
         if names is None:
             return listed
-        by_name, found = {shot.name: shot for shot in listed}, list[Shot]()
+        by_name, selected = {shot.name: shot for shot in listed}, list[Shot]()
         up, middle = (torch.tensor(v, dtype=torch.float64) for v in ((0.0, 0.0, 1.0), self.middle))
         for name in names:
             own, _, angle = name.partition("@")
@@ -71,8 +71,8 @@ class ClosedFormData(Capture):
             pose = by_name[own].T_world_camera
             assert pose is not None
             turned = rotate_about(pose, middle, up, float(angle or 0))
-            found.append(replace(by_name[own], T_world_camera=turned, name=name))
-        return found
+            selected.append(replace(by_name[own], T_world_camera=turned, name=name))
+        return selected
 
     def sequence(self, name: str, count: int, angle: float) -> tuple[str, ...]:
         """Return the names of ``count`` frames, ``angle`` degrees apart, ending with frame ``name``."""
@@ -99,9 +99,9 @@ def closed_form_data(name: str) -> ClosedFormData:
             middle = (0.0, 0.0, 1.25)
         render, background = partial(scene.render, DEMO_CAMERA), scene.bounds.background
     shots = [
-        RenderedShot(render=render, T_world_camera=pose, splits=(split,), stem=f"{place:04d}")
+        RenderedShot(render=render, T_world_camera=pose, splits=(split,), stem=f"{number:04d}")
         for split, group in (("train", training), ("test", poses))
-        for place, pose in enumerate(group)
+        for number, pose in enumerate(group)
     ]
     return ClosedFormData(Path(name), shots, background, middle=middle)
 

@@ -69,9 +69,9 @@ def _lorry() -> list[Primitive]:
     ]
     wheels = []
     for (x, y), radius, hub in tyres:
-        place = (x, y, radius - 0.85)
+        position = (x, y, radius - 0.85)
         outward = math.copysign(0.1, y)
-        wheels.append(_solid(Cylinder(radius, 0.1), place, checker(C.slate, C.navy, 0.24, phase=x), roll=90))
+        wheels.append(_solid(Cylinder(radius, 0.1), position, checker(C.slate, C.navy, 0.24, phase=x), roll=90))
         cap = (x, y + outward, radius - 0.85)
         wheels.append(_solid(Cylinder(0.6 * radius, 0.03), cap, blotches(hub, C.red, 0.25, round(9 * x * y)), roll=90))
     return [
@@ -130,9 +130,9 @@ def _furniture() -> list[Primitive]:
         (C.blue, C.sand),
     ]
     for i, (first, second) in enumerate(paints):
-        tall, board, place = 0.13 + 0.015 * (3 * i % 5), (0.4, 0.85, 1.3)[i % 3], -1.05 + 0.14 * i
+        tall, board, position = 0.13 + 0.015 * (3 * i % 5), (0.4, 0.85, 1.3)[i % 3], -1.05 + 0.14 * i
         paint = stripes(first, second, (0, 0.3, 1), 0.22, phase=float(i))
-        books.append(_solid(Box((0.12, 0.07, tall)), (-1.85, place, board + 0.02 + tall), paint))
+        books.append(_solid(Box((0.12, 0.07, tall)), (-1.85, position, board + 0.02 + tall), paint))
     return [
         _solid(Box((2.0, 1.5, 1.25)), (0, 0, 1.25), walls),
         _solid(Cylinder(0.75, 0.012), (0.25, -0.1, 0.0), blotches(C.red, C.navy, 0.5, 13)),
@@ -172,12 +172,12 @@ def _furniture() -> list[Primitive]:
 
 
 def _solid(
-    shape: Shape, place: Sequence[float], texture: Texture, yaw: float = 0, pitch: float = 0, roll: float = 0
+    shape: Shape, position: Sequence[float], texture: Texture, yaw: float = 0, pitch: float = 0, roll: float = 0
 ) -> Primitive:
-    """Return a shape rotated about x (roll), then y (pitch), then z (yaw), in degrees, and moved to ``place`` (metres)."""
+    """Return a shape rotated about x (roll), then y (pitch), then z (yaw), in degrees, and moved to ``position`` (metres)."""
     rotation = torch.eye(3, dtype=torch.float64)
     for axis, angle in enumerate((roll, pitch, yaw)):
         turn = torch.zeros(6, dtype=torch.float64)
         turn[3 + axis] = math.radians(angle)
         rotation = SE3.exp(turn).rotation @ rotation
-    return Primitive(shape, SE3(rotation, torch.tensor(place, dtype=torch.float64)), texture)
+    return Primitive(shape, SE3(rotation, torch.tensor(position, dtype=torch.float64)), texture)

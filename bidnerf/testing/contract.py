@@ -14,10 +14,11 @@ from torch import Tensor, nn
 from bidnerf.testing import field_checks, recipes
 from bidnerf.testing.device import check_steps
 from bidnerf.testing.faults import calling, is_one_line, once, query, require
-from bidnerf.testing.scene import SCENE_BOUNDS, awkward_rays, joined, points, rgb_views, rgbd_views
+from bidnerf.testing.scene import SCENE_BOUNDS, awkward_rays, join_rays, points, rgb_views, rgbd_views
 from bidnerf_core.backend import Backend, load_backend
 from bidnerf_core.fields import RadianceField, levels
 from bidnerf_core.io import from_plain, to_plain
+from bidnerf_core.registry import interface_defects
 
 
 class BackendContract:
@@ -41,26 +42,14 @@ class BackendContract:
         require(f"{who}.summary", (is_one_line(summary), f"is {summary!r}, expected one line of text"))
 
     def test_config_is_a_frozen_dataclass_with_defaults_and_steps(self) -> None:
-        kind, who = self._backend().config_type, f"{type(self._backend()).__name__}.config_type"
-        is_one = isinstance(kind, type) and dataclasses.is_dataclass(kind)
-        require(who, (is_one, f"is {kind!r}, expected a dataclass"))
-        bare = [
-            f.name
-            for f in dataclasses.fields(kind)
-            if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
-        ]
-        require(
-            f"{who} {kind.__name__}",
-            (cast(Any, kind).__dataclass_params__.frozen, "not frozen, expected @dataclass(frozen=True)"),
-            (not bare, f"has no default for {', '.join(bare)}, expected one for every field"),
-        )
+        kind, who = self._backend().config_type, type(self._backend()).__name__
+        for defect in interface_defects(self._backend(), ("config_type",), {}):
+            require(who, (False, defect))
         steps = getattr(kind(), "steps", None)
+        is_length = type(steps) is int and steps > 0
         require(
-            f"{who} {kind.__name__}",
-            (
-                type(steps) is int and steps > 0,
-                f"has steps = {steps!r}, expected a field of type int: the length of a training",
-            ),
+            f"{who}.config_type {kind.__name__}",
+            (is_length, f"has steps = {steps!r}, expected a field of type int: the length of a training"),
         )
 
     def test_config_survives_json(self) -> None:
@@ -125,14 +114,14 @@ class BackendContract:
     def test_field_moves_to_a_device(self) -> None:
         if not torch.cuda.is_available():
             return
-        rays = joined(list(awkward_rays().values()))
+        rays = join_rays(list(awkward_rays().values()))
         field = self._trained()
         with calling(f"{type(field).__name__} on CUDA"):
             moved = copy.deepcopy(field).to("cuda")
             names = (f.name for f in dataclasses.fields(rays))
             elsewhere = dataclasses.replace(rays, **{name: getattr(rays, name).cuda() for name in names})
-            found = field_checks.seen(cast(RadianceField, moved), elsewhere, "rays on CUDA").cpu()
-        same = field_checks.close(found, field_checks.seen(field, rays, "rays"), 2e-2)
+            found = field_checks.render_channels(cast(RadianceField, moved), elsewhere, "rays on CUDA").cpu()
+        same = field_checks.close(found, field_checks.render_channels(field, rays, "rays"), 2e-2)
         require(type(field).__name__, (same, "renders otherwise on CUDA than on the CPU"))
 
     def test_query_serves_several_threads(self) -> None:
@@ -171,11 +160,11 @@ class BackendContract:
     def test_saved_field_renders_the_same(self) -> None:
         trained, fresh = self._trained(), self._build(self._reread(self._config()))
         with calling(f"{type(fresh).__name__}.load_state_dict of a saved state_dict"):
-            fresh.load_state_dict(recipes.stored(dict(trained.state_dict())))
+            fresh.load_state_dict(recipes.round_trip(dict(trained.state_dict())))
         loaded = frozen(fresh)
-        rays = joined(list(awkward_rays().values()))
+        rays = join_rays(list(awkward_rays().values()))
         same = torch.equal(_answers(loaded), _answers(trained)) and all(
-            torch.equal(field_checks.seen(a, rays, "rays"), field_checks.seen(b, rays, "rays"))
+            torch.equal(field_checks.render_channels(a, rays, "rays"), field_checks.render_channels(b, rays, "rays"))
             for a, b in zip(levels(loaded), levels(trained), strict=True)
         )
         require(
@@ -233,11 +222,11 @@ class BackendContract:
 
         def train() -> recipes.Training:
             field, total = self._build(), self._config().steps
-            before = recipes.copied(field)
+            before = recipes.copy_state(field)
             report = recipes.Recorder(due={1, total // 2, total})
             with calling(f"{type(self._backend()).__name__}.train"):
                 self._backend().train(field, rgbd_views(), self._config(), report)
-            return recipes.Training(frozen(field), before, recipes.copied(field), report)
+            return recipes.Training(frozen(field), before, recipes.copy_state(field), report)
 
         return once(self, train)
 
@@ -276,4 +265,4 @@ def precise(field: RadianceField) -> tuple[RadianceField, torch.dtype]:
 
 
 def _answers(field: RadianceField) -> Tensor:
-    return field_checks.stacked(query(field, *points(256), "points"))
+    return field_checks.to_channels(query(field, *points(256), "points"))

@@ -18,6 +18,7 @@ from bidnerf.testing.faults import (
     equal,
     is_depth,
     is_one_line,
+    is_refused,
     once,
     require,
 )
@@ -32,7 +33,6 @@ from bidnerf.testing.textured_field import (
     training_views,
     unseen,
 )
-from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import METHODS, Localization, Localizer
@@ -101,7 +101,7 @@ class MethodContract(Named):
         )
 
     def test_same_seed_gives_the_same_pose(self) -> None:
-        again = self._localized(textured_map(surface=True), unseen().frame, unseen().T_ref_camera)
+        again = self._localize(textured_map(surface=True), unseen().frame, unseen().T_ref_camera)
         first, second = (found.T_world_camera.matrix() for found in (self._first(), again))
         expected = "expected all randomness to come from it"
         require(
@@ -111,7 +111,7 @@ class MethodContract(Named):
 
     def test_pose_moves_with_the_world(self) -> None:
         truth = T_MOVED_WORLD @ unseen().T_ref_camera
-        here, there = self._first(), self._localized(moved_map(), unseen().frame, truth)
+        here, there = self._first(), self._localize(moved_map(), unseen().frame, truth)
         error = _difference(there.T_world_camera, T_MOVED_WORLD @ here.T_world_camera)
         require(
             f"{self._who}, in a world that is moved",
@@ -125,7 +125,7 @@ class MethodContract(Named):
 
     def test_image_of_another_scene_is_rejected(self) -> None:
         scene = textured_map(surface=True)
-        found = self._localized(scene, seen(POSES[1], CAMERA, "other", seed=1).frame, POSES[1])
+        found = self._localize(scene, seen(POSES[1], CAMERA, "other", seed=1).frame, POSES[1])
         require(
             self._who,
             (
@@ -138,18 +138,16 @@ class MethodContract(Named):
     def test_missing_start_is_refused(self) -> None:
         if not self._part(METHODS.load).needs_start:
             return
-        try:
-            Localizer(textured_map(surface=True), self.name, self.config, warm_up=False)(unseen().frame)
-        except InputError:
-            return
-        require(self._who, (False, "needs a start, but does without one, expected an InputError"))
+        localizer = Localizer(textured_map(surface=True), self.name, self.config, warm_up=False)
+        refused = is_refused(lambda: localizer(unseen().frame))
+        require(self._who, (refused, "needs a start, but does without one, expected an InputError"))
 
     def _first(self) -> Localization:
         """Return the answer for an image of the map's scene, found once per test class."""
         scene, view = textured_map(surface=True), unseen()
-        return once(self, lambda: self._localized(scene, view.frame, view.T_ref_camera))
+        return once(self, lambda: self._localize(scene, view.frame, view.T_ref_camera))
 
-    def _localized(self, scene: MapWithLandmarks, frame: Frame, truth: SE3) -> Localization:
+    def _localize(self, scene: MapWithLandmarks, frame: Frame, truth: SE3) -> Localization:
         # A tangent vector (metres, radians) from the true pose to the start of methods that need one.
         off = torch.tensor((0.02, -0.015, 0.02, 0.01, -0.008, 0.012), dtype=torch.float64)
         near = truth.to("cpu", torch.float64).retract(off)
@@ -180,7 +178,7 @@ class FeaturesContract(Named):
 
     def test_keypoints_are_well_formed(self) -> None:
         for number, image in enumerate(_images()):
-            found = self._found(image)
+            found = self._detect(image)
             pixels, sizes, descriptors = found.pixels, found.sizes, found.descriptors
             count, (height, width) = len(pixels), image.shape[:2]
             shapes = tuple(pixels.shape), tuple(sizes.shape), tuple(descriptors.shape[:1])
@@ -207,7 +205,7 @@ class FeaturesContract(Named):
             )
 
     def test_descriptors_have_one_length(self) -> None:
-        lengths = {self._found(image).descriptors.shape[1] for image in (*_images(), _blank())}
+        lengths = {self._detect(image).descriptors.shape[1] for image in (*_images(), _blank())}
         require(
             self._who,
             (
@@ -219,11 +217,11 @@ class FeaturesContract(Named):
 
     def test_same_image_gives_the_same_keypoints(self) -> None:
         image = _images()[0]
-        expected = self._found(image)
+        expected = self._detect(image)
         with ThreadPoolExecutor(4) as pool:
             same = [
                 torch.equal(found.pixels, expected.pixels) and torch.equal(found.descriptors, expected.descriptors)
-                for found in pool.map(self._found, [image] * 8)
+                for found in pool.map(self._detect, [image] * 8)
             ]
         require(
             self._who,
@@ -231,12 +229,12 @@ class FeaturesContract(Named):
         )
 
     def test_blank_image_has_no_keypoints(self) -> None:
-        count = len(self._found(_blank()).pixels)
+        count = len(self._detect(_blank()).pixels)
         require(self._who, (count == 0, f"{count} keypoints in an image of one colour, expected none"))
 
     def test_keypoints_move_with_the_image(self) -> None:
         image = _images()[0]
-        first, second = self._found(image[:-SHIFT, :-SHIFT]), self._found(image[SHIFT:, SHIFT:])
+        first, second = self._detect(image[:-SHIFT, :-SHIFT]), self._detect(image[SHIFT:, SHIFT:])
         require(self._who, (len(second.pixels) > 0, "no keypoint in a shifted image"))
         moved = first.pixels - SHIFT
         height, width = image.shape[0] - SHIFT, image.shape[1] - SHIFT
@@ -254,7 +252,7 @@ class FeaturesContract(Named):
             ),
         )
 
-    def _found(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
+    def _detect(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
         with calling(self._who):
             return self._part(find_features)(rgb)
 
@@ -292,7 +290,7 @@ class FaultContract(Named):
     def test_other_sizes_change_something(self) -> None:
         frame = _frame()
         for size in self._fault.sizes:
-            found = self._changed(frame, size)
+            found = self._change(frame, size)
             changed = (
                 not _same(found, frame)
                 or found.intrinsics != frame.intrinsics
@@ -304,12 +302,12 @@ class FaultContract(Named):
     def test_same_seed_gives_the_same_image(self) -> None:
         expected = "expected all randomness to come from the generator"
         for size in self._fault.sizes:
-            same = _same(*(self._changed(_frame(), size) for _ in range(2)))
+            same = _same(*(self._change(_frame(), size) for _ in range(2)))
             require(self._who, (same, f"two calls with one seed differ, {expected}"))
 
     def test_image_stays_an_image(self) -> None:
         for size in self._fault.sizes:
-            found = self._changed(_frame(), size)
+            found = self._change(_frame(), size)
             shape, rgb, depth = (found.intrinsics.height, found.intrinsics.width), found.rgb, found.depth
             require(
                 f"{self._who} of size {size:g}",
@@ -332,24 +330,19 @@ class FaultContract(Named):
     def test_given_image_is_left_alone(self) -> None:
         frame = _frame()
         for size in self._fault.sizes:
-            self._changed(frame, size)
+            self._change(frame, size)
         require(self._who, (_same(frame, _frame()), "writes into the given image, expected a new one"))
 
     def test_fault_of_depth_needs_depth(self) -> None:
-        fault = self._fault
-        if not fault.needs_depth:
-            return
-        try:
-            fault.change(_frame().replace(depth=None), fault.sizes[0], _generator())
-        except InputError:
-            return
-        require(self._who, (False, "changes depth, but accepts an image without it, expected an InputError"))
+        fault, bare = self._fault, _frame().replace(depth=None)
+        refused = not fault.needs_depth or is_refused(lambda: fault.change(bare, fault.sizes[0], _generator()))
+        require(self._who, (refused, "changes depth, but accepts an image without it, expected an InputError"))
 
     @property
     def _fault(self) -> Fault:
         return self._part(FAULTS.load)
 
-    def _changed(self, frame: Frame, size: float) -> Frame:
+    def _change(self, frame: Frame, size: float) -> Frame:
         with calling(f"{self._who} of size {size:g}"):
             return self._fault.change(frame, size, _generator())
 

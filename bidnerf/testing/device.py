@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from typing import Any, cast
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -85,7 +86,7 @@ class DeviceFault(AssertionError):
 class _There(torch.Tensor):
     """A tensor that reports ``DEVICE`` as its device and keeps its values in a tensor on the CPU."""
 
-    held: Tensor
+    host_values: Tensor
 
     @staticmethod
     def __new__(cls, values: Tensor) -> _There:
@@ -98,7 +99,7 @@ class _There(torch.Tensor):
             layout=values.layout,
             device=DEVICE,
         )
-        made.held = values
+        made.host_values = values
         return made
 
     def __init__(self, values: Tensor) -> None:
@@ -112,9 +113,6 @@ class _There(torch.Tensor):
 
     def new_tensor(self, data: Any, *args: Any, **options: Any) -> Tensor:
         return torch.tensor(data, dtype=options.pop("dtype", self.dtype), **options).to(DEVICE)
-
-    def __repr__(self) -> str:  # type: ignore[override]
-        return f"elsewhere({self.held!r})"
 
     @classmethod
     def __torch_dispatch__(  # type: ignore[override]
@@ -136,17 +134,15 @@ class Elsewhere(TorchDispatchMode):
 
     def __enter__(self) -> Any:
         devices.forget()
-        self._generator = torch.Generator
-        torch.Generator = _generator_of(torch.Generator)  # type: ignore[misc]
-        self._check = _adam._device_dtype_check_for_fused
-        _adam._device_dtype_check_for_fused = lambda *_, **__: None
+        self._patches = contextlib.ExitStack()
+        self._patches.callback(devices.forget)
+        self._patches.enter_context(patch.object(torch, "Generator", _generator_of(torch.Generator)))
+        self._patches.enter_context(patch.object(_adam, "_device_dtype_check_for_fused"))
         return super().__enter__()
 
     def __exit__(self, *exception: Any) -> None:
         super().__exit__(*exception)
-        torch.Generator = self._generator  # type: ignore[misc]
-        _adam._device_dtype_check_for_fused = self._check
-        devices.forget()
+        self._patches.close()
 
     @contextmanager
     def strict(self) -> Iterator[None]:
@@ -169,7 +165,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any], mode: Elsewhere | None) -
         raise DeviceFault("a tensor was made of the host's numbers on the device, as torch.tensor(..., device=...)")
     if not there and wanted != DEVICE.type:
         return func(*args, **kwargs)
-    name, is_returned, places = _signature(func)
+    name, is_returned, outputs = _signature(func)
     if mode is not None and (fault := _waiting(name, args, flat, there, wanted)) is not None:
         if mode._strict:
             raise DeviceFault(fault)
@@ -182,11 +178,13 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any], mode: Elsewhere | None) -
         raise DeviceFault(f"{name} mixes devices: a tensor of shape {shapes} is on the CPU")
     if wanted == DEVICE.type or func is _aten._to_copy.default:
         kwargs = kwargs | {"device": torch.device("cpu")}
-    found = func(*[_each(_held, part) for part in args], **{key: _each(_held, part) for key, part in kwargs.items()})
+    found = func(
+        *[_each(_values_of, part) for part in args], **{key: _each(_values_of, part) for key, part in kwargs.items()}
+    )
     if wanted == "cpu":
         return found.clone() if isinstance(found, Tensor) else found
     # A result that is written in place is the argument itself.
-    written = [args[place] if place < len(args) else kwargs.get(key) for place, key in places]
+    written = [args[index] if index < len(args) else kwargs.get(key) for index, key in outputs]
     if written and is_returned:
         return written[0] if len(func._schema.returns) == 1 else tuple(written)
     return _each(lambda part: _There(part) if type(part) is Tensor else part, found)
@@ -196,23 +194,17 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any], mode: Elsewhere | None) -
 def _signature(func: Any) -> tuple[str, bool, list[tuple[int, str]]]:
     """Return the name of an operation, whether it returns anything, and the positions and names of the arguments it writes."""
     schema = func._schema
-    places = [
-        (place, argument.name)
-        for place, argument in enumerate(schema.arguments)
+    outputs = [
+        (index, argument.name)
+        for index, argument in enumerate(schema.arguments)
         if argument.alias_info is not None and argument.alias_info.is_write
     ]
-    return schema.name.removeprefix("aten::"), bool(schema.returns), places
+    return schema.name.removeprefix("aten::"), bool(schema.returns), outputs
 
 
 def _leaves(parts: Iterable[Any]) -> list[Any]:
     """Return an operation's arguments with lists, which are never nested, flattened; far faster than PyTorch's ``tree_leaves``."""
-    found = list[Any]()
-    for part in parts:
-        if isinstance(part, list | tuple):
-            found.extend(part)
-        else:
-            found.append(part)
-    return found
+    return [leaf for part in parts for leaf in (part if isinstance(part, list | tuple) else (part,))]
 
 
 def _each(change: Callable[[Any], Any], part: Any) -> Any:
@@ -220,8 +212,8 @@ def _each(change: Callable[[Any], Any], part: Any) -> Any:
     return type(part)([change(each) for each in part]) if isinstance(part, list | tuple) else change(part)
 
 
-def _held(part: Any) -> Any:
-    return part.held if isinstance(part, _There) else part
+def _values_of(part: Any) -> Any:
+    return part.host_values if isinstance(part, _There) else part
 
 
 def _on_cpu(parts: Iterable[Any]) -> list[Tensor]:
@@ -291,15 +283,10 @@ def check_steps(field: RadianceField) -> None:
                 step = "a step of Levenberg-Marquardt"
                 _second_order(problem, number, mode)
             except DeviceFault as fault:
-                expected_place = "expected all of it on the field's device, in shapes that are known"
-                raise AssertionError(f"{who}: {step}: {fault}; {expected_place}") from fault
-        require(
-            who,
-            (
-                close(found, expected, 1e-3),
-                "steps on another device lead to a different pose than on the CPU; is some state not moved?",
-            ),
-        )
+                reason = f"{fault}; expected all of it on the field's device, in shapes that are known"
+                raise AssertionError(f"{who}: {step}: {reason}") from fault
+        other = "steps on another device lead to a different pose than on the CPU; is some state not moved?"
+        require(who, (close(found, expected, 1e-3), other))
 
 
 def _problem(field: RadianceField) -> Problem:

@@ -9,6 +9,7 @@ from typing import ClassVar, TypeVar
 import torch
 from torch import Generator, Tensor
 
+from bidnerf_core.errors import InputError
 from bidnerf_core.fields import FieldValues, RadianceField, Rays, RaySamples
 
 T = TypeVar("T")
@@ -56,6 +57,15 @@ def are_colours(rgb: Tensor) -> bool:
 def is_depth(depth: Tensor | None) -> bool:
     """Return whether a depth image, if there is one, is finite and not negative."""
     return depth is None or bool(depth.isfinite().all() and (depth >= 0).all())
+
+
+def is_refused(call: Callable[[], object]) -> bool:
+    """Return whether a call raises ``InputError``."""
+    try:
+        call()
+    except InputError:
+        return True
+    return False
 
 
 def once(subject: object, make: Callable[[], T]) -> T:

@@ -15,10 +15,10 @@ from bidnerf.testing.scene import (
     awkward_points,
     awkward_rays,
     camera_rays,
-    joined,
-    picked,
+    join_rays,
     points,
     rgbd_views,
+    select_rays,
 )
 from bidnerf_core.fields import (
     DifferentiatedField,
@@ -40,11 +40,11 @@ from bidnerf_core.fields import (
 def check_shapes(field: RadianceField) -> None:
     """Check that points may have any leading axes, including empty ones, and that values do not depend on this arrangement."""
     positions, directions = points(7)
-    flat = stacked(query(field, positions, directions, "7 points"))
+    flat = to_channels(query(field, positions, directions, "7 points"))
     for shape in ((), (7,), (1,), (2, 3), (2, 1, 3), (0,), (2, 0), (0, 3)):
         count = torch.Size(shape).numel()
         places, towards = (x[:count].reshape(*shape, 3) for x in (positions, directions))
-        values = stacked(query(field, places, towards, f"points arranged as {shape}"))
+        values = to_channels(query(field, places, towards, f"points arranged as {shape}"))
         require(
             f"{type(field).__name__}.query",
             (
@@ -97,10 +97,10 @@ def check_precision(field: RadianceField, doubled: RadianceField) -> None:
 def check_threads(field: RadianceField) -> None:
     """Check that concurrent queries return the same values as a single one."""
     parts = [points(200 + 31 * i, seed=i) for i in range(4)] * 8
-    alone = [stacked(query(field, *part, "points")) for part in parts[:4]] * 8
+    alone = [to_channels(query(field, *part, "points")) for part in parts[:4]] * 8
     with ThreadPoolExecutor(4) as pool:
         of = "points, by several threads at once"
-        answers = pool.map(lambda part: stacked(query(field, part[0], part[1], of)), parts)
+        answers = pool.map(lambda part: to_channels(query(field, part[0], part[1], of)), parts)
         require(
             f"{type(field).__name__}.query",
             (
@@ -110,7 +110,7 @@ def check_threads(field: RadianceField) -> None:
         )
 
 
-def stacked(values: FieldValues) -> Tensor:
+def to_channels(values: FieldValues) -> Tensor:
     """Return density and colour as four channels (*p 4)."""
     return torch.cat([values.density[..., None], values.rgb], dim=-1).detach()
 
@@ -285,12 +285,12 @@ def _arrangements() -> Iterator[Rays]:
     """Yield batches of rays with various shapes, some of them without any rays."""
     for shape in ((), (1,), (2, 3), (0,), (2, 0)):
         index = torch.arange(torch.Size(shape).numel()).reshape(shape)
-        yield picked(awkward_rays()["rays from outside"], index)
+        yield select_rays(awkward_rays()["rays from outside"], index)
 
 
 def check_repeatable(field: RadianceField) -> None:
     """Check that samples are reproducible without jitter and, with jitter, for equal seeds of the given generator."""
-    rays = joined(list(awkward_rays().values()))
+    rays = join_rays(list(awkward_rays().values()))
     with torch.random.fork_rng(devices=[]):
         twice = [sample(field, rays, "rays") for _ in range(2)]
         jittered = [sample(field, rays, "rays with jitter", _generator()) for _ in range(2)]
@@ -310,12 +310,14 @@ def check_repeatable(field: RadianceField) -> None:
 
 def check_rays_alone(field: RadianceField) -> None:
     """Check that the rendering of a ray depends neither on the other rays nor on their arrangement."""
-    rays = joined(list(awkward_rays().values()))
+    rays = join_rays(list(awkward_rays().values()))
     count = len(rays.near) // 4 * 4
-    whole = seen(field, picked(rays, torch.arange(count)), "rays")
+    whole = render_channels(field, select_rays(rays, torch.arange(count)), "rays")
     order = torch.randperm(count, generator=_generator())
-    permuted = seen(field, picked(rays, order.reshape(4, -1)), "rays in another order").reshape(-1, 5)
-    alone = torch.cat([seen(field, picked(rays, torch.arange(i, i + 1)), "a ray") for i in range(0, count, 7)])
+    permuted = render_channels(field, select_rays(rays, order.reshape(4, -1)), "rays in another order").reshape(-1, 5)
+    alone = torch.cat(
+        [render_channels(field, select_rays(rays, torch.arange(i, i + 1)), "a ray") for i in range(0, count, 7)]
+    )
     expected = "expected each ray to be sampled for itself"
     require(
         f"{type(field).__name__} rendered",
@@ -329,7 +331,7 @@ def check_rays_alone(field: RadianceField) -> None:
 
 def check_background(field: RadianceField) -> None:
     """Check that a ray that misses the scene sees only the background."""
-    found = seen(field, awkward_rays()["rays that miss the scene"], "rays that miss the scene")
+    found = render_channels(field, awkward_rays()["rays that miss the scene"], "rays that miss the scene")
     require(
         f"{type(field).__name__} rendered",
         (
@@ -346,11 +348,11 @@ def check_levels(field: RadianceField) -> None:
     for number, level in enumerate(offered):
         is_field = isinstance(level, RadianceField)
         require(type(field).__name__, (is_field, f"levels[{number}] is a {type(level).__name__}, {expected}"))
-    rays = joined(list(awkward_rays().values()))
+    rays = join_rays(list(awkward_rays().values()))
     require(
         f"{type(field).__name__}.levels",
         (
-            close(seen(offered[-1], rays, "rays"), seen(field, rays, "rays"), 1e-3),
+            close(render_channels(offered[-1], rays, "rays"), render_channels(field, rays, "rays"), 1e-3),
             "the last one renders otherwise than the field itself; expected the coarsest first and the field itself last",
         ),
     )
@@ -410,7 +412,7 @@ def check_hits(field: RadianceField) -> None:
     )
 
 
-def seen(field: RadianceField, rays: Rays, of: str) -> Tensor:
+def render_channels(field: RadianceField, rays: Rays, of: str) -> Tensor:
     """Return rendered colour, distance and opacity as five channels (*r 5)."""
     with calling(f"render of {of} by {type(field).__name__}"), torch.no_grad():
         rendering = render(field, rays, BACKGROUND)

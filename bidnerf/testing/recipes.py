@@ -42,14 +42,14 @@ class Recorder:
         return step in self._due
 
     def save(self, state: TrainingState) -> None:
-        self.saved.append(TrainingState(state.step, stored(state.field), stored(state.optimizer)))
+        self.saved.append(TrainingState(state.step, round_trip(state.field), round_trip(state.optimizer)))
 
     @property
     def stopping(self) -> bool:
         return self._stop is not None and len(self.steps) >= self._stop
 
 
-def stored(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+def round_trip(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return the tensors after a round trip through the safetensors format."""
     with calling("writing the tensors of a state to safetensors"):
         packed = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
@@ -65,7 +65,7 @@ class Training(NamedTuple):
     report: Recorder
 
 
-def copied(field: Any) -> dict[str, Tensor]:
+def copy_state(field: Any) -> dict[str, Tensor]:
     """Return a copy of a field's state, or an empty one if the field is not a module; another test reports this."""
     state = field.state_dict() if isinstance(field, nn.Module) else {}
     return {name: value.detach().clone() for name, value in state.items()}
@@ -106,7 +106,7 @@ def check_exposure(backend: Backend, config: Any) -> None:
         _train(backend, fields[-1], views, config, Recorder(), "on RGB views of different exposure")
     found = []
     for number, view in enumerate(exposed_views(0.0)):
-        bright, dark = (rendered(field, view, DIMMED_BOUNDS) for field in fields)
+        bright, dark = (render_view(field, view, DIMMED_BOUNDS) for field in fields)
         ratio = (bright * dark).sum() / dark.square().sum().clamp(min=1e-12)
         found.append((-1) ** number * math.log(max(float(ratio), 1e-6)) / (2 * EXPOSURE))
     share = sum(found) / len(found)
@@ -187,12 +187,12 @@ def check_resuming(backend: Backend, make: Callable[[], Any], config: Any, whole
 
 def colour_error(field: RadianceField) -> float:
     """Return the mean squared colour error over all pixels of the training views."""
-    found = [rendered(field, view, SCENE_BOUNDS) for view in rgbd_views()]
+    found = [render_view(field, view, SCENE_BOUNDS) for view in rgbd_views()]
     seen = torch.cat([view.frame.rgb.reshape(-1, 3) for view in rgbd_views()])
     return float((torch.cat(found) - seen).square().mean())
 
 
-def rendered(field: RadianceField, view: View, bounds: SceneBounds) -> Float[Tensor, "r 3"]:
+def render_view(field: RadianceField, view: View, bounds: SceneBounds) -> Float[Tensor, "r 3"]:
     """Return the field's colours at all pixels of a view."""
     with torch.no_grad(), calling(f"render by {type(field).__name__}"):
         return render(field, camera_rays(view.T_ref_camera.to(torch.float32)), bounds.background).rgb

@@ -94,11 +94,11 @@ def awkward_rays() -> dict[str, Rays]:
     }
 
 
-def picked(rays: Rays, index: Tensor) -> Rays:
+def select_rays(rays: Rays, index: Tensor) -> Rays:
     """Return the rays at the indices ``index``, arranged in the shape of ``index``."""
     return Rays(rays.origins[index], rays.directions[index], rays.near[index], rays.far[index])
 
 
-def joined(parts: list[Rays]) -> Rays:
+def join_rays(parts: list[Rays]) -> Rays:
     names = ("origins", "directions", "near", "far")
     return Rays(*(torch.cat([getattr(part, name) for part in parts]) for name in names))

@@ -42,15 +42,15 @@ def read_sequence(options: DatasetOptions, path: str | Path, readers: Sequence[R
     from bidnerf_core.datasets.formats.photos import reader as photos
     from bidnerf_core.datasets.formats.photos import video_reader as video
 
-    place = Path(path)
-    if not place.exists():
-        raise InputError("no such file or folder", where=place)
-    reader = _reader_of(place, readers) or next((r for r in (photos, video) if r.recognises(place)), None)
-    if reader is None and place.is_dir():
-        raise InputError("no images in it", where=place, expected="image files or a dataset")
+    path = Path(path)
+    if not path.exists():
+        raise InputError("no such file or folder", where=path)
+    reader = _reader_of(path, readers) or next((r for r in (photos, video) if r.recognises(path)), None)
+    if reader is None and path.is_dir():
+        raise InputError("no images in it", where=path, expected="image files or a dataset")
     if reader is None:
-        raise no_dataset(place, or_else=f", or {video.expected}")
-    return _read(options, reader, place).in_time_order()
+        raise no_dataset(path, or_else=f", or {video.expected}")
+    return _read(options, reader, path).in_time_order()
 
 
 def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
@@ -76,7 +76,7 @@ def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
         if is_given and option not in reader.accepts:
             raise InputError(problem, where=path)
     try:
-        found: Any = reader.read(path, options)
+        capture: Any = reader.read(path, options)
     except (InputError, OSError, MemoryError):
         raise
     except Exception as error:
@@ -84,10 +84,10 @@ def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
             raise
         who = f"reader {type(reader).__name__} failed to open it"
         raise InputError(f"{who}: {type(error).__name__}: {error}", where=path) from error
-    if not isinstance(found, Capture):
-        who = f"reader {type(reader).__name__} returned a {type(found).__name__}"
+    if not isinstance(capture, Capture):
+        who = f"reader {type(reader).__name__} returned a {type(capture).__name__}"
         raise InputError(who, where=path, expected="a Capture")
-    shots = drop_missing_files(found)
+    shots = drop_missing_files(capture)
     farthest = 1e10  # even in millimetres from the centre of the Earth, its surface is at 6.4e9
     for shot in shots:
         pose = shot.T_world_camera
@@ -95,18 +95,18 @@ def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
             position = ", ".join(f"{x:.3g}" for x in pose.translation.tolist())
             raise InputError(
                 f"{shot.name} is at {position}",
-                where=found.pose_file or path,
+                where=capture.pose_file or path,
                 expected=f"coordinates below {farthest:g}",
             )
-    if not found.splits:
-        shots = hold_out(shots, rate=found.rate)
+    if not capture.splits:
+        shots = hold_out(shots, rate=capture.rate)
         posed = [bool(shot.splits) for shot in shots if shot.T_world_camera is not None]
         if not all(posed):
-            rate = f"{found.rate:g} per second; the sequence has all"
+            rate = f"{capture.rate:g} per second; the sequence has all"
             warn_about(path, f"the dataset has {sum(posed)} of {amount(len(posed), 'frame')}, {rate}")
     faces = [replace(face, name="") for shot in shots for face in shot.faces()]
-    found = replace(found, shots=faces, largest=options.largest)
-    return found if (masks := options.mask_folder) is None else found.with_masks(masks)
+    capture = replace(capture, shots=faces, largest=options.largest)
+    return capture if (masks := options.mask_folder) is None else capture.with_masks(masks)
 
 
 def open_dataset(

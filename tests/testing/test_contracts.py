@@ -1,4 +1,4 @@
-"""The bundled readers, methods, detectors and faults fulfil the contracts, and the contracts refuse what breaks them."""
+"""Bundled methods, detectors and faults fulfil the contracts, and the contracts refuse what breaks them."""
 
 from __future__ import annotations
 
@@ -62,14 +62,6 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture")
     write_transforms(folder, {"train": list(training_views())}, BOUNDS.background)
     return folder
-
-
-class TestTransforms(ReaderContract):
-    name = "transforms"
-
-    @pytest.fixture(autouse=True)
-    def _folder(self, capture: Path) -> None:
-        type(self).folder = capture
 
 
 def test_plugins_are_a_mapping() -> None:

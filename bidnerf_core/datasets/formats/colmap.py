@@ -69,7 +69,7 @@ IMAGES = (
 def _read(path: Path, models: list[Path], options: DatasetOptions) -> Capture:
     """Read the project. Raises ``InputError`` if its model is damaged or has no registered image."""
     model, folder, images, cameras, files = colmap_project(path)
-    if options.masks is None and any((place / "masks").is_dir() for place in (path, folder.parent)):
+    if options.masks is None and any((each / "masks").is_dir() for each in (path, folder.parent)):
         text = "masks lies beside the images and is not used; name it (--masks, masks= in Python) to use it"
         warn_about(path, text)
     if folder != path:
@@ -108,7 +108,7 @@ def colmap_project(path: Path) -> tuple[Path, Path, list[ModelImage], dict[int, 
 
 def colmap_models(path: Path) -> list[Path]:
     """Return the models at the first location that contains any."""
-    return next((models for place in MODELS if (models := _models_at(path / place))), [])
+    return next((models for name in MODELS if (models := _models_at(path / name))), [])
 
 
 def _models_at(folder: Path) -> list[Path]:
@@ -117,9 +117,9 @@ def _models_at(folder: Path) -> list[Path]:
     A model without its ``images`` file is reported as damaged, rather than taken for photos that still need poses.
     """
     inside = [child for child in folder.glob("*") if child.name.isdecimal()]
-    places = [folder, *sorted(inside, key=lambda child: natural_order(child.name))]
-    complete = [place for place in places if files_of(place, "cameras", "images")]
-    return complete or [place for place in places if files_of(place, "cameras", "points3D")][:1]
+    folders = [folder, *sorted(inside, key=lambda child: natural_order(child.name))]
+    complete = [each for each in folders if files_of(each, "cameras", "images")]
+    return complete or [each for each in folders if files_of(each, "cameras", "points3D")][:1]
 
 
 def _largest(path: Path, models: Sequence[Path]) -> tuple[Path, list[ModelImage], dict[int, Camera]]:
@@ -138,12 +138,11 @@ def _largest(path: Path, models: Sequence[Path]) -> tuple[Path, list[ModelImage]
 def _image_folder(path: Path, model: Path, images: Sequence[ModelImage]) -> tuple[Path, dict[str, Path]]:
     """Return the folder that holds most of the images, and the image files by their names in the model."""
     beside = [model.parent / "images", model.parent.parent / "images"]
-    places = list(dict.fromkeys([*beside, *(path / place for place in IMAGES)]))
+    folders = list(dict.fromkeys([*beside, *(path / name for name in IMAGES)]))
     best: tuple[Path, dict[str, Path]] = (path / IMAGES[0], {})
-    for folder in filter(Path.is_dir, places):
+    for folder in filter(Path.is_dir, folders):
         names = FileNames(folder)
-        found = {image.name: names.find(posix_name(image.name)) for image in images}
-        files = {name: file for name, file in found.items() if file is not None}
+        files = {image.name: file for image in images if (file := names.find(posix_name(image.name))) is not None}
         if len(files) > len(best[1]):
             best = folder, files
         if len(files) == len(images):

@@ -38,7 +38,7 @@ class PhotoShot(Shot):
     def frame(self, background: Colour = BLACK, side: int | None = None) -> Frame:
         """Read the photo as ``Frame.read`` does."""
         source = self.camera if isinstance(self.camera, CameraSource) else CameraSource(self.camera)
-        found = Frame.read(
+        frame = Frame.read(
             self.image,
             source,
             depth=self.depth_image,
@@ -47,7 +47,7 @@ class PhotoShot(Shot):
             background=None if self.awaits_background else background,
             largest=side,
         )
-        return found.replace(name=self.name)
+        return frame.replace(name=self.name)
 
 
 def _read(path: Path, photos: list[Path], options: DatasetOptions) -> Capture:
@@ -77,7 +77,7 @@ def timestamp(stem: str) -> float | None:
     return float(stem) if re.fullmatch(r"\d+\.\d+", stem) else None
 
 
-def _read_video(path: Path, found: bool, options: DatasetOptions) -> Capture:
+def _read_video(path: Path, is_video: bool, options: DatasetOptions) -> Capture:
     """List the frames of a video. Raises ``InputError`` if the file is not a video, and if there is no camera."""
     source, video = options.camera_source, Video(path)
     source.require(path, "a video does not record its focal length")

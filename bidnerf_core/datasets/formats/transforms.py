@@ -41,7 +41,7 @@ from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import background_colour, is_file, read_header
 
 
-def _read(path: Path, found: list[Path], options: DatasetOptions) -> Capture:
+def _read(path: Path, files: list[Path], options: DatasetOptions) -> Capture:
     """Read the frames and find their files. Raises ``InputError`` if a file is invalid."""
     listed, names = read_splits(path), FileNames(path)
     images = [names.path(frame.file_path, IMAGE_ENDINGS, moved=True) for frame, _ in listed]

@@ -62,10 +62,10 @@ def _read(path: Path, colour_list: Path, options: DatasetOptions) -> Capture:
     trajectory = read_trajectory(truth, times) if truth.is_file() else None
     given: Camera | Path | None = options.given_camera
     if isinstance(given, Path) and not given.exists():
-        given = _published(str(given), whole=True) or given
+        given = _published_camera(str(given), whole=True) or given
     sensors = "freiburg1, freiburg2 and freiburg3"
     unknown, ways = f"its name contains none of {sensors}", f"one of {sensors}, or a file"
-    camera = folder_camera(path, given, _published(path.resolve().name), unknown, ways)
+    camera = folder_camera(path, given, _published_camera(path.resolve().name), unknown, ways)
     sensor, unit = options.sensor(path), options.depth_unit or 1 / 5000
     depth_list, read_depth = path / "depth.txt", DepthReader(documented=("65535",))
     images = [_file(row, names) for row in colours]
@@ -76,7 +76,7 @@ def _read(path: Path, colour_list: Path, options: DatasetOptions) -> Capture:
     # Only existing files are associated: an image whose nearest depth image is missing may belong to the next one.
     there = [index for index, image in enumerate(images) if is_file(image)]
     partners = associate([times[index] for index in there], [time for time, _ in depths], 0.02)  # as in the benchmark
-    depth_of = {there[place]: depths[other][1] for place, other in partners.items()}
+    depth_of = {there[index]: depths[other][1] for index, other in partners.items()}
     shots = list[Shot]()
     for index, (time, image) in enumerate(zip(times, images, strict=True)):
         depth = depth_of.get(index)
@@ -106,11 +106,11 @@ def _find(path: Path) -> Path | None:
     return first_file(path, "rgb.txt")
 
 
-def _published(name: str, whole: bool = False) -> Intrinsics | None:
+def _published_camera(name: str, whole: bool = False) -> Intrinsics | None:
     """Return the benchmark's calibration of the sensor that ``name`` contains (or is, with ``whole``), or None."""
     sensor = re.compile(r"(?:freiburg|fr)_?([123])(?!\d)", re.IGNORECASE)
-    found = sensor.fullmatch(name) if whole else sensor.search(name)
-    return CAMERAS[found[1]] if found else None
+    match = sensor.fullmatch(name) if whole else sensor.search(name)
+    return CAMERAS[match[1]] if match else None
 
 
 def _file(row: TimedRow, names: FileNames) -> Path:
@@ -130,7 +130,7 @@ def associate(times: Sequence[float], others: Sequence[float], largest: float) -
     forth = np.searchsorted((theirs[1:] + theirs[:-1]) / 2, ours)
     back = np.searchsorted((ours[1:] + ours[:-1]) / 2, theirs)
     is_pair = (back[forth] == np.arange(len(ours))) & (np.abs(ours - theirs[forth]) <= largest)
-    return {int(place): int(forth[place]) for place in np.flatnonzero(is_pair)}
+    return {int(index): int(forth[index]) for index in np.flatnonzero(is_pair)}
 
 
 reader = Format(
