@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import bidnerf as bn
 from bidnerf.results import PosedImage, normalized_error_squared
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera import CameraBatch, Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import Localization, Outcome
@@ -96,6 +96,16 @@ def test_opencv_projects_to_the_same_pixels() -> None:
     )
     ours = CAMERA.project(T_camera_world.apply(points))
     np.testing.assert_allclose(pixels[:, 0] + 0.5, ours.numpy(), atol=1e-6)
+
+
+@pytest.mark.parametrize("coefficients", [4, 5, 8, 12, 14])
+def test_one_camera_is_undistorted_as_a_batch_is(coefficients: int) -> None:
+    """OpenCV undistorts the pixels of one camera, kornia those of a batch of cameras."""
+    lens = (0.1, -0.05, 0.001, 0.002, 0.01, 0.02, 0.01, 0.001, 0.001, 0.002, 0.001, 0.002, 0.02, 0.01)[:coefficients]
+    camera = Intrinsics(400.0, 410.0, 321.5, 238.0, 640, 480, lens)
+    pixels = torch.rand(500, 2, generator=GENERATOR, dtype=torch.float64) * torch.tensor([640.0, 480.0])
+    batch = CameraBatch.of([camera]).unproject(pixels, torch.zeros(500, dtype=torch.long))
+    torch.testing.assert_close(camera.unproject(pixels), batch, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("lens", [(), (0.05, -0.02, 0.003, 0.004), (0.05, -0.02, 0.003, 0.004, 0.01)])

@@ -15,6 +15,7 @@ from bidnerf import SE3, Frame, InputError, Intrinsics, View
 from bidnerf_core.mapping import (
     SIFT,
     CachedFeatures,
+    InvertedFile,
     Keypoints,
     Sift,
     byte_of_zero,
@@ -24,6 +25,7 @@ from bidnerf_core.mapping import (
     nearest_centre,
     paired_squared_distances,
     quantize,
+    smallest,
     squared_distances,
     track_views,
     unrelated_distance,
@@ -183,3 +185,21 @@ def test_bytes_reach_detectors_that_take_them_without_a_detour_through_floats(mo
         keypoints = image_keypoints(view, detector).keypoints
         assert len(keypoints) >= 20
         assert all(torch.equal(a, b) for a, b in zip(vars(keypoints).values(), vars(usual).values(), strict=True))
+
+
+def test_an_inverted_file_selects_once_from_all_cells(
+    generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    many = torch.randint(0, 256, (5000, 16), generator=generator, dtype=torch.uint8)
+    index, selections = InvertedFile(many, 0), list[int]()
+
+    def counted(distances: torch.Tensor, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+        selections.append(count)
+        return smallest(distances, count)
+
+    monkeypatch.setattr("bidnerf_core.mapping.landmarks.descriptors.smallest", counted)
+    distance, number = index.nearest(many[:200], 3)
+    assert selections == [12, 3]  # cells, then landmarks
+    assert torch.equal(number[:, 0], torch.arange(200))
+    assert torch.equal(squared_distances(many[:200], many).gather(1, number), distance)
+    assert bool((distance.diff(dim=1) >= 0).all())
