@@ -163,17 +163,11 @@ def test_python_blocks_run(page: Path, inside: Path) -> None:
         execute(page)
 
 
-def test_blocks_that_are_not_run_exist() -> None:
-    found = {(page.name, block.text.splitlines()[0]) for page in PAGES for block in blocks(page, "python")}
-    assert set(NOT_RUN) <= found
-
-
-def test_blocks_are_of_known_languages() -> None:
-    found = {page.name: {block.language for block in blocks(page)} - LANGUAGES for page in PAGES}
-    assert {name: unknown for name, unknown in found.items() if unknown} == {}
-    for page in PAGES:
-        for block in blocks(page, "toml"):
-            tomllib.loads(block.text)
+def test_blocks_are_of_known_languages_and_those_that_are_not_run_exist() -> None:
+    every = [(page.name, block) for page in PAGES for block in blocks(page)]
+    assert [(name, block.language) for name, block in every if block.language not in LANGUAGES] == []
+    assert set(NOT_RUN) <= {(name, block.text.splitlines()[0]) for name, block in every if block.language == "python"}
+    assert all(tomllib.loads(block.text) for _, block in every if block.language == "toml")
 
 
 @pytest.mark.slow
@@ -253,10 +247,16 @@ class TestFog(BackendContract):
 
 
 def test_readme_is_short() -> None:
-    lines = (ROOT / "README.md").read_text().splitlines()
-    assert len(lines) <= 120
-    program = blocks(ROOT / "README.md", "python")[0].text
-    assert len(program.splitlines()) <= 8
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 120
+    assert len(blocks(ROOT / "README.md", "python")[0].text.splitlines()) <= 8
+
+
+def test_the_modules_of_the_table_of_methods_exist() -> None:
+    section = (ROOT / "docs" / "methods.md").read_text().partition("{ #code }")[2].partition("\n## ")[0]
+    names = re.findall(r"`([a-z_/]+(?:\.py|/))`", section)
+    assert len(names) > 10
+    folders = (ROOT, ROOT / "bidnerf_core", ROOT / "bidnerf_core" / "localization")
+    assert [name for name in names if not any((folder / name).exists() for folder in folders)] == []
 
 
 @each([*PAGES, ROOT / "benchmarks" / "results" / "README.md"])

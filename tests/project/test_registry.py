@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -30,7 +29,7 @@ from bidnerf_core.registry import (
     load_plugin,
     register,
 )
-from commands import Run
+from commands import Run, quietly
 from refusals import refused
 
 FOG = '''"""A field of fog.
@@ -116,11 +115,12 @@ def listed(name: str, group: str = "backends") -> list[PluginInfo]:
     return [info for info in list_plugins(group) if info.name == name]
 
 
-def refusal(name: str, group: str = "backends") -> str:
+def refusal(name: str, caused: bool = False) -> str:
     with pytest.raises(PluginError) as caught:
-        load_backend(name) if group == "backends" else load_plugin(group, name)
+        load_backend(name)
     assert isinstance(caught.value, InputError)
     assert "\n" not in str(caught.value)
+    assert not caused or caught.value.__cause__ is not None
     return str(caught.value)
 
 
@@ -170,12 +170,8 @@ def test_listing_imports_nothing(site: Site) -> None:
         "print(json.dumps([infos, foreign]))"
     )
     path = os.pathsep.join([str(site.folder), *filter(None, [os.environ.get("PYTHONPATH")])])
-    environment = {**os.environ, "PYTHONPATH": path}
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    infos, foreign = json.loads(done.stdout)
-    assert infos == {"loud": "Made for a test", "hashgrid": None}
-    assert foreign == []
+    printed = quietly([sys.executable, "-c", program], env={**os.environ, "PYTHONPATH": path})
+    assert json.loads(printed) == [{"loud": "Made for a test", "hashgrid": None}, []]
 
 
 # Groups.
@@ -221,10 +217,7 @@ def test_bundled_plugins_are_registered_as_a_strangers_are_and_their_names_are_t
 
 def test_an_unknown_name_gets_the_nearest_and_the_installed(site: Site) -> None:
     site.backend()
-    message = refusal("hash-grid")
-    assert "'hash-grid'" in message
-    assert "did you mean 'hashgrid'?" in message
-    assert re.search(r"installed: .*\bfog, .*hashgrid", message)
+    assert re.search(r"'hash-grid'.*did you mean 'hashgrid'\?.*installed: .*\bfog, .*hashgrid", refusal("hash-grid"))
     assert "did you mean" not in refusal("zzz")
 
 
@@ -242,12 +235,10 @@ def test_an_unknown_name_gets_the_nearest_and_the_installed(site: Site) -> None:
 def test_a_module_that_does_not_import_is_told_with_its_cause(site: Site, source: str, causes: list[str]) -> None:
     site.backend(source, dist="stranger-broken", version="0.7")
     assert listed("fog")[0].fault is None  # its fault surfaces when it is asked for, and only then
-    message = refusal("fog")
-    for part in ["'fog'", "stranger_fog:backend", "stranger-broken 0.7", *causes]:
-        assert part in message
-    with pytest.raises(PluginError) as caught:
-        load_backend("fog")
-    assert caught.value.__cause__ is not None
+    message = refusal("fog", caused=True)
+    assert [
+        part for part in ("'fog'", "stranger_fog:backend", "stranger-broken 0.7", *causes) if part not in message
+    ] == []
 
 
 def test_ctrl_c_during_an_import_stays_an_interruption(site: Site) -> None:
@@ -305,9 +296,7 @@ def test_a_name_claimed_twice_is_nobodys(site: Site) -> None:
     site.backend(dist="stranger-two", version="4.0")
     assert [info.distribution for info in listed("fog")] == ["stranger-one", "stranger-two"]
     assert all("also claimed by" in (info.fault or "") for info in listed("fog"))
-    message = refusal("fog")
-    assert "stranger-one 1.0" in message
-    assert "stranger-two 4.0" in message
+    assert re.search(r"stranger-one 1\.0.*stranger-two 4\.0", refusal("fog"))
     assert "stranger_fog" not in sys.modules
 
 

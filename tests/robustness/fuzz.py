@@ -24,6 +24,7 @@ from hypothesis import strategies as st
 
 import tiny
 from bidnerf import SE3, Frame, Intrinsics, Localizer, Tracker, load_map, open_sequence
+from bidnerf_core.datasets import read_depth_points
 from bidnerf_core.localization import settings_of
 from damage import (
     NUMBERS,
@@ -150,13 +151,13 @@ TARGETS: list[tuple[str, Callable[[bytes], Damages], list[FolderDoor]]] = [
     ("camera.json", of_json, [[*PHOTO, "--camera", "{}/camera.json"], frame_door(camera="camera.json")]),
     ("cameras.txt", of_points, [[*PHOTO, "--camera", "{}/cameras.txt"], frame_door(camera="cameras.txt")]),
     ("pose.json", of_json, [KNOWN, [*KNOWN, "--json"]]),
-    ("points.txt", of_points, [[*KNOWN, "--depth-points", "{}/points.txt"]]),
-    ("points.npy", of_array, [[*KNOWN, "--depth-points", "{}/points.npy"]]),
-    ("points.npz", of_array, [[*KNOWN, "--depth-points", "{}/points.npz"]]),
+    ("points.txt", of_points, [lambda folder: read_depth_points(folder / "points.txt")]),
+    ("points.npy", of_array, [lambda folder: read_depth_points(folder / "points.npy")]),
+    ("points.npz", of_array, [lambda folder: read_depth_points(folder / "points.npz")]),
     (
         MODEL,
         of_colmap,
-        [COLMAP, lambda folder: read_all(folder / "colmap"), [*FRAME, "--depth-points", "{}/colmap/sparse/0"]],
+        [COLMAP, lambda folder: read_all(folder / "colmap"), [*TRAIN, "--depth-points", "{}/colmap/sparse/0"]],
     ),
     (STATE, of_tensors, [restore]),
     ("results.jsonl", of_json, [REPORT, [*SEARCH, "{}/results.jsonl"]]),
