@@ -8,7 +8,7 @@ text of the expression, not by its line; one that no longer applies is reported 
 one is drawn with a fixed seed: delete it to draw again.
 
 Tests run first on the sound code, which records which functions they enter and the CPU time. With a fault, the
-files that enter its function run until a test fails, for up to ``--seconds`` of CPU: first those whose text speaks most of
+files that enter its function run until a test fails, for up to ``--seconds`` of CPU: first those whose text names most of
 it, then all others, the slow tests last. A fault is caught if a test fails or hangs. What only other processes enter is not
 seen. Each run is a line of ``OUT.rows.jsonl``, from which the program goes on after an interruption, or with more seconds;
 OUT is the summary. Remove both when the tests or the code change.
@@ -285,7 +285,7 @@ class Measurement:
         return [(name, slow) for name in names if "robustness" not in name]
 
     def mentioning(self, fault: Fault) -> list[Unit]:
-        """Return the few files of tests that speak most of the fault's function or of what its file defines."""
+        """Return the few files of tests that name most often the fault's function or of what its file defines."""
         module = ast.parse((self.copy / fault.file).read_bytes())
         defined = {node.name for node in module.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
         words = {name for name in defined if not name.startswith("_")} | {*fault.function.split(".")}

@@ -15,12 +15,12 @@ from bidnerf_core.training import TrainingStep
 
 def stop_at(patch: pytest.MonkeyPatch, number: int) -> None:
     """Ctrl-C during that step of the next training."""
-    told = Checkpoints.step
+    original = Checkpoints.step
 
     def step(self: Checkpoints, now: TrainingStep) -> None:
         if now.step == number:
             signal.raise_signal(signal.SIGINT)
-        told(self, now)
+        original(self, now)
 
     patch.setattr(Checkpoints, "step", step)
 
