@@ -26,7 +26,7 @@ TRAINING_VIEWS, ANIMATED = 60, 14
 DESCENT = {"rays": 768, "max_steps": 150, "decay_steps": 60}  # faster than the defaults, for small images
 
 
-class Trial(NamedTuple):
+class DemoFrame(NamedTuple):
     """An unseen frame, a start far from its true pose, and the answers of two methods."""
 
     view: View
@@ -88,7 +88,7 @@ def run_demo(
             # The error of the start is in scene units (the object fills a 2x2x2 cube) and degrees.
             start = perturb(view.T_ref_camera, 0.55, 13.0, seed=seed + number)
             with console.status(f"localizing frame {number + 1}"):
-                trial = Trial(view, start, auto(view.frame, seed=seed), bid(view.frame, start, seed=seed))
+                trial = DemoFrame(view, start, auto(view.frame, seed=seed), bid(view.frame, start, seed=seed))
             trials.append(trial)
             begin = trial.errors(start)
             unit = symbol(begin.unit)
@@ -112,7 +112,7 @@ def run_demo(
         _draw(stored, trials, out)
 
 
-def _draw(stored: Map, trials: list[Trial], out: Path) -> None:
+def _draw(stored: Map, trials: list[DemoFrame], out: Path) -> None:
     import numpy as np
 
     from bidnerf.results import Painter, save_gif

@@ -6,16 +6,25 @@ import os
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 from urllib.parse import quote
 
-from bidnerf.cli.options import TEST_IMAGES, Device, Json, MethodOptions, Names, wrong_usage
+from bidnerf.cli.options import (
+    TEST_IMAGES,
+    Device,
+    Images,
+    Json,
+    Localization,
+    MethodOptions,
+    Names,
+    wrong_usage,
+)
 from bidnerf.cli.output import check_folder, console, print_json, require_outside_maps, say, show
-from bidnerf.cli.parser import Flag, Option, Without
+from bidnerf.cli.parser import Flag, Group, Option, Without
 from bidnerf.cli.running import displayed, working
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount
-from bidnerf_core.settings import WholeNumbers
+from bidnerf_core.settings import EXPERT, WholeNumbers
 
 if TYPE_CHECKING:
     from bidnerf.evaluation import Plan
@@ -69,6 +78,9 @@ class TrialOptions:
             )
 
 
+Starts: TypeAlias = Annotated[TrialOptions, Group("starts", "Which frames are tried, and from which starts.")]
+
+
 @dataclass(frozen=True)
 class InputOptions:
     """What the method receives."""
@@ -96,8 +108,8 @@ class WorkOptions:
         Option("N", "number of single-threaded processes", "one per core; one on a GPU"),
     ] = None
     dask: Annotated[str | None, Option("ADDRESS", "address of a dask scheduler whose workers run the trials")] = None
-    shards: Annotated[int, Option("N", "number of parts that the trials are split into")] = 1
-    shard: Annotated[int, Option("I", "the part to run, from 0")] = 0
+    shards: Annotated[int, EXPERT, Option("N", "number of parts that the trials are split into")] = 1
+    shard: Annotated[int, EXPERT, Option("I", "the part to run, from 0")] = 0
 
 
 def run_evaluate(
@@ -108,16 +120,16 @@ def run_evaluate(
         Option("[DATA]", "folder of a dataset, or demo:object, demo:room, demo:blobs", positional=True),
     ] = None,
     *,
-    starts: TrialOptions,
-    input: InputOptions,
-    work: WorkOptions,
-    images: Annotated[DatasetOptions, Without("largest", "background")] = TEST_IMAGES,
-    method: MethodOptions,
+    starts: Starts,
+    input: Annotated[InputOptions, Group("input", "What the method receives of each frame.")],
+    work: Annotated[WorkOptions, Group("work", "Where the trials are run.")],
+    images: Annotated[Images, Without("largest", "background")] = TEST_IMAGES,
+    method: Localization,
 ) -> None:
     """Localize many frames of a dataset, and write one JSON line a trial.
 
-    Trials begin at perturbed starts, or at none. Finished trials are always kept: the same command resumes where it stopped. 'bidnerf report' makes tables and figures from the
-    results.
+    Trials begin at perturbed starts, or at none. Finished trials are always kept: the same command resumes where it stopped.
+    'bidnerf report' makes tables and figures from the results.
     """
     from bidnerf.evaluation import evaluate
 
@@ -155,15 +167,16 @@ def run_compare(
         Option("SIZE", "error of the start: e_t, or METRES:DEGREES for perturb", "the protocol's first"),
     ] = None,
     *,
-    starts: Annotated[TrialOptions, Without("size")],
+    starts: Annotated[Starts, Without("size")],
     json: Json = False,
     overwrite: Annotated[Flag, Option(None, "replace the contents of --out")] = False,
-    images: Annotated[DatasetOptions, Without("largest", "background")] = TEST_IMAGES,
-    method: MethodOptions,
+    images: Annotated[Images, Without("largest", "background")] = TEST_IMAGES,
+    method: Localization,
 ) -> None:
     """Localize the same frames in several maps, and compare the results.
 
-    The starts are the same; success, steps, time and memory are compared. Each map has its own process, and the maps take turns at each start.
+    The starts are the same; success, steps, time and memory are compared. Each map has its own process, and the maps take turns at
+    each start.
     """
     from bidnerf.evaluation import compare, comparison_figure
     from bidnerf_core.io import output_folder, to_plain
@@ -201,9 +214,11 @@ def run_report(
         Literal["10%", "5deg 0.05", "1deg 0.02"] | None,
         Option(None, "success criterion for displays that use only one", "10%; 5deg 0.05 if trials had no start"),
     ] = None,
-    title: Annotated[str, Option("TEXT", "title of the page")] = "Localization results",
+    title: Annotated[str, EXPERT, Option("TEXT", "title of the page")] = "Localization results",
     view: Annotated[
-        Path | None, Option("PAGE.html", "page of 'bidnerf view --results', whose frames the report links to", "")
+        Path | None,
+        EXPERT,
+        Option("PAGE.html", "page of 'bidnerf view --results', whose frames the report links to", ""),
     ] = None,
     data: Annotated[
         Names, Option("DATA...", "datasets of the results, from which the worst frames are shown", "no pictures")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -11,19 +12,20 @@ from typing import TYPE_CHECKING, Annotated
 
 from bidnerf.cli.options import (
     TEST_IMAGES,
+    Images,
     Json,
+    Localization,
     MapFolder,
-    MethodOptions,
-    QueryOptions,
+    Queries,
     Seed,
+    pose_file_help,
     refuse,
     require_one,
 )
 from bidnerf.cli.output import check_folder, check_output, print_json, say, show
-from bidnerf.cli.parser import Option, Without
+from bidnerf.cli.parser import Group, Option, Without
 from bidnerf.cli.running import displayed
 from bidnerf.cli.signals import uninterrupted
-from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount, enumeration
 
 if TYPE_CHECKING:
@@ -36,7 +38,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StartOptions:
-    """Where to start (default: no start; at most one of these)."""
+    """Where localization starts: at most one of these, by default nowhere."""
 
     start: Annotated[
         Path | None,
@@ -44,7 +46,9 @@ class StartOptions:
     ] = None
     perturb: Annotated[
         tuple[float, float] | None,
-        Option("T R", "start from the dataset's pose moved by T metres and R degrees"),
+        Option(
+            "T R", "start from the dataset's pose moved by T metres and R degrees, each frame in a direction of its own"
+        ),
     ] = None
 
     def __post_init__(self) -> None:
@@ -67,26 +71,24 @@ class StartOptions:
                 raise UsageError(error, where="--perturb") from error
         poses = None if start is None else read_poses(start)
 
+        numbers = itertools.count(seed)
+        moves: dict[str, SE3 | None] = {}  # by frame, since a drawing asks for the start again
+
         def start_of(query: Query) -> SE3 | None:
             if moved is not None and query.truth is not None:
-                return perturb(query.truth, *moved, seed)
+                if query.name not in moves:
+                    moves[query.name] = perturb(query.truth, *moved, next(numbers))
+                return moves[query.name]
             return None if poses is None else pose_of(poses, query.name, start or "start")
 
         return start_of
 
 
 @dataclass(frozen=True)
-class OutputOptions:
-    """What is written."""
+class AnswerOutput:
+    """Where answers are written."""
 
-    out: Annotated[
-        Path | None,
-        Option(
-            "POSES",
-            "write poses to this file: .txt or .tum, transforms.json, images.txt (COLMAP; with cameras.txt and points3D.txt),"
-            " or .json with all details",
-        ),
-    ] = None
+    out: Annotated[Path | None, Option("POSES", pose_file_help)] = None
     draw: Annotated[Path | None, Option("DIR", "draw each photo next to the map rendered from the pose found")] = None
     json: Json = False
 
@@ -118,11 +120,11 @@ def run_localize(
         ),
     ] = (),
     *,
-    output: OutputOptions,
-    queries: QueryOptions,
-    images: Annotated[DatasetOptions, Without("largest", "background")] = TEST_IMAGES,
-    start: StartOptions,
-    method: MethodOptions,
+    output: Annotated[AnswerOutput, Group("output", "What is written beside the lines on standard output.")],
+    queries: Queries,
+    images: Annotated[Images, Without("largest", "background")] = TEST_IMAGES,
+    start: Annotated[StartOptions, Group("start", "Where localization starts. By default, it needs no start.")],
+    method: Localization,
     seed: Seed = 0,
 ) -> None:
     """Find the poses of photos, or of a dataset's frames, in a map.
@@ -130,7 +132,7 @@ def run_localize(
     If several maps are given, each image is localized in the one that it shows. QUERY is image files, folders of photos, or a dataset. A photo's camera comes from its EXIF unless it is given; if EXIF has no
     focal length, method auto begins with the camera of the map's images. Dataset frames named by --frame form a rig: their
     relative poses come from the dataset, and the pose found is that of the last one's camera. Poses are camera to world with
-    OpenCV axes (x right, y down, z forward). Points are in the camera's axes, unless a .npz also holds T_camera_sensor.
+    OpenCV axes (x right, y down, z forward).
     """
     from bidnerf.results import Answers, localize_each
     from bidnerf_core.datasets import Photos
@@ -139,7 +141,6 @@ def run_localize(
         landmark_cameras,
         matches_landmarks,
         require_start,
-        require_use_of_depth,
     )
     from bidnerf_core.maps import MapCollection, load_map, maps_in
 
@@ -151,13 +152,11 @@ def run_localize(
         raise UsageError(f"no QUERY after {named};", expected=expected)
     start_of = start.of_queries(seed)
     require_start(method.method, start.start is not None or start.perturb is not None)
-    if queries.depth_points is not None:
-        require_use_of_depth(method.method)
-    files = (*paths, *queries.depth, start.start, queries.depth_points, images.camera, images.register_depth)
+    files = (*paths, *queries.depth, start.start, images.camera, images.register_depth)
     inputs = [Path(file) for file in files if isinstance(file, str | Path)]
     output.check(inputs)
     if len(maps) > 1 or maps_in(map) not in ([], [map]):
-        _check_for_several(output, queries, start)
+        _check_for_several(output, start)
         with displayed():
             collection = MapCollection(maps, method.method, method.config)
         finder: Localizer | MapCollection = collection
@@ -165,7 +164,7 @@ def run_localize(
     else:
         scene = load_map(map)
         cameras = landmark_cameras(scene) if matches_landmarks(method.method, method.config) else ()
-        source = queries.open(paths, images, cameras, scene)
+        source = queries.open(paths, images, cameras, scene.bounds.background)
         answers = Answers(scene)
         finder = Localizer(scene, method.method, method.config, warm_up=len(source.names) > 1)
     if start.perturb is not None and isinstance(source, Photos):
@@ -190,7 +189,7 @@ def _holds_maps(path: Path) -> bool:
     return not images and find_reader(path) is None
 
 
-def _check_for_several(output: OutputOptions, queries: QueryOptions, start: StartOptions) -> None:
+def _check_for_several(output: AnswerOutput, start: StartOptions) -> None:
     """Raise ``UsageError`` if an option is given that cannot be used with several maps."""
     from bidnerf.results import pose_format
 
@@ -198,7 +197,6 @@ def _check_for_several(output: OutputOptions, queries: QueryOptions, start: Star
         "--start": start.start,
         "--perturb": start.perturb,
         "--draw": output.draw,
-        "--depth-points": queries.depth_points,
     }
     refuse(given, "applies to one map, but several are given")
     if output.out is not None and pose_format(output.out) != ".json":
@@ -209,7 +207,7 @@ def _check_for_several(output: OutputOptions, queries: QueryOptions, start: Star
 class Run:
     """Prints and draws answers as they arrive, and writes them to the pose file however the run ends."""
 
-    output: OutputOptions
+    output: AnswerOutput
     answers: Answers
     total: int  # queries
     start: Callable[[Query], SE3 | None]

@@ -12,21 +12,22 @@ from bidnerf.cli.options import (
     TEST_IMAGES,
     BakeSettings,
     Device,
+    Images,
     Json,
     MapFolder,
-    MapOptions,
     Names,
+    NewMap,
+    list_names,
     refuse,
     require_one,
     wrong_usage,
 )
 from bidnerf.cli.output import check_folder, check_output, print_json, say, show
-from bidnerf.cli.parser import Flag, Option, Settings, Without
+from bidnerf.cli.parser import Flag, Group, Option, SettingsGroup, Without
 from bidnerf.cli.running import displayed, working
-from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.progress import counter
-from bidnerf_core.settings import Above, WholeNumbers
+from bidnerf_core.settings import EXPERT, Above, WholeNumbers
 
 if TYPE_CHECKING:
     from bidnerf_core.datasets import Capture
@@ -75,9 +76,7 @@ def run_export(
         str,
         Option(
             "FORMAT",
-            "ply: surface, landmarks and cameras as point clouds and meshes; colmap: a text model of cameras and landmarks;"
-            " transforms.json: cameras in nerfstudio's format, with landmarks as sparse points; or another one of"
-            " 'bidnerf plugins exporters'",
+            lambda: f"format of the files, one of 'bidnerf plugins exporters': {list_names('exporters')}",
         ),
     ],
     out: Annotated[Path, Option("DIR", "folder for the files")],
@@ -154,9 +153,12 @@ def run_render(
     data: Annotated[Path, Option("DATA", "folder of a dataset, or a .r3d file", positional=True)],
     out: Annotated[Path, Option("DIR", "folder for the images")],
     frame: Annotated[Names, Option("NAME...", "render only these frames", "all of the split")] = (),
-    level: Annotated[int | None, Option("N", "level of detail, 0 the coarsest", "the field itself, the finest")] = None,
+    level: Annotated[
+        int | None, EXPERT, Option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
+    ] = None,
     overwrite: Annotated[Flag, Option(None, "replace images in --out")] = False,
-    images: Annotated[DatasetOptions, Without("masks", "mask_hides", "largest", "background")] = TEST_IMAGES,
+    *,
+    images: Annotated[Images, Without("masks", "mask_hides", "largest", "background")] = TEST_IMAGES,
 ) -> None:
     """Render a map from the poses of a dataset.
 
@@ -231,15 +233,16 @@ def run_bake(
         ),
     ] = None,
     rendered_landmarks: Annotated[
-        Flag, Option(None, "replace landmarks of photos by landmarks of rendered images")
+        Flag, EXPERT, Option(None, "replace landmarks of photos by landmarks of rendered images")
     ] = False,
     landmark_features: Annotated[
         str | None,
+        EXPERT,
         Option("NAME", "detector of the landmarks, one of 'bidnerf plugins features'", "the map's"),
     ] = None,
     device: Device = "cpu",
     *,
-    images: Annotated[DatasetOptions, Without("background")],
+    images: Annotated[Images, Without("background")],
     config: BakeSettings = None,
 ) -> None:
     """Find the surface and the landmarks of a map, and store them in it.
@@ -280,7 +283,7 @@ def run_extend(
         Option("N", "training steps", "in proportion to the new photos, at least a quarter of the usual number"),
     ] = None,
     *,
-    images: Annotated[DatasetOptions, Without("masks", "mask_hides", "largest", "background")],
+    images: Annotated[Images, Without("masks", "mask_hides", "largest", "background")],
     config: BakeSettings = None,
 ) -> None:
     """Add photos of the same scene to a map.
@@ -331,6 +334,7 @@ class WorldOptions:
     scale: Annotated[float, Above(0.0), Option("FACTOR", "metres per unit of length in the file")] = 1.0
     T_world_file: Annotated[
         Path | None,
+        EXPERT,
         Option("POSE", "file of a pose (JSON, 4x4) that takes the scaled coordinates of the file to the world"),
     ] = None
 
@@ -345,17 +349,20 @@ def run_import(
         str | None, Option("NAME", "one of 'bidnerf plugins importers'", "the one that recognizes the file")
     ] = None,
     *,
-    world: WorldOptions,
+    world: Annotated[WorldOptions, Group("world", "How the coordinates of the file become those of the map.")],
     photos: Annotated[
         Path | None,
         Option("DATA", "dataset whose photos, with poses in the world, provide the landmarks", "rendered images"),
     ] = None,
-    target: MapOptions,
+    target: NewMap,
     images: Annotated[
-        DatasetOptions,
+        Images,
         Without("register_depth", "depth_unit", "masks", "mask_hides", "largest", "background"),
     ],
-    config: Annotated[Any, Settings(_importer_settings, "settings of the importer")] = None,
+    config: Annotated[
+        Any,
+        SettingsGroup("settings of the importer", "What the importer cannot find in the file.", _importer_settings),
+    ] = None,
 ) -> None:
     """Build a map from a COLMAP model, or from a field trained elsewhere.
 

@@ -8,24 +8,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
-from bidnerf.cli.output import say
-from bidnerf.cli.parser import FLAG, Option, Settings
+from bidnerf.cli.parser import FLAG, Group, Option, SettingsGroup
 from bidnerf_core import datasets, mapping
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
-from bidnerf_core.registry import USUAL_FEATURES, USUAL_METHOD
-from bidnerf_core.settings import LARGEST_SEED, WholeNumbers
+from bidnerf_core.registry import USUAL_FEATURES, USUAL_METHOD, list_plugins
+from bidnerf_core.settings import EXPERT, LARGEST_SEED, WholeNumbers
 
 if TYPE_CHECKING:
     from bidnerf_core.camera import CameraSource, Intrinsics
-    from bidnerf_core.datasets import QuerySource
-    from bidnerf_core.maps import Map
+    from bidnerf_core.datasets import DatasetFrames, Photos
+    from bidnerf_core.io import Background
 
 TEST_IMAGES = DatasetOptions(split="test")
 """The default options for images with which a map is tested."""
+Images: TypeAlias = Annotated[DatasetOptions, Group("images", "How the images and their depth are read.")]
 
 MapFolder: TypeAlias = Annotated[Path, Option("MAP", "folder of a map, as written by 'bidnerf train'", positional=True)]
-Method: TypeAlias = Annotated[str, Option("NAME", "how poses are found, one of 'bidnerf plugins methods'")]
+Method: TypeAlias = Annotated[str, Option("NAME", "method that finds poses, one of 'bidnerf plugins methods'")]
 Device: TypeAlias = Annotated[str, Option("NAME", "device on which the field computes: cpu, cuda ...")]
 Host: TypeAlias = Annotated[
     str | None,
@@ -39,12 +39,30 @@ Names: TypeAlias = tuple[str, ...]
 
 BakeSettings: TypeAlias = Annotated[
     Any,
-    Settings(lambda *_: mapping.BakeConfig(), "settings of the surface and the landmarks"),
+    SettingsGroup(
+        "settings of the surface and the landmarks",
+        "How the surface and the landmarks of the map are made.",
+        lambda *_: mapping.BakeConfig(),
+    ),
 ]
 PointChoice: TypeAlias = Annotated[
     Any,
-    Settings(lambda *_: datasets.SparseChoice(), "which points of a COLMAP model are used"),
+    SettingsGroup(
+        "choice of points",
+        "Which points of the COLMAP model named by --depth-points are used.",
+        lambda *_: datasets.SparseChoice(),
+    ),
 ]
+
+
+def list_names(group: str) -> str:
+    """Return the names of a group's plugins for a help text; nothing is imported."""
+    return ", ".join(dict.fromkeys(info.name for info in list_plugins(group)))
+
+
+def pose_file_help() -> str:
+    """Return the help text of an option that names a pose file."""
+    return f"write the poses to this file, in the format of its ending: {list_names('writers')}; .json has all details"
 
 
 def _method_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
@@ -61,21 +79,31 @@ class MethodOptions:
     method: Method = USUAL_METHOD
     preset: Annotated[
         str | None,
-        Option("NAME", "method settings to begin with, such as the paper's (default: the usual ones)"),
+        EXPERT,
+        Option("NAME", "settings of the method to begin with, such as the paper's", "the usual ones"),
     ] = None
-    config: Annotated[Any, Settings(_method_settings, "settings of the method")] = None
+    config: Annotated[
+        Any,
+        SettingsGroup("settings of the method", "How the method named by --method works.", _method_settings),
+    ] = None
+
+
+Localization: TypeAlias = Annotated[MethodOptions, Group("localization", "How poses are found.")]
 
 
 @dataclass(frozen=True)
-class MapOptions:
+class MapOutput:
     """The map that is written, and its landmarks."""
 
     overwrite: Annotated[bool, FLAG, Option(None, "replace the map in --out")] = False
-    no_bake: Annotated[bool, FLAG, Option(None, "leave the surface and landmarks to 'bidnerf bake'")] = False
+    no_bake: Annotated[bool, FLAG, EXPERT, Option(None, "leave the surface and landmarks to 'bidnerf bake'")] = False
     landmark_features: Annotated[
-        str, Option("NAME", "detector of the landmarks, one of 'bidnerf plugins features'")
+        str, EXPERT, Option("NAME", "detector of the landmarks, one of 'bidnerf plugins features'")
     ] = USUAL_FEATURES
     device: Device = "cpu"
+
+
+NewMap: TypeAlias = Annotated[MapOutput, Group("map", "How the map is written, and its landmarks are made.")]
 
 
 def require_one(values: Mapping[str, object], required: bool = False) -> None:
@@ -105,7 +133,7 @@ def wrong_usage() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """The camera of images whose format stores none (default: from EXIF or the map)."""
+    """The camera of images whose format stores none."""
 
     focal: Annotated[float | None, Option("PX", "focal length in pixels of the image file")] = None
     hfov: Annotated[float | None, Option("DEG", "horizontal field of view of the upright image")] = None
@@ -122,33 +150,30 @@ class CameraOptions:
         return CameraSource(images.camera, self.focal, self.hfov, tuple(assumed))
 
 
+CameraGroup: TypeAlias = Annotated[
+    CameraOptions,
+    Group("camera", "The camera of photos without one of their own. By default, it comes from EXIF or from the map."),
+]
+
+
 @dataclass(frozen=True)
 class QueryOptions:
     """Photos and frames."""
 
-    camera: CameraOptions = CameraOptions()
+    camera: CameraGroup = CameraOptions()
     depth: Annotated[
         tuple[Path, ...],
         Option("FILE...", "depth images or .npy files of the photos, in the same order, or matched by name"),
     ] = ()
-    depth_points: Annotated[
-        Path | None,
-        Option(
-            "FILE",
-            "points measured by a sensor, in the camera frame, metres: rows of x y z, .npy, or .npz; or the folder of a"
-            " COLMAP sparse model, whose points are used where the frames observe them",
-        ),
-    ] = None
     frame: Annotated[
         Names,
-        Option("NAME...", "frames of a dataset, together as a rig (default: each frame of the split on its own)"),
+        Option("NAME...", "frames of a dataset, together as a rig", "each frame of the split on its own"),
     ] = ()
     window: Annotated[
         int,
         WholeNumbers(1),
         Option("K", "combine each frame with those before it in the split, K in all, as a rig"),
     ] = 1
-    model_points: PointChoice = None
 
     def __post_init__(self) -> None:
         twice = next((name for name in self.frame if self.frame.count(name) > 1), None)
@@ -156,8 +181,7 @@ class QueryOptions:
             raise UsageError(f"--frame names {twice} more than once", expected="each once")
         if self.window > 1 and len(self.frame) > 1:
             raise UsageError(
-                f"--window {self.window} with {len(self.frame)} frames",
-                expected="one: the last of the window",
+                f"--window {self.window} with {len(self.frame)} frames", expected="one: the last of the window"
             )
 
     def open(
@@ -165,33 +189,16 @@ class QueryOptions:
         paths: Sequence[Path],
         images: DatasetOptions,
         assumed: Sequence[Intrinsics],
-        scene: Map | None = None,
-    ) -> QuerySource:
+        background: Background | None = None,
+    ) -> Photos | DatasetFrames:
         """Return the queries named by the QUERY arguments: image files and folders of photos, or one dataset.
 
-        ``scene`` is the map, or None if there are several maps. Raises ``InputError`` if the arguments hold neither
+        ``background`` is that of the map, or None if there are several maps. Raises ``InputError`` if the arguments hold neither
         photos nor a dataset, and ``UsageError`` for options that apply only to the other kind.
         """
-        from bidnerf_core.datasets import (
-            DatasetFrames,
-            DepthPoints,
-            Photos,
-            SparsePoints,
-            depth_files,
-            find_reader,
-            photo_files,
-        )
+        from bidnerf_core.datasets import DatasetFrames, Photos, depth_files, find_reader, photo_files
         from bidnerf_core.io import IMAGE_SUFFIXES
-        from bidnerf_core.maps import named_poses
 
-        points = None
-        if self.depth_points is not None and scene is not None:
-            points = DepthPoints(self.depth_points, None)
-            if self.depth_points.is_dir():
-                sparse = SparsePoints(self.depth_points, named_poses(scene.info), self.model_points)
-                say(sparse.summary)
-                points = DepthPoints(self.depth_points, sparse)
-        background = None if scene is None else scene.bounds.background
         is_dataset = (p.suffix.lower() not in IMAGE_SUFFIXES and find_reader(p) is not None for p in paths)
         if self.frame or any(is_dataset):
             if len(paths) > 1:
@@ -201,21 +208,15 @@ class QueryOptions:
                 f"is for photos, but {paths[0]} is a dataset, which has its own; to use its images as photos, name the files",
             )
             dataset = replace(images, background=background).open(paths[0])
-            source: QuerySource = DatasetFrames(dataset, images.split, self.frame, self.window, points)
-            kind = "frames; name one by --frame"
-        else:
-            if self.window > 1:
-                raise UsageError(f"--window {self.window} needs known relative poses", expected="a dataset")
-            files = photo_files(paths, self.depth)
-            if not self.depth:
-                of_depth = {
-                    "--depth-unit": images.depth_unit,
-                    "--register-depth": images.registration or None,
-                }
-                refuse(of_depth, "was given without --depth", expected="the depth image that it belongs to")
-            options = replace(images, camera=self.camera.source(images, assumed), background=background)
-            source = Photos(files, options, depth_files(files, self.depth), points)
-            kind = "photos; expected one photo"
-        if points is not None and points.sparse is None and len(source.names) > 1:
-            raise UsageError(f"points of a single camera, but {len(source.names)} {kind}", where=points.path)
-        return source
+            return DatasetFrames(dataset, images.split, self.frame, self.window)
+        if self.window > 1:
+            raise UsageError(f"--window {self.window} needs known relative poses", expected="a dataset")
+        files = photo_files(paths, self.depth)
+        if not self.depth:
+            of_depth = {"--depth-unit": images.depth_unit, "--register-depth": images.registration or None}
+            refuse(of_depth, "was given without --depth", expected="the depth image that it belongs to")
+        options = replace(images, camera=self.camera.source(images, assumed), background=background)
+        return Photos(files, options, depth_files(files, self.depth))
+
+
+Queries: TypeAlias = Annotated[QueryOptions, Group("queries", "What is localized, and which depth was measured.")]

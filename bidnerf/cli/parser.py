@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import argparse
 import ast
+import builtins
 import dataclasses
 import functools
 import inspect
+import itertools
 import math
 import re
 import shutil
@@ -23,14 +25,16 @@ from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
-from bidnerf_core.errors import InputError, UsageError, spelling_hint
-from bidnerf_core.settings import Expert, Range
+from bidnerf_core.errors import InputError, UsageError, enumeration, spelling_hint
+from bidnerf_core.settings import Allowed, Expert
 
 T = TypeVar("T")
 
 HELP, HELP_ALL = "--help", "--help-all"
 NEGATIVE = re.compile(r"-[\d.]")
 """Matches the beginning of a value such as -1,0,2, which is not an option."""
+ESCAPE = "\0"
+"""Precedes words that are no options, though they look like one; arguments of a program cannot contain it."""
 KINDS = {
     int: ("INT", "a whole number"),
     float: ("FLOAT", "a number"),
@@ -41,10 +45,14 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Option:
-    """The name and description of an argument; without ``help``, the docstring or comment beside the field describes it."""
+    """The name and description of an argument.
+
+    Without ``help``, the docstring or comment beside the field describes the argument. A function that returns the text is called when
+    a help page shows it.
+    """
 
     metavar: str | None = None
-    help: str = ""
+    help: str | Callable[[], str] = ""
     default: str | None = None  # in words; None: the value itself; empty: it is not mentioned
     positional: bool = False
 
@@ -57,16 +65,26 @@ class Without(frozenset[str]):
 
 
 @dataclass(frozen=True)
-class Settings:
+class Group:
+    """The title of the options of a nested dataclass on help pages, and a sentence about them for users.
+
+    Options of a dataclass without one stand among those of the dataclass around it.
+    """
+
+    title: str
+    text: str
+
+
+@dataclass(frozen=True)
+class SettingsGroup(Group):
     """Marks a parameter that takes a dataclass of settings, which depends on other arguments or is slow to import.
 
     ``load`` returns the default settings, given the values of the options parsed so far, by parameter name, and all
     words of the command line. ``--help-all`` describes the options of the settings; ``--help`` only mentions them by
-    ``summary``.
+    the title.
     """
 
     load: Callable[[Mapping[str, Any], Sequence[str]], Any]
-    summary: str
 
 
 FLAG = "flag"
@@ -85,8 +103,8 @@ class Parameter:
     doc: str
 
     def note(self, kind: type[T]) -> T | None:
-        """Return the first annotation of type ``kind``, or None if there is none."""
-        return next((note for note in self.notes if isinstance(note, kind)), None)
+        """Return the last annotation of type ``kind``, or None if there is none."""
+        return next((note for note in reversed(self.notes) if isinstance(note, kind)), None)
 
     @property
     def option(self) -> Option:
@@ -103,64 +121,81 @@ class Parameter:
         """The fields that are not options, if the parameter is a dataclass."""
         return self.note(Without) or frozenset()
 
+    @property
+    def description(self) -> str:
+        """The help text, with the default."""
+        option, default, words = self.option, self.default, self.option.default
+        if words is None and default is not MISSING and default not in (None, (), "") and default is not False:
+            words = " ".join(map(str, default if isinstance(default, tuple) else (default,)))
+        text = option.help if isinstance(option.help, str) else option.help()
+        text = " ".join((text or self.doc).replace("``", "'").split())
+        if default is MISSING and not option.positional:
+            text += " (required)"
+        return (f"{text} (default: {words.replace('True', 'yes')})" if words else text).replace("%", "%%")
+
 
 def parse(command: str, target: Callable[..., T], arguments: Sequence[str]) -> T:
     """Call ``target``, a function or a dataclass, with the parsed arguments.
 
     Raises ``UsageError`` for invalid arguments, and ``SystemExit`` after printing help.
     """
+    end = arguments.index("--") if "--" in arguments else len(arguments)
     # The names of options may be written with underscores, as in Python.
-    words = [re.sub("^--[^=]*", lambda name: name[0].replace("_", "-"), word) for word in arguments]
-    if {"-h", HELP, HELP_ALL} & set(words):
-        loaded = _loaded(command, target, words) if HELP_ALL in words else None
-        sys.stdout.write(_Parser(command, target, loaded).format_help())
+    words = [re.sub("^--[^=]*", lambda name: name[0].replace("_", "-"), word) for word in arguments[:end]]
+    pages, words = {"-h", HELP, HELP_ALL} & set(words), [*words, *arguments[end:]]
+    if pages and HELP_ALL not in pages:
+        sys.stdout.write(_Parser(command, target, {}, short=True).format_help())
         raise SystemExit(0)
-    loaded = _loaded(command, target, words)
-    return _built(target, _Parser(command, target, loaded).values(words), loaded)
+    loaded = dict[str, Any]()  # the default settings that depend on other arguments, by parameter name
+    pending = {p.name: note for p, note in _leaves(target, {}) if isinstance(note, SettingsGroup)}
+    if pending:
+        first = _Parser(command, target, {}, options_only=True)
+        given = vars(first.parse_known_args(_escape(words))[0])
+        values = {p.name: p.default for p, _ in _leaves(target, {})} | given
+        missing = [p.flag for p, _ in _leaves(target, {}) if values[p.name] is MISSING and not p.option.positional]
+        if missing and not pages and first.unknown_option(words) is None:
+            first.error(f"the following arguments are required: {', '.join(missing)}")
+        loaded = {name: note.load(values, words) for name, note in pending.items()}
+    parser = _Parser(command, target, loaded)
+    if pages:
+        sys.stdout.write(parser.format_help())
+        raise SystemExit(0)
+    return _build(target, parser.parse_all(words), loaded)
 
 
-def _loaded(command: str, target: Callable[..., Any], words: Sequence[str]) -> dict[str, Any]:
-    """Return the default settings that depend on other arguments, by parameter name."""
-    pending = {p.name: note for p, _ in _walk(target, {}) if (note := p.note(Settings)) is not None}
-    if not pending:
-        return {}
-    given = _Parser(command, target, {}, options_only=True).parse_known_args(_escaped(words))[0]
-    values = {p.name: p.default for p, _ in _walk(target, {})} | vars(given)
-    return {name: note.load(values, words) for name, note in pending.items()}
-
-
-def _walk(
-    target: Any, loaded: Mapping[str, Any], default: Any = None, left_out: frozenset[str] = frozenset()
-) -> Iterator[tuple[Parameter, Any]]:
-    """Yield each parameter of ``target`` and of nested dataclasses, with its default instance if it is a dataclass, else None."""
+def _leaves(
+    target: Any,
+    loaded: Mapping[str, Any],
+    default: Any = None,
+    left_out: frozenset[str] = frozenset(),
+    group: Group | None = None,
+) -> Iterator[tuple[Parameter, Group | None]]:
+    """Yield each parameter of ``target``, or in place of nested dataclasses their fields, with its group."""
     for parameter in parameters_of(target):
         if parameter.name in left_out:
             continue
         if default is not None:
             parameter = dataclasses.replace(parameter, default=getattr(default, parameter.name))
-        group = loaded.get(parameter.name, parameter.default)
-        group = group if dataclasses.is_dataclass(group) else None
-        yield parameter, group
-        if group is not None:
-            yield from _walk(type(group), loaded, group, parameter.left_out)
+        own, nested = parameter.note(Group) or group, loaded.get(parameter.name, parameter.default)
+        if dataclasses.is_dataclass(nested):
+            yield from _leaves(type(nested), loaded, nested, parameter.left_out, own)
+        else:
+            yield parameter, own
 
 
-def _built(target: Callable[..., T], given: Mapping[str, Any], loaded: Mapping[str, Any], default: Any = None) -> T:
+def _build(target: Callable[..., T], given: Mapping[str, Any], loaded: Mapping[str, Any], default: Any = None) -> T:
     """Call ``target`` with the given values for its parameters and for the fields of nested dataclasses."""
     values = dict[str, Any]()
     for parameter in parameters_of(target):
         usual = parameter.default if default is None else getattr(default, parameter.name)
-        group = loaded.get(parameter.name, usual)
-        if dataclasses.is_dataclass(group):
+        nested = loaded.get(parameter.name, usual)
+        if dataclasses.is_dataclass(nested):
             own = {name: value for name, value in given.items() if name not in parameter.left_out}
-            value = _built(type(group), own, loaded, group)
+            value = _build(type(nested), own, loaded, nested)
             if value is not usual or default is None:
                 values[parameter.name] = value
         elif parameter.name in given:
-            value = values[parameter.name] = given[parameter.name]
-            allowed = parameter.note(Range)
-            if allowed is not None and value is not None and value not in allowed:
-                raise UsageError(f"{parameter.flag} is {value}", expected=allowed)
+            values[parameter.name] = given[parameter.name]
     if default is None:
         return target(**values)
     try:
@@ -172,15 +207,16 @@ def _built(target: Callable[..., T], given: Mapping[str, Any], loaded: Mapping[s
 class _Parser(argparse.ArgumentParser):
     """The argument parser of a command.
 
-    ``loaded`` holds the settings that depend on other arguments; if it is None, help only mentions that these
-    settings exist.
+    ``loaded`` holds the settings that depend on other arguments. If ``short`` is set, help pages leave out what is rarely needed. If
+    ``options_only`` is set, positional arguments are unknown, and required options may be missing.
     """
 
     def __init__(
         self,
         command: str,
         target: Callable[..., Any],
-        loaded: Mapping[str, Any] | None,
+        loaded: Mapping[str, Any],
+        short: bool = False,
         options_only: bool = False,
     ) -> None:
         self.width = max(40, shutil.get_terminal_size().columns)  # 40 columns even in narrower terminals
@@ -189,113 +225,93 @@ class _Parser(argparse.ArgumentParser):
             add_help=False,
             allow_abbrev=False,
             argument_default=argparse.SUPPRESS,
-            description=self._filled(inspect.getdoc(target) or ""),
+            description=self._fill(inspect.getdoc(target) or ""),
             formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, 2, 24, self.width),
         )
-        self._is_short, self._options_only = loaded is None, options_only
-        self._positional, self._required = list[str](), list[str]()  # for the usage
-        own = self.add_argument_group("options")
-        announced, groups = list[str](), dict[str, Any]()  # group of each parameter
-        for parameter, default in _walk(target, loaded or {}):
-            settings = parameter.note(Settings)
-            if default is not None:
-                kind: Any = type(default)
-                text = settings.summary if settings else (inspect.getdoc(kind) or "").split("\n\n")[0]
-                group = self.add_argument_group(parameter.name.replace("_", " "), self._filled(text, 2))
-                groups |= {inner.name: group for inner in parameters_of(kind)}
-            elif settings is not None:
-                announced.append(settings.summary)
-            else:
-                self._add(parameter, groups.get(parameter.name, own))
-        own.add_argument("-h", HELP, action="store_true", help="show the usual options")
-        more = "show all options" + (f", also {' and '.join(announced)}" if announced else "")
-        own.add_argument(HELP_ALL, action="store_true", help=more)
-        usage = " ".join([f"bidnerf {command} [OPTIONS]", *self._positional, *self._required])
-        self.usage = textwrap.fill(usage, self.width - len("usage: "), subsequent_indent="  ").replace("%", "%%")
+        self._positionals.title = "arguments"
+        usage, groups, others = [f"bidnerf {command} [OPTIONS]"], dict[Group | None, Any](), dict[str, None]()
+        groups[None] = self.add_argument_group("options")
+        for parameter, group in _leaves(target, loaded):
+            if isinstance(group, SettingsGroup) and parameter.note(SettingsGroup) is group:  # not loaded
+                others[f"the {group.title}"] = None
+            elif short and parameter.note(Expert) is not None:
+                others["rarely needed options"] = None
+            elif not (options_only and parameter.option.positional):
+                if group not in groups:
+                    assert group is not None
+                    groups[group] = self.add_argument_group(group.title, self._fill(group.text, 2))
+                usage += self._add(parameter, groups[group], complete=not options_only)
+        if short and others:
+            self.epilog = self._fill(f"'{self.prog} {HELP_ALL}' also describes {enumeration(sorted(others))}.")
+        else:
+            for name in ("-h", HELP, HELP_ALL):  # known to the parser, whose pages do not repeat them
+                self.add_argument(name, action="store_true", help=argparse.SUPPRESS)
+        self.usage = textwrap.fill(
+            " ".join(usage), self.width - len("usage: "), subsequent_indent="  ", break_on_hyphens=False
+        ).replace("%", "%%")
 
-    def _filled(self, text: str, indent: int = 0) -> str:
+    def _fill(self, text: str, indent: int = 0) -> str:
         """Return the paragraphs of ``text``, wrapped to the width of the terminal less ``indent`` columns."""
         paragraphs = (" ".join(part.replace("``", "'").split()) for part in text.split("\n\n"))
         fill = functools.partial(textwrap.fill, width=self.width - indent, break_on_hyphens=False)
         return "\n\n".join(map(fill, paragraphs))
 
-    def _add(self, parameter: Parameter, group: Any) -> None:
-        option, default = parameter.option, parameter.default
-        nargs, convert, metavar = conversion(parameter.hint)
-        shown, is_required = option.metavar or metavar, default is MISSING
-        expert = any(isinstance(note, Expert) for note in parameter.notes) and self._is_short
-        common: dict[str, Any] = {
-            "type": convert,
-            "metavar": shown,
-            "help": argparse.SUPPRESS if expert else _description(parameter),
-        }
+    def _add(self, parameter: Parameter, group: Any, complete: bool) -> list[str]:
+        """Add an argument, and return its words in the usage, if any."""
+        option, flag, required = parameter.option, parameter.flag, parameter.default is MISSING
+        nargs, convert, metavar = conversion(parameter.hint, parameter.notes)
+        shown = option.metavar or metavar
+        common: dict[str, Any] = {"type": convert, "metavar": shown, "help": parameter.description}
         if option.positional:
-            if not self._options_only:
-                self._positional.append(shown)
-                nargs = nargs if is_required else {None: "?", "+": "*"}[nargs]  # type: ignore[index]
-                self.add_argument(parameter.name, nargs=nargs, **common)
-            return
-        flag = parameter.flag
+            nargs = nargs if required else {None: "?", "+": "*"}[nargs]  # type: ignore[index]
+            self.add_argument(parameter.name, nargs=nargs, **common)
+            return [shown]
         if parameter.hint is bool:
             action = "store_true" if FLAG in parameter.notes else argparse.BooleanOptionalAction
             group.add_argument(flag, action=action, dest=parameter.name, help=common["help"])
-            return
-        if is_required:
-            self._required.append(f"{flag} {shown}")
+            return []
         common["metavar"] = tuple(shown.split()) if isinstance(nargs, int) else shown.removesuffix("...")
+        action = "extend" if nargs == "+" else "store"
         group.add_argument(
-            flag,
-            action="extend" if nargs == "+" else "store",
-            nargs=nargs,
-            dest=parameter.name,
-            required=is_required and not self._options_only,
-            **common,
+            flag, action=action, nargs=nargs, dest=parameter.name, required=required and complete, **common
         )
+        return [f"{flag} {shown}"] if required else []
 
-    def values(self, words: Sequence[str]) -> dict[str, Any]:
+    def unknown_option(self, words: Sequence[str]) -> str | None:
+        """Return the first word before ``--`` that looks like an option but is none."""
+        names = (word.split("=")[0] for word in itertools.takewhile("--".__ne__, words))
+        return next((n for n in names if n.startswith("--") and n not in self._option_string_actions), None)
+
+    def parse_all(self, words: Sequence[str]) -> dict[str, Any]:
         """Parse words, and return the values of the arguments given, by parameter name. Raises ``UsageError``."""
         self._words = words
-        found, more = self.parse_known_intermixed_args(_escaped(words))
+        given, more = self.parse_known_intermixed_args(_escape(words))
         if more:
-            self.error(f"unexpected argument {more[0].strip()!r}")
-        return {name: tuple(value) if isinstance(value, list) else value for name, value in vars(found).items()}
+            self.error(f"unexpected argument {more[0].removeprefix(ESCAPE)!r}")
+        return {name: tuple(value) if isinstance(value, list) else value for name, value in vars(given).items()}
 
     def error(self, message: str) -> NoReturn:
         """Raise ``UsageError``. An unknown option is reported instead of ``message``, since it explains the other errors."""
         message = re.sub(r"^argument (\S+): ", r"\1 ", message)
-        for word in getattr(self, "_words", ()):
-            name = word.split("=")[0]
-            if name.startswith("--") and len(name) > 2 and name not in self._option_string_actions:
-                message = f"no option {name!r}{spelling_hint(name, self._option_string_actions)}"
-                break
+        if (name := self.unknown_option(getattr(self, "_words", ()))) is not None:
+            message = f"no option {name!r}{spelling_hint(name, self._option_string_actions)}"
         raise UsageError(f"{message}; '{self.prog} {HELP}' describes all arguments")
 
 
-def _description(parameter: Parameter) -> str:
-    """Return the help text of a parameter, with its default."""
-    option, default = parameter.option, parameter.default
-    words = option.default
-    if words is None and default is not MISSING and default not in (None, (), "") and default is not False:
-        words = " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
-    text = " ".join((option.help or parameter.doc).replace("``", "'").split())
-    if default is MISSING and not option.positional:
-        text += " (required)"
-    return (f"{text} (default: {words})" if words else text).replace("%", "%%")
+def _escape(words: Sequence[str]) -> list[str]:
+    """Return the words without ``--``, and with ``ESCAPE`` before those that argparse would wrongly take for options.
 
-
-def _escaped(words: Sequence[str]) -> list[str]:
-    """Return the words with a space before values like -1,0,2, since argparse would otherwise take these values for options."""
-    return [f" {word}" if NEGATIVE.match(word) else word for word in words]
+    These are values like -1,0,2, and all words after ``--``.
+    """
+    end = words.index("--") if "--" in words else len(words)
+    before = [ESCAPE + word if NEGATIVE.match(word) else word for word in words[:end]]
+    return [*before, *(ESCAPE + word for word in words[end + 1 :])]
 
 
 @functools.cache
 def parameters_of(target: Any) -> list[Parameter]:
     """Return the parameters of a function or a dataclass."""
-    kinds: Any = [kind for kind in getattr(target, "__mro__", (target,)) if kind is not object]
-    names = _Names()
-    for kind in reversed(kinds):
-        names |= vars(sys.modules[kind.__module__])
-    hints = typing.get_type_hints(target, localns=names, include_extras=True)
+    kinds: Any = [kind for kind in reversed(getattr(target, "__mro__", (target,))) if kind is not object]
     docs = dict[str, str]()
     if dataclasses.is_dataclass(target):
         defaults = {
@@ -303,28 +319,32 @@ def parameters_of(target: Any) -> list[Parameter]:
             for field in dataclasses.fields(target)
             if field.init
         }
-        for kind in reversed(kinds):
+        for kind in kinds:
             docs |= _field_docs(kind)
     else:
         defaults = {
             name: MISSING if parameter.default is inspect.Parameter.empty else parameter.default
             for name, parameter in inspect.signature(target).parameters.items()
         }
-    found = []
+    hints = dict[str, Any]()
+    for kind in kinds:
+        module = vars(sys.modules[kind.__module__])
+        names, annotations = _Names(vars(builtins) | module), inspect.get_annotations(kind).items()
+        # typing's own evaluation raises NameError for names that are imported only for type checkers.
+        hints |= {name: eval(hint, module, names) if isinstance(hint, str) else hint for name, hint in annotations}
+    listed = []
     for name, default in defaults.items():
         hint, notes = _bare(hints[name])
         is_group = default is MISSING and dataclasses.is_dataclass(hint)
-        found.append(Parameter(name, hint, notes, hint() if is_group else default, docs.get(name, "")))
-    return found
+        listed.append(Parameter(name, hint, notes, hint() if is_group else default, docs.get(name, "")))
+    return listed
 
 
 class _Names(dict[str, Any]):
-    """Names for resolving annotations; a name that is imported only for type checkers resolves to ``object``."""
+    """Names for evaluating annotations; a name that is imported only for type checkers stands for ``object``."""
 
     def __missing__(self, name: str) -> Any:
-        builtins = self["__builtins__"]
-        found = builtins if isinstance(builtins, dict) else vars(builtins)
-        return found.get(name, object)
+        return object
 
 
 def _field_docs(kind: type) -> dict[str, str]:
@@ -336,20 +356,20 @@ def _field_docs(kind: type) -> dict[str, str]:
     lines = source.splitlines()
     (tree,) = ast.parse(source).body
     assert isinstance(tree, ast.ClassDef)
-    found = dict[str, str]()
+    docs = dict[str, str]()
     for node, after in zip(tree.body, [*tree.body[1:], None], strict=True):
         if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
             continue
         if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
-            found[node.target.id] = str(after.value.value)
+            docs[node.target.id] = str(after.value.value)
             continue
         first = node.lineno - 1
         if not any("# " in line for line in lines[first : node.end_lineno]):
             while lines[first - 1].lstrip().startswith("#"):
                 first -= 1
         comments = (line.partition("# ")[2].strip() for line in lines[first : node.end_lineno])
-        found[node.target.id] = " ".join(filter(None, comments))
-    return found
+        docs[node.target.id] = " ".join(filter(None, comments))
+    return docs
 
 
 def _bare(hint: Any) -> tuple[Any, tuple[Any, ...]]:
@@ -360,29 +380,34 @@ def _bare(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     return hint, ()
 
 
-def conversion(hint: Any) -> tuple[int | str | None, Callable[[str], Any], str]:
-    """Return argparse's ``nargs`` for a type (None for one word), the function that converts a word, and the metavar."""
-    hint, _ = _bare(hint)
+def conversion(hint: Any, notes: Sequence[Any] = ()) -> tuple[int | str | None, Callable[[str], Any], str]:
+    """Return argparse's ``nargs`` for a type (None for one word), the function that converts a word, and the metavar.
+
+    The function checks values against the ranges and names among the annotations of the type and ``notes``.
+    """
+    hint, own = _bare(hint)
     is_union = typing.get_origin(hint) in (typing.Union, types.UnionType)
-    members = [_bare(part)[0] for part in typing.get_args(hint)] if is_union else [hint]
+    parts = [_bare(part) for part in typing.get_args(hint)] if is_union else [(hint, ())]
+    limits = [n for found in (notes, own, *(more for _, more in parts)) for n in found if isinstance(n, Allowed)]
+    members = [kind for kind, _ in parts]
     optional = type(None) in members
     tuples = [part for part in members if typing.get_origin(part) is tuple]
     words = [part for part in members if part in KINDS or typing.get_origin(part) is Literal]
     if tuples and not words:
-        parts = typing.get_args(tuples[0])
-        several = parts[-1] is Ellipsis
-        _, convert, metavar = conversion(parts[0])
-        return ("+", convert, metavar) if several else (len(parts), convert, " ".join([metavar] * len(parts)))
+        elements = typing.get_args(tuples[0])
+        _, convert, metavar = conversion(elements[0], limits)
+        if elements[-1] is Ellipsis:
+            return "+", convert, metavar
+        return len(elements), convert, " ".join([metavar] * len(elements))
     kinds = sorted(words, key=lambda kind: 1 if kind is str else 2 if kind is Path else 0) or [str]
     choices = {str(c): c for kind in kinds if typing.get_origin(kind) is Literal for c in typing.get_args(kind)}
     plain = [kind for kind in kinds if kind in KINDS]
     metavar = KINDS[plain[0]][0] if plain else f"{{{','.join(choices)}}}"
-    expected = " or ".join(
-        [*([f"one of {', '.join(choices)}"] if choices else []), *(KINDS[kind][1] for kind in plain)]
-    )
+    names = [f"one of {', '.join(choices)}"] if choices else []
+    expected = " or ".join([*names, *(KINDS[kind][1] for kind in plain)])
 
     def convert_word(word: str) -> Any:
-        word = word[1:] if word.startswith(" ") and NEGATIVE.match(word[1:]) else word
+        word = word.removeprefix(ESCAPE)
         if word in choices:
             return choices[word]
         if optional and word == "None":
@@ -392,8 +417,12 @@ def conversion(hint: Any) -> tuple[int | str | None, Callable[[str], Any], str]:
                 value = kind(word)
             except ValueError:
                 continue
-            if not isinstance(value, float) or math.isfinite(value):
-                return value
+            if isinstance(value, float) and not math.isfinite(value):
+                continue
+            for limit in limits:
+                if value not in limit:
+                    raise argparse.ArgumentTypeError(f"is {word!r}, expected {limit}")
+            return value
         raise argparse.ArgumentTypeError(f"is {word!r}, expected {expected}")
 
     return None, convert_word, metavar

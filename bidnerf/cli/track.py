@@ -1,83 +1,35 @@
-"""``bidnerf track``: poses of a recording's frames or, with ``--follow``, of those that arrive in a folder or on stdin."""
+"""``bidnerf track``: poses of a sequence's frames."""
 
 from __future__ import annotations
 
-import sys
-import time as clocks
-from collections.abc import Iterator
-from contextlib import nullcontext
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from bidnerf.cli.options import CameraOptions, MapFolder, refuse
-from bidnerf.cli.output import check_output, print_json, print_table, say
-from bidnerf.cli.parser import Flag, Option, Settings, Without
+from bidnerf.cli.options import CameraGroup, Images, MapFolder, pose_file_help
+from bidnerf.cli.output import check_output, print_table, say
+from bidnerf.cli.parser import Group, Option, SettingsGroup, Without
 from bidnerf.cli.running import displayed
 from bidnerf.cli.signals import uninterrupted
 from bidnerf_core import localization
-from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.registry import USUAL_METHOD
-from bidnerf_core.settings import WholeNumbers
+from bidnerf_core.settings import EXPERT, WholeNumbers
 
 if TYPE_CHECKING:
-    from bidnerf.results import Answers, TrackingVideo
-    from bidnerf_core.depth import DepthCamera
-    from bidnerf_core.frames import Frame
-    from bidnerf_core.localization import Tracker
-
-STDIN = "-"
-POLL = 0.05
-"""Seconds between two checks of a watched folder."""
-
-
-@dataclass(frozen=True)
-class OutputOptions:
-    """What is written."""
-
-    out: Annotated[
-        Path | None,
-        Option(
-            "TRAJECTORY",
-            "pose file, required without --follow: .txt or .tum, transforms.json, or .json with all details",
-        ),
-    ] = None
-    plot: Annotated[Path | None, Option("PNG", "draw the path over the map's surface, coloured by uncertainty")] = None
-    video: Annotated[
-        Path | None,
-        Option("MP4", "draw each image next to the map rendered from its pose; takes far longer"),
-    ] = None
-
-    def check(self, inputs: list[Path]) -> None:
-        """Check that the outputs can be written, before any work is done."""
-        from bidnerf.results import check_pose_file, check_video, require_matplotlib
-
-        if self.out is not None:
-            check_pose_file(self.out)
-        if self.plot is not None:
-            require_matplotlib()
-            if self.plot.suffix.lower() not in (".png", ".svg"):
-                raise UsageError(where=self.plot, expected="a name that ends with .png or .svg")
-        if self.video is not None:
-            check_video(self.video)
-        for file in filter(None, (self.out, self.plot, self.video)):
-            check_output(file, inputs)
+    from bidnerf.results import Answers
 
 
 @dataclass(frozen=True)
 class FrameOptions:
     """Which frames are tracked, and what they measure."""
 
-    follow: Annotated[
-        Flag,
-        Option(None, "answer frames as they arrive, one JSON object per line on stdout, until Ctrl-C or the end"),
-    ] = False
     split: Annotated[str | None, Option("NAME", "use only the frames of one split of a dataset", "all")] = None
     every: Annotated[int, WholeNumbers(1), Option("N", "use only every Nth frame")] = 1
     depth: Annotated[bool, Option(None, "use measured depth if available")] = True
     depth_sensor: Annotated[
-        str, Option("NAME", "what measured the depth: unknown, kinect, realsense, lidar or rendered")
+        str, EXPERT, Option("NAME", "what measured the depth: unknown, kinect, realsense, lidar or rendered")
     ] = "unknown"
 
 
@@ -90,6 +42,7 @@ class TrackingOptions:
     ] = None
     risk: Annotated[
         float | None,
+        EXPERT,
         Option(
             "SHARE",
             "tolerated fraction of wrong poses among those accepted after a search of the map; does not apply to the"
@@ -97,111 +50,72 @@ class TrackingOptions:
             "accepted as usual",
         ),
     ] = None
-    config: Annotated[Any, Settings(lambda *_: localization.TrackerConfig(), "settings of the tracker")] = None
+    config: Annotated[
+        Any,
+        SettingsGroup(
+            "settings of the tracker",
+            "How poses are predicted, corrected and accepted from frame to frame.",
+            lambda *_: localization.TrackerConfig(),
+        ),
+    ] = None
 
 
 def run_track(
     map: MapFolder,
-    sequence: Annotated[
-        Path,
-        Option(
-            "SEQUENCE",
-            "folder of a dataset or images, or a video; with --follow a folder, or - for stdin",
-            positional=True,
-        ),
-    ],
+    sequence: Annotated[Path, Option("SEQUENCE", "folder of a dataset or images, or a video", positional=True)],
+    out: Annotated[Path, Option("TRAJECTORY", pose_file_help)],
+    plot: Annotated[Path | None, Option("PNG", "draw the path over the map's surface, coloured by uncertainty")] = None,
     *,
-    output: OutputOptions,
-    frames: FrameOptions,
-    camera: CameraOptions,
-    images: Annotated[DatasetOptions, Without("split", "largest", "background")],
-    tracking: TrackingOptions,
+    frames: Annotated[FrameOptions, Group("frames", "Which frames are tracked, and whether their depth is used.")],
+    camera: CameraGroup,
+    images: Annotated[Images, Without("split", "largest", "background")],
+    tracking: Annotated[TrackingOptions, Group("tracking", "How tracking begins, and which poses it accepts.")],
 ) -> None:
     """Find the poses of a sequence's frames in a map, in order of time.
 
     Each pose is predicted from those before it, refined and validated. A frame whose pose is not accepted counts as lost; the
     following ones are searched for in the whole map. If the sequence has true poses, a table shows the errors.
     """
-    from bidnerf.results import Answers, TrackingVideo, read_pose, track
+    from bidnerf.results import Answers, check_pose_file, read_pose, require_matplotlib, track
     from bidnerf_core.localization import Localizer, Tracker, settings_of
     from bidnerf_core.maps import load_map
 
-    if frames.follow:
-        given = {"--split": frames.split, "--depth-unit": images.depth_unit, "--masks": images.masks}
-        refuse(given, "is for recordings; with --follow, a line of stdin may state the depth unit and a mask")
-    if output.out is None and not frames.follow:
-        raise UsageError("no --out", expected="the name of a pose file")
+    check_pose_file(out)
+    if plot is not None:
+        require_matplotlib()
+        if plot.suffix.lower() not in (".png", ".svg"):
+            raise UsageError(where=plot, expected="a name that ends with .png or .svg")
     named = (sequence, images.camera, tracking.start, images.register_depth)
-    output.check([Path(each) for each in named if isinstance(each, str | Path)])
+    for file in filter(None, (out, plot)):
+        check_output(file, [Path(each) for each in named if isinstance(each, str | Path)])
     start = None if tracking.start is None else read_pose(tracking.start)
     settings = settings_of(USUAL_METHOD, {"depth_sensor": frames.depth_sensor, "risk": tracking.risk})
     scene = load_map(map)
-    path, began = Answers(scene, is_sequence=True), clocks.perf_counter()
+    path, began = Answers(scene, is_sequence=True), time.perf_counter()
     localizer = Localizer(scene, config=settings)
     try:
-        with (
-            nullcontext() if output.video is None else TrackingVideo(output.video, scene) as video,
-            displayed(),
-        ):
+        with displayed():
             source = camera.source(images, localizer.assumed_cameras)
-            opened = replace(images, camera=source, background=scene.bounds.background)
-            tracker = Tracker(localizer, tracking.config, start)
-            if frames.follow:
-                _follow(str(sequence), opened, frames.depth, tracker, path, video)
-                return
-            recorded = opened.open_sequence(sequence)
+            recorded = replace(images, camera=source, background=scene.bounds.background).open_sequence(sequence)
             recorded = recorded if frames.split is None else recorded.split(frames.split)
-            track(
-                tracker,
-                recorded,
-                every=frames.every,
-                depth=frames.depth,
-                answers=path,
-                each=None if video is None else video.add,
-            )
+            tracker = Tracker(localizer, tracking.config, start)
+            track(tracker, recorded, every=frames.every, depth=frames.depth, answers=path)
     finally:  # however tracking ended, the frames so far are written
         with uninterrupted():
             if path.given:
                 try:
-                    if output.out is not None:
-                        path.save(output.out)
+                    path.save(out)
                 finally:
-                    if output.plot is not None:
-                        path.plot(output.plot, scene.surface, scene.up)
-            if path.given and not frames.follow:
-                _summarize(path, clocks.perf_counter() - began, tracking.config.frame_seconds)
+                    if plot is not None:
+                        path.plot(plot, scene.surface, scene.up)
+                _summarize(path, time.perf_counter() - began, tracking.config.frame_seconds)
     if path.unread:
         read = amount(path.unread + len(path), "frame")
         raise InputError(f"{path.unread} of {read} could not be read, see above")
 
 
-def _follow(
-    source: str, images: DatasetOptions, depth: bool, tracker: Tracker, path: Answers, video: TrackingVideo | None
-) -> None:
-    """Answer each frame on arrival with one line of JSON."""
-    from bidnerf.results import BAD_INPUT
-
-    sensor = images.sensor(source)
-    say(f"waiting for {'JSON lines on stdin' if source == STDIN else f'images in {source}'}; Ctrl-C ends")
-    for request in requests(source):
-        name = None
-        try:
-            if isinstance(request, InputError):
-                raise request
-            name = Path(request.image).stem
-            frame = request.read(images, sensor)
-            found = tracker(frame if depth else frame.replace(depth=None), request.time)
-            answer = path.add(frame, found, request.time)
-            if video is not None:
-                video.add(frame, answer)
-            print_json(path.plain(answer))
-        except InputError as error:
-            print_json({"frame": name, "converged": False, "outcome": BAD_INPUT, "reason": str(error)})
-        sys.stdout.flush()
-
-
 def _summarize(path: Answers, seconds: float, frame_seconds: float) -> None:
-    """Print a summary of a tracked recording."""
+    """Print a summary of a tracked sequence."""
     print_table([""] * 2, path.summary(seconds))
     if path.lost and all(answer.time is None for answer in path.answers):
         say(
@@ -210,90 +124,3 @@ def _summarize(path: Answers, seconds: float, frame_seconds: float) -> None:
         )
     if not path.accepted:
         say(f"no pose of {amount(len(path), 'frame')} was accepted")
-
-
-@dataclass(frozen=True)
-class FrameRequest:
-    """A request to track a frame, whose image, depth and mask are files."""
-
-    image: str  # path, as for the depth and the mask
-    depth: str | None = None
-    time: float | None = None  # seconds
-    depth_unit: float | None = None  # metres per step
-    mask: str | None = None  # black is ignored
-
-    @staticmethod
-    def parse(line: str) -> FrameRequest:
-        """Parse a line such as ``{"image": path, "depth": path, "time": s}``; only the image is required."""
-        from bidnerf_core.io import from_plain, parse_json
-
-        return from_plain(FrameRequest, parse_json(line, "request", "a JSON object"), "request")
-
-    def read(self, images: DatasetOptions, sensor: DepthCamera | None) -> Frame:
-        """Read the image, depth and mask. Raises ``InputError`` if one cannot be read or the camera is unknown."""
-        from bidnerf_core.frames import Frame, MaskFile
-
-        mask = None if self.mask is None else MaskFile(Path(self.mask))
-        return Frame.read(
-            self.image,
-            images.camera_source,
-            depth=self.depth,
-            depth_unit=self.depth_unit,
-            sensor=sensor,
-            background=images.background,
-            mask=mask,
-        )
-
-
-def requests(source: str) -> Iterator[FrameRequest | InputError]:
-    """Yield requests as they arrive: from lines of stdin until it ends, or from images in a folder until the program is stopped.
-
-    For a line that is not a valid request, the ``InputError`` to send as its answer is yielded.
-    """
-    if source != STDIN:
-        yield from _arriving(Path(source))
-        return
-    for line in iter(sys.stdin.readline, ""):  # iterating over stdin itself would wait for a full buffer
-        if not line.strip():
-            continue
-        try:
-            yield FrameRequest.parse(line)
-        except InputError as error:
-            yield error
-
-
-def _arriving(folder: Path) -> Iterator[FrameRequest]:
-    """Yield the images of a folder in natural name order, and then new images as they arrive."""
-    from bidnerf_core.frames import photos_in
-    from bidnerf_core.io import IMAGE_SUFFIXES
-
-    if not folder.is_dir():
-        raise InputError("no such folder", where=folder, expected=f"one that receives images, or {STDIN} for stdin")
-    given, sizes = set[Path](), dict[Path, tuple[int, int]]()
-    while True:
-        photos, others = photos_in(folder)
-        waiting = [photo for photo in photos if photo not in given]
-        for photo in waiting:
-            # Other files of the photo's name, such as NAME.json, are not depth.
-            depths = [
-                file
-                for file in others
-                if file.name.startswith(f"{photo.stem}.") and file.suffix.lower() in (".npy", *IMAGE_SUFFIXES)
-            ]
-            if not all(_is_steady(file, sizes) for file in (photo, *depths[:1])):
-                break  # later names have to wait, to keep the name order
-            given.add(photo)
-            yield FrameRequest(str(photo), str(depths[0]) if depths else None)
-        clocks.sleep(POLL)
-
-
-def _is_steady(file: Path, sizes: dict[Path, tuple[int, int]]) -> bool:
-    """Return whether the size of a file was unchanged in the last two checks, which suggests that it is written completely."""
-    try:
-        size = file.stat().st_size
-    except OSError:
-        return False
-    before, looks = sizes.get(file, (-1, 0))
-    looks = looks + 1 if size == before and size > 0 else 0
-    sizes[file] = (size, looks)
-    return looks >= 2

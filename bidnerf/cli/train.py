@@ -7,20 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from bidnerf.cli.options import (
-    Json,
-    MapOptions,
-    PointChoice,
-    refuse,
-    wrong_usage,
-)
+from bidnerf.cli.options import Images, Json, MapOutput, NewMap, PointChoice, refuse, wrong_usage
 from bidnerf.cli.output import check_folder, print_json
-from bidnerf.cli.parser import Flag, Option, Settings
+from bidnerf.cli.parser import Flag, Group, Option, SettingsGroup
 from bidnerf.cli.running import working
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.registry import USUAL_BACKEND, USUAL_FEATURES
-from bidnerf_core.settings import Range
+from bidnerf_core.settings import EXPERT, Range
 
 if TYPE_CHECKING:
     from bidnerf_core.maps import MapInfo
@@ -90,6 +84,7 @@ class TrainingOptions:
     checkpoint_every: Annotated[
         float,
         Range(0.0),
+        EXPERT,
         Option("SECONDS", "time between checkpoints: the most work lost if the program is killed"),
     ] = 60.0
 
@@ -105,7 +100,9 @@ class PoseOptions:
             "refine the given poses with the keypoints that images share: always, never, or auto (if inconsistent)",
         ),
     ] = "auto"
-    trust_poses: Annotated[Flag, Option(None, "train even if the given poses contradict most pairs of photos")] = False
+    trust_poses: Annotated[
+        Flag, EXPERT, Option(None, "train even if the given poses contradict most pairs of photos")
+    ] = False
 
 
 @dataclass(frozen=True)
@@ -125,14 +122,18 @@ def run_train(
     ],
     out: Annotated[Path, Option("MAP", "folder for the map")],
     *,
-    training: TrainingOptions,
-    target: MapOptions,
-    given_poses: PoseOptions,
-    sparse_depth: DepthPointsOptions,
-    images: DatasetOptions,
+    training: Annotated[TrainingOptions, Group("training", "Which field is trained, and how long.")],
+    target: NewMap,
+    given_poses: Annotated[PoseOptions, Group("given poses", "What happens to the poses of the dataset.")],
+    sparse_depth: Annotated[DepthPointsOptions, Group("sparse depth", "Depth for images that have none.")],
+    images: Images,
     config: Annotated[
         Any,
-        Settings(_backend_settings, "size and training of the field: settings of the backend, such as --steps"),
+        SettingsGroup(
+            "settings of the backend",
+            "The size and the training of the field, for the backend named by --backend.",
+            _backend_settings,
+        ),
     ] = None,
 ) -> None:
     """Build a map from a dataset, or from photos without poses.
@@ -192,7 +193,7 @@ def run_train(
 
 
 def _interrupted(
-    out: Path, backend: str | None, config: Any, target: MapOptions, given_poses: PoseOptions, images: DatasetOptions
+    out: Path, backend: str | None, config: Any, target: MapOutput, given_poses: PoseOptions, images: DatasetOptions
 ) -> MapInfo:
     """Return the description of the map to resume.
 

@@ -3,35 +3,24 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from bidnerf import service, viewer
-from bidnerf.cli.options import (
-    TEST_IMAGES,
-    Device,
-    Host,
-    MapFolder,
-    Method,
-    Names,
-    Port,
-    QueryOptions,
-)
+from bidnerf.cli.options import TEST_IMAGES, Device, Host, Images, MapFolder, Method, Names, Port, Queries
 from bidnerf.cli.output import check_output, console, say, show
-from bidnerf.cli.parser import Option, Without
+from bidnerf.cli.parser import Group, Option, Without
 from bidnerf.cli.running import displayed
 from bidnerf.service import LEAST_TOKEN, ServiceLimits
 from bidnerf.service import serve as serve_maps
-from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, spelling_hint
 from bidnerf_core.io import read_file
 from bidnerf_core.progress import counter
 from bidnerf_core.registry import USUAL_METHOD
 
 if TYPE_CHECKING:
-    from bidnerf_core.datasets import Query, QuerySource
+    from bidnerf_core.datasets import QuerySource
     from bidnerf_core.localization import Localizer
 
 
@@ -67,21 +56,20 @@ def run_view(
         Option("[QUERY...]", "photos, folders of photos, or one dataset, to localize and show", positional=True),
     ] = (),
     *,
-    page: PageOptions,
+    page: Annotated[PageOptions, Group("page", "What the page shows beside the map, and whether it is a file.")],
     frame: Annotated[
         Names,
         Option("NAME...", "show only these frames of a dataset, each localized on its own", "all of the split"),
     ] = (),
-    server: ServerOptions,
-    queries: Annotated[QueryOptions, Without("frame", "window", "depth_points", "model_points")],
-    images: Annotated[
-        DatasetOptions, Without("register_depth", "masks", "mask_hides", "largest", "background")
-    ] = TEST_IMAGES,
+    server: Annotated[ServerOptions, Group("server", "The server of the page, and how photos are localized there.")],
+    queries: Annotated[Queries, Without("frame", "window")],
+    images: Annotated[Images, Without("register_depth", "masks", "mask_hides", "largest", "background")] = TEST_IMAGES,
 ) -> None:
     """View a map, and localizations in it, in a browser.
 
-    The page shows how and why a pose was found or rejected, also of photos that are dropped on it. Ctrl-C stops it. The photos and frames of QUERY can be selected there. Photos dropped on the page take the camera given here, whose field of
-    view can be changed there. With --save, QUERY is localized immediately, and the saved page shows the same without a server.
+    The page shows how and why a pose was found or rejected, also of photos that are dropped on it. Ctrl-C stops it. The photos and
+    frames of QUERY can be selected there. Photos dropped on the page take the camera given here, whose field of view can be changed
+    there. With --save, QUERY is localized immediately, and the saved page shows the same without a server.
     """
     from bidnerf.evaluation import read_results
     from bidnerf.viewer import LiveView, MapView, map_json, require_viewer, row_json, serve_view, trajectory_json
@@ -104,7 +92,7 @@ def run_view(
     source = None
     camera = queries.camera.source(images, localizer.assumed_cameras)
     if query:
-        source = queries.open(query, images, localizer.assumed_cameras, scene)
+        source = queries.open(query, images, localizer.assumed_cameras, scene.bounds.background)
         data = source.capture if isinstance(source, DatasetFrames) else None
         splits = {} if data is None else {split: data.frame_names(split) for split in data.splits}
         camera = CameraSource() if isinstance(source, DatasetFrames) else camera
@@ -114,7 +102,7 @@ def run_view(
                 raise InputError(describe_other_split(name, splits) or hint)
         step = -(-len(source.names) // 24) if page.save else 1  # a page of at most 24 images, spread over all
         places = [source.names.index(name) for name in frame] or range(0, len(source.names), step)
-        source = Chosen(source, places)
+        source = source.select(places)
     if page.save is None:
         serve_view(
             LiveView(localizer, source, path, rows, camera),
@@ -148,22 +136,6 @@ def _localized(localizer: Localizer, source: QuerySource) -> tuple[dict[str, Any
     return tuple(answers)
 
 
-class Chosen:
-    """A query source that offers only some of another source's queries."""
-
-    def __init__(self, source: QuerySource, places: Sequence[int]) -> None:
-        self._source, self._places = source, places
-
-    @property
-    def names(self) -> Sequence[str]:
-        """The names of the chosen queries."""
-        return [self._source.names[place] for place in self._places]
-
-    def read(self, place: int) -> Query:
-        """Read the chosen query at index ``place``."""
-        return self._source.read(self._places[place])
-
-
 TOKEN = "BIDNERF_TOKEN"
 """The environment variable that may hold the token; a command-line argument would be visible to all users of
 the machine."""
@@ -191,11 +163,15 @@ def run_serve(
     method: Method = USUAL_METHOD,
     device: Device = "cpu",
     *,
-    limits: ServiceLimits,
+    limits: Annotated[
+        ServiceLimits, Group("limits", "How many requests are served at a time, and how large they may be.")
+    ],
 ) -> None:
     """Serve localization over HTTP: photos in, poses out.
 
-    Answers are the JSON of 'bidnerf localize'. Ctrl-C stops the service. A photo is sent as a form or as the body of a request, with its camera, depth image or start if known:
+    Answers are the JSON of 'bidnerf localize'. Ctrl-C stops the service. A photo is sent as a form or as the body of a request, with its
+    camera, depth image or start if known:
+
     curl -F photo=@photo.jpg -F hfov=68 http://127.0.0.1:8000/localize
 
     /docs describes all paths, as does /openapi.json, and /health and /metrics are for monitoring. Each request is logged as a line of

@@ -22,9 +22,7 @@ from .export import export_map as export_map
 from .export import head as head
 from .export import ply as ply
 from .overlays import Painter as Painter
-from .overlays import TrackingVideo as TrackingVideo
 from .overlays import as_picture as as_picture
-from .overlays import check_video as check_video
 from .overlays import overlay as overlay
 from .overlays import save_gif as save_gif
 from .overlays import tile as tile

@@ -408,19 +408,15 @@ def localize_each(
                 query = queries.read(number)
                 truth = query.truth
                 if isinstance(localizer, MapCollection):
-                    if len(query.views) != 1 or query.depth_rays is not None:
-                        rig, expected = (
-                            "is a rig or has points from a sensor",
-                            "single images for several maps",
-                        )
-                        raise InputError(rig, where=name, expected=expected)
+                    if len(query.views) != 1:
+                        raise InputError("is a rig", where=name, expected="single images for several maps")
                     placement = localizer(query.views[0].frame, seed)
                     localization, truth = placement.found, None
                 else:
                     if number == 0:
                         _log_depth(query, localizer.shared.depth_sensor)
                     begin = None if start is None else start(query)
-                    localization = localizer(query.views, begin, query.depth_rays, seed)
+                    localization = localizer(query.views, begin, seed=seed)
                 frame = query.frame.replace(name=query.name)
                 answer = Answer.of(frame, number, localization, truth=truth, file=query.file, placement=placement)
                 if placement is None and not answer.is_finite:
@@ -443,7 +439,7 @@ def localize_each(
 def _log_depth(query: Query, sensor: str) -> None:
     """Log if the images of a dataset have no measured depth, or if the depth noise does not match the sensor."""
     bare = [view.frame.name for view in query.views if not view.frame.has_depth]
-    if bare and query.truth is not None and query.depth_rays is None:
+    if bare and query.truth is not None:
         log.info("%s: no measured depth; colour only", ", ".join(bare))
     shown = query.frame
     if sensor != "unknown" and shown.depth is not None and shown.has_depth:

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from bidnerf.results.answers import Answer
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import render_picture
 from bidnerf_core.frames import Frame
@@ -134,71 +130,3 @@ def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float 
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     content = iio.imwrite("<bytes>", pictures, extension=".gif", duration=1000 / fps, loop=0)
     write_file(Path(path), bytes(content))
-
-
-def check_video(file: Path) -> None:
-    """Raise ``InputError`` if a video cannot be written to ``file``, before any work is done."""
-    try:
-        import av  # noqa: F401
-    except ImportError as error:
-        raise InputError(
-            "writing a video needs the extra 'video' (pip install 'bidnerf[video]')", where=file
-        ) from error
-    if file.suffix.lower() not in CODECS or not file.parent.is_dir():
-        raise InputError(where=file, expected=f"a name that ends with {', '.join(CODECS)}, in an existing folder")
-
-
-CODECS = {".mp4": "libx264", ".mkv": "libx264", ".webm": "libvpx-vp9"}
-
-
-class TrackingVideo:
-    """A video of a tracked sequence: a picture for each frame, shown at the time of the frame."""
-
-    def __init__(self, file: Path, scene: SceneMap) -> None:
-        self._file, self._scene = file, scene
-        self._partial = file.with_name(f".{file.stem}.partial{file.suffix}")
-        self._output: Any = None
-        self._stream: Any = None
-        self._start, self._latest = 0.0, -1
-
-    def __enter__(self) -> TrackingVideo:
-        return self
-
-    def __exit__(self, *about: object) -> None:
-        """Finish the file and only then give it its final name."""
-        if self._stream is not None:
-            self._output.mux(self._stream.encode())
-            self._output.close()
-            self._partial.replace(self._file)
-
-    def add(self, frame: Frame, answer: Answer) -> None:
-        """Add a frame next to the rendered map; a frame without colour is shown by its depth, as grey values up to 5 m."""
-        import av
-
-        localization = answer.localization
-        painter = Painter(self._scene, localization.frame_as_taken(frame))
-        observed = painter.observed
-        if frame.depth is not None and not frame.has_colour:
-            grey = (frame.depth.cpu() / 5.0).clamp(0, 1)[None, None]
-            size = (observed.shape[0], observed.shape[1])
-            observed = torch.nn.functional.interpolate(grey, size)[0].permute(1, 2, 0).expand(-1, -1, 3)
-        caption = "rendered at the pose found" if localization.converged else f"not accepted: {localization.outcome}"
-        tiles = (
-            tile(observed, f"observed: {frame.name}"),
-            tile(painter.render(localization.T_world_camera), caption),
-        )
-        picture = Image.fromarray(np.concatenate(tiles, axis=1))
-        # Frames without timestamps are shown at 30 frames per second.
-        time = answer.number / 30 if answer.time is None else answer.time
-        if self._stream is None:
-            self._output, self._start = av.open(str(self._partial), "w"), time
-            # At this quality, hardly any loss is visible.
-            codec = CODECS[self._file.suffix.lower()]
-            self._stream = self._output.add_stream(codec, rate=1000, options={"crf": "20"})  # times in ms
-            self._stream.width, self._stream.height = picture.width // 2 * 2, picture.height // 2 * 2
-            self._stream.pix_fmt = "yuv420p"
-        picture = picture.resize((self._stream.width, self._stream.height))
-        shown = av.VideoFrame.from_image(picture)
-        self._latest = max(self._latest + 1, round(1000 * (time - self._start)))
-        shown.pts, shown.time_base = self._latest, Fraction(1, 1000)
-        self._output.mux(self._stream.encode(shown))

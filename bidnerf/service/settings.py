@@ -7,12 +7,12 @@ from typing import Annotated
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import usable_cores
-from bidnerf_core.settings import Above, Range, Settings
+from bidnerf_core.settings import EXPERT, Above, Range, Settings
 
 MEBIBYTE = 2**20
 LEAST_TOKEN = 16
 """Minimum length of a token; shorter ones could be guessed."""
-Limit = Annotated[float, Above(0.0, 1e6)]
+Limit = Annotated[float, Above(0.0, 1e6), EXPERT]
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class ServiceLimits(Settings):
     """
 
     workers: Annotated[int, Range(0, 1000)] = 0  # processes that localize, each with one thread; 0: one per core
-    queue: Annotated[int, Range(0, 100_000)] = (
+    queue: Annotated[int, Range(0, 100_000), EXPERT] = (
         16  # requests that may upload or wait besides those at work; further ones get status 429
     )
     timeout: Limit = 60.0  # seconds for an answer, counted from the complete request; else status 504

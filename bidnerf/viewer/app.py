@@ -245,7 +245,7 @@ def viewer_app(live: LiveView, token: str | None = None, limits: ServiceLimits |
                     except InputError as error:
                         raise InputError(public_message(error, Path(folder))) from error
                 views = tuple(view.over(scene.bounds.background) for view in query.views)
-                return Query(upload.name, views, query.truth, query.depth_rays), start, upload.seed
+                return Query(upload.name, views, query.truth), start, upload.seed
 
             return JSONResponse({"job": jobs.start(upload.name, read, slot.pop_all()).id}, 202)
 

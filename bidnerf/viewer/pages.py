@@ -155,7 +155,7 @@ def answer_query(
     with recorded() as record:
         if follow is not None:
             follow(record, None)
-        localization = localizer(query.views, start, query.depth_rays, seed)
+        localization = localizer(query.views, start, seed=seed)
     answer = answer_json(scene, query.name, localization, frame, record, query.truth)
     if follow is not None:
         follow(record, add_renderings(answer, scene, localization, frame, quick=True))

@@ -26,13 +26,11 @@ from .options import DepthRegistration as DepthRegistration
 from .pose_rows import camera_of as camera_of
 from .pose_rows import pose_of_rows as pose_of_rows
 from .queries import DatasetFrames as DatasetFrames
-from .queries import DepthPoints as DepthPoints
 from .queries import Photos as Photos
 from .queries import Query as Query
 from .queries import QuerySource as QuerySource
 from .queries import depth_files as depth_files
 from .queries import photo_files as photo_files
-from .queries import read_depth_points as read_depth_points
 from .reader import READERS as READERS
 from .reader import Background as Background
 from .reader import DepthCamera as DepthCamera

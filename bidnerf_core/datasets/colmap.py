@@ -20,7 +20,6 @@ from torch import Tensor
 from bidnerf_core.datasets.colmap_files import ModelImage, read_model
 from bidnerf_core.depth import nearest_depth
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields import Observations
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, fit_similarity, spread
 from bidnerf_core.settings import Above, Settings, WholeNumbers
@@ -124,23 +123,6 @@ class SparsePoints:
         position = position[(self._points.ids[position] == image.points) & self._chosen[position]]
         points = image.T_camera_model.apply(self._points.positions[position]) * self.metres
         return points[points[:, 2] > 0]
-
-    def rays(self, views: Sequence[View], split: str) -> Observations:
-        """Return the points observed by the ``views``, as rays in the last camera's frame.
-
-        The points are transformed by the relative poses of the views. Raises ``InputError`` if no point is observed.
-        """
-        T_last_ref = views[-1].T_ref_camera.to("cpu", torch.float64).inverse()
-        found = [(view, self.seen(view.frame.name, split)) for view in views]
-        parts = [
-            Observations.from_points(points, T_last_ref @ view.T_ref_camera.to("cpu", torch.float64))
-            for view, points in found
-            if len(points)
-        ]
-        if not parts:
-            names = ", ".join(view.frame.name for view in views)
-            raise InputError(f"has no points observed by {names}; it has {self._some}", where=self.folder)
-        return Observations.joined(parts)
 
     def onto(self, view: View, split: str) -> View:
         """Return the view with the depth (planar z) of the nearest observed point at each pixel, 0 elsewhere.

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, Union
 
 from bidnerf_core.errors import InputError, UsageError
-from bidnerf_core.settings import WholeNumbers
+from bidnerf_core.settings import EXPERT, WholeNumbers
 
 if TYPE_CHECKING:
     from bidnerf_core.camera import Camera, CameraSource
@@ -38,7 +38,7 @@ class DatasetOptions:
     split: Annotated[str, "NAME"] = "train"
     """split of the dataset; all: every image with a pose"""
 
-    register_depth: Annotated[DepthRegistration | None, "SENSOR.json"] = None
+    register_depth: Annotated[DepthRegistration | None, EXPERT, "SENSOR.json"] = None
     """file with the intrinsics of the depth camera and T_colour_depth (4x4), from which depth is registered to colour images;
     'no' if depth is already registered"""
 
@@ -46,15 +46,15 @@ class DatasetOptions:
     """metres per step of the depth images, such as 0.001 for millimetres"""
 
     masks: Annotated[str | Path | MaskFolder | None, "DIR"] = None
-    """masks named like the images: black pixels (--mask-hides) are ignored, such as people or the robot itself"""
+    """masks named like the images: black pixels are ignored, such as people or the robot itself"""
 
-    mask_hides: Annotated[Literal["black", "white"], "COLOUR"] = "black"
+    mask_hides: Annotated[Literal["black", "white"], EXPERT, "COLOUR"] = "black"
     """colour in --masks that is ignored: black or white"""
 
-    largest: Annotated[int | None, WholeNumbers(1), "PX"] = None
+    largest: Annotated[int | None, WholeNumbers(1), EXPERT, "PX"] = None
     """longer side to which larger images are downscaled"""
 
-    background: Annotated[Background | None, "COLOUR"] = None
+    background: Annotated[Background | None, EXPERT, "COLOUR"] = None
     """colour behind images with alpha: white or black"""
 
     def __post_init__(self) -> None:

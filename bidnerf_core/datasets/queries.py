@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-import numpy as np
-import torch
-
 from bidnerf_core.datasets.capture import Capture
-from bidnerf_core.datasets.colmap import SparsePoints
 from bidnerf_core.datasets.formats.photos import PhotoShot
 from bidnerf_core.datasets.options import AS_STORED
 from bidnerf_core.datasets.reader import DatasetOptions, file_of_dataset, no_dataset
 from bidnerf_core.errors import InputError, InputWarning, UsageError, amount
-from bidnerf_core.fields import Observations
 from bidnerf_core.frames import DEPTH_STEM, Frame, View, photos_in
-from bidnerf_core.geometry import SE3, pose_from_matrix
-from bidnerf_core.io import looks_like_image, read_archive, read_array, read_rows
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import looks_like_image
 from bidnerf_core.localization import window as windowed
 
 log = logging.getLogger("bidnerf")
-
-EXPECTED_POINTS = "n rows of x, y, z in metres"
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +30,6 @@ class Query:
     name: str
     views: tuple[View, ...]
     truth: SE3 | None = None  # T_world_camera if the dataset has it; used only for errors and --perturb
-    depth_rays: Observations | None = None
     file: Path | None = None  # of the last image
 
     @property
@@ -57,66 +50,6 @@ class QuerySource(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class DepthPoints:
-    """Measured points from a point file, or from a COLMAP model with the points that each frame observes."""
-
-    path: Path
-    sparse: SparsePoints | None
-
-    def rays(self, views: Sequence[View], split: str) -> Observations:
-        """Return the measured points as rays in the last camera's frame."""
-        if self.sparse is None:
-            return read_depth_points(self.path)
-        rays = self.sparse.rays(views, split)
-        names = [view.frame.name for view in views]
-        blind = ", ".join(name for name in names if len(self.sparse.seen(name, split)) == 0)
-        log.info("%s: %s seen%s", names[-1], amount(len(rays), "point"), blind and f", but {blind} observes none")
-        return rays
-
-
-def read_depth_points(path: Path) -> Observations:
-    """Read points (metres, OpenCV axes) as depth rays in the camera's frame.
-
-    A text file (.txt, .csv, .xyz) has rows of x, y, z, separated by commas or spaces. Further columns are
-    ignored, and ``#`` begins a comment. Text and .npy files hold points in the camera's frame, measured from
-    the camera. A .npz file holds ``points`` and, for a separate sensor such as a lidar, ``T_camera_sensor``
-    (4x4); the points are then in the sensor's frame. Raises ``InputError`` for anything else.
-    """
-    points: np.ndarray = np.zeros(0)
-    T_camera_sensor = SE3.identity()
-    if path.suffix == ".npz":
-        arrays = read_archive(path, ("points", "T_camera_sensor"), "a .npz file of points")
-        if "points" not in arrays:
-            raise InputError("no array 'points'", where=path, expected=f"one with {EXPECTED_POINTS}")
-        points, given = arrays["points"], arrays.get("T_camera_sensor")
-        if given is not None:
-            matrix = given.astype(np.float64) if given.dtype.kind in "fiu" else np.zeros(0)
-            T_camera_sensor = pose_from_matrix(torch.from_numpy(matrix), "T_camera_sensor", path)
-    elif path.suffix == ".npy":
-        points = read_array(path, "a .npy file of points")
-    else:
-        rows = read_rows(path, "a file of points", EXPECTED_POINTS)
-        # A row with commas has no other separator: "1,5 2,5" has decimal commas and is rejected.
-        words = [(row, row.text.split("," if "," in row.text else None)[:3]) for row in rows]
-        lengths = {len(found) for _, found in words}
-        if len(lengths) > 1:
-            found = f"has rows of {min(lengths)} and of {max(lengths)} numbers"
-            raise InputError(found, where=path, expected=EXPECTED_POINTS)
-        points = np.array([row.numbers(found) for row, found in words], dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
-        raise InputError(
-            f"has an array of shape {points.shape} and type {points.dtype}",
-            where=path,
-            expected=EXPECTED_POINTS,
-        )
-    xyz = torch.from_numpy(points[:, :3].astype(np.float64))
-    try:
-        return Observations.from_points(xyz, T_camera_sensor)
-    except InputError as error:
-        raise InputError(error, where=path) from error
-
-
 class Photos:
     """Image files, each of which is a query. ``depth`` maps photos that have depth to their depth files.
 
@@ -128,9 +61,8 @@ class Photos:
         files: Sequence[Path],
         options: DatasetOptions = AS_STORED,
         depth: Mapping[Path, Path] | None = None,
-        points: DepthPoints | None = None,
     ) -> None:
-        self._depth, self._points, self._remarks = depth or {}, points, set[str]()
+        self._depth, self._remarks = depth or {}, set[str]()
         sensor = options.sensor("register_depth")
         shots = [
             PhotoShot(
@@ -146,6 +78,12 @@ class Photos:
         self.capture = Capture(Path("photos"), shots, options.colour)
         if (masks := options.mask_folder) is not None:
             self.capture = self.capture.with_masks(masks, by_stem=True)
+
+    def select(self, indices: Sequence[int]) -> Photos:
+        """Return only some of the photos."""
+        chosen = copy.copy(self)
+        chosen.capture = replace(self.capture, shots=[self.capture.shots[index] for index in indices])
+        return chosen
 
     @property
     def names(self) -> Sequence[str]:
@@ -168,8 +106,7 @@ class Photos:
                 log.info("%s: %s", shot.name, text)
             self._remarks.add(text)
         views = (View(frame, SE3.identity()),)
-        rays = None if self._points is None else self._points.rays(views, "")
-        return Query(frame.name, views, None, rays, shot.file)
+        return Query(frame.name, views, None, shot.file)
 
 
 class DatasetFrames:
@@ -184,9 +121,8 @@ class DatasetFrames:
         split: str = "test",
         names: tuple[str, ...] = (),
         window: int = 1,
-        points: DepthPoints | None = None,
     ) -> None:
-        self.capture, self._split, self._points = dataset, split, points
+        self.capture, self._split = dataset, split
         listed = dataset.frame_names(split)
         if not listed:
             raise InputError(f"split {split!r} has no frames", where=dataset.path)
@@ -200,6 +136,12 @@ class DatasetFrames:
                     before = f"{rig[-1]} has only {len(rig) - 1} before it in split {split!r}"
                     log.info("--window %d: %s; a rig of %d", window, before, len(rig))
 
+    def select(self, indices: Sequence[int]) -> DatasetFrames:
+        """Return only some of the rigs."""
+        chosen = copy.copy(self)
+        chosen._rigs = [self._rigs[index] for index in indices]
+        return chosen
+
     @property
     def names(self) -> Sequence[str]:
         return [rig[-1] for rig in self._rigs]
@@ -211,8 +153,7 @@ class DatasetFrames:
             tuple(self.capture.views(self._split, rig)),
             self.capture.select(self._split, rig[-1:]),
         )
-        rays = None if self._points is None else self._points.rays(views, self._split)
-        return Query(views[-1].frame.name, views, views[-1].T_ref_camera, rays, shot.file)
+        return Query(views[-1].frame.name, views, views[-1].T_ref_camera, shot.file)
 
 
 def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]:

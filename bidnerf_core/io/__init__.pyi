@@ -61,7 +61,6 @@ from .tensors import TensorKind as TensorKind
 from .tensors import check_tensors as check_tensors
 from .tensors import load_part as load_part
 from .tensors import pack_tensors as pack_tensors
-from .tensors import read_archive as read_archive
 from .tensors import read_array as read_array
 from .tensors import read_saved as read_saved
 from .tensors import read_tensors as read_tensors

@@ -10,7 +10,7 @@ import pickle
 import re
 import sys
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -42,17 +42,8 @@ def read_array(path: Path, expected: str) -> np.ndarray:
         try:
             return _array(file, os.fstat(file.fileno()).st_size)
         except Exception as error:  # NumPy parses the header as Python, which may raise anything
-            raise _unreadable(path, error, expected) from error
-
-
-def read_archive(path: Path, names: Sequence[str], expected: str) -> dict[str, np.ndarray]:
-    """Read the arrays ``names`` from a ``.npz`` file, skipping those that it lacks. Raises ``InputError`` as ``read_array`` does."""
-    archive = Archive(path, expected, LARGEST_ARRAY)
-    found = {name: archive.read(f"{name}.npy") for name in names if f"{name}.npy" in archive}
-    try:
-        return {name: _array(io.BytesIO(content), len(content)) for name, content in found.items()}
-    except Exception as error:  # as above
-        raise _unreadable(path, error, expected) from error
+            reason = str(error).strip().partition("\n")[0][:120] or type(error).__name__
+            raise InputError(f"not readable as an array ({reason})", where=path, expected=expected) from error
 
 
 def _array(file: BinaryIO | io.BytesIO, size: int) -> np.ndarray:
@@ -69,11 +60,6 @@ def _array(file: BinaryIO | io.BytesIO, size: int) -> np.ndarray:
         raise ValueError(f"an array of {needed:,} bytes in {left:,}".replace(",", " "))
     file.seek(0)
     return np.asarray(np.load(file, allow_pickle=False))
-
-
-def _unreadable(path: Path, error: Exception, expected: str) -> InputError:
-    reason = str(error).strip().partition("\n")[0][:120] or type(error).__name__
-    return InputError(f"not readable as an array ({reason})", where=path, expected=expected)
 
 
 def read_tensors(path: Path, expected: str = TENSOR_FILE) -> dict[str, Tensor]:

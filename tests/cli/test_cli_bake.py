@@ -115,12 +115,8 @@ def test_a_baked_map_needs_no_start(sharp: Path, baked: Path, once: CommandResul
     assert found["error"]["translation"] < 0.1
     assert found["error"]["rotation_deg"] < 2
     assert len(found["covariance"]) == len(found["covariance"][0]) == 6
-    points = folder / "points.txt"
-    points.write_text("0 0 3\n0.1 0 3\n")
     shown = bidnerf(*place).out
     assert "one standard deviation" in shown
-    with_points = json.loads(bidnerf(*place, "--depth-points", points, "--json").out)
-    assert with_points["loss"] != found["loss"]  # they are used beside the image's own depth
     # Baking the photos has left a record of them.
     (line,) = [line for line in err.splitlines() if "16 photos, " in line and "horizon" in line]
     assert len(facts["capture"]["photos"]) == 16

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -62,44 +61,3 @@ def test_a_training_is_resumed_with_the_depth_that_it_began_with(
         assert bidnerf(*train, *points).status == 130
     assert_refused(bidnerf(*train, "--resume"), 2, "--depth-points", "got 0")
     assert bidnerf(*train, *points, "--resume").status == 0
-
-
-def test_localization_takes_the_points_that_the_frames_observe(bidnerf: Run, shared: Path, given: Path) -> None:
-    place = ["localize", shared / "map", given / "data", *QUICK, "--frame", "t_0001", "--window", 2]
-    without, with_points = bidnerf(*place), bidnerf(*place, "--depth-points", given / "sparse")
-    assert (without.status, with_points.status) == (0, 0)
-    assert json.loads(without.out)["loss"] != json.loads(with_points.out)["loss"]
-    assert "its unit is 0.37 m according to 6 training cameras" in with_points.err
-    assert "points seen" in with_points.err
-    assert "none by" not in with_points.err
-
-
-def test_with_a_surface_the_points_take_the_place_of_a_start(
-    bidnerf: Run, shared: Path, given: Path, map_folder: Path
-) -> None:
-    frames = ["--frame", "t_0002", "--window", 3, "--json"]
-    place = ["localize", map_folder, given / "data", *frames, "--depth-points", given / "sparse"]
-    assert_refused(bidnerf(*place), 1, "needs a start", after_remarks=True)
-    assert bidnerf("bake", map_folder, "--data", shared / "data", "--cells", 20_000).status == 0
-    found = bidnerf(*place)
-    assert found.status == 0
-    assert json.loads(found.out)["method"] == "auto"
-    assert "colour only" not in found.err
-
-
-@pytest.mark.parametrize("method", ["inerf", "inerf-lm"])
-def test_methods_of_colour_alone_refuse_them(method: str, bidnerf: Run, shared: Path, given: Path) -> None:
-    words = ["localize", shared / "map", given / "data", "--frame", "t_0001", "--perturb", 0.1, 5]
-    refused = bidnerf(*words, "--method", method, "--depth-points", given / "sparse")
-    assert_refused(refused, 1, f"'{method}'", "colour alone", after_remarks=True)
-
-
-def test_a_model_that_is_of_no_use_is_told_in_a_line(bidnerf: Run, shared: Path, given: Path, tmp_path: Path) -> None:
-    place = ["localize", shared / "map", given / "data", *QUICK, "--frame", "t_0001", "--depth-points"]
-    assert_refused(bidnerf(*place, given / "data"), 1, given / "data", "no COLMAP sparse model")
-    assert_refused(bidnerf(*place, given / "strangers"), 1, "0 of the 6 training cameras")
-    # The model is summarized once, whatever frames follow.
-    refused = bidnerf(*place, given / "training")
-    assert_refused(refused, 1, "no points observed by t_0001", "6 images", after_remarks=True)
-    (tmp_path / "sparse").symlink_to(given / "sparse")
-    assert_refused(bidnerf(*place, tmp_path), 1, tmp_path, "as in sparse/0 of a project")

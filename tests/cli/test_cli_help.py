@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import pytest
 
 # Inside: the parser alone, and the options of all commands by name
 from bidnerf.cli import COMMANDS, main, parser
-from bidnerf.cli.parser import FLAG, Option, Without, parse
+from bidnerf.cli.parser import FLAG, Group, Option, SettingsGroup, Without, parse
 from bidnerf_core.errors import UsageError
 from bidnerf_core.localization import METHODS
 from bidnerf_core.registry import list_plugins
 from bidnerf_core.settings import EXPERT, Settings
 from commands import Run
+
+if TYPE_CHECKING:
+    from decimal import Decimal
 
 CHOICES = {
     "train": [["--backend", info.name] for info in list_plugins("backends") if info.distribution == "bidnerf"],
@@ -65,14 +69,15 @@ def test_every_option_has_a_help_text_of_its_own(
     texts = dict[str, str]()
     add = parser._Parser.add_argument
 
-    def kept(self: Any, name: str, *rest: Any, **more: Any) -> Any:
+    def add_and_keep(self: Any, name: str, *rest: Any, **more: Any) -> Any:
         texts[name] = more["help"]
         return add(self, name, *rest, **more)
 
-    monkeypatch.setattr(parser._Parser, "add_argument", kept)
-    monkeypatch.setattr(parser.argparse._ArgumentGroup, "add_argument", kept)
+    monkeypatch.setattr(parser._Parser, "add_argument", add_and_keep)
+    monkeypatch.setattr(parser.argparse._ArgumentGroup, "add_argument", add_and_keep)
     assert bidnerf(*words, "--help-all").status == 0
-    texts.pop("-h")
+    for name in ("-h", "--help", "--help-all"):  # not shown
+        texts.pop(name)
     assert texts
     for name, text in texts.items():
         assert len(text.split()) > 1, f"{name}: {text!r}"
@@ -101,6 +106,23 @@ def test_pages_fit_the_terminal(words: list[str], bidnerf: Run, monkeypatch: pyt
         assert "PATH" not in page
         assert max(map(len, page.splitlines())) <= columns
         assert option == "--help-all" or page.count("\n") < 80
+
+
+MOST = 170
+"""Largest number of arguments on all pages of ``--help``; what is rarely needed belongs on those of ``--help-all``."""
+
+
+def test_help_is_short_and_describes_groups_in_sentences_for_users(bidnerf: Run) -> None:
+    arguments = 0
+    for command in (name for name in COMMANDS if COMMANDS[name].__module__.startswith("bidnerf.")):
+        page = bidnerf(command, "--help").out
+        arguments += len(re.findall(r"^  (?:-|\[?[A-Z]{2})", page, re.MULTILINE))
+        for title, text in re.findall(r"^([a-z].*):\n  (.*(?:\n  \S.*)*)\n", page, re.MULTILINE):
+            if title in ("arguments", "options"):
+                continue
+            assert re.fullmatch(r"[A-Z][^:]*\.", text), (command, title, text)
+            assert "option" not in text.lower(), (command, title, text)
+    assert 100 < arguments <= MOST
 
 
 @pytest.mark.parametrize("columns", ["1", "39"])
@@ -148,7 +170,8 @@ class Outer:
     share: Annotated[float | None, Option("SHARE", "a fraction")] = 0.5
     loud: Annotated[bool, FLAG, Option(None, "whether it is loud")] = False
     other: Annotated[int | None, Option("N", "another number")] = None
-    inner: Annotated[Inner, Without("other")] = Inner()
+    inner: Annotated[Inner, Without("other"), Group("inside", "These are inside.")] = Inner()
+    unseen: Decimal | None = None
 
 
 @pytest.mark.parametrize(
@@ -160,6 +183,8 @@ class Outer:
         ("here --point -1.5 -2e3 there --plain 3", Outer(Path("here"), ("there",), point=(-1.5, -2e3), inner=Inner(3))),
         ("- --share None", Outer(Path("-"), share=None)),
         ("here --other 2", Outer(Path("here"), other=2)),  # and not the inner one
+        ("--other 2 -- --my_photo.jpg -1", Outer(Path("--my_photo.jpg"), ("-1",), other=2)),
+        ("here --unseen 2.5", Outer(Path("here"), unseen="2.5")),  # type: ignore[arg-type]
     ],
 )
 def test_arguments_are_fields(line: str, expected: Outer) -> None:
@@ -184,11 +209,13 @@ def test_help_hides_what_experts_need(capsys: pytest.CaptureFixture[str]) -> Non
             "usage: bidnerf x [OPTIONS] PLACE MORE...\n",
             "All of them.",
             "--plain",
-            "What is inside.",
+            "inside:\n  These are inside.\n",
         ):
             assert part in page
         assert page.count("--other") == 1
+        assert "What is inside" not in page
         assert ("--rare" in page) == (option == "--help-all")
+        assert ("'bidnerf x --help-all' also describes rarely needed options." in page) == (option == "--help")
 
 
 # Arguments that are wrong.
@@ -203,6 +230,8 @@ def test_help_hides_what_experts_need(capsys: pytest.CaptureFixture[str]) -> Non
         ("train d", "the following arguments are required: --out"),
         ("train d --out", "--out expected one argument"),
         ("train d --out x --steps a", "--steps is 'a', expected a whole number"),
+        ("train d --out x --steps 0", "--steps is '0', expected 1 to 10,000,000"),
+        ("localize m p --window 0 --stepz", "--window is '0', expected a whole number, from 1 up"),
         ("localize m p --focal=abc", "--focal is 'abc', expected a number"),
         ("scale m --distance a b", "--distance expected 3 arguments"),
         ("scale m", "one of --distance, --poses, --factor is missing"),
@@ -215,6 +244,22 @@ def test_wrong_arguments_are_told_in_a_line(bidnerf: Run, line: str, message: st
     status, out, err = bidnerf(*line.split())
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert err.startswith(f"bidnerf {line.split()[0]}: {message}")
+
+
+def test_values_are_refused_before_settings_are_loaded() -> None:
+    """The settings of a method take long to import."""
+
+    def load(*_: object) -> None:
+        raise AssertionError("loaded")
+
+    def command(
+        where: Path, out: Path, size: float = 1.0, config: Annotated[Any, SettingsGroup("x", "It.", load)] = None
+    ) -> None:
+        """Do something."""
+
+    for words in (["here", "--out", "x", "--size", "a"], ["here"]):
+        with pytest.raises(UsageError, match=r"--size is 'a', expected a number|required: --where, --out"):
+            parse("x", command, words)
 
 
 def test_a_command_needs_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -165,7 +165,9 @@ def test_files_of_poses_hold_what_converged(
     bidnerf: Run, given: Path, place: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     answer = Localizer.__call__
-    monkeypatch.setattr(Localizer, "__call__", lambda *a: replace(answer(*a), outcome=Outcome.CONVERGED))
+    monkeypatch.setattr(
+        Localizer, "__call__", lambda *a, **more: replace(answer(*a, **more), outcome=Outcome.CONVERGED)
+    )
     sure = [*place, given / "photos", *FOCAL, "--json"]
     found = objects(bidnerf(*sure, "--out", tmp_path / "poses.tum").out)
     rows = np.loadtxt(tmp_path / "poses.tum")

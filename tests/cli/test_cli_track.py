@@ -1,24 +1,18 @@
-"""``bidnerf track``: files of poses, the summary, frames as they come, and videos."""
+"""``bidnerf track``: files of poses, and the summary."""
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import shutil
-import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 
-# Inside: single lines of standard input, and a watched folder without waiting
-import bidnerf.cli.track as following
-from bidnerf import InputError, View
-from bidnerf.cli.track import FrameRequest, requests
+from bidnerf import View
 from bidnerf.testing import CAMERA
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.datasets import open_dataset, read_trajectory, write_transforms
@@ -159,12 +153,8 @@ def test_a_dataset_of_poses_can_be_read_again(bidnerf: Run, data: Path) -> None:
         ("{data} --out path.doc", 2, "path.doc"),
         ("{data} --out nowhere/path.txt", 1, "no folder nowhere"),
         ("{data}", 2, "--out"),
-        ("{data} --out path.txt --every 0", 2, "--every is 0"),
+        ("{data} --out path.txt --every 0", 2, "--every is '0'"),
         ("{data} --out path.txt --points 0", 2, "points"),
-        ("{data} --out path.txt --video path.gif", 1, "path.gif"),
-        ("{data} --out path.txt --video nowhere/path.mp4", 1, "nowhere/path.mp4"),
-        ("{data} --follow --split test", 2, "--split"),
-        ("none --follow --hfov 60", 1, "none: no such folder"),
     ],
 )
 def test_wrong_options_are_refused_before_any_work(
@@ -178,92 +168,5 @@ def test_wrong_options_are_refused_before_any_work(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     found = bidnerf("track", "MAP", *line.format(data=data).split())
-    assert_refused(found, status, named, after_remarks="--hfov" in line)
+    assert_refused(found, status, named)
     assert list(tmp_path.iterdir()) == []
-
-
-# Frames as they come.
-
-
-def lines(data: Path) -> list[dict[str, Any]]:
-    written = json.loads((data / "transforms_test.json").read_text())
-    unit = (written | written["frames"][0])["depth_unit_scale_factor"]
-    photos, depths = (sorted((data / kind).rglob("*.png")) for kind in ("images", "depth"))
-    return [
-        {"image": str(photo), "depth": str(depth), "time": 0.1 * n, "depth_unit": unit}
-        for n, (photo, depth) in enumerate(zip(photos, depths, strict=True))
-    ]
-
-
-def test_lines_of_stdin_are_answered_one_by_one(
-    bidnerf: Run, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    given = [json.dumps(line) for line in lines(data)]
-    given[1:1] = ["no json", "", '{"image": "missing.png"}']
-    monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(given) + "\n"))
-    words = ("track", "MAP", "-", "--follow", "--focal", CAMERA.fx, "--out", tmp_path / "path.tum")
-    status, out, err = bidnerf(*words)
-    assert status == 0, err
-    found = [json.loads(line) for line in out.splitlines()]
-    assert [row["outcome"] for row in found][1:3] == ["bad input"] * 2
-    assert "missing.png" in found[2]["reason"]
-    good = [row for row in found if row["outcome"] != "bad input"]
-    assert [row["converged"] for row in good] == [True, True, True, False, True, True]
-    assert [row["time"] for row in good] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 0.5])
-    assert read_trajectory(tmp_path / "path.tum").times.tolist() == pytest.approx([0, 0.1, 0.2, 0.4, 0.5])
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("{", "not JSON"),
-        ("[1]", "an object"),
-        ('{"image": 3}', "image"),
-        ('{"image": "a", "depth": 1}', "depth"),
-        ('{"image": "a", "time": "now"}', "time"),
-        ('{"image": "a", "time": NaN}', "time"),
-        ('{"image": "a", "times": 1}', "times"),
-    ],
-)
-def test_lines_that_are_no_requests(line: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        FrameRequest.parse(line)
-
-
-def test_a_line_may_name_a_file_by_bytes_that_are_not_utf_8() -> None:
-    assert FrameRequest.parse('{"image": "a\udcff.png"}').image == "a\udcff.png"
-
-
-def test_a_folder_is_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An image is given once, when its size no longer changes, in the order of names, with the depth of its name."""
-    monkeypatch.setattr(following, "POLL", 0.0)
-    image = np.zeros((4, 4, 3), dtype=np.uint8)
-    for name in ("2.png", "10.png", "2.depth.png"):
-        iio.imwrite(tmp_path / name, image)
-    np.save(tmp_path / "10.npy", np.ones((4, 4)))
-    for name in ("2.json", "10.xmp", "11.AAE"):  # what phones and apps write beside photos
-        (tmp_path / name).write_text("{}")
-    arriving = requests(str(tmp_path))
-    found = [next(arriving) for _ in range(2)]
-    iio.imwrite(tmp_path / "11.png", image)
-    found.append(next(arriving))
-    pairs = [(Path(r.image).name, r.depth and Path(r.depth).name) for r in found if isinstance(r, FrameRequest)]
-    assert pairs == [("2.png", "2.depth.png"), ("10.png", "10.npy"), ("11.png", None)]
-
-
-def test_a_video_shows_each_frame_beside_the_map(bidnerf: Run, data: Path, tmp_path: Path) -> None:
-    """The right half shows the map from the pose found, so it resembles the left half."""
-    av = pytest.importorskip("av")
-    words = ("track", "MAP", data, "--out", tmp_path / "path.txt", "--video", tmp_path / "path.mp4")
-    status, _, err = bidnerf(*words)
-    assert status == 0, err
-    assert {file.name for file in tmp_path.iterdir()} == {"path.mp4", "path.txt"}
-    with av.open(str(tmp_path / "path.mp4")) as video:
-        pictures = [picture.to_ndarray(format="rgb24") for picture in video.decode(video=0)]
-    width = pictures[0].shape[1]
-    assert len(pictures) == FRAMES
-    first, lost = pictures[0].astype(float), pictures[3].astype(float)
-    left, right = (part[30:-10] for part in (first[:, : width // 2], first[:, width // 2 :]))
-    assert np.abs(left - right).mean() < 15
-    dark = lost[:, : width // 2][30:-10]
-    assert np.abs(dark - lost[:, width // 2 :][30:-10]).mean() > 40

@@ -8,7 +8,6 @@ import os
 import shutil
 import struct
 import warnings
-import zipfile
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -26,11 +25,10 @@ from bidnerf import Frame, load_map
 from bidnerf.evaluation import read_results
 from bidnerf.results import read_pose
 from bidnerf_core.camera import read_camera
-from bidnerf_core.datasets import open_dataset, read_depth_points, read_model
+from bidnerf_core.datasets import open_dataset, read_model
 from bidnerf_core.depth import read_depth_image
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.io import (
-    read_archive,
     read_array,
     read_image,
     read_record,
@@ -91,9 +89,6 @@ READERS: dict[str, tuple[str, Callable[[bytes], Damages], Callable[[Path], objec
     "photo": ("data/images/t_0000.png", of_image, lambda p: Frame.open(p, hfov=40.0)),
     "depth": ("data/depth/t_0000.png", of_image, lambda p: read_depth_image(p, 0.001)),
     "depth array": ("depth.npy", of_array, lambda p: read_depth_image(p, 0.001)),
-    "points": ("points.txt", of_points, read_depth_points),
-    "array of points": ("points.npy", of_array, read_depth_points),
-    "archive of points": ("points.npz", of_array, read_depth_points),
     "weights": ("map/weights-*", of_tensors, lambda p: load(p.parent)),
     "COLMAP points": ("sparse/points3D.txt", of_points, lambda p: read_model(p.parent)),
     "COLMAP images": ("sparse/images.txt", of_points, lambda p: read_model(p.parent)),
@@ -239,8 +234,6 @@ FILES: dict[str, Callable[[Path], object]] = {
     "tensors": read_tensors,
     "camera": lambda p: read_camera(p, (24, 24)),
     "array": lambda p: read_array(p, "an array"),
-    "archive": lambda p: read_archive(p, ["points"], "an archive"),
-    "points": read_depth_points,
 }
 
 
@@ -269,19 +262,6 @@ def test_arrays_are_judged_by_their_header(kind: str, shape: str, tmp_path: Path
     (tmp_path / "a.npy").write_bytes(content)
     with pytest.raises(InputError, match="not readable as an array"):
         read_array(tmp_path / "a.npy", "a .npy file")
-    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
-        archive.writestr("points.npy", content)
-    with pytest.raises(InputError, match="not readable as an array"):
-        read_depth_points(tmp_path / "a.npz")
-
-
-def test_an_archive_that_unpacks_to_more_than_an_image_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("bidnerf_core.io.tensors.LARGEST_ARRAY", 10**6)
-    np.savez_compressed(tmp_path / "a.npz", points=np.zeros((10**5, 3)))
-    with pytest.raises(InputError, match=r"points\.npy: unpacks to 2 MiB"):
-        read_depth_points(tmp_path / "a.npz")
 
 
 def test_a_field_that_is_larger_than_its_weights_takes_no_memory(folder: Path, tmp_path: Path) -> None:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
 import torch
 
-from bidnerf_core.datasets import read_depth_points
 from bidnerf_core.fields import Observations, render
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, perturb
@@ -133,44 +129,6 @@ def test_nothing_measured_is_told() -> None:
     for points in (torch.zeros(3, 3), torch.full((2, 3), torch.nan), torch.zeros(0, 3)):
         with refused(where="depth rays", found="nothing was measured", expected="one finite point in front"):
             Observations.from_points(points, SE3.identity())
-
-
-def test_files_of_points(tmp_path: Path) -> None:
-    points = np.array([[0.1, 0.2, 1.5], [-1.0, 0.0, 2.0]])
-    (tmp_path / "p.txt").write_text("# x y z intensity\n0.1 0.2 1.5 7\n\n-1.0 0 2.0 9\n")
-    (tmp_path / "p.csv").write_text("0.1,0.2,1.5\n-1.0,0,2.0\n")
-    np.save(tmp_path / "p.npy", points)
-    np.savez(tmp_path / "camera.npz", points=points)
-    for name in ("p.txt", "p.csv", "p.npy", "camera.npz"):
-        torch.testing.assert_close(read_depth_points(tmp_path / name).points, torch.from_numpy(points))
-    T = T_CAMERA_LIDAR
-    np.savez(tmp_path / "lidar.npz", points=points.astype(np.float32), T_camera_sensor=T.matrix().numpy())
-    found = read_depth_points(tmp_path / "lidar.npz")
-    torch.testing.assert_close(found.points, T.apply(torch.from_numpy(points)), atol=1e-6, rtol=0)
-    torch.testing.assert_close(found.origins[0], T.translation)
-
-
-def test_files_that_are_none_are_told(tmp_path: Path) -> None:
-    (tmp_path / "words.txt").write_text("no points here")
-    (tmp_path / "two.txt").write_text("1 2\n3 4\n")
-    (tmp_path / "ragged.txt").write_text("1 2 3\n3 4\n")
-    (tmp_path / "decimal_commas.txt").write_text("1,5 2,5\n3,5 4,5\n")
-    (tmp_path / "empty.txt").write_text("")
-    (tmp_path / "zeros.txt").write_text("0 0 0\n")
-    (tmp_path / "binary.txt").write_bytes(bytes(range(256)))
-    (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04 broken")
-    (tmp_path / "empty.npy").write_bytes(b"")
-    np.save(tmp_path / "words.npy", np.array([["a", "b", "c"]]))
-    np.save(tmp_path / "objects.npy", np.array([[{}, {}, {}]], dtype=object))
-    np.savez(tmp_path / "other.npz", cloud=np.ones((2, 3)))
-    with zipfile.ZipFile(tmp_path / "no_array.npz", "w") as archive:
-        archive.writestr("points.npy", b"no array at all")
-    np.savez(tmp_path / "scaled.npz", points=np.ones((2, 3)), T_camera_sensor=2 * np.eye(4))
-    np.savez(tmp_path / "flat.npz", points=np.ones((2, 3)), T_camera_sensor=np.eye(3))
-    np.savez(tmp_path / "text.npz", points=np.ones((2, 3)), T_camera_sensor=np.array("no"))
-    for name in [*(path.name for path in tmp_path.iterdir()), "missing.txt"]:
-        with refused(where=tmp_path / name):
-            read_depth_points(tmp_path / name)
 
 
 def test_a_window_is_the_last_items() -> None:

@@ -52,6 +52,7 @@ def test_example_runs(
         DEPTH_RESIDUALS.update(before)
     printed = capsys.readouterr().out
     assert "off by" in printed or "success" in printed
+    assert "success in 0" not in printed
 
 
 def test_what_is_shortened_is_there() -> None:

@@ -243,7 +243,7 @@ def test_a_query_that_fails_does_not_stop_the_others(tmp_path: Path, monkeypatch
     files = [tmp_path / f"{n}.png" for n in range(3)]
     for file in (files[0], files[2]):
         iio.imwrite(file, np.zeros((3, 4, 3), dtype=np.uint8))
-    monkeypatch.setattr(Localizer, "__call__", lambda self, *given: replace(FOUND, outcome=Outcome.CONVERGED))
+    monkeypatch.setattr(Localizer, "__call__", lambda self, *given, **more: replace(FOUND, outcome=Outcome.CONVERGED))
     source = Photos(files, DatasetOptions(CAMERA))
     seen = list[str]()
     answers = localize_each(

@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 
 import tiny
 from bidnerf import SE3, Frame, Intrinsics, Localizer, Tracker, load_map, open_sequence
-from bidnerf_core.datasets import read_depth_points
+from bidnerf_core.datasets import
 from bidnerf_core.localization import settings_of
 from damage import (
     NUMBERS,
@@ -151,9 +151,6 @@ TARGETS: list[tuple[str, Callable[[bytes], Damages], list[FolderDoor]]] = [
     ("camera.json", of_json, [[*PHOTO, "--camera", "{}/camera.json"], frame_door(camera="camera.json")]),
     ("cameras.txt", of_points, [[*PHOTO, "--camera", "{}/cameras.txt"], frame_door(camera="cameras.txt")]),
     ("pose.json", of_json, [KNOWN, [*KNOWN, "--json"]]),
-    ("points.txt", of_points, [lambda folder: read_depth_points(folder / "points.txt")]),
-    ("points.npy", of_array, [lambda folder: read_depth_points(folder / "points.npy")]),
-    ("points.npz", of_array, [lambda folder: read_depth_points(folder / "points.npz")]),
     (
         MODEL,
         of_colmap,
@@ -210,7 +207,7 @@ OPTIONS = """
 --out --seed --split --frame --size --trials --workers --shards --shard --images --angle --fault --device --protocol --method
 --steps --levels --log2-table-size --width --learning-rate --cells --rays --max-steps --hypotheses --start --perturb --window
 --depth --depth-unit --depth-points --camera --focal --hfov --draw --json --level --overwrite --resume --background --backend
---dask --criterion --title --no-depth --split= --plot --video --help --help-all --nothing
+--dask --criterion --title --no-depth --split= --plot --help --help-all --nothing
 """.split()  # noqa: SIM905
 VALUES = (
     *TEXTS,
