@@ -1,12 +1,11 @@
 """Film a tracked sequence: each image, the map rendered from the pose found, and both blended, as a video (extra `video`).
 
-    python examples/08_film_a_track.py [--map MAP --data DATA] [--every 1] [--out track.mp4]
+    python examples/09_film_a_track.py [--map MAP --data DATA] [--every 1] [--out track.mp4]
 
 Where the edges of image and map coincide, the pose is right. Without a map, a textured ground in closed form stands in for one.
 """
 
 import argparse
-import math
 from pathlib import Path
 
 import av
@@ -27,8 +26,7 @@ given = parser.parse_args()
 if given.map:
     scene, sequence = bn.load_map(given.map), given.data
 else:
-    angles = [0.6 + 0.035 * number for number in range(3)]
-    eyes = [(0.75 * math.cos(angle), 0.75 * math.sin(angle), 1.5) for angle in angles]
+    eyes = [(0.7 - 0.03 * number, 0.4, 1.5) for number in range(3)]
     scene = textured_map(surface=True)
     sequence = of_views([view(look_at(eye, (0.0, 0.0, 0.0)), str(n)) for n, eye in enumerate(eyes)], Path("ground"))
 
