@@ -34,7 +34,7 @@ with av.open(given.out, "w") as film:
     stream = film.add_stream("libx264", rate=10)
 
     def add(frame, answer):
-        picture = overlay(scene, frame, answer.found)
+        picture = overlay(scene, frame, answer.localization)
         stream.height, stream.width = (side // 2 * 2 for side in picture.shape[:2])  # the codec wants even sides
         film.mux(stream.encode(av.VideoFrame.from_ndarray(picture[: stream.height, : stream.width])))
 
