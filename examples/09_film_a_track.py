@@ -35,7 +35,8 @@ with av.open(given.out, "w") as film:
 
     def add(frame, answer):
         picture = overlay(scene, frame, answer.localization)
-        stream.height, stream.width = (side // 2 * 2 for side in picture.shape[:2])  # the codec wants even sides
+        if not stream.codec_context.is_open:
+            stream.height, stream.width = (side // 2 * 2 for side in picture.shape[:2])  # the codec wants even sides
         film.mux(stream.encode(av.VideoFrame.from_ndarray(picture[: stream.height, : stream.width])))
 
     path = bn.track(scene, sequence, every=given.every, each=add)
