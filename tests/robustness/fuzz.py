@@ -24,7 +24,6 @@ from hypothesis import strategies as st
 
 import tiny
 from bidnerf import SE3, Frame, Intrinsics, Localizer, Tracker, load_map, open_sequence
-from bidnerf_core.datasets import
 from bidnerf_core.localization import settings_of
 from damage import (
     NUMBERS,
