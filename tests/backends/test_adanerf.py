@@ -23,6 +23,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields import FieldValues, Rays, RaySamples, query_samples, render, rendering_weights
 from bidnerf_core.frames import View
 from bidnerf_core.training import RayBank, TrainingBatch
+from optional import require
 from tiny import black_batch
 
 SMALL = AdaNerfConfig(
@@ -167,8 +168,7 @@ def test_bins_that_will_be_shaded_count_fully_in_the_soft_phase() -> None:
     counted = soft_weights(scores, 0.2)
     torch.testing.assert_close(counted.detach(), torch.tensor([[0.0, 0.25, 0.5, 1.0, 1.0, 1.0]]))
     counted.sum().backward()
-    assert scores.grad is not None
-    assert bool((scores.grad[0, :3] > 0).all())  # what a picture lacks, the oracle can call back
+    assert bool((require(scores.grad)[0, :3] > 0).all())  # what a picture lacks, the oracle can call back
     assert torch.equal(soft_weights(scores.detach(), 0.0)[0, 1:], torch.ones(5))
 
 
@@ -178,9 +178,7 @@ def test_gradients_of_soft_rendering_are_finite_where_all_is_opaque(rays: Rays) 
     scores = torch.ones_like(density).requires_grad_()
     values = FieldValues(density, torch.rand((*density.shape, 3)))
     render_softly(values, samples, scores, torch.zeros(len(density), 3)).rgb.sum().backward()
-    assert density.grad is not None
-    assert scores.grad is not None
-    assert bool(density.grad.isfinite().all() and scores.grad.isfinite().all())
+    assert bool(require(density.grad).isfinite().all() and require(scores.grad).isfinite().all())
 
 
 def test_bins_without_room_for_matter_are_shaded_now_and_then(field: AdaNerfField, generator: Generator) -> None:

@@ -16,6 +16,7 @@ from torch import Tensor
 from bidnerf_hashgrid import encoding as encoding_module
 from bidnerf_hashgrid.encoding import HashEncoding, HashEncodingConfig
 from bidnerf_hashgrid.threads import concurrently
+from optional import require
 
 Interpolation = Literal["linear", "smooth"]
 both_interpolations = pytest.mark.parametrize("interpolation", ["linear", "smooth"])
@@ -67,8 +68,7 @@ def reference(encoding: HashEncoding, positions: Tensor) -> np.ndarray:
 def position_gradient(encoding: HashEncoding, positions: Tensor) -> Tensor:
     positions = positions.clone().requires_grad_()
     encoding(positions).sum().backward()
-    assert positions.grad is not None
-    return positions.grad
+    return require(positions.grad)
 
 
 @pytest.mark.parametrize(
@@ -120,8 +120,7 @@ def test_float32_gradients_are_those_of_float64(interpolation: Interpolation) ->
     single.load_state_dict(encoding.state_dict())
     torch.testing.assert_close(position_gradient(single, positions), exact.float(), rtol=1e-3, atol=1e-3)
     for table, expected in zip(single.tables, exact_tables, strict=True):
-        assert expected is not None
-        torch.testing.assert_close(table.grad, expected.float(), rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(table.grad, require(expected).float(), rtol=1e-3, atol=1e-4)
 
 
 def test_gives_gradients_only_where_they_are_required() -> None:
@@ -177,8 +176,7 @@ def test_no_points(features: int) -> None:
     encoded = encoding(positions)
     assert encoded.shape == (0, encoding.width)
     encoded.sum().backward()
-    assert positions.grad is not None
-    assert positions.grad.shape == (0, 3)
+    assert require(positions.grad).shape == (0, 3)
     assert all(table.grad is not None and not table.grad.any() for table in encoding.tables)
 
 

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from bidnerf.evaluation import PROTOCOLS, Group, Plan, Trial, group_results
 from bidnerf.scenes import orbit
 from bidnerf_core.geometry import SE3, look_at
+from optional import require
 from refusals import refused
 from trial_results import trial_result
 
@@ -85,8 +86,7 @@ def test_parallel_starts_are_the_published_draws(script: Script) -> None:
             assert np.array_equal(ours, theirs)
         assert protocol.cases(frames, 25, 1234) == [(chosen[i // 5], 1234 + i) for i in range(25)]
         for i in range(25):
-            start = protocol.start(T_true, (float(frames),), 1234 + i)
-            assert start is not None
+            start = require(protocol.start(T_true, (float(frames),), 1234 + i))
             phi, theta, psi = angles[i // 5, i % 5]
             turn = Rotation.from_euler("xyz", [psi, -theta, phi], degrees=True).as_matrix()
             np.testing.assert_allclose(start.rotation, turn @ T_true.rotation.numpy(), atol=1e-12)

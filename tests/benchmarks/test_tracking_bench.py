@@ -12,6 +12,7 @@ import torch
 
 from bidnerf import Frame, Intrinsics
 from bidnerf_core.datasets import TimedFrame
+from optional import require
 
 CAMERA = Intrinsics(8.0, 8.0, 4.0, 3.0, 8, 6)
 
@@ -56,8 +57,7 @@ def test_covered_frames_are_the_blind_ones_and_sight_returns_after_them(tracking
     assert [float(timed.frame.rgb.max()) < 0.1 for timed in photos.frames] == [
         number in photos.blind for number in range(30)
     ]
-    assert photos.returns is not None
-    assert photos.frames[photos.returns].frame.name == "57"
+    assert photos.frames[require(photos.returns)].frame.name == "57"
 
 
 def test_depth_that_stops_takes_the_frames_of_depth_alone_with_it(tracking: Any) -> None:
@@ -74,9 +74,7 @@ def test_carrying_leaves_no_trace_in_the_times(tracking: Any) -> None:
         "140",
     ]
     before, after = run.frames[tracking.FIRST - 1].time, run.frames[tracking.FIRST].time
-    assert before is not None
-    assert after is not None
-    assert after - before == pytest.approx(1.1)
+    assert require(after) - require(before) == pytest.approx(1.1)
 
 
 @pytest.mark.parametrize(("accepted", "expected"), [("1101", 2), ("1011", 1), ("1000", 3)])

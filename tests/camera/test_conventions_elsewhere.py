@@ -17,6 +17,7 @@ from bidnerf_core.camera import CameraBatch, Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import Localization, Outcome
+from optional import require
 from photo_files import noise, write_photo
 
 CAMERA = Intrinsics(400.0, 410.0, 321.5, 238.0, 640, 480, (0.05, -0.02, 0.003, 0.004))
@@ -41,8 +42,7 @@ def found(covariance: torch.Tensor | None = COVARIANCE) -> Localization:
 
 
 def mahalanobis(residual: np.ndarray, covariance: torch.Tensor | None) -> float:
-    assert covariance is not None
-    return float(residual @ np.linalg.solve(covariance.numpy(), residual))
+    return float(residual @ np.linalg.solve(require(covariance).numpy(), residual))
 
 
 EXPECTED = float(normalized_error_squared(FOUND, TRUE, COVARIANCE))
@@ -76,8 +76,7 @@ def test_gtsam_itself_agrees() -> None:
     def pose(T: SE3) -> Any:
         return gtsam.Pose3(gtsam.Rot3.Quaternion(*T.quaternion("wxyz").tolist()), T.translation.numpy())
 
-    covariance = found().covariance_in("gtsam")
-    assert covariance is not None
+    covariance = require(found().covariance_in("gtsam"))
     np.testing.assert_allclose(pose(FOUND).matrix(), FOUND.matrix().numpy(), atol=1e-12)
     factor = gtsam.PriorFactorPose3(0, pose(FOUND), gtsam.noiseModel.Gaussian.Covariance(covariance.numpy()))
     values = gtsam.Values()

@@ -17,6 +17,7 @@ from bidnerf_core.captures.training_views import training_poses
 from bidnerf_core.localization import LandmarkMatcher, Loop, Outcome
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, detect_keypoints, track_views
 from landmark_scene import Points, looking_in
+from optional import require
 
 EACH = 20
 AWAY = torch.tensor([6.0, 0.0, 0.0], dtype=torch.float64)
@@ -66,8 +67,7 @@ def test_a_photo_of_either_room_is_not_accepted_in_the_other() -> None:
     matcher = LandmarkMatcher(found.tracked.landmarks(DEFAULT_LANDMARKS))
     for number in range(6):
         query = points.view(looking_in(1.0 * number + 0.1, 0.2, 3.8), seed=number)
-        answer = Loop([query], matcher, features=points)()
-        assert answer is not None
+        answer = require(Loop([query], matcher, features=points)())
         assert answer.verdict.outcome is Outcome.AMBIGUOUS
         here, there = (answer.posterior.place(mode).translation for mode in (0, 1))
         assert float((here - there).norm()) == pytest.approx(float(AWAY.norm()), abs=0.05)

@@ -42,6 +42,7 @@ from bidnerf_core.mapping import (
 from bidnerf_core.training import RayBank
 from inaccurate_captures import VIEWS, capture, turned, updates
 from landmark_scene import PINHOLE, Points, looking_in
+from optional import require
 
 NOISE = 0.3
 METRES, RADIANS = 0.01, 0.008  # what a hand does in a few hundredths of a second: about three pixels
@@ -97,8 +98,7 @@ def test_few_images_are_no_evidence() -> None:
 def test_motions_are_estimated_and_the_poses_become_more_accurate() -> None:
     found, views, poses = corrected(1.0)
     assert found.refined
-    assert found.consistency is not None
-    assert found.consistency.noise_after == pytest.approx(NOISE, rel=0.15)
+    assert require(found.consistency).noise_after == pytest.approx(NOISE, rel=0.15)
     true, estimated, none = (last_row(poses, m) for m in (motions(1.0), found.tracked.motion, motions(0.0)))
     assert float((estimated - true).norm(dim=-1).median()) < 0.35 * float((true - none).norm(dim=-1).median())
     given = SE3.stack([view.T_ref_camera for view in views])
@@ -165,9 +165,7 @@ def test_the_motion_is_stored_with_the_pose() -> None:
     cameras = record_refinement(views, stored_cameras(trained), found.pixels.tolist())
     again = apply_stored_poses(views, cameras)
     for one, other in zip(again, trained, strict=True):
-        assert one.motion is not None
-        assert other.motion is not None
-        assert torch.equal(one.motion, other.motion)
+        assert torch.equal(require(one.motion), require(other.motion))
     assert found.consistency is not None
     noise = found.consistency.noise_before, found.consistency.noise_after
     lines = pose_sentences(cameras, PoseRefinement(*noise, True))

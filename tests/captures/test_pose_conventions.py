@@ -18,6 +18,7 @@ from bidnerf_core.captures.pose_conventions import Y_AND_Z_REVERSED as REVERSED
 from bidnerf_core.captures.pose_conventions import PoseContradiction, readings
 from bidnerf_core.mapping import ImageKeypoints, detect_keypoints
 from landmark_scene import Points, looking_in, ring
+from optional import require
 from refusals import refused
 
 COUNT = 150  # points: as many as tell all readings apart
@@ -46,9 +47,9 @@ def judged(poses: list[SE3], noise: float = 0.4, outliers: float = 0.2) -> PoseC
 
 def is_explained(found: PoseContradiction | None, given: list[SE3], truth: list[SE3]) -> bool:
     """Return whether the reading turns the given poses into the true ones."""
-    assert found is not None
-    assert found.reading is not None
-    return torch.allclose(found.reading.understand(SE3.stack(given)).matrix(), SE3.stack(truth).matrix())
+    return torch.allclose(
+        require(require(found).reading).understand(SE3.stack(given)).matrix(), SE3.stack(truth).matrix()
+    )
 
 
 def test_right_poses_are_in_the_expected_convention_in_any_world() -> None:
@@ -63,8 +64,7 @@ def test_inverse_matrices_are_recognised(axes: Tensor, height: float) -> None:
     truth = [looking_in(0.105 * i, height * (i % 3)) for i in range(IMAGES)]
     seen = detect_keypoints([points.view(T, seed=i) for i, T in enumerate(truth)], points)
     given = [with_axes(T, axes).inverse() for T in truth]
-    found = pose_contradiction([replace(p, T_ref_camera=T) for p, T in zip(seen, given, strict=True)])
-    assert found is not None
+    found = require(pose_contradiction([replace(p, T_ref_camera=T) for p, T in zip(seen, given, strict=True)]))
     assert "inverses" in found.sentence
 
 
@@ -74,8 +74,7 @@ def test_a_few_wrong_poses_are_accepted_and_random_ones_refused_without_a_readin
     some[3], some[8] = with_axes(some[3], REVERSED), with_axes(some[8], CYCLED)
     assert judged(some) is None
     tangents = 2 * torch.randn(IMAGES, 6, dtype=torch.float64, generator=generator)
-    found = judged([SE3.exp(tangent) for tangent in tangents])
-    assert found is not None
+    found = require(judged([SE3.exp(tangent) for tangent in tangents]))
     assert found.reading is None
     assert f"agree with the keypoints of {found.agreeing_as_given} of {found.pairs}" in found.sentence
 
@@ -172,13 +171,11 @@ def test_mistakes_are_refused_with_the_remedy_that_works(mistake: str) -> None:
     change, words = WRONG[mistake]
     truth = SE3.stack(irregular_poses())
     given = change(truth)
-    found = pose_contradiction(seen_from(truth, given, COUNT))
-    assert found is not None
-    assert found.reading is not None
+    found = require(pose_contradiction(seen_from(truth, given, COUNT)))
     assert words in found.sentence
     assert found.agreeing >= 0.9 * found.pairs
     assert found.agreeing_as_given < 0.3 * found.pairs
-    corrected = found.reading.understand(given)
+    corrected = require(found.reading).understand(given)
     known = corrected.translation.isfinite().all(-1)
     corrected, expected = corrected[known], truth[known]
     relative = [(T[0].inverse() @ T).matrix() for T in (corrected, expected)]  # in whatever world
@@ -214,8 +211,7 @@ def test_images_in_no_order_are_judged_as_well() -> None:
     found = detect_keypoints(views, points)
     assert pose_contradiction(found) is None
     mixed = [replace(image, T_ref_camera=found[(7 * i) % 40].T_ref_camera) for i, image in enumerate(found)]
-    contradiction = pose_contradiction(mixed)
-    assert contradiction is not None
+    contradiction = require(pose_contradiction(mixed))
     assert contradiction.agreeing_as_given < 0.5 * contradiction.pairs
 
 

@@ -30,6 +30,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import LandmarkConfig, Sift, TrackedViews, track_views
 from inaccurate_captures import VIEWS, refined, turned, updates
 from landmark_scene import Points, looking_in, ring
+from optional import require
 
 WRONG = 7
 METRES, RADIANS = 0.01, 0.004  # together about two pixels
@@ -51,8 +52,7 @@ def test_exact_poses_do_not_move_at_all() -> None:
     found, views, _ = refined(0.0, NOTHING, least=0.0)
     moved = torch.cat([(found.tracked.T_world_camera[i].inverse() @ v.T_ref_camera).log() for i, v in enumerate(views)])
     assert float(moved.abs().max()) < 1e-5  # the keypoints are float32
-    assert found.consistency is not None
-    assert found.consistency.inconsistency == pytest.approx(0, abs=1e-3)
+    assert require(found.consistency).inconsistency == pytest.approx(0, abs=1e-3)
 
 
 def test_poses_that_fit_are_kept() -> None:
@@ -61,8 +61,7 @@ def test_poses_that_fit_are_kept() -> None:
     assert found.replaced == []
     for i, view in enumerate(views):
         assert torch.equal(found.tracked.T_world_camera[i].matrix(), view.T_ref_camera.matrix())
-    assert found.consistency is not None
-    assert found.consistency.inconsistency < 0.15
+    assert require(found.consistency).inconsistency < 0.15
 
 
 def test_known_errors_are_taken_back() -> None:

@@ -25,6 +25,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
+from optional import require
 
 CAMERA = Intrinsics(60.0, 58.0, 33.0, 23.0, 64, 48)
 LENS = replace(CAMERA, distortion=(-0.2, 0.05, 0.001, -0.002))
@@ -214,10 +215,8 @@ def test_a_freed_sphere_is_wholly_in_the_free(x: float, y: float, z: float, radi
     pixels = view.frame.intrinsics.project(around_it).floor().long()
     assert ((pixels >= 0) & (pixels < torch.tensor([64, 48]))).all()
     depth, alpha = view.frame.depth, view.frame.alpha
-    assert depth is not None
-    assert alpha is not None
-    behind = around_it[:, 2] > depth[pixels[:, 1], pixels[:, 0]]
-    assert not (behind & (alpha[pixels[:, 1], pixels[:, 0]] > 0)).any()
+    behind = around_it[:, 2] > require(depth)[pixels[:, 1], pixels[:, 0]]
+    assert not (behind & (require(alpha)[pixels[:, 1], pixels[:, 0]] > 0)).any()
 
 
 # Bounds
@@ -271,8 +270,7 @@ def test_wild_measurements_do_not_move_the_box() -> None:
     wild = estimate_bounds(views)
     assert max(wild.size) < 2000  # one in 400 is more than may be wild: the box tells of it ...
     for view in views[1:]:
-        assert view.frame.depth is not None
-        view.frame.depth[0, :2] = 0
+        require(view.frame.depth)[0, :2] = 0
     assert max(estimate_bounds(views).size) < 1.1 * max(calm.size)  # ... one in 4000 is not
 
 

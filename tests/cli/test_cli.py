@@ -40,6 +40,7 @@ from bidnerf_core.maps import Checkpoints, MapInfo, load_info, load_map
 from bidnerf_core.registry import list_plugins
 from bidnerf_core.training import TrainingStep
 from commands import Run, assert_refused, strict
+from optional import require
 from trainings import assert_same_map, stop_at
 
 LOCALIZE_KEYS = {
@@ -803,8 +804,7 @@ class Forking:
         self.modules = {*self._line().split()}  # that were imported to localize
 
     def _line(self) -> str:
-        assert self.process.stdout is not None
-        return self.process.stdout.readline()
+        return require(self.process.stdout).readline()
 
     def begin(self, words: list[str], out: str = os.devnull, err: str = os.devnull) -> int:
         """Begin a command, and return the id of its process."""
@@ -824,8 +824,7 @@ def forking(shared: Path) -> Iterator[Forking]:
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     with subprocess.Popen(program, text=True, env=ALONE, **pipes) as process:
         yield Forking(process)
-        assert process.stdin is not None
-        process.stdin.close()
+        require(process.stdin).close()
 
 
 @pytest.mark.slow

@@ -28,6 +28,7 @@ from bidnerf_core.maps import Map, TrainOptions, load_info, load_map
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid import backend as hashgrid
 from commands import CommandResult, Run, assert_refused
+from optional import require
 
 pytestmark = pytest.mark.slow
 
@@ -102,12 +103,10 @@ def test_a_baked_map_needs_no_start(sharp: Path, baked: Path, once: CommandResul
     facts = json.loads(bidnerf("info", folder, "--json").out)
     assert facts["surfels"] > 1000
     stored = load_map(folder)
-    surface = stored.surface
-    assert surface is not None
+    surface = require(stored.surface)
     cells, size = len(surface.index.entries), round(surface.mebibytes, 1)
     assert facts["surface"] == {"cell": surface.cell, "cells": cells, "MiB": size}
-    assert stored.colour_noise is not None
-    assert stored.colour_noise > 0.05  # a field of four steps is not what the photos show
+    assert require(stored.colour_noise) > 0.05  # a field of four steps is not what the photos show
     place = ["localize", folder, data, "--frame", "t_0000"]
     status, out, _ = bidnerf(*place, "--json")
     found = json.loads(out)
@@ -139,8 +138,7 @@ def test_a_map_that_was_imported_is_baked_from_where_a_dataset_was_seen(
     status, _, err = bidnerf(*bake, "--data", tmp_path / "data")
     assert status == 0
     assert "from 9 rendered views" in err
-    surface = load_map(folder).surface
-    assert surface is not None
+    surface = require(load_map(folder).surface)
     assert len(surface.keyframes) == 9
 
 
@@ -151,8 +149,7 @@ def test_a_map_is_baked_from_what_it_renders_and_anew_if_its_surface_is_damaged(
         status, out, err = bidnerf(*bake)
         assert (status, out) == (0, "")
         assert "from 16 rendered views" in err
-        surface = load_map(folder).surface
-        assert surface is not None
+        surface = require(load_map(folder).surface)
         height = torch.linalg.vector_norm(surface.surfels.positions, dim=-1) - 0.5
         assert height.abs().max() < surface.cell
         assert len(surface.keyframes) == 16
@@ -266,8 +263,7 @@ def test_landmarks_of_photos_are_built_once_for_training_and_baking(
     )
     assert built == [16]
     assert seen[0] > 100
-    assert stored.landmarks is not None
-    assert stored.landmarks.trial.images == len(photos) // 3
+    assert require(stored.landmarks).trial.images == len(photos) // 3
     assert stored.bounds.contracted
 
 

@@ -23,6 +23,7 @@ from bidnerf_core.mapping import TrackedViews, track_views
 from bidnerf_core.maps import cameras_of, load_info, read_part, read_views
 from commands import Run, assert_refused
 from landmark_scene import Points, ring
+from optional import require
 from trainings import assert_same_map, stop_at
 
 UPDATE = torch.tensor([0.01, -0.02, 0.0, 0.0, 0.03, 0.0], dtype=torch.float64)
@@ -111,8 +112,7 @@ def test_photos_that_are_baked_later_have_the_refined_poses(
     out = Path(shutil.copytree(refined, tmp_path / "map"))
     assert bidnerf("bake", out, "--data", shared / "data", "--measured", 5000, "--cells", 5000).status == 0
     info = load_info(out)
-    capture = read_part(out, info, "capture")
-    assert capture is not None
+    capture = require(read_part(out, info, "capture"))
     photos = capture.photos
     for photo, (_, T) in zip(photos, cameras_of(info), strict=True):
         torch.testing.assert_close(torch.tensor(photo.position).double(), T.translation, rtol=0, atol=1e-6)

@@ -22,6 +22,7 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.training import RayBank, Silent, ray_termination
 from bidnerf_hashgrid import backend as hashgrid
+from optional import require
 from refusals import refused
 from sparse_model import Known
 
@@ -296,8 +297,7 @@ def test_a_depth_image_of_the_points(model: Path, scene: Known) -> None:
     """Points lie on pixel centres of one view; seen from others they are a pixel's width off at most."""
     sparse = opened(model, scene)
     for place, view in enumerate(scene.views):
-        depth = sparse.onto(bare(view), "train").frame.depth
-        assert depth is not None
+        depth = require(sparse.onto(bare(view), "train").frame.depth)
         assert view.frame.depth is not None
         assert 0 < int((depth > 0).sum()) <= len(scene.truth(place))
         both = (depth > 0) & (view.frame.depth > 0)
@@ -309,8 +309,7 @@ def test_a_depth_image_of_the_points(model: Path, scene: Known) -> None:
 def test_of_points_at_one_pixel_the_nearest_is_seen(model: Path, scene: Known) -> None:
     small = Intrinsics(1.0, 1.0, 0.5, 0.5, 1, 1)
     frame = Frame(scene.views[0].frame.name, torch.zeros(1, 1, 3), small)
-    depth = opened(model, scene).onto(View(frame, scene.views[0].T_ref_camera), "train").frame.depth
-    assert depth is not None
+    depth = require(opened(model, scene).onto(View(frame, scene.views[0].T_ref_camera), "train").frame.depth)
     assert float(depth) == pytest.approx(float(scene.truth(0)[:, 2].min()))
 
 

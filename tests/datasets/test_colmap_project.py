@@ -13,6 +13,7 @@ import torch
 
 from bidnerf_core.datasets import open_dataset, open_sequence
 from bidnerf_core.geometry import SE3
+from optional import require
 from refusals import refused
 from scan_layouts import message, read_all, remarks_of
 from sparse_model import to_binary, write_model
@@ -58,13 +59,12 @@ def test_poses_and_projections_are_those_of_pycolmap(binary: bool, project: Path
         image = by_name[name]
         assert float(timed.frame.rgb.mean()) == pytest.approx(10 * NAMES.index(name) / 255)
         assert (timed.frame.intrinsics.width, timed.frame.intrinsics.height) == (16, 12)
-        assert timed.truth is not None
         for point in np.array([[0.1, -0.05, 2.0], [-0.3, 0.2, 1.0]]):
             expected = image.camera.img_from_cam(point)
             found = timed.frame.intrinsics.project(torch.from_numpy(point))
             np.testing.assert_allclose(found, expected, atol=1e-9)
             world = image.cam_from_world().inverse() * point
-            np.testing.assert_allclose(timed.truth.apply(torch.from_numpy(point)), world, atol=1e-9)
+            np.testing.assert_allclose(require(timed.truth).apply(torch.from_numpy(point)), world, atol=1e-9)
 
 
 def test_every_eighth_is_held_out_in_natural_order(project: Path) -> None:

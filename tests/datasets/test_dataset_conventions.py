@@ -20,6 +20,7 @@ from torch.nn import functional
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
+from optional import require
 
 pytestmark = pytest.mark.data
 PAIRS = 10
@@ -49,8 +50,7 @@ def compared(source: View, other: View) -> tuple[float, float, float]:
     size = torch.tensor([other.frame.intrinsics.width, other.frame.intrinsics.height])
     inside = ((pixels > 2) & (pixels < size - 2)).all(dim=-1)
     seen, pixels, colours = seen[inside], pixels[inside], colours[inside]
-    depth = other.frame.depth
-    assert depth is not None
+    depth = require(other.frame.depth)
     there = depth[pixels[:, 1].long(), pixels[:, 0].long()].double()
     off = torch.where(there > 0, seen[:, 2] / there - 1, torch.inf)
     same = off.abs() < SAME_SURFACE
@@ -61,8 +61,7 @@ def compared(source: View, other: View) -> tuple[float, float, float]:
 
 def measured(view: View) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Points (world) and colours of all pixels with depth."""
-    depth = view.frame.depth
-    assert depth is not None
+    depth = require(view.frame.depth)
     known = depth > 0
     ray = view.frame.intrinsics.unproject(view.frame.intrinsics.pixel_centres(torch.float64))
     return view.T_ref_camera.apply(ray[known] * depth[known][:, None].double()), view.frame.rgb[known]

@@ -24,6 +24,7 @@ from bidnerf_core.datasets import (
     open_sequence,
     write_transforms,
 )
+from optional import require
 from refusals import refused
 from scan_layouts import edit_frame, edit_keys, small_views, write_nerfstudio
 
@@ -52,10 +53,9 @@ def test_frames_are_in_the_order_of_their_times(key: str, tmp_path: Path) -> Non
     assert names(sequence) == ["b_2", "b_1", "a_3", "b_10"]
     assert [timed.time for timed in sequence] == [-1, 0, 2, 3.5]
     for timed in sequence:  # pose and image belong together
-        assert timed.truth is not None
         (view,) = [view for view in VIEWS if view.frame.name == timed.frame.name]
         torch.testing.assert_close(timed.frame.rgb, view.frame.rgb)
-        torch.testing.assert_close(timed.truth.matrix(), view.T_ref_camera.matrix())
+        torch.testing.assert_close(require(timed.truth).matrix(), view.T_ref_camera.matrix())
 
 
 def test_the_source_of_a_frame_may_be_its_time(tmp_path: Path) -> None:
@@ -138,8 +138,7 @@ def test_a_folder_of_images(tmp_path: Path) -> None:
     assert [timed.frame.name for timed in frames] == ["9", "10"]
     assert [timed.time for timed in frames] == [None, None]
     assert frames[0].frame.intrinsics == Intrinsics(4, 4, 4, 3, 8, 6).from_hfov(90, 8, 6)
-    assert frames[0].frame.depth is not None
-    assert float(frames[0].frame.depth.mean()) == pytest.approx(1.5)
+    assert float(require(frames[0].frame.depth).mean()) == pytest.approx(1.5)
     assert frames[1].frame.depth is None
     with refused(where=tmp_path / "9.png", found="no focal length in EXIF", expected="a camera"):
         list(open_sequence(tmp_path))

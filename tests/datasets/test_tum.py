@@ -18,6 +18,7 @@ from bidnerf_core.datasets.formats.tum import CAMERAS, associate
 
 # Inside: the published cameras and the association of times, compared with OpenCV and SciPy
 from bidnerf_core.geometry import SE3
+from optional import require
 from refusals import refused
 from scan_layouts import remarks_of, small_views, write_tum
 from tum_folder import edit_rows
@@ -114,9 +115,7 @@ def test_lists_may_be_in_any_order_and_end_as_on_windows(folder: Path) -> None:
         (folder / name).write_bytes(b"\xef\xbb\xbf" + content.replace(b"\n", b"\r\n") + b"\r\n\r\n")
     for timed, (time, name, truth) in zip(open_sequence(folder), expected, strict=True):
         assert (timed.time, timed.frame.name) == (time, name)
-        assert timed.truth is not None
-        assert truth is not None
-        torch.testing.assert_close(timed.truth.matrix(), truth.matrix())
+        torch.testing.assert_close(require(timed.truth).matrix(), require(truth).matrix())
 
 
 def test_a_recording_that_was_copied_in_part(folder: Path) -> None:
@@ -137,9 +136,7 @@ def test_a_recording_that_was_copied_in_part(folder: Path) -> None:
     frames = list(open_sequence(folder))
     assert [timed.frame.depth is not None for timed in frames] == [True] * 5 + [False]
     for timed, truth in zip(frames, expected, strict=False):
-        assert timed.truth is not None
-        assert truth is not None
-        torch.testing.assert_close(timed.truth.matrix(), truth.matrix())
+        torch.testing.assert_close(require(timed.truth).matrix(), require(truth).matrix())
     for file in (folder / "rgb").iterdir():
         file.unlink()
     image = folder / "rgb/1305031102.175304.png"
@@ -190,9 +187,7 @@ def test_trajectories_of_other_kinds(kind: str, folder: Path) -> None:
     said = remarks_of(folder)
     assert len(said) == (kind == "KITTI")
     for timed, (_, truth) in zip(open_sequence(folder), frames, strict=True):
-        assert timed.truth is not None
-        assert truth is not None
-        torch.testing.assert_close(timed.truth.matrix(), truth.matrix(), atol=1e-9, rtol=0)
+        torch.testing.assert_close(require(timed.truth).matrix(), require(truth).matrix(), atol=1e-9, rtol=0)
     edit_rows(folder / "groundtruth.txt", lambda rows: rows[:-1])
     if kind == "KITTI":
         with refused(
@@ -227,8 +222,7 @@ def test_interpolation_is_scipys_slerp(tmp_path: Path) -> None:
     path = read_trajectory(tmp_path / "path.txt")
     slerp = Slerp(times, turns)
     for time in generator.uniform(times[0], times[-1], 30):
-        found = path.at(time, largest_gap=1.0)
-        assert found is not None
+        found = require(path.at(time, largest_gap=1.0))
         np.testing.assert_allclose(found.rotation, slerp(time).as_matrix(), atol=1e-9)
         np.testing.assert_allclose(found.translation, [np.interp(time, times, p) for p in places.T], atol=1e-9)
     for time in times:

@@ -13,6 +13,7 @@ from torch import Generator, Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.depth import DepthNoise, estimate_depth_noise, find_depth_sensor
+from optional import require
 
 CAMERA = Intrinsics.from_hfov(60.0, 320, 240)
 LENS = Intrinsics(280.0, 280.0, 158.0, 121.0, 320, 240, (0.1, -0.05, 0.001, 0.002))
@@ -32,8 +33,7 @@ def noisy(
 
 
 def relative(noise: DepthNoise | None, z: float) -> float:
-    assert noise is not None
-    return noise.deviation(z) / z
+    return require(noise).deviation(z) / z
 
 
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "distorted"])
@@ -116,8 +116,9 @@ def test_real_sensors_have_the_noise_that_the_literature_states(
     dataset = open_dataset(data_dir / name)
     frames = dataset.frame_names("test")
     for view in dataset.views("test", [frames[1], frames[6]]):
-        assert view.frame.depth is not None
-        assert least <= relative(estimate_depth_noise(view.frame.depth, view.frame.intrinsics), distance) <= most
+        assert (
+            least <= relative(estimate_depth_noise(require(view.frame.depth), view.frame.intrinsics), distance) <= most
+        )
 
 
 def test_noise_does_not_depend_on_the_unit_of_length(generator: Generator) -> None:

@@ -20,6 +20,7 @@ from bidnerf_core.datasets import DepthCamera, TimedFrame, open_dataset, open_se
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
+from optional import require
 from tum_folder import Recorded, write_recording
 
 COLOUR = Intrinsics(131.0, 132.0, 79.0, 61.0, 160, 120)
@@ -141,16 +142,13 @@ def first(path: Path, **options: object) -> TimedFrame:
 
 
 def test_a_recording_like_tums_is_registered_from_a_sensor(recording: Path, tmp_path: Path) -> None:
-    stored = first(recording, camera=COLOUR).frame.depth
-    assert stored is not None
+    stored = require(first(recording, camera=COLOUR).frame.depth)
     sensor = write_sensor(tmp_path / "sensor.json")
     found = first(recording, camera=COLOUR, register_depth=str(sensor))
     torch.testing.assert_close(found.frame.depth, SENSOR.register(stored, COLOUR, "depth"))
     (view,) = open_dataset(recording, camera=COLOUR, register_depth=SENSOR).views("test")
-    assert found.frame.depth is not None
-    assert torch.equal(view.frame.depth, found.frame.depth)  # type: ignore[arg-type]
-    assert found.truth is not None
-    assert bool(torch.equal(view.T_ref_camera.translation, found.truth.translation))
+    assert torch.equal(view.frame.depth, require(found.frame.depth))  # type: ignore[arg-type]
+    assert bool(torch.equal(view.T_ref_camera.translation, require(found.truth).translation))
     assert torch.equal(first(recording, camera=COLOUR, register_depth=False).frame.depth, stored)  # type: ignore[arg-type]
 
 

@@ -21,6 +21,7 @@ from bidnerf_core.depth import (
 )
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization import AutoConfig, settings_of
+from optional import require
 from problems import FieldMap
 
 
@@ -69,8 +70,7 @@ def test_another_name_is_an_error_that_lists_the_names() -> None:
 def test_localize_compares_a_named_sensor_with_the_image(generator: Generator) -> None:
     camera = Intrinsics.from_focal(100.0, 120, 90)
     depth = torch.linspace(1.0, 1.3, 120).expand(90, 120) * (1 + 0.02 * torch.randn((90, 120), generator=generator))
-    sentence = describe_depth_noise(depth, camera, "kinect")
-    assert sentence is not None
+    sentence = require(describe_depth_noise(depth, camera, "kinect"))
     assert re.search(r"is about (1\.[6-9]|2\.[0-4])\d%; 'kinect' usually has 0\.\d+%", sentence)
     assert describe_depth_noise(torch.zeros_like(depth), camera, "kinect") is None
 
@@ -83,8 +83,7 @@ def test_the_covariance_of_a_pose_by_depth_grows_with_the_scale_of_the_sensor() 
         by_sensor[name] = Localizer(scene, config=config, warm_up=False)(view.frame)
     sizes = {}
     for name, found in by_sensor.items():
-        assert found.covariance is not None
-        sizes[name] = float(found.covariance[:3, :3].trace())
+        sizes[name] = float(require(found.covariance)[:3, :3].trace())
     # The pose is the same, so the covariances differ by the squared scales alone.
     ratio = (sizes["kinect"] - sizes["rendered"]) / (sizes["unknown"] - sizes["rendered"])
     assert ratio == pytest.approx((DEPTH_SENSORS["kinect"].scale / UNKNOWN.scale) ** 2, rel=1e-3)

@@ -34,6 +34,7 @@ from bidnerf.evaluation.run import InThisProcess, local_processes, terminate_on_
 from bidnerf.evaluation.summary import success_of
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.io import from_plain
+from optional import require
 from refusals import refused
 from trial_results import timeless, trial_result
 
@@ -160,8 +161,7 @@ def test_without_a_start_there_is_no_share_of_its_error(tmp_path: Path) -> None:
     free = replace(result(1.0, [0.04, 0.01]), start_error=None)
     row = MapRow.of("short", 0, [free], [1.0])
     assert row.success["10%"] is None
-    absolute = row.success["5deg 0.05"]
-    assert absolute is not None
+    absolute = require(row.success["5deg 0.05"])
     assert (absolute.rate.successes, absolute.steps) == (1, 0)
     found = Comparison("d", "test", "none", (), "auto", {}, 0, 1, (row,), ((free,),))
     assert "<svg" in comparison_figure(tmp_path, found).read_text()

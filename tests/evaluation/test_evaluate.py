@@ -45,6 +45,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import from_plain
 from bidnerf_core.localization import find_method
 from bidnerf_core.progress import Progress
+from optional import require
 from refusals import refused
 from trial_results import timeless
 
@@ -109,8 +110,7 @@ def test_a_table_has_what_the_command_writes(shared: Path, tmp_path: Path, capsy
 def test_a_table_is_summed_up_saved_and_loaded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = bn.evaluate(BLOBS, BLOBS, quick(trials=4))
     (group,) = table.groups
-    found = group.summary.success["5deg 0.05"]
-    assert found is not None
+    found = require(group.summary.success["5deg 0.05"])
     assert (group.title, group.label, found.rate.trials) == ("bid 0.3", "bid", 4)
     assert 0 <= found.rate.low <= found.rate.rate <= found.rate.high <= 1
     assert "5deg 0.05" in str(table)

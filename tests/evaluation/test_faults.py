@@ -17,6 +17,7 @@ from bidnerf.scenes import views as seen_from
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3, look_at, random_units
+from optional import require
 from refusals import refused
 
 CAMERA = Intrinsics(70.0, 72.0, 41.0, 29.5, 80, 60)
@@ -32,8 +33,7 @@ every_fault = pytest.mark.parametrize("name", FAULTS)
 def view() -> View:
     """A view of an object before a background, with alpha and a distorted lens; some pixels measure nothing."""
     (seen,) = seen_from(demo_object(), LENS, orbit(2.6, 1, seed=4))
-    assert seen.frame.depth is not None
-    alpha = (seen.frame.depth > 0).float()
+    alpha = (require(seen.frame.depth) > 0).float()
     assert 0.2 < float(alpha.mean()) < 0.9
     return View(dataclasses.replace(seen.frame, alpha=alpha), seen.T_ref_camera)
 
@@ -59,13 +59,11 @@ def same(a: Frame, b: Frame) -> bool:
 
 
 def depth_of(view: View) -> torch.Tensor:
-    assert view.frame.depth is not None
-    return view.frame.depth
+    return require(view.frame.depth)
 
 
 def alpha_of(view: View) -> torch.Tensor:
-    assert view.frame.alpha is not None
-    return view.frame.alpha
+    return require(view.frame.alpha)
 
 
 # All faults.

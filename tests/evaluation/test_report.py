@@ -39,6 +39,7 @@ from bidnerf.evaluation.summary import situation_titles, situations
 from bidnerf.results import success_rate_by_frame
 from bidnerf_core.datasets import DatasetOptions, write_transforms
 from bidnerf_core.errors import InputError
+from optional import require
 from trial_results import trial_result
 
 STEPS = 10
@@ -95,8 +96,7 @@ def test_groups_are_named_by_what_differs(results: list[TrialResult]) -> None:
 def test_a_summary_counts(results: list[TrialResult]) -> None:
     by_name = {(g.situation.start, g.label): summarize(g.results) for g in group_results(results)}
     slow = by_name["bid, all sizes", "bid, level none"]
-    judged = slow.success["10%"]
-    assert judged is not None
+    judged = require(slow.success["10%"])
     assert (judged.rate.successes, judged.rate.trials) == (6, 12)
     assert judged.rate == success_rate_by_frame([True] * 6 + [False] * 6, [0] * 12)
     assert judged.steps == 7

@@ -26,6 +26,7 @@ from bidnerf_core.datasets import (
 from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
+from optional import require
 from refusals import refused
 from scan_layouts import (
     LAYOUTS,
@@ -322,8 +323,7 @@ def test_depth_of_another_camera_is_registered(views: list[View], tmp_path: Path
     line = next(line for line in info.splitlines() if line.startswith("m_calibrationDepthIntrinsic"))
     (folder / "info.txt").write_text(info.replace(line, line.replace("130.0", "65.0")))
     iio.imwrite(folder / "data/frame-000000.depth.png", np.full((96, 128), 1500, np.uint16))
-    depth = open_dataset(folder).views("test", ["frame-000000"])[0].frame.depth
-    assert depth is not None
+    depth = require(open_dataset(folder).views("test", ["frame-000000"])[0].frame.depth)
     assert depth.unique().tolist() == pytest.approx([1.5])
 
 

@@ -27,6 +27,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.maps import read_views
 from bidnerf_core.registry import list_plugins
+from optional import require
 from scan_layouts import LAYOUTS, PERIOD, message, read_all, small_views
 
 COUNT = 10
@@ -103,8 +104,7 @@ def test_poses_in_all_directions_come_back(kind: str, tmp_path: Path) -> None:
     views, options = small_views(6), LAYOUTS[kind].options
     frames = open_sequence(LAYOUTS[kind].write(tmp_path, views), **options)
     for timed, view in zip(frames, views, strict=True):
-        assert timed.truth is not None
-        torch.testing.assert_close(timed.truth.matrix(), view.T_ref_camera.matrix(), atol=1e-6, rtol=0)
+        torch.testing.assert_close(require(timed.truth).matrix(), view.T_ref_camera.matrix(), atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("kind", OF_IMAGE_FILES)
@@ -149,8 +149,7 @@ def test_a_recorded_scene_is_the_same_in_another_layout(kind: str, scene: str, d
         assert torch.equal(timed.frame.rgb, view.frame.rgb)
         if LAYOUTS[kind].depth:
             torch.testing.assert_close(timed.frame.depth, view.frame.depth)
-        assert timed.truth is not None
-        torch.testing.assert_close(timed.truth.matrix(), view.T_ref_camera.matrix(), atol=1e-6, rtol=0)
+        torch.testing.assert_close(require(timed.truth).matrix(), view.T_ref_camera.matrix(), atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("kind", ["record3d", "polycam", "stray-scanner"])

@@ -16,6 +16,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import Capture, open_dataset, open_sequence
 from bidnerf_core.depth import DepthCamera
 from bidnerf_core.geometry import SE3
+from optional import require
 from refusals import refused
 
 SIZE = (160, 120)
@@ -83,8 +84,7 @@ def test_registered_depth_lies_under_its_colours(scene: Path) -> None:
     assert wrong_share(registered) < 0.005
     assert wrong_share(open_dataset(scene, register_depth=False)) > 0.03
     for view in registered.views("test"):
-        depth = view.frame.depth
-        assert depth is not None
+        depth = require(view.frame.depth)
         plane = on_plane(COLOUR, view.T_ref_camera)[1]
         measured = depth > 0
         assert float((depth - torch.from_numpy(plane))[measured].abs().max()) < 0.01
@@ -97,8 +97,7 @@ def test_without_registration_everything_is_as_stored(scene: Path) -> None:
     for number, view in enumerate(dataset.views("test")):
         assert view.frame.intrinsics == DEPTH
         torch.testing.assert_close(view.T_ref_camera.matrix(), pose_of(number).matrix(), atol=1e-9, rtol=0)
-        depth = view.frame.depth
-        assert depth is not None
+        depth = require(view.frame.depth)
         plane = torch.from_numpy(on_plane(DEPTH, pose_of(number))[1]).float()
         plane[40:44, 50:54] = plane[60:64, 90:94] = 0
         torch.testing.assert_close(depth, plane, atol=0.00051, rtol=0)

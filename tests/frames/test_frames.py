@@ -13,6 +13,7 @@ from bidnerf.testing import unseen
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame, observe
 from bidnerf_core.geometry import SE3
+from optional import require
 from refusals import refused
 
 LENS = Intrinsics(20, 20, 12, 8, 24, 16)
@@ -71,8 +72,7 @@ def test_what_is_no_frame_is_refused_where_it_is_made(
 
 def test_depth_that_is_no_number_was_not_measured() -> None:
     depth = torch.tensor([1.0, torch.nan, torch.inf, -torch.inf]).repeat(16, 6)
-    found = Frame("a", GOOD["rgb"], LENS, depth).depth
-    assert found is not None
+    found = require(Frame("a", GOOD["rgb"], LENS, depth).depth)
     assert torch.equal(found, torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(16, 6))
 
 

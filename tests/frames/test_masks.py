@@ -28,6 +28,7 @@ from bidnerf_core.maps import rendering_scores
 # Inside: each quantity computed from pixels, which is equal whatever a mask hides
 from bidnerf_core.training import RayBank, photo_measures
 from commands import Run
+from optional import require
 from photo_files import write_photo
 from refusals import refused
 from tiny import options, views, write_dataset
@@ -121,8 +122,7 @@ def test_inverted_masks_are_suspected() -> None:
     assert masks_sentence([None, None]) is None
     usual, inverted = masks_sentence([part, None]), masks_sentence([~part, ~part, None])
     assert usual == "masks hide 25 % of the pixels of 1 image; 1 image without hidden pixels"
-    assert inverted is not None
-    assert "inverted" in inverted
+    assert "inverted" in require(inverted)
 
 
 def masked_dataset(folder: Path, **keys: str) -> Path:
@@ -144,8 +144,7 @@ def test_mask_path_and_dynamic_masks_are_read(tmp_path: Path) -> None:
         saved(data / "masks" / f"{name}.png", left(48, 48))
     with pytest.warns(InputWarning, match="2 of 4 masks are missing"):
         first, _, third = open_dataset(data).views("train")
-    assert first.frame.hidden is not None
-    assert torch.equal(first.frame.hidden, torch.from_numpy(left(24, 24) == 0))
+    assert torch.equal(require(first.frame.hidden), torch.from_numpy(left(24, 24) == 0))
     assert third.frame.hidden is None
     saved(data / "images" / f"dynamic_mask_{names[0]}.png", left(24, 24))
     with pytest.warns(InputWarning):
@@ -188,17 +187,15 @@ def test_masks_of_turned_photos_serve_sequences_as_they_serve_photos(
         (timed,) = open_sequence(tmp_path / "photos", focal=10.0, masks=tmp_path / "masks")
         upright = Frame.open(photo, focal=10.0).rgb.shape[:2]
     assert alone is not None
-    assert timed.frame.hidden is not None
     assert torch.equal(alone, Orientation.from_exif(code).upright(torch.from_numpy(mask == 0)))
-    assert torch.equal(timed.frame.hidden, alone)
+    assert torch.equal(require(timed.frame.hidden), alone)
     assert alone.shape == upright
 
 
 def test_frames_take_masks_as_arrays() -> None:
     rgb, camera = np.zeros((SIZE[1], SIZE[0], 3), np.uint8), Intrinsics.from_focal(10.0, *SIZE)
     made = Frame.from_numpy(rgb, camera, hidden=left() == 0)
-    assert made.hidden is not None
-    assert torch.equal(made.hidden, torch.from_numpy(left() == 0))
+    assert torch.equal(require(made.hidden), torch.from_numpy(left() == 0))
     assert Frame.from_numpy(rgb, camera, hidden=left() < 0).hidden is None
     for nothing in (None, torch.from_numpy(left() < 0)):
         assert made.with_hidden(nothing) is made

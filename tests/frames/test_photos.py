@@ -15,6 +15,7 @@ from bidnerf import Frame, InputWarning, Intrinsics
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.frames import photos_in
+from optional import require
 from photo_files import noise, write_photo
 from refusals import refused
 
@@ -64,9 +65,8 @@ def test_a_point_stays_on_the_same_content(tmp_path: Path, code: int) -> None:
     rays[:, :2] = rays[:, :2] @ turn.mT
     column, row = frame.intrinsics.project(rays).floor().long().unbind(-1)
     torch.testing.assert_close(frame.rgb[row, column], torch.from_numpy(pixels.reshape(-1, 3)).float() / 255)
-    assert frame.depth is not None
     expected = torch.from_numpy(STEPS.reshape(-1).astype(np.float32)) * 0.001
-    torch.testing.assert_close(frame.depth[row, column], expected)
+    torch.testing.assert_close(require(frame.depth)[row, column], expected)
 
 
 # Reading.
@@ -76,8 +76,7 @@ def test_a_photo_with_exif_needs_nothing_else(photo: Path) -> None:
     for given in (photo, str(photo)):
         frame = Frame.open(given)
         assert frame.name == "IMG_7"
-        assert frame.camera_source is not None
-        assert frame.camera_source.startswith("26 mm equivalent in EXIF: fx 30 px at 40x30 (the principal")
+        assert require(frame.camera_source).startswith("26 mm equivalent in EXIF: fx 30 px at 40x30 (the principal")
         assert frame.alpha is frame.depth is None
         torch.testing.assert_close(frame.rgb, torch.from_numpy(noise(HEIGHT, WIDTH)).float() / 255)
 
@@ -117,8 +116,7 @@ def test_reducing_keeps_the_directions_of_pixels(tmp_path: Path, code: int) -> N
     torch.testing.assert_close(little.project(big.unproject(centres)), centres / 2, atol=1e-6, rtol=0)
     blocks = whole.rgb.unflatten(0, (-1, 2)).unflatten(2, (-1, 2)).mean((1, 3))
     torch.testing.assert_close(small.rgb, blocks, atol=1.001 / 255, rtol=0)  # the mean of bytes, and a byte
-    assert small.depth is not None
-    assert set(small.depth.flatten().tolist()) == {1.0, 4.0}  # never a mean over an edge
+    assert set(require(small.depth).flatten().tolist()) == {1.0, 4.0}  # never a mean over an edge
     assert Frame.open(path, camera=CAMERA, largest=40).intrinsics == whole.intrinsics
     with refused(found="largest is 0", expected="a positive whole number"):
         Frame.open(path, camera=CAMERA, largest=0)
@@ -162,8 +160,7 @@ def test_the_assumptions_about_depth_are_one_line(photo: Path, tmp_path: Path) -
     )
     with pytest.warns(InputWarning, match=said):
         frame = Frame.open(photo, depth=path)
-    assert frame.depth is not None
-    assert not frame.depth[0, :5].any()
+    assert not require(frame.depth)[0, :5].any()
 
 
 # Arrays.

@@ -20,6 +20,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.maps import Map, MapInfo
 from commands import Run
+from optional import require
 from stored_ground import open_map
 
 
@@ -38,8 +39,7 @@ def stored(monkeypatch: pytest.MonkeyPatch, landmarks: LandmarkMap | None) -> No
 
 
 def landmarks_of(*cameras: Intrinsics) -> LandmarkMap:
-    found = textured_map().landmarks
-    assert found is not None
+    found = require(textured_map().landmarks)
     scatter = torch.full((4,), 0.001, dtype=torch.float64)  # as if trial photos had been localized in the map
     return replace(found, cameras=cameras, calibration_scatter=scatter)
 
@@ -102,8 +102,7 @@ def test_a_portrait_photo_in_a_map_of_landscape_ones_has_their_camera() -> None:
     frame = Frame("portrait", rgb, camera, focal_is_approximate=True)
     found = Localizer(replace(textured_map(surface=True), landmarks=landmarks_of(CAMERA)))(frame)
     assert found.converged
-    assert found.intrinsics is not None
-    assert found.intrinsics.fx == pytest.approx(CAMERA.fx, rel=0.001)
+    assert require(found.intrinsics).fx == pytest.approx(CAMERA.fx, rel=0.001)
     turn = SE3.exp(torch.tensor([0, 0, 0, 0, 0, math.pi / 2], dtype=torch.float64))
     error = pose_error(found.T_world_camera, unseen().T_ref_camera @ turn)
     assert error.translation < 0.02

@@ -35,6 +35,7 @@ from bidnerf_core.maps import views as views_of_map
 
 # Inside: blocks are made so small that the images of a test fill several
 from bidnerf_core.training import RayBank, excess, nearby_photos, ray_bank
+from optional import require
 from photo_files import noise
 
 CAMERA = Intrinsics(30.0, 31.0, 12.3, 8.1, 24, 16)
@@ -95,10 +96,8 @@ def test_reducing_a_frame_keeps_colours_rays_and_what_is_hidden() -> None:
     assert (small.intrinsics.width, small.intrinsics.height) == (12, 8)
     means = as_floats(held).reshape(8, 2, 12, 2, 3).mean((1, 3))
     torch.testing.assert_close(small.rgb, means, atol=0.51 / 255, rtol=0)
-    assert small.hidden is not None
-    assert small.hidden.nonzero().tolist() == [[0, 0]]
-    assert small.depth is not None
-    assert small.depth[4].tolist() == [2.0] * 6 + [1.0] * 6
+    assert require(small.hidden).nonzero().tolist() == [[0, 0]]
+    assert require(small.depth)[4].tolist() == [2.0] * 6 + [1.0] * 6
     there = torch.tensor([[3.0, 5.0], [20.0, 11.0]], dtype=torch.float64)
     torch.testing.assert_close(small.intrinsics.unproject(there / 2), LENS.unproject(there))
 

@@ -35,6 +35,7 @@ from bidnerf_core.io import (
     resample_nearest,
 )
 from bidnerf_core.io.images import ImageHeader
+from optional import require
 from photo_files import noise
 from refusals import refused
 
@@ -90,8 +91,7 @@ def test_palettes_become_colours(tmp_path: Path) -> None:
     expected = torch.from_numpy(np.array(image.convert("RGB"))).float() / 255
     torch.testing.assert_close(read_image(path)[0], expected)
     image.save(path, transparency=0)
-    alpha = read_image(path)[1]
-    assert alpha is not None
+    alpha = require(read_image(path)[1])
     assert alpha.equal((torch.from_numpy(np.array(image)) != 0).float())
     assert read_header(path).has_alpha
 

@@ -27,6 +27,7 @@ from bidnerf_core.localization import (
 from bidnerf_core.localization.accept import judge, least_confidence
 from bidnerf_core.localization.auto import within_risk
 from localizations import answer
+from optional import require
 from refusals import refused
 
 SOUND = Evidence(
@@ -109,8 +110,7 @@ def test_an_unlikely_answer_is_uncertain(monkeypatch: pytest.MonkeyPatch) -> Non
     found = judge(SOUND)
     assert found.outcome is Outcome.UNCERTAIN
     assert found.confidence == pytest.approx(1 / (1 + math.e))
-    assert found.confidence is not None
-    assert f"{math.floor(100 * found.confidence)}%" in found.reason
+    assert f"{math.floor(100 * require(found.confidence))}%" in found.reason
 
 
 BETTER: dict[str, list[float]] = {

@@ -32,6 +32,7 @@ from bidnerf_core.mapping import (
 )
 from conditions import POSES, centred, part, point_landmarks, scaled
 from landmark_scene import PINHOLE
+from optional import require
 
 BENT = replace(PINHOLE, distortion=(-0.02, 0.0, 0.0, 0.0))
 LANDSCAPE = Intrinsics(520.0, 521.0, 310.0, 245.0, 640, 480, (0.05, -0.01, 0.001, 0.002))
@@ -83,8 +84,7 @@ def test_the_correction_between_cameras_is_the_one_that_was_applied(
     stated: Intrinsics, correction: tuple[float, ...]
 ) -> None:
     expected = torch.tensor([*correction, *[0.0] * (6 - len(correction))], dtype=torch.float64)
-    found = correction_between(stated, true_intrinsics(stated, expected))
-    assert found is not None
+    found = require(correction_between(stated, true_intrinsics(stated, expected)))
     tolerance = 3e-3 if stated.distortion else 1e-6  # two distortions make up one only approximately
     torch.testing.assert_close(found, expected, rtol=0, atol=tolerance)
 
@@ -142,8 +142,7 @@ def test_a_portrait_image_has_a_landscape_camera_turned_to_either_side() -> None
     expected = [correction_between(stated, camera) for camera in LANDSCAPE.quarter_turns()]
     assert len(found) == 2
     for one, other in zip(found, expected, strict=True):
-        assert other is not None
-        assert torch.equal(one, other)
+        assert torch.equal(one, require(other))
     portrait = replace(LANDSCAPE.quarter_turns()[0], fx=500.0, fy=500.0)
     (own,) = cameras_of_map(query(portrait), landmarks(LANDSCAPE, portrait))
     assert float(own.abs().max()) < 1e-9
@@ -151,8 +150,7 @@ def test_a_portrait_image_has_a_landscape_camera_turned_to_either_side() -> None
 
 def test_crops_are_compared_only_with_a_focal_length_that_is_approximate() -> None:
     square = Intrinsics.from_focal(400, 480, 480)
-    cropped = correction_between(square, LANDSCAPE.centre_crop(480, 480))
-    assert cropped is not None
+    cropped = require(correction_between(square, LANDSCAPE.centre_crop(480, 480)))
     for approximate in (False, True):
         found = cameras_of_map(query(square, approximate=approximate), landmarks(LANDSCAPE))
         assert any(torch.equal(each, cropped) for each in found) is approximate

@@ -39,6 +39,7 @@ from bidnerf_core.localization import (
 from bidnerf_core.localization.adam import RATE, WINDOW
 from bidnerf_core.settings import to_flat
 from blob_images import BOUNDS, CAMERA, TRUTH
+from optional import require
 from problems import FieldMap, localize, single
 from refusals import refused
 
@@ -95,8 +96,7 @@ def test_the_learning_rate_is_inerfs(problem: Problem) -> None:
     xi = (found.poses[1] @ found.poses[0].inverse()).log()  # a left update
     torch.testing.assert_close(xi.abs(), torch.full((6,), 0.01, dtype=torch.float64), rtol=1e-3, atol=0)
     config = InerfConfig().adam
-    assert config.learning_rate is not None
-    assert config.learning_rate * config.decay ** (200 / config.decay_steps) == pytest.approx(0.01 * 0.8**2)
+    assert require(config.learning_rate) * config.decay ** (200 / config.decay_steps) == pytest.approx(0.01 * 0.8**2)
 
 
 def test_bid_is_inerf_with_other_settings(problem: Problem) -> None:
@@ -120,8 +120,7 @@ def test_updates_are_written_where_the_pivot_is(problem: Problem) -> None:
     torch.testing.assert_close(pivot("camera", problem).moved(TRUTH, XI).matrix(), TRUTH.retract(XI).matrix())
     torch.testing.assert_close(pivot("world", problem).moved(TRUTH, XI).matrix(), (SE3.exp(XI) @ TRUTH).matrix())
     about = pivot("scene", problem)
-    assert about.T_camera_pivot is not None
-    middle = about.T_camera_pivot.translation
+    middle = require(about.T_camera_pivot).translation
     assert abs(float(middle.norm()) - 4) < 1  # the blobs are about the origin, four metres away
     turn = torch.cat([torch.zeros(3, dtype=torch.float64), XI[3:]])
     torch.testing.assert_close(about.moved(TRUTH, turn).apply(middle), TRUTH.apply(middle))  # it stays

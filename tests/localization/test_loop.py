@@ -49,6 +49,7 @@ from conditions import (
 )
 from landmark_scene import PINHOLE, looking_in
 from localizations import CHI2_999, assert_covered, assert_near, colour_only
+from optional import require
 
 LARGEST = 0.05, 2.0
 """Largest error of any accepted pose: metres and degrees, at distances of 1.7 to 4.4 m."""
@@ -244,8 +245,7 @@ def other_camera(factor: float) -> list[View]:
 
 def own_correlation() -> LandmarkMap:
     """Return landmarks of surer cameras, whose keypoints are as correlated as those of the map's images."""
-    built = textured_map().landmarks
-    assert built is not None
+    built = require(textured_map().landmarks)
     return replace(ground_landmarks(scatter=0.003), correlation=built.correlation)
 
 
@@ -308,8 +308,7 @@ def solved(*views: View, rays: int = 0, matching: LandmarkMatcher | None = None,
     scene = replace(textured_map(surface=True), **changes)
     matching = (matching or matcher()).for_query()
     problem = rig(scene, views, None, matcher=matching)
-    found = Loop(problem.views, matching, problem, rays)()
-    assert found is not None
+    found = require(Loop(problem.views, matching, problem, rays)())
     return found
 
 
@@ -349,8 +348,7 @@ def test_a_blurred_field_is_not_rendered(noise: float | None, fused: bool) -> No
 @pytest.mark.parametrize("scale", [0.001, 0.3048, 0.8, 1.2])
 def test_depth_of_another_unit_does_not_mislead(scale: float) -> None:
     """Millimetres, or feet, read as metres."""
-    depth = unseen().frame.depth
-    assert depth is not None
+    depth = require(unseen().frame.depth)
     found = solved(replace(unseen(), frame=replace(unseen().frame, depth=scale * depth)), rays=256)
     error = pose_error(found.T_world_rig, TRUTH)
     assert not found.verdict.accepted or float(error.translation) < 0.015
@@ -371,8 +369,7 @@ def test_a_pose_found_by_other_means_is_confirmed_or_contradicted() -> None:
     problem = rig(textured_map(), [view], None, matcher=matching)
     loop = Loop(problem.views, matching, problem)
     near_truth = TRUTH.retract(torch.tensor([0.01, -0.01, 0.01, 0.005, 0.0, 0.005], dtype=torch.float64))
-    there = loop.at(near_truth)
-    assert there is not None
+    there = require(loop.at(near_truth))
     assert there.verdict.accepted
     assert_near(there.T_world_rig, TRUTH, 0.02, 0.5)
     wrong = loop.at(TRUTH.retract(torch.tensor([0.3, 0.2, 0.0, 0.0, 0.0, 0.8], dtype=torch.float64)))
@@ -421,9 +418,7 @@ def test_in_a_moved_world_the_answer_moves(monkeypatch: pytest.MonkeyPatch) -> N
         directions=T.rotate(known.directions.double()).float(),
     )
     here, there = (Loop([view], LandmarkMatcher(each), features=seen)() for each in (known, moved))
-    assert here is not None
-    assert there is not None
-    assert_near(there.T_world_rig, T @ here.T_world_rig, 1e-3, 0.02)
+    assert_near(require(there).T_world_rig, T @ require(here).T_world_rig, 1e-3, 0.02)
 
 
 def test_images_of_different_cameras_are_localized_with_the_stated_ones() -> None:
@@ -494,7 +489,5 @@ def test_the_same_seed_gives_the_same_answer_in_any_thread() -> None:
         again = list(pool.map(lambda view: localize(view, seed=3), views))
     for one, other in zip(expected, again, strict=True):
         assert torch.equal(one.T_world_camera.matrix(), other.T_world_camera.matrix())
-        assert one.covariance is not None
-        assert other.covariance is not None
-        assert torch.equal(one.covariance, other.covariance)
+        assert torch.equal(require(one.covariance), require(other.covariance))
         assert (one.outcome, one.reason) == (other.outcome, other.reason)

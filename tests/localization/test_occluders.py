@@ -19,6 +19,7 @@ from bidnerf_core.localization import AutoConfig, Localization
 
 # Inside: which pixels are an occluder, of which an answer shows no image
 from bidnerf_core.localization.by_surface import nearest_piece
+from optional import require
 from problems import localize
 from refusals import refused
 
@@ -56,15 +57,12 @@ def found_for(view: View, config: AutoConfig = QUICK) -> Localization:
 def test_the_nearest_piece_is_cut_out_along_its_edges() -> None:
     box = (slice(10, 50), slice(20, 60))
     depth = wall(box, 0.6)
-    occluder = nearest_piece(baked.problem(seen(depth)))
-    assert occluder is not None
+    occluder = require(nearest_piece(baked.problem(seen(depth))))
     frame = occluder.rest.views[0].frame
     inside = torch.zeros((SIZE, SIZE), dtype=torch.bool)
     inside[box] = True
-    assert frame.hidden is not None
-    assert frame.depth is not None
-    assert torch.equal(frame.hidden, inside)
-    assert torch.equal(frame.depth, torch.where(inside, 0, depth))
+    assert torch.equal(require(frame.hidden), inside)
+    assert torch.equal(require(frame.depth), torch.where(inside, 0, depth))
     assert occluder.share == pytest.approx(40 * 40 / SIZE**2)
     expected = depth[box].double()
     assert float(occluder.points[:, 2].min()) == pytest.approx(float(expected.min()), rel=1e-6)
@@ -102,15 +100,13 @@ def test_rigs_and_images_without_depth_have_none() -> None:
 
 def test_only_what_is_in_front_of_the_surface_hides_it() -> None:
     view = baked.unseen()[0]
-    depth = view.frame.depth
-    assert depth is not None
+    depth = require(view.frame.depth)
     half = torch.zeros_like(depth, dtype=torch.bool)
     half[:, : SIZE // 2] = depth[:, : SIZE // 2] > 0
     for factor, expected in ((0.6, 1.0), (1.0, 0.0), (1.4, 0.0)):
         # Whatever the factor, this half is the nearest piece.
         moved = torch.where(half, factor * depth, 3 * depth)
-        occluder = nearest_piece(baked.problem(replace(view, frame=replace(view.frame, depth=moved))))
-        assert occluder is not None
+        occluder = require(nearest_piece(baked.problem(replace(view, frame=replace(view.frame, depth=moved)))))
         in_front = occluder.share_in_front(baked.toy(), view.T_ref_camera)
         assert in_front == pytest.approx(expected, abs=0.15), factor
 
@@ -119,10 +115,8 @@ def test_what_the_user_hides_stays_hidden() -> None:
     view = seen(wall((slice(10, 50), slice(20, 60)), 0.6))
     own = torch.zeros((SIZE, SIZE), dtype=torch.bool)
     own[:10] = True
-    occluder = nearest_piece(baked.problem(replace(view, frame=replace(view.frame, hidden=own))))
-    assert occluder is not None
-    hidden = occluder.rest.views[0].frame.hidden
-    assert hidden is not None
+    occluder = require(nearest_piece(baked.problem(replace(view, frame=replace(view.frame, hidden=own)))))
+    hidden = require(occluder.rest.views[0].frame.hidden)
     assert bool(hidden[:10].all())
     assert bool(hidden[10:50, 20:60].all())
     assert int(hidden.sum()) == 10 * SIZE + 40 * 40
@@ -165,14 +159,11 @@ def test_a_hidden_part_is_a_mask_of_the_image(hidden: torch.Tensor, found: str, 
 
 def test_nothing_is_measured_where_the_scene_is_hidden() -> None:
     frame = baked.unseen()[0].frame
-    assert frame.depth is not None
     hidden = torch.zeros((SIZE, SIZE), dtype=torch.bool)
     hidden[:, SIZE // 2 :] = True
     masked = replace(frame, hidden=hidden)
-    assert masked.depth is not None
-    assert torch.equal(masked.depth, torch.where(hidden, 0, frame.depth))
-    mirrored = faulty(View(masked, SE3.identity()), "mirror", 0).frame.hidden
-    assert mirrored is not None
+    assert torch.equal(require(masked.depth), torch.where(hidden, 0, require(frame.depth)))
+    mirrored = require(faulty(View(masked, SE3.identity()), "mirror", 0).frame.hidden)
     assert torch.equal(mirrored, hidden.flip(1))
 
 

@@ -13,6 +13,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.localization import Localizer, Tracker
 from bidnerf_core.mapping import surface_from_tensors, surface_tensors
 from flights import flight
+from optional import require
 
 
 def overflowing(tensors: dict[str, Tensor], part: str, value: float) -> dict[str, Tensor]:
@@ -24,9 +25,8 @@ def overflowing(tensors: dict[str, Tensor], part: str, value: float) -> dict[str
 @pytest.mark.parametrize("part", ["rgb", "normals", "positions"])
 def test_a_surface_of_overflowing_numbers_ends_no_tracking(part: str, value: float) -> None:
     known = textured_map(surface=True)
-    assert known.surface is not None
     try:
-        tensors = overflowing(surface_tensors(known.surface), part, value)
+        tensors = overflowing(surface_tensors(require(known.surface)), part, value)
         scene = replace(known, surface=surface_from_tensors(tensors))
     except (InputError, ValueError):
         return

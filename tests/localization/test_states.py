@@ -30,6 +30,7 @@ from bidnerf_core.mapping import (
     project,
     rays_through,
 )
+from optional import require
 
 CAMERA = Intrinsics(310.0, 290.0, 190.0, 160.0, 400, 300, (0.05, -0.02, 0.001, 0.002))
 LENGTHS = {"vx": 0.02, "vy": 0.02, "vz": 0.02, "wx": 0.01, "wy": 0.01, "wz": 0.01}
@@ -166,14 +167,12 @@ def test_points_behind_the_camera_have_no_influence() -> None:
 
 def term_of_the_surface(rig: bool) -> tuple[Surface, States]:
     view, others = unseen(), training_views()[:2] if rig else ()
-    surface = textured_map(surface=True).surface
-    assert surface is not None
+    surface = require(textured_map(surface=True).surface)
     parts = surface.surfels
     exact = Surfels(*(x.double() for x in (parts.positions, parts.normals, parts.rgb, parts.rgb_gradient)))
     truth = view.T_ref_camera
     views = [View(v.frame, truth.inverse() @ v.T_ref_camera) for v in (*others, view)]
-    term = Surface.of(views, None, replace(surface, surfels=exact), 0, 300)
-    assert term is not None
+    term = require(Surface.of(views, None, replace(surface, surfels=exact), 0, 300))
     at = drawn(2, moving=False, about=truth)
     term = replace(term, rgb=term.rgb.double(), coloured=term.coloured.double(), colour_weight=0.7, noise=0.05)
     return term, replace(at, z=0.1 * at.z)

@@ -33,6 +33,7 @@ from bidnerf_core.localization import (
 # Inside: the odds themselves, far from the values at which they decide
 from bidnerf_core.localization.accept import log_odds, same_pose, support
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
+from optional import require
 from problems import FieldMap, localize
 
 CAMERA = Intrinsics(70.0, 70.0, 40.0, 30.0, 80, 60)
@@ -114,8 +115,7 @@ def test_a_textured_wall_determines_the_pose(method: str) -> None:
     answer = found(photograph(QUERY, 0.1), 0.1, method)
     assert answer.converged, answer.reason
     assert float((answer.T_world_camera.translation - QUERY.translation).norm()) < 0.05
-    assert answer.confidence is not None
-    assert answer.confidence > 0.8
+    assert require(answer.confidence) > 0.8
 
 
 @pytest.mark.parametrize(

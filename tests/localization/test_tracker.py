@@ -42,6 +42,7 @@ from flights import (
     without_depth,
 )
 from localizations import CHI2_99, assert_covered
+from optional import require
 from refusals import refused
 
 Flight = list[tuple[float, Frame, SE3]]
@@ -147,8 +148,7 @@ def test_depth_of_another_unit_is_left_out() -> None:
     """Feet read as metres after the first frame: each frame is tracked by its colours, and says so."""
     frames = Flight(flight()[:1])
     for t, frame, T in flight()[1:4]:
-        assert frame.depth is not None
-        frames.append((t, replace(frame, depth=3.28 * frame.depth), T))
+        frames.append((t, replace(frame, depth=3.28 * require(frame.depth)), T))
     answers = tracked(frames)
     assert_right(answers, frames)
     assert all("without depth: it is 3.2" in answer.reason for answer in answers[1:])
@@ -162,9 +162,7 @@ def test_repeated_frames_do_not_make_it_more_certain() -> None:
     answers = [tracker(frame, time) for _ in range(10)]
     assert_right(answers, [(time, frame, truth)] * 10)
     first, last = (answers[i].covariance for i in (0, -1))
-    assert first is not None
-    assert last is not None
-    assert float(last.diagonal()[:3].sum()) > 0.5 * float(first.diagonal()[:3].sum())
+    assert float(require(last).diagonal()[:3].sum()) > 0.5 * float(require(first).diagonal()[:3].sum())
 
 
 @pytest.mark.parametrize("known", [0, 3], ids=["none", "every third"])
@@ -212,9 +210,7 @@ def test_a_saved_state_continues_bit_for_bit(tmp_path: Path, lost: bool) -> None
     one, two = tracked(flight()[4:6], tracker), tracked(flight()[4:6], other)
     for a, b in zip(one, two, strict=True):
         assert torch.equal(a.T_world_camera.matrix(), b.T_world_camera.matrix())
-        assert a.covariance is not None
-        assert b.covariance is not None
-        assert torch.equal(a.covariance, b.covariance)
+        assert torch.equal(require(a.covariance), require(b.covariance))
     other.restore(tmp_path / "fresh")
     assert not other.tracking
     assert other.lost_frames == 0

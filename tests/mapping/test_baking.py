@@ -31,6 +31,7 @@ from bidnerf_core.mapping.surface.posed_depth import (
     surface_bytes,
 )
 from bidnerf_core.progress import job_context
+from optional import require
 
 RADIUS = 0.6
 BALL = baked.one_solid(Sphere(RADIUS), blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1))
@@ -75,8 +76,7 @@ def test_colours_are_those_of_the_scene() -> None:
 def test_a_floater_that_one_view_sees_is_dropped() -> None:
     views = ball_views()
     frame = views[3].frame
-    assert frame.depth is not None
-    depth = frame.depth.clone()
+    depth = require(frame.depth).clone()
     depth[30:40, 30:40] = 2.0  # well before the ball
     views[3] = View(replace(frame, depth=depth), views[3].T_ref_camera)
     assert height(measured(views)).abs().max() < 1
@@ -120,8 +120,7 @@ def test_the_grid_has_at_most_the_given_number_of_cells() -> None:
 
 
 def bare(view: View) -> View:
-    assert view.frame.depth is not None
-    return View(replace(view.frame, depth=torch.zeros_like(view.frame.depth)), view.T_ref_camera)
+    return View(replace(view.frame, depth=torch.zeros_like(require(view.frame.depth))), view.T_ref_camera)
 
 
 def test_where_nothing_was_seen_there_is_no_surface() -> None:
@@ -138,8 +137,7 @@ def test_views_that_contradict_each_other_have_no_surface() -> None:
     views = ball_views(4)
     spoilt = []
     for i, view in enumerate(views):
-        assert view.frame.depth is not None
-        spoilt.append(View(replace(view.frame, depth=view.frame.depth * (0.8 + 0.1 * i)), view.T_ref_camera))
+        spoilt.append(View(replace(view.frame, depth=require(view.frame.depth) * (0.8 + 0.1 * i)), view.T_ref_camera))
     with pytest.raises(InputError, match="several views agree on"):
         measured(spoilt, agreement=3, cells=4_000_000)
 
@@ -150,8 +148,7 @@ SCENE = baked.one_solid(Box((0.6, 0.6, 0.6)), blotches((0.9, 0.2, 0.1), (0.1, 0.
 def images(noise: float, generator: Generator, count: int = 16) -> list[PosedDepthImage]:
     found = []
     for view in baked.images(SCENE, count, seed=0):
-        depth = view.frame.depth
-        assert depth is not None
+        depth = require(view.frame.depth)
         noisy = torch.where(depth > 0, depth + noise * torch.randn(depth.shape, generator=generator), 0)
         found.append(posed_measurement(View(replace(view.frame, depth=noisy), view.T_ref_camera), 1e9))
     return found

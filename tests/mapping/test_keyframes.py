@@ -19,6 +19,7 @@ from bidnerf_core.fields import SceneBounds, Stratified
 from bidnerf_core.localization import LandmarkMatcher, Loop
 from bidnerf_core.mapping import build_landmarks, colour_noise, render_views
 from localizations import assert_near
+from optional import require
 
 BALL = HomogeneousBall(0.5, 400.0, rgb=(0.8, 0.3, 0.2), sampler=Stratified(256))
 CUBE = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 8.0)
@@ -56,8 +57,7 @@ def test_keyframes_are_as_many_and_as_large_as_is_useful_at_most() -> None:
 def test_landmarks_of_keyframes_find_a_photo() -> None:
     """They stand in for the photos of a map that came without."""
     views = render_views(ground(), BOUNDS, [(CAMERA, view.T_ref_camera) for view in training_views()[:6]])
-    found = Loop([View(unseen().frame, SE3.identity())], LandmarkMatcher(build_landmarks(views)))()
-    assert found is not None
+    found = require(Loop([View(unseen().frame, SE3.identity())], LandmarkMatcher(build_landmarks(views)))())
     assert_near(found.T_world_rig, unseen().T_ref_camera, 0.02, 0.5)
 
 

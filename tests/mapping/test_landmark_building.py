@@ -29,6 +29,7 @@ from bidnerf_core.mapping.landmarks.landmark_map import MOST_IN_CELL, LandmarkCe
 from bidnerf_core.mapping.landmarks.tracks import Matches, _mean_descriptors, link_tracks
 from bidnerf_core.progress import Progress, job_context
 from landmark_scene import PINHOLE, Points, looking_in, ring
+from optional import require
 
 
 def truth(points: Points, landmarks: LandmarkMap) -> torch.Tensor:
@@ -221,11 +222,9 @@ def test_scatter_of_updates_is_that_of_the_images_that_moved_if_most_did() -> No
     deviations = torch.tensor([3, 2, 1, 0.3, 0.2, 0.1], dtype=torch.float64)
     noise = torch.randn((400, 6), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     updates = list(noise * deviations)
-    found = update_scatter(updates)
-    assert found is not None
+    found = require(update_scatter(updates))
     torch.testing.assert_close(found.diagonal().sqrt(), deviations, rtol=0.15, atol=0)
-    half = update_scatter([*updates, *[None] * 400])
-    assert half is not None
+    half = require(update_scatter([*updates, *[None] * 400]))
     assert torch.equal(half, found)
     for few in ([*updates, *[None] * 401], updates[:7], []):
         assert update_scatter(few) is None

@@ -25,6 +25,7 @@ from bidnerf_core.maps import load_info, rendering_scores
 from bidnerf_core.progress import Progress
 from bidnerf_core.registry import PluginError
 from bidnerf_hashgrid import backend as hashgrid
+from optional import require
 from refusals import refused
 
 BAKE = BakeConfig(cells=5000)
@@ -150,7 +151,6 @@ def test_what_was_finished_is_kept_when_a_stage_is_cancelled_and_finish_ends_it(
     with pytest.raises(bn.Cancelled) as stopped:
         bn.train(views, out=out, config=tiny.config(), bake=BAKE, **stopping_at(stage))
     half = bn.load_map(out)
-    assert half.landmarks is not None
     if stage == "baking":
         assert "the map has its landmarks and field so far" in str(stopped.value)
     else:
@@ -158,8 +158,7 @@ def test_what_was_finished_is_kept_when_a_stage_is_cancelled_and_finish_ends_it(
         assert bn.Localizer(half, warm_up=False)(unseen().frame).converged
     done = bn.resume(out, views, bake=BAKE, finish=True)
     assert (done.info.complete, done.info.step) == (True, half.info.step)
-    assert done.landmarks is not None
-    assert torch.equal(done.landmarks.positions, half.landmarks.positions)
+    assert torch.equal(require(done.landmarks).positions, require(half.landmarks).positions)
     with refused(found="nothing to resume"):
         bn.resume(out, views)
 
@@ -255,14 +254,12 @@ def test_baking_stores_what_it_made_where_the_map_is(scene: bn.Map, tmp_path: Pa
 
 def test_parts_that_were_not_read_are_saved(tmp_path: Path) -> None:
     baked = trained(tmp_path / "map", bake=BAKE)
-    assert baked.surface is not None
     bare = bn.load_map(tmp_path / "map", baked=False)
     assert bare.surface is None
     for folder in (tmp_path / "copy", tmp_path / "map"):
         bare.save(folder, overwrite=True)
         found = bn.load_map(folder)
-        assert found.surface is not None
-        assert len(found.surface.surfels) == len(baked.surface.surfels)
+        assert len(require(found.surface).surfels) == len(require(baked.surface).surfels)
 
 
 def test_a_description_is_for_people_and_for_json(scene: bn.Map) -> None:
@@ -271,8 +268,7 @@ def test_a_description_is_for_people_and_for_json(scene: bn.Map) -> None:
     assert f"{tiny.STEPS} steps of backend hashgrid" in str(summary)
     facts = summary.plain()
     assert (facts["map"], facts["bytes"], facts["cameras"]) == ("", None, 6)
-    assert scene.surface is not None
-    assert facts["surfels"] == len(scene.surface.surfels) > 0
+    assert facts["surfels"] == len(require(scene.surface).surfels) > 0
 
 
 @pytest.mark.usefixtures("unchecked")

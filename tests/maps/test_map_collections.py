@@ -26,6 +26,7 @@ from bidnerf_core.mapping import BakeConfig, bake, build_landmarks
 from bidnerf_core.mapping.landmarks.vocabulary import visible
 from bidnerf_core.maps import Map, MapInfo, maps_in, name_maps
 from commands import Run
+from optional import require
 from refusals import refused
 
 SEEDS = (0, 4)
@@ -104,8 +105,7 @@ def test_the_service_finds_the_map_of_a_photo(grounds: list[Map], tmp_path: Path
     """Under the names by which the maps are served, and with the localizers that serve them."""
     localizers = {name: bn.Localizer(scene, warm_up=False) for name, scene in zip("ab", grounds, strict=False)}
     worker = LoadedMaps(localizers, 1e6)
-    assert worker.together is not None
-    assert worker.together.localizer("b") is localizers["b"]
+    assert require(worker.together).localizer("b") is localizers["b"]
     assert LoadedMaps({"a": localizers["a"]}, 1e6).together is None
     png = iio.imwrite("<bytes>", (255 * photo(SEEDS[1]).frame.rgb).byte().numpy(), extension=".png")
     task = {"map": None, "upload": Upload({"name": "<i>", "focal": CAMERA.fx}, {"photo": png})}
@@ -119,8 +119,7 @@ def test_the_service_finds_the_map_of_a_photo(grounds: list[Map], tmp_path: Path
 
 
 def test_landmarks_that_a_camera_sees(grounds: list[Map]) -> None:
-    landmarks = grounds[0].landmarks
-    assert landmarks is not None
+    landmarks = require(grounds[0].landmarks)
     camera = grounds[0].info.cameras[0]
     seen = visible(landmarks, CAMERA, camera.pose)
     assert 0.2 * len(landmarks) < len(seen.unique()) == len(seen) <= len(landmarks)

@@ -21,6 +21,7 @@ from bidnerf_core.io import FileInUse, lock
 from bidnerf_core.maps import Anchor, Map, MapInfo, factor_of_distance, factor_of_poses, load_info
 from bidnerf_core.maps.known_lengths import locate_point
 from commands import Run
+from optional import require
 from refusals import refused
 
 
@@ -61,9 +62,7 @@ def test_scaling_back_gives_the_same_answers(ground: Map) -> None:
     assert torch.equal(back.render(unseen()).rgb, ground.render(unseen()).rgb)
     before, after = (bn.Localizer(scene, warm_up=False)(unseen().frame) for scene in (ground, back))
     assert torch.equal(after.T_world_camera.matrix(), before.T_world_camera.matrix())
-    assert before.covariance is not None
-    assert after.covariance is not None
-    assert torch.equal(after.covariance, before.covariance)
+    assert torch.equal(require(after.covariance), require(before.covariance))
 
 
 def test_a_known_length_gives_the_factor(ground: Map) -> None:
@@ -196,8 +195,7 @@ def test_the_command(bidnerf: Run, tmp_path: Path) -> None:
     assert "all lengths multiplied by 0.5" in out
     half = bn.load_map(tmp_path / "half")
     assert half.unit == "metres"
-    anchor = load_info(tmp_path / "half").anchor
-    assert anchor is not None
+    anchor = require(load_info(tmp_path / "half").anchor)
     assert anchor.metres_per_unit == 1.0
     assert half.bounds.side == 0.5 * before.bounds.side
     names = [camera.name for camera in before.info.cameras]

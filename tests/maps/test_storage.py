@@ -49,6 +49,7 @@ from commands import Run
 from drawn import poses, record, shares
 from interruptions import FULL, Stopped, outcomes, striking
 from landmark_scene import Points, ring
+from optional import require
 from refusals import refused
 
 BOUNDS = SceneBounds((-0.1, -1 / 3, -1.0), (1.0, 2 / 3, 1e-17), 0.1, 5.0, (1.0, 0.5, 0.0))
@@ -212,8 +213,7 @@ def test_old_files_are_removed_and_others_are_left_alone(tmp_path: Path) -> None
         (tmp_path / name).touch()
     write_parts(tmp_path, info(step=5), state(5))
     saved = write_parts(tmp_path, info(step=6), state(6))
-    assert saved.training is not None
-    assert names(tmp_path) == {*mine, "map.json", saved.weights, saved.training}
+    assert names(tmp_path) == {*mine, "map.json", saved.weights, require(saved.training)}
     done = write_parts(tmp_path, info(step=7, complete=True), state(7))
     assert names(tmp_path) == {*mine, "map.json", done.weights}
 

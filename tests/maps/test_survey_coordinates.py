@@ -40,6 +40,7 @@ from bidnerf_core.maps.known_lengths import locate_point
 from bidnerf_core.maps.views import choose_origin
 from bidnerf_core.progress import Progress
 from bidnerf_core.registry import registered
+from optional import require
 
 ORIGIN = (500_000.0, 4_000_000.0, 100.0)
 OFFSET = torch.tensor(ORIGIN, dtype=torch.float64)
@@ -88,9 +89,7 @@ def test_the_map_is_the_same_but_for_its_origin() -> None:
     assert far().origin == ORIGIN
     assert far().bounds.size == pytest.approx(near().bounds.size, abs=MILLIMETRE)
     a, b = near().landmarks, far().landmarks
-    assert a is not None
-    assert b is not None
-    assert torch.allclose(a.positions, b.positions, atol=MILLIMETRE)
+    assert torch.allclose(require(a).positions, require(b).positions, atol=MILLIMETRE)
 
 
 @pytest.mark.parametrize("depth", [False, True])
@@ -140,8 +139,7 @@ def test_renderings_are_from_poses_of_the_users_world() -> None:
 
 
 def test_exports_are_in_the_users_world(tmp_path: Path) -> None:
-    landmarks = far().landmarks
-    assert landmarks is not None
+    landmarks = require(far().landmarks)
     expected = landmarks.positions.double() + OFFSET
     for to in ("ply", "colmap", "transforms.json"):
         export_map(far(), tmp_path / to, to)

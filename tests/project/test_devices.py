@@ -23,6 +23,7 @@ from bidnerf_core.io import to_plain
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.maps import MapInfo
+from optional import require
 from problems import FieldMap
 from refusals import refused
 
@@ -57,8 +58,7 @@ def elsewhere_of(value: Any, device: torch.device) -> list[str]:
 
 @functools.cache
 def landmarks() -> LandmarkMap:
-    found = textured_map().landmarks
-    assert found is not None
+    found = require(textured_map().landmarks)
     return found
 
 
@@ -186,7 +186,6 @@ def test_a_tensor_that_is_forgotten_is_named(part: str) -> None:
 @pytest.mark.parametrize("device", ["mars", "cuda:99", "cpu:5", "meta", ""])
 def test_a_device_that_does_not_work_is_named(device: str) -> None:
     stored = whole_map("vanilla")
-    assert stored.surface is not None
-    for move in (stored.to, stored.surface.to, landmarks().to):
+    for move in (stored.to, require(stored.surface).to, landmarks().to):
         with refused(found=f"device {device!r} does not work here", expected="cpu"):
             move(device)

@@ -34,6 +34,7 @@ from bidnerf_core.localization import ADVICE, METHODS, AutoConfig, Problem, sett
 from bidnerf_core.maps import MapInfo
 from bidnerf_core.registry import registered
 from bidnerf_core.training import Silent
+from optional import require
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -284,11 +285,9 @@ def test_commands_and_methods_are_documented() -> None:
 @pytest.fixture(scope="module")
 def tables() -> Any:
     """The module that makes tables from records; the documentation's folder is no package."""
-    spec = importlib.util.spec_from_file_location("docs_tables", ROOT / "docs" / "tables.py")
-    assert spec is not None
-    assert spec.loader is not None
+    spec = require(importlib.util.spec_from_file_location("docs_tables", ROOT / "docs" / "tables.py"))
     module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    require(spec.loader).exec_module(module)
     return module
 
 

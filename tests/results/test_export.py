@@ -19,6 +19,7 @@ from bidnerf_core.datasets import read_frames
 from bidnerf_core.io import read_record
 from bidnerf_core.maps import Map, MapInfo
 from bidnerf_core.registry import PluginError, registered
+from optional import require
 from refusals import refused
 
 
@@ -44,14 +45,13 @@ def test_point_clouds(scene: Map, tmp_path: Path) -> None:
     files = bn.export_map(scene, tmp_path / "out", "ply")
     assert [file.name for file in files] == ["cameras.json", "cameras.ply", "landmarks.ply", "surface.ply"]
     assert scene.surface is not None
-    assert scene.landmarks is not None
     lines, surface = read_ply(files[3])
     assert "comment lengths in metres" in lines
     places = np.stack([surface[axis] for axis in "xyz"], axis=-1)
     np.testing.assert_array_equal(places, scene.surface.surfels.positions.numpy())
     assert np.abs(surface["red"] / 255 - scene.surface.surfels.rgb[:, 0].numpy()).max() < 0.01
     _, landmarks = read_ply(files[2])
-    assert landmarks["photos"].tolist() == scene.landmarks.views.tolist()
+    assert landmarks["photos"].tolist() == require(scene.landmarks).views.tolist()
     _, cameras = read_ply(files[1])
     centre = scene.info.cameras[1].pose.translation
     np.testing.assert_allclose([cameras[axis][5] for axis in "xyz"], centre, atol=1e-6)
@@ -74,14 +74,12 @@ def test_colmap_reads_the_model(scene: Map, tmp_path: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     bn.export_map(scene, tmp_path / "out", "colmap")
     model = pycolmap.Reconstruction(str(tmp_path / "out"))
-    landmarks = scene.landmarks
-    assert landmarks is not None
-    assert landmarks.tracks is not None
+    landmarks = require(scene.landmarks)
     assert len(model.points3D) == len(landmarks)
     np.testing.assert_allclose(model.points3D[1].xyz, landmarks.positions[0], atol=1e-6)
     assert {image.name for image in model.images.values()} == {f"{camera.name}.JPG" for camera in scene.info.cameras}
     assert [model.points3D[n + 1].track.length() for n in range(len(landmarks))] == landmarks.views.tolist()
-    assert model.compute_num_observations() == len(landmarks.tracks.landmark)
+    assert model.compute_num_observations() == len(require(landmarks.tracks).landmark)
     first = model.points3D[1]
     seen = first.track.elements[0]
     image = model.images[seen.image_id]
@@ -169,8 +167,7 @@ def test_a_registered_exporter_gets_the_map(scene: Map, tmp_path: Path, monkeypa
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "notes.txt").write_text("mine")
     (file,) = bn.export_map(scene, tmp_path / "out", "count", overwrite=True)
-    assert scene.landmarks is not None
-    assert file.read_text() == str(len(scene.landmarks))
+    assert file.read_text() == str(len(require(scene.landmarks)))
 
     monkeypatch.setitem(registered, ("exporters", "count"), lambda: None)
     with refused(where="exporter 'count'", found="not an exporter: it does not take (scene, out)", error=PluginError):

@@ -27,6 +27,7 @@ from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import read_record
+from optional import require
 from photo_files import noise, write_photo
 from refusals import refused
 
@@ -191,8 +192,7 @@ def test_transforms_with_times_are_a_sequence(tmp_path: Path) -> None:
     sequence = open_sequence(tmp_path)
     assert [timed.time for timed in sequence] == [image.time for image in written[::-1]]
     for timed, image in zip(sequence, written[::-1], strict=True):
-        assert timed.truth is not None
-        torch.testing.assert_close(timed.truth.matrix(), image.T_world_camera.matrix(), atol=1e-9, rtol=0)
+        torch.testing.assert_close(require(timed.truth).matrix(), image.T_world_camera.matrix(), atol=1e-9, rtol=0)
 
 
 def test_heads_state_the_direction_of_the_poses_and_no_unit_where_there_is_no_pose(tmp_path: Path) -> None:

@@ -39,6 +39,7 @@ from bidnerf_core.frames import BLACK, View
 from bidnerf_core.progress import Progress
 from drawn import record
 from flights import covered, flight
+from optional import require
 from refusals import refused
 
 FRAMES = 5
@@ -320,8 +321,7 @@ def test_errors_by_another_world_are_told_from_errors_of_poses(line: bool) -> No
     there = [SE3(T.rotation @ truth.rotation, T.apply(1.7 * truth.translation)) for truth in truths]
     noise = 0.01 * torch.randn((6, 6), dtype=torch.float64, generator=generator)
     noisy = [pose.retract(step) for pose, step in zip(there, noise, strict=True)]
-    remark = answers_with(noisy, truths).world_mismatch
-    assert remark is not None
+    remark = require(answers_with(noisy, truths).world_mismatch)
     assert remark.startswith("all 6 accepted poses differ from the dataset's by one transformation")
     scale = float(remark.partition("a scale of ")[2].split()[0])
     assert scale == pytest.approx(1.7, rel=0.02)

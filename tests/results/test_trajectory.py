@@ -15,6 +15,7 @@ from bidnerf.results import TrajectoryErrors, spans
 # Inside: errors after each alignment, compared with evo's, and the paths that are drawn
 from bidnerf.results.errors import ErrorSummary, alignment_errors, relative_errors
 from bidnerf.results.plots import draw_path
+from optional import require
 from refusals import refused
 
 
@@ -41,8 +42,7 @@ def test_ate_is_evos() -> None:
     estimate.align(reference, correct_scale=False)
     ape = metrics.APE(metrics.PoseRelation.translation_part)
     ape.process_data((reference, estimate))
-    ours = alignment_errors(found, true)
-    assert ours is not None
+    ours = require(alignment_errors(found, true))
     assert np.allclose(ours.numpy(), ape.error, atol=1e-9)
     ate = TrajectoryErrors.of(found, true).ate
     assert ate == pytest.approx(ape.get_statistic(metrics.StatisticsType.rmse), abs=1e-9)
@@ -68,14 +68,12 @@ def test_the_raw_error_sees_an_offset_that_alignment_removes() -> None:
     errors = TrajectoryErrors.of(moved, true)
     assert errors.raw.translation_median > 0.1
     assert errors.ate == pytest.approx(0.0, abs=1e-9)
-    assert errors.rpe is not None
-    assert errors.rpe.translation_rmse == pytest.approx(0.0, abs=1e-9)
+    assert require(errors.rpe).translation_rmse == pytest.approx(0.0, abs=1e-9)
 
 
 def test_scale_is_not_aligned() -> None:
     true = walk()
-    errors = alignment_errors(SE3(true.rotation, 1.1 * true.translation), true)
-    assert errors is not None
+    errors = require(alignment_errors(SE3(true.rotation, 1.1 * true.translation), true))
     assert float(errors.max()) > 0.01
 
 

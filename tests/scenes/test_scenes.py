@@ -13,6 +13,7 @@ from bidnerf.scenes import ClosedFormScene, demo_object, demo_room, look_around,
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import SE3, look_at
+from optional import require
 
 CAMERA = Intrinsics(70.0, 75.0, 31.0, 24.5, 64, 48)
 SCENES = [demo_object(), demo_room()]
@@ -117,10 +118,8 @@ def test_coverage_is_soft_at_contours_and_whole_in_rooms() -> None:
     assert (frame.rgb[frame.alpha == 0] == 1).all()
     room = demo_room()
     for view in views(room, CAMERA, look_around(room.bounds, 3)):
-        assert view.frame.alpha is not None
-        assert view.frame.alpha.min() == 1
-        assert view.frame.depth is not None
-        assert view.frame.depth.min() > 0.1
+        assert require(view.frame.alpha).min() == 1
+        assert require(view.frame.depth).min() > 0.1
 
 
 SYMMETRIES = [

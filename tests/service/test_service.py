@@ -35,6 +35,8 @@ import numpy as np
 import psutil
 import pytest
 
+from optional import require
+
 pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
 pytest.importorskip("uvicorn", reason="the extra 'serve' is not installed")
 
@@ -433,8 +435,7 @@ def test_nothing_is_lost_when_a_worker_is_killed(service: Service, inputs: Input
 
 def holder_of_maps(service: Service) -> psutil.Process:
     """Return the process from which workers are forked."""
-    assert service.pool._maps is not None
-    return psutil.Process(service.pool._maps[0].pid)
+    return psutil.Process(require(service.pool._maps)[0].pid)
 
 
 @pytest.mark.slow

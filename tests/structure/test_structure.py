@@ -42,6 +42,7 @@ from bidnerf_core.geometry import fit_similarity, look_at
 # Inside: each stage of the search for poses, with its rare geometry
 from bidnerf_core.maps.training import open_posed_images, poses_folder
 from commands import Run
+from optional import require
 from photo_files import write_photo
 from photo_room import CAMERA, photograph, walk, write_photos
 from refusals import refused
@@ -469,7 +470,6 @@ def test_pairs_with_many_matches_tell_a_folded_model() -> None:
 def test_poses_that_many_pairs_contradict_are_doubted(search: Search) -> None:
     assert search.found.doubt is None
     assert search.found.sure_pairs > 0
-    doubt = replace(search.found, sure_pairs=400, contradicting=3).doubt
-    assert doubt is not None
+    doubt = require(replace(search.found, sure_pairs=400, contradicting=3).doubt)
     assert doubt.startswith("3 of 400 pairs of photos that share many keypoints (0.8%)")
     assert replace(search.found, sure_pairs=400, contradicting=2).doubt is None

@@ -25,6 +25,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import Problem, Surface, rig
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, SurfelIndex, Surfels, bake
+from optional import require
 from problems import FieldMap
 
 CAMERA = Intrinsics(96.0, 96.0, 36.0, 36.0, 72, 72)
@@ -73,8 +74,7 @@ def problem(*views: View, start: SE3 | None = None, surface: SurfaceMap | None =
 
 def points(*views: View, count: int = 1000, seed: int = 0, surface: SurfaceMap | None = None) -> Surface:
     """Return measured points of views whose poses are known in the world, in the last one's frame."""
-    found = Surface.of(problem(*views).views, None, toy() if surface is None else surface, seed, count)
-    assert found is not None
+    found = require(Surface.of(problem(*views).views, None, toy() if surface is None else surface, seed, count))
     return found
 
 

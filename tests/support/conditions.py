@@ -18,6 +18,7 @@ from bidnerf_core.localization import settings_of
 from bidnerf_core.mapping import Features, Keypoints, LandmarkMap, Sift, build_landmarks
 from landmark_scene import PINHOLE, Points, looking_in, ring
 from localizations import colour_only
+from optional import require
 
 POSES = (looking_in(0.43, 0.45, 3.6), looking_in(0.2, 0.6, 4.0), looking_in(0.8, -0.2, 4.4))
 COPY = SE3.exp(torch.tensor([30.0, 5.0, -20.0, 0.2, -0.9, 0.4], dtype=torch.float64))
@@ -138,8 +139,7 @@ def twice(landmarks: LandmarkMap, share: float = 1.0) -> LandmarkMap:
 @functools.cache
 def ground_landmarks(features: str = "sift", scatter: float = 0.01) -> LandmarkMap:
     """Return landmarks of a map whose images hardly show which focal length is right: their own estimates scatter."""
-    landmarks = textured_map().landmarks
-    assert landmarks is not None
+    landmarks = require(textured_map().landmarks)
     deviations = torch.full((4,), scatter, dtype=torch.float64)
     cameras = (CAMERA,)
     return replace(landmarks, features=features, calibration_scatter=deviations, correlation=1.0, cameras=cameras)

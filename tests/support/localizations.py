@@ -9,6 +9,7 @@ import torch
 
 from bidnerf import SE3, Frame, Localization, Outcome, View
 from bidnerf.results import normalized_error_squared, pose_error
+from optional import require
 
 CHI2_99, CHI2_999 = 16.8, 22.5  # of six degrees of freedom
 
@@ -42,8 +43,7 @@ def assert_near(T: SE3, truth: SE3, metres: float, degrees: float) -> None:
 
 def assert_covered(T: SE3, truth: SE3, covariance: torch.Tensor | None, most: float = CHI2_99) -> None:
     """Assert that a pose is as near the truth as its covariance says."""
-    assert covariance is not None
-    assert float(normalized_error_squared(T, truth, covariance)) < most
+    assert float(normalized_error_squared(T, truth, require(covariance))) < most
 
 
 def colour_only(view: View) -> View:

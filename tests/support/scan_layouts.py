@@ -23,6 +23,7 @@ from bidnerf_core.datasets import open_dataset, open_sequence
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
+from optional import require
 from sparse_model import to_binary, write_model
 from tum_folder import Recorded, write_recording
 
@@ -49,8 +50,7 @@ def pixels(view: View) -> np.ndarray:
 
 
 def metres(view: View) -> np.ndarray:
-    assert view.frame.depth is not None
-    return np.asarray(view.frame.depth, dtype=np.float64)
+    return np.asarray(require(view.frame.depth), dtype=np.float64)
 
 
 def millimetres(view: View) -> np.ndarray:

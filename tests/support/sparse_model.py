@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from bidnerf_core.frames import View, all_pixels, observe
 from bidnerf_core.geometry import SE3
+from optional import require
 
 UNIT = 0.37
 """Metres that one of the model is long."""
@@ -57,11 +58,10 @@ def known(views: Sequence[View], names: Sequence[str], each: int = 12, wrong: in
 
 def _sees(view: View, points: torch.Tensor, agree: float) -> torch.Tensor:
     camera, depth = view.frame.intrinsics, view.frame.depth
-    assert depth is not None
     there = view.T_ref_camera.inverse().apply(points)
     column, row = camera.project(there).nan_to_num(-1).floor().long().unbind(-1)
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    z = depth[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)].double()
+    z = require(depth)[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)].double()
     return inside & ((z - there[:, 2]).abs() < agree * z)
 
 

@@ -14,6 +14,7 @@ from bidnerf.testing import textured_map
 from bidnerf_core.captures import StoredCamera
 from bidnerf_core.datasets import write_transforms
 from bidnerf_core.maps import MapInfo
+from optional import require
 
 
 def open_ground(
@@ -21,8 +22,7 @@ def open_ground(
 ) -> None:
     """Let commands open the ground, whatever folder they name. ``assumed``: the landmarks' cameras, if given."""
     known = textured_map(surface=True)
-    assert known.landmarks is not None
-    landmarks = known.landmarks
+    landmarks = require(known.landmarks)
     if assumed:  # as if trial photos by that camera had been localized in the map
         scatter = torch.full((4,), 0.001, dtype=torch.float64)
         landmarks = replace(landmarks, cameras=assumed, calibration_scatter=scatter)

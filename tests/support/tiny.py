@@ -20,6 +20,7 @@ from bidnerf_core.maps import Anchor
 from bidnerf_core.training import TrainingBatch
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid.encoding import HashEncodingConfig
+from optional import require
 from scan_layouts import millimetres, opengl, write_image
 
 SIZE = 24
@@ -92,8 +93,7 @@ def write_dataset(folder: Path, train: int = 6, test: int = 3, depth: bool = Tru
 
 
 def _rgba(view: View) -> np.ndarray:
-    alpha = view.frame.alpha
-    assert alpha is not None
+    alpha = require(view.frame.alpha)
     cover = alpha[..., None]
     colour = (view.frame.rgb - (1 - cover) * torch.tensor(BACKGROUND)) / cover.clamp(min=1e-3)
     return (torch.cat([colour.clamp(0, 1), cover], dim=-1) * 255).round().to(torch.uint8).numpy()

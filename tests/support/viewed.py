@@ -14,6 +14,7 @@ from PIL import Image
 from bidnerf import SE3, Frame, TrainOptions, View, train
 from bidnerf_core.datasets import Query
 from bidnerf_core.mapping import BakeConfig
+from optional import require
 from photo_room import CAMERA, HALF, photograph
 from photo_room import walk as walk
 from tiny import config
@@ -58,6 +59,5 @@ def photo_file(folder: Path, name: str = "photo.png") -> Path:
 
 def state_of(page: str) -> Any:
     """Return the state that a page holds."""
-    found = re.search(r'<script type="application/json" id="state">(.*?)</script>', page, re.DOTALL)
-    assert found is not None
+    found = require(re.search(r'<script type="application/json" id="state">(.*?)</script>', page, re.DOTALL))
     return json.loads(found[1])

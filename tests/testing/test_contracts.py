@@ -38,6 +38,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import AutoConfig, Localization, Outcome, Problem, find_method, settings_of
 from bidnerf_core.mapping import SIFT, Keypoints
 from bidnerf_core.registry import registered
+from optional import require
 
 QUICK = AutoConfig(points=1000, hypotheses=64, rounds=1, refine_steps=0, fused_rays=128)
 FEW = {"poses": 8, "fine_rays": 512}
@@ -111,8 +112,7 @@ def reversed_axes(view: View) -> View:
 
 
 def millimetres(view: View) -> View:
-    assert view.frame.depth is not None
-    return replace(view, frame=replace(view.frame, depth=1000 * view.frame.depth))
+    return replace(view, frame=replace(view.frame, depth=1000 * require(view.frame.depth)))
 
 
 def stretched(view: View) -> View:
@@ -231,8 +231,7 @@ def test_a_mistake_of_a_method_is_named(monkeypatch: pytest.MonkeyPatch, solve: 
 
 
 def in_place(frame: Frame, size: float, generator: Generator) -> Frame:
-    assert frame.depth is not None
-    frame.depth.mul_(size)
+    require(frame.depth).mul_(size)
     return frame
 
 

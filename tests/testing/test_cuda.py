@@ -25,6 +25,7 @@ from bidnerf_core.geometry import perturb
 from bidnerf_core.localization import settings_of
 from bidnerf_core.maps import load_map
 from bidnerf_core.training import Silent, TrainingState, TrainingStep, TrainingStopped
+from optional import require
 from problems import FieldMap
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU here")
@@ -226,8 +227,7 @@ def test_a_map_that_was_made_on_a_gpu_serves_on_a_cpu(tmp_path: Path) -> None:
     assert main(["train", str(data), "--out", str(map), "--device", "cuda", *tiny.options()]) == 0
     assert main(["bake", str(map), "--device", "cuda", "--opacity", "0.01", "--agreement", "0"]) == 0
     made = load_map(map)
-    assert made.surface is not None
-    assert device_of(made.field).type == made.surface.surfels.positions.device.type == "cpu"
+    assert device_of(made.field).type == require(made.surface).surfels.positions.device.type == "cpu"
 
 
 def test_levels_lie_where_their_field_does() -> None:

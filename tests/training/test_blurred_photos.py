@@ -17,6 +17,7 @@ from bidnerf_core.fields import render
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.training import Silent, Supervision, SupervisionConfig, TrainingStep, relative_detail
 from landmark_scene import looking_in
+from optional import require
 from test_supervision import BACKENDS
 
 BOUNDS, COUNT, BLURRED = demo_object().bounds, 12, 5
@@ -50,8 +51,7 @@ def test_exposure_does_not_count_as_blur() -> None:
 
 def test_the_loss_is_that_of_weighted_squares() -> None:
     supervision = Supervision(photos(3.0), BOUNDS, replace(SupervisionConfig(), exposure=False))
-    weight = supervision.image_weight
-    assert weight is not None
+    weight = require(supervision.image_weight)
     batch = supervision.draw(400, torch.Generator().manual_seed(1))
     rendering = render(ground(), batch.rays, batch.background)
     loss, mse = supervision.loss(rendering, batch)

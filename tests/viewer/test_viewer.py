@@ -43,6 +43,7 @@ from bidnerf_core.localization import (
 from bidnerf_core.mapping import States
 from bidnerf_core.progress import job_context
 from commands import Run, assert_refused
+from optional import require
 
 
 @pytest.fixture(scope="module")
@@ -199,8 +200,7 @@ def test_a_bar_is_beyond_its_middle_on_the_side_that_passes(found: dict[str, Any
         assert figure.passed is (value >= 0.5 if at_least else value <= 0.5), figure
         assert 0 <= value <= 1
         assert at_least is figure.threshold.startswith("at least")
-    near = bar(3.22, 3.0, at_least=False)
-    assert near is not None
+    near = require(bar(3.22, 3.0, at_least=False))
     assert math.isclose(near["value"] / 0.5, 3.22 / 3.0)
     assert bar(1.47, 0.25, at_least=False) == {"value": 1.0, "at_least": False}
     assert bar(math.nan, 3.0, True) is None
@@ -275,8 +275,7 @@ def test_the_ellipsoid_is_that_of_two_standard_deviations_in_the_world(generator
     root = torch.randn((6, 6), generator=generator, dtype=torch.float64)
     covariance = root @ root.mT
     T = SE3.exp(torch.randn(6, generator=generator, dtype=torch.float64))
-    found = ellipsoid(T, covariance)
-    assert found is not None
+    found = require(ellipsoid(T, covariance))
     axes = torch.tensor(found["axes"], dtype=torch.float64).reshape(3, 3)
     world = T.rotation @ covariance[:3, :3] @ T.rotation.mT
     torch.testing.assert_close(axes.mT @ axes, 4 * world)
@@ -287,8 +286,9 @@ def test_the_ellipsoid_is_that_of_two_standard_deviations_in_the_world(generator
 
 def test_depth_difference_is_the_offset_of_a_shifted_measurement(room: Map, query: Query) -> None:
     image, frame = room.render(query.views[0]), query.frame
-    shifted = depth_difference(image, replace(frame, depth=torch.where(image.depth > 0.3, image.depth - 0.25, 0)))
-    assert shifted is not None
+    shifted = require(
+        depth_difference(image, replace(frame, depth=torch.where(image.depth > 0.3, image.depth - 0.25, 0)))
+    )
     assert math.isclose(shifted["median"], 0.25, rel_tol=1e-4)
     assert depth_difference(image, replace(frame, depth=None)) is None
 
@@ -328,12 +328,10 @@ def test_the_page_holds_its_state_and_hostile_names_stay_text(
 
 def test_the_page_asks_nobody_for_anything(room: Map, found: dict[str, Any]) -> None:
     page = MapView(map_json(room, 0), (found,)).html()
-    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)
-    assert policy is not None
+    policy = require(re.search(r'Content-Security-Policy" content="([^"]*)"', page))
     assert "default-src 'none'" in policy[1]
     assert "connect-src 'none'" in policy[1]
-    script = re.search(r"script-src ([^;]*);", policy[1])
-    assert script is not None
+    script = require(re.search(r"script-src ([^;]*);", policy[1]))
     assert "unsafe" not in script[1]
     assert not re.search(r'(?:src|href)="(?!data:)[^"]', page.partition("<script>")[0])
     modules = page.rpartition('<script type="module">')[2]
@@ -347,8 +345,7 @@ def test_a_notebook_shows_the_page_in_a_frame_that_cannot_reach_it(room: Map, qu
     shown = view(room, frame=query.frame)
     markup = shown._repr_html_()
     assert 'sandbox="allow-scripts"' in markup
-    source = re.search(r'srcdoc="([^"]*)"', markup)
-    assert source is not None
+    source = require(re.search(r'srcdoc="([^"]*)"', markup))
     assert viewed.state_of(html.unescape(source[1]))["answers"][0]["outcome"] == "converged"
     assert "1 localization" in repr(shown)
 

@@ -16,6 +16,8 @@ from urllib.parse import quote
 
 import pytest
 
+from optional import require
+
 pytest.importorskip("starlette", reason="the extra 'viewer' is not installed")
 pytest.importorskip("uvicorn", reason="the extra 'viewer' is not installed")
 
@@ -185,8 +187,7 @@ def test_closing_ends_the_localization_at_work(room: Map, method: str) -> None:
     began = time.monotonic()
     until(lambda: running.state == "done")
     assert time.monotonic() - began < 20  # of hours; a busy machine takes seconds to end a step
-    assert running.answer is not None
-    assert (running.answer["outcome"], waiting.state) == ("stopped", "waiting")
+    assert (require(running.answer)["outcome"], waiting.state) == ("stopped", "waiting")
 
 
 def test_thumbnails_and_renderings_are_images_of_the_size_asked_for(client: Client) -> None:
