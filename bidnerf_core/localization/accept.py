@@ -300,7 +300,7 @@ def support(
     steps = torch.cat([torch.diag(size), -torch.diag(size)]).to(T.translation)
     many = SE3(T.rotation.expand(12, 3, 3), T.translation.expand(12, 3))
     against = {} if plain is None else {"plain": float(log_odds(plain[None], here)[0])}
-    against["displaced"] = float(log_odds(costs(about.moved(many, steps)), here).min())
+    against["displaced"] = float(log_odds(costs(about.move(many, steps)), here).min())
     if others is not None and len((far := others[~same_pose(T, others, middle)]).translation):
         against["other"] = float(log_odds(costs(far), here).min())
     explained = None

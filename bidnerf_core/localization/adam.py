@@ -52,13 +52,13 @@ class AdamSteps:
     def __call__(self) -> None:
         """Take one optimization step."""
         delta = torch.zeros_like(self._rate).requires_grad_()
-        value = self._loss(self._pivot.moved_linearly(self._T, delta))
+        value = self._loss(self._pivot.move_linearly(self._T, delta))
         update = torch.zeros_like(delta)
         if value.requires_grad:  # false if no ray hits anything
             (gradient,) = torch.autograd.grad(value, delta)
             update = self._update(gradient)
         with torch.no_grad():
-            there = self._pivot.moved(self._T, update).polished()
+            there = self._pivot.move(self._T, update).polished()
             finite = there.rotation.isfinite().all() & there.translation.isfinite().all()
             for now, then in ((self._T.rotation, there.rotation), (self._T.translation, there.translation)):
                 now.copy_(torch.where(finite, then, now))

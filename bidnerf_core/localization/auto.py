@@ -17,7 +17,7 @@ from bidnerf_core.depth import find_depth_sensor
 from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Evidence, least_confidence
-from bidnerf_core.localization.by_surface import localize_by_depth, localize_by_images, nearest_piece
+from bidnerf_core.localization.by_surface import localize_by_depth, localize_by_images
 from bidnerf_core.localization.explanations import CAMERAS, MOVING
 from bidnerf_core.localization.loop import LandmarkAnswer, Loop
 from bidnerf_core.localization.methods import BidConfig, Method, SharedSettings, bid
@@ -74,32 +74,23 @@ def _on_surface(
     if surface is None or (loop is not None and loop.landmarks.usual_matches >= 150):
         return best or unrecognized(problem)
     config = config if loop is None else replace(config, rounds=1)
-    occluder = nearest_piece(problem)
-    for given in (problem, *(() if occluder is None else (occluder.rest,))):
-        found = localize_by_depth(given, surface, config, seed)
-        if found is None:
-            break
-        if occluder is not None and given is not problem:
-            # At least nine tenths of an occluder's points lie in front of the surface.
-            if not found.converged or occluder.share_in_front(surface, found.T_world_camera) < 0.9:
-                continue
-            share = f"the nearest {occluder.share:.0%} of the measured points, which are on an occluder"
-            found = replace(found, reason=f"{found.reason}, without {share}")
-        there = None if loop is None else loop.at(found.T_world_camera)
-        if there is not None and there.verdict.accepted:
-            found = localization_of(problem, there, began)
-            return replace(found, reason=f"found on the surface; {found.reason}")
-        if there is not None and found.converged and there.contradicted:
-            why = f"{there.evidence.inliers} landmarks match, {there.evidence.by_chance:.0f} by chance"
-            found = found.rejected(Verdict(Outcome.TOO_FEW_MATCHES, why))
-        found = _uncertain_camera(found, problem)
-        if found.converged:
-            return found
-        if best is None or best.outcome is Outcome.TOO_FEW_MATCHES:  # a pose by chance
-            best = found
-    if best is None and loop is None:
-        return _uncertain_camera(localize_by_images(problem, surface, config, seed), problem)
-    return best or unrecognized(problem)
+    found = localize_by_depth(problem, surface, config, seed)
+    if found is None:
+        if best is None and loop is None:
+            found = localize_by_images(problem, surface, config, seed)
+            return _uncertain_camera(found, problem)
+        return best or unrecognized(problem)
+    there = None if loop is None else loop.at(found.T_world_camera)
+    if there is not None and there.verdict.accepted:
+        found = localization_of(problem, there, began)
+        return replace(found, reason=f"found on the surface; {found.reason}")
+    if there is not None and found.converged and there.contradicted:
+        why = f"{there.evidence.inliers} landmarks match, {there.evidence.by_chance:.0f} by chance"
+        found = found.rejected(Verdict(Outcome.TOO_FEW_MATCHES, why))
+    found = _uncertain_camera(found, problem)
+    # A landmark-based pose with too few matches is a pose by chance.
+    is_better = found.converged or best is None or best.outcome is Outcome.TOO_FEW_MATCHES
+    return found if is_better or best is None else best
 
 
 def _uncertain_camera(found: Localization, problem: Problem) -> Localization:

@@ -229,14 +229,14 @@ class Pivot:
         reach = 0.0 if self.T_camera_pivot is None else float(self.T_camera_pivot.translation.norm())
         return reach if reach > 0 else 1.0
 
-    def moved(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
+    def move(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
         """Return ``T``, one pose or a batch, after the update ``delta``; differentiable in ``delta``."""
         if self.T_camera_pivot is None:
             return SE3.exp(delta) @ T  # a left update (iNeRF, section 3.1)
         return (T @ self.T_camera_pivot).retract(delta) @ self.T_camera_pivot.inverse()
 
-    def moved_linearly(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
-        """Return ``move_to`` to first order in ``delta``: cheaper, with the same value and derivative at 0."""
+    def move_linearly(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
+        """Approximate ``move`` to first order in ``delta``: cheaper, with the same value and derivative at 0."""
         if self.T_camera_pivot is None:
             return SE3.identity(device=delta.device).retract_linearly(delta) @ T
         return (T @ self.T_camera_pivot).retract_linearly(delta) @ self.T_camera_pivot.inverse()

@@ -117,13 +117,13 @@ def test_bid_is_inerf_with_other_settings(problem: Problem) -> None:
 
 
 def test_updates_are_written_where_the_pivot_is(problem: Problem) -> None:
-    torch.testing.assert_close(pivot("camera", problem).moved(TRUTH, XI).matrix(), TRUTH.retract(XI).matrix())
-    torch.testing.assert_close(pivot("world", problem).moved(TRUTH, XI).matrix(), (SE3.exp(XI) @ TRUTH).matrix())
+    torch.testing.assert_close(pivot("camera", problem).move(TRUTH, XI).matrix(), TRUTH.retract(XI).matrix())
+    torch.testing.assert_close(pivot("world", problem).move(TRUTH, XI).matrix(), (SE3.exp(XI) @ TRUTH).matrix())
     about = pivot("scene", problem)
     middle = require(about.T_camera_pivot).translation
     assert abs(float(middle.norm()) - 4) < 1  # the blobs are about the origin, four metres away
     turn = torch.cat([torch.zeros(3, dtype=torch.float64), XI[3:]])
-    torch.testing.assert_close(about.moved(TRUTH, turn).apply(middle), TRUTH.apply(middle))  # it stays
+    torch.testing.assert_close(about.move(TRUTH, turn).apply(middle), TRUTH.apply(middle))  # it stays
 
 
 def test_a_turn_moves_the_camera_as_far_as_a_shift(problem: Problem) -> None:
@@ -136,7 +136,7 @@ def test_a_turn_moves_the_camera_as_far_as_a_shift(problem: Problem) -> None:
     torch.testing.assert_close(first[0], torch.tensor(RATE * about.lever_arm).double())
     torch.testing.assert_close(first[3], torch.tensor(RATE).double())
     turn = torch.tensor([0, 0, 0, 1e-4, 0, 0], dtype=torch.float64)
-    shift = float((about.moved(TRUTH, turn).translation - TRUTH.translation).norm())
+    shift = float((about.move(TRUTH, turn).translation - TRUTH.translation).norm())
     assert shift == pytest.approx(1e-4 * about.lever_arm, rel=0.05)
 
 

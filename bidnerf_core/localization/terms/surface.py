@@ -161,13 +161,16 @@ class Surface:
         near, alike = self.inliers(states)
         return 1 - near + self.colour_weight * (1 - near * alike)
 
+    def mean_cost(self, states: States) -> Float[Tensor, "h"]:
+        return self.costs(states).mean(-1)
+
     def fitted_noise(self, states: States) -> Surface:
         """Return the term with the noise estimated from the points at the first state."""
         r = self._offsets(move_to(states[:1], self.surface.device))[0].abs()
         found = (MAD_TO_SIGMA * r.median()).clamp(min=0.25 * self.surface.cell)
         return replace(self, noise=found.clamp(max=3 * self.noise))
 
-    def exposed(self, states: States) -> Surface:
+    def match_exposure(self, states: States) -> Surface:
         """Return the term with colours converted to the map's exposure, using the points on the surface at the first state.
 
         The colours are left unchanged if the conversion makes hardly any more points match the surface's colour.
