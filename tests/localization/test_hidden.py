@@ -16,6 +16,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import DRAWERS, Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import AutoConfig, Localization, Outcome, is_blank
+from optional import require
 from problems import localize
 from refusals import refused
 
@@ -25,9 +26,7 @@ SIZE = baked.CAMERA.height
 
 def behind_a_board(view: View) -> View:
     """A board near the camera, which covers two fifths of the image, more than the toy does."""
-    depth, rgb = view.frame.depth, view.frame.rgb.clone()
-    assert depth is not None
-    board, depth = slice(0, 2 * SIZE // 5), depth.clone()
+    depth, rgb, board = require(view.frame.depth).clone(), view.frame.rgb.clone(), slice(0, 2 * SIZE // 5)
     depth[:, board] = 0.5 * float(depth[depth > 0].min())
     rgb[:, board] = torch.rand((SIZE, 2 * SIZE // 5, 3), generator=torch.Generator().manual_seed(0))
     return replace(view, frame=replace(view.frame, depth=depth, rgb=rgb))
@@ -63,15 +62,12 @@ def test_a_hidden_part_is_a_mask_of_the_image(hidden: torch.Tensor, found: str, 
 
 def test_nothing_is_measured_where_the_scene_is_hidden() -> None:
     frame = baked.unseen()[0].frame
-    assert frame.depth is not None
     hidden = torch.zeros((SIZE, SIZE), dtype=torch.bool)
     hidden[:, SIZE // 2 :] = True
     masked = replace(frame, hidden=hidden)
-    assert masked.depth is not None
-    assert torch.equal(masked.depth, torch.where(hidden, 0, frame.depth))
+    assert torch.equal(require(masked.depth), torch.where(hidden, 0, require(frame.depth)))
     mirrored = faulty(View(masked, SE3.identity()), "mirror", 0).frame.hidden
-    assert mirrored is not None
-    assert torch.equal(mirrored, hidden.flip(1))
+    assert torch.equal(require(mirrored), hidden.flip(1))
 
 
 def test_a_hidden_board_does_not_matter() -> None:
