@@ -160,7 +160,6 @@ CameraGroup: TypeAlias = Annotated[
 class QueryOptions:
     """Photos and frames."""
 
-    camera: CameraGroup = CameraOptions()
     depth: Annotated[
         tuple[Path, ...],
         Option("FILE...", "depth images or .npy files of the photos, in the same order, or matched by name"),
@@ -174,6 +173,7 @@ class QueryOptions:
         WholeNumbers(1),
         Option("K", "combine each frame with those before it in the split, K in all, as a rig"),
     ] = 1
+    camera: CameraGroup = CameraOptions()
 
     def __post_init__(self) -> None:
         twice = next((name for name in self.frame if self.frame.count(name) > 1), None)

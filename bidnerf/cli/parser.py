@@ -229,7 +229,8 @@ class _Parser(argparse.ArgumentParser):
             formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, 2, 24, self.width),
         )
         self._positionals.title = "arguments"
-        usage, groups, others = [f"bidnerf {command} [OPTIONS]"], dict[Group | None, Any](), dict[str, None]()
+        usage = {True: list[str](), False: list[str]()}  # positional arguments, and required options
+        groups, others = dict[Group | None, Any](), dict[str, None]()
         groups[None] = self.add_argument_group("options")
         for parameter, group in _leaves(target, loaded):
             if isinstance(group, SettingsGroup) and parameter.note(SettingsGroup) is group:  # not loaded
@@ -240,14 +241,17 @@ class _Parser(argparse.ArgumentParser):
                 if group not in groups:
                     assert group is not None
                     groups[group] = self.add_argument_group(group.title, self._fill(group.text, 2))
-                usage += self._add(parameter, groups[group], complete=not options_only)
+                usage[parameter.option.positional] += self._add(parameter, groups[group], complete=not options_only)
         if short and others:
             self.epilog = self._fill(f"'{self.prog} {HELP_ALL}' also describes {enumeration(sorted(others))}.")
         else:
             for name in ("-h", HELP, HELP_ALL):  # known to the parser, whose pages do not repeat them
                 self.add_argument(name, action="store_true", help=argparse.SUPPRESS)
         self.usage = textwrap.fill(
-            " ".join(usage), self.width - len("usage: "), subsequent_indent="  ", break_on_hyphens=False
+            " ".join([f"{self.prog} [OPTIONS]", *usage[True], *usage[False]]),
+            self.width - len("usage: "),
+            subsequent_indent="  ",
+            break_on_hyphens=False,
         ).replace("%", "%%")
 
     def _fill(self, text: str, indent: int = 0) -> str:

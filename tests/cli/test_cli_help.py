@@ -16,6 +16,7 @@ import pytest
 # Inside: the parser alone, and the options of all commands by name
 from bidnerf.cli import COMMANDS, main, parser
 from bidnerf.cli.parser import FLAG, Group, Option, SettingsGroup, Without, parse
+from bidnerf.evaluation import PROTOCOLS
 from bidnerf_core.errors import UsageError
 from bidnerf_core.localization import METHODS
 from bidnerf_core.registry import list_plugins
@@ -123,6 +124,16 @@ def test_help_is_short_and_describes_groups_in_sentences_for_users(bidnerf: Run)
             assert re.fullmatch(r"[A-Z][^:]*\.", text), (command, title, text)
             assert "option" not in text.lower(), (command, title, text)
     assert 100 < arguments <= MOST
+
+
+def test_help_names_what_is_installed(bidnerf: Run) -> None:
+    page = " ".join(bidnerf("evaluate", "--help").out.split())
+    assert page.partition("how starts are chosen: ")[2].startswith(
+        f"{', '.join([*PROTOCOLS][:-1])} or {[*PROTOCOLS][-1]} "
+    )
+    for words, group in (("localize", "writers"), ("track", "writers"), ("export", "exporters")):
+        page = " ".join(bidnerf(words, "--help").out.split())
+        assert ", ".join(info.name for info in list_plugins(group)) in page
 
 
 @pytest.mark.parametrize("columns", ["1", "39"])

@@ -14,7 +14,12 @@ import pytest
 import torch
 
 import tiny
-from bidnerf import Localizer
+from bidnerf import SE3, Localizer
+
+# Inside: the starts of --perturb, without a localization of each
+from bidnerf.cli.localize import StartOptions
+from bidnerf.results import pose_error
+from bidnerf.testing import unseen
 from bidnerf_core.datasets import Photos, Query, open_dataset
 from bidnerf_core.errors import printable
 from bidnerf_core.localization import Outcome
@@ -156,6 +161,19 @@ def test_each_frame_of_a_split_or_of_all_is_a_query(bidnerf: Run, shared: Path, 
     assert len(bidnerf(*split).out.splitlines()) == 3
     everything = bidnerf(*place, shared / "data", "--split", "all", "--json")
     assert len(objects(everything.out)) == 9, everything.err
+
+
+def test_each_frame_is_moved_in_a_direction_of_its_own() -> None:
+    view = unseen()
+    start_of = StartOptions(perturb=(0.1, 5.0)).of_queries(seed=3)
+    first, second, again = (start_of(Query(name, (view,), view.T_ref_camera)) for name in ("a", "b", "a"))
+    assert isinstance(first, SE3)
+    assert isinstance(second, SE3)
+    for start in (first, second):
+        error = pose_error(start, view.T_ref_camera)
+        assert (float(error.translation), float(error.rotation_deg)) == pytest.approx((0.1, 5.0))
+    assert first is again
+    assert float((first.translation - second.translation).norm()) > 0.01
 
 
 # Files of poses.
