@@ -24,7 +24,7 @@ from bidnerf.cli.parser import Flag, Group, Option, Without
 from bidnerf.cli.running import displayed, working
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount
-from bidnerf_core.settings import EXPERT, WholeNumbers
+from bidnerf_core.settings import EXPERT, LARGEST_SEED, WholeNumbers
 
 if TYPE_CHECKING:
     from bidnerf.evaluation import Plan
@@ -48,9 +48,12 @@ class TrialOptions:
     ] = ()
     trials: Annotated[
         int | None,
+        WholeNumbers(1),
         Option("N", "number of trials per size; without a start, at most one per frame", "the protocol's"),
     ] = None
-    seed: Annotated[int | None, Option("N", "seed of every random choice", "the protocol's")] = None
+    seed: Annotated[
+        int | None, WholeNumbers(0, LARGEST_SEED), Option("N", "seed of every random choice", "the protocol's")
+    ] = None
     frame: Annotated[Names, Option("NAME...", "try only these frames", "all of the split")] = ()
 
     def plan(self, method: MethodOptions, images: DatasetOptions, **more: Any) -> Plan:
@@ -108,8 +111,8 @@ class WorkOptions:
         Option("N", "number of single-threaded processes", "one per core; one on a GPU"),
     ] = None
     dask: Annotated[str | None, Option("ADDRESS", "address of a dask scheduler whose workers run the trials")] = None
-    shards: Annotated[int, EXPERT, Option("N", "number of parts that the trials are split into")] = 1
-    shard: Annotated[int, EXPERT, Option("I", "the part to run, from 0")] = 0
+    shards: Annotated[int, WholeNumbers(1), EXPERT, Option("N", "number of parts that the trials are split into")] = 1
+    shard: Annotated[int, WholeNumbers(0), EXPERT, Option("I", "the part to run, from 0")] = 0
 
 
 def run_evaluate(

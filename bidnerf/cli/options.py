@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
-from bidnerf.cli.parser import FLAG, Group, Option, SettingsGroup
+from bidnerf.cli.parser import FLAG, Group, Option, SettingsGroup, as_usage_error
 from bidnerf_core import datasets, mapping
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
@@ -128,7 +128,7 @@ def wrong_usage() -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise UsageError(error) from error
+        raise as_usage_error(error) from error
 
 
 @dataclass(frozen=True)

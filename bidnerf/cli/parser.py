@@ -201,7 +201,15 @@ def _build(target: Callable[..., T], given: Mapping[str, Any], loaded: Mapping[s
     try:
         return dataclasses.replace(default, **values) if values else default
     except InputError as error:
-        raise UsageError(error) from error
+        raise as_usage_error(error) from error
+
+
+def as_usage_error(error: InputError) -> UsageError:
+    """Return the error about a setting as one about the option of its name."""
+    if error.where not in (None, "config"):
+        return UsageError(error)
+    found = re.sub(r"^(\w+)(?= is )", lambda name: f"--{name[0].replace('_', '-')}", error.found)
+    return UsageError(found, expected=error.expected)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -425,7 +433,7 @@ def conversion(hint: Any, notes: Sequence[Any] = ()) -> tuple[int | str | None, 
                 continue
             for limit in limits:
                 if value not in limit:
-                    raise argparse.ArgumentTypeError(f"is {word!r}, expected {limit}")
+                    raise argparse.ArgumentTypeError(f"is {value!r}, expected {limit}")
             return value
         raise argparse.ArgumentTypeError(f"is {word!r}, expected {expected}")
 

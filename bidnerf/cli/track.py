@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from bidnerf.cli.options import CameraGroup, Images, MapFolder, pose_file_help
+from bidnerf.cli.options import CameraGroup, Images, MapFolder, pose_file_help, wrong_usage
 from bidnerf.cli.output import check_output, print_table, say
 from bidnerf.cli.parser import Group, Option, SettingsGroup, Without
 from bidnerf.cli.running import displayed
@@ -89,7 +89,8 @@ def run_track(
     for file in filter(None, (out, plot)):
         check_output(file, [Path(each) for each in named if isinstance(each, str | Path)])
     start = None if tracking.start is None else read_pose(tracking.start)
-    settings = settings_of(USUAL_METHOD, {"depth_sensor": frames.depth_sensor, "risk": tracking.risk})
+    with wrong_usage():
+        settings = settings_of(USUAL_METHOD, {"depth_sensor": frames.depth_sensor, "risk": tracking.risk})
     scene = load_map(map)
     path, began = Answers(scene, is_sequence=True), time.perf_counter()
     localizer = Localizer(scene, config=settings)

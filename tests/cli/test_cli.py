@@ -536,7 +536,7 @@ def test_a_window_is_the_frame_and_those_before_it(bidnerf: Run, shared: Path, p
         assert cut == (size == 3)
     for words, status, named in (
         (["t_0000", "t_0001", "--window", 2], 2, ("--window 2", "2 frames")),
-        (["t_0000", "--window", 0], 2, ("--window is '0'",)),
+        (["t_0000", "--window", 0], 2, ("--window is 0",)),
         (["t_0000", "--window", 4], 2, ("--window is 4", "1 to 3")),
         (["t_9", "--window", 2], 1, ("'t_9'",)),
     ):
@@ -775,7 +775,7 @@ def test_the_demo_leaves_a_map_and_the_data_that_it_was_made_from(
 # for each line on stdin with a file for what a command prints, one for what it complains of, and its words, the child's process id
 # and how it ended.
 FORKING = """
-import os, sys, bidnerf_core as bn, bidnerf.cli.localize
+import os, sys, bidnerf as bn, bidnerf.cli.localize
 bn.Localizer, bn.load_map
 print(*sys.modules, flush=True)
 import torch._dynamo, bidnerf.cli.train, bidnerf_core.backend

@@ -153,7 +153,7 @@ def test_a_dataset_of_poses_can_be_read_again(bidnerf: Run, data: Path) -> None:
         ("{data} --out path.doc", 2, "path.doc"),
         ("{data} --out nowhere/path.txt", 1, "no folder nowhere"),
         ("{data}", 2, "--out"),
-        ("{data} --out path.txt --every 0", 2, "--every is '0'"),
+        ("{data} --out path.txt --every 0", 2, "--every is 0"),
         ("{data} --out path.txt --points 0", 2, "points"),
     ],
 )
