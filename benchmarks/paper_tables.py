@@ -38,7 +38,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 from scipy.stats import fisher_exact, mannwhitneyu
 
-from bidnerf.cli import displayed
+from bidnerf.cli import display_progress
 from bidnerf.evaluation import (
     NEVER,
     PROTOCOLS,
@@ -268,7 +268,7 @@ def run_part(trials: Sequence[Trial], path: Path, workers: int, minutes: float |
         return minutes is not None and time.monotonic() - began > 60 * minutes
 
     with ResultsFile(path) as file:
-        with displayed(), suppress(Cancelled, KeyboardInterrupt), job_context(cancel=late):
+        with display_progress(), suppress(Cancelled, KeyboardInterrupt), job_context(cancel=late):
             run_trials(trials, file, workers=workers)
         done = [trial for trial in trials if trial in file]
         if not done or (len(done) < len(trials) and minutes is None):

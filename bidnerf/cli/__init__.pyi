@@ -9,4 +9,4 @@ from .parser import Group as Group
 from .parser import Option as Option
 from .program import COMMANDS as COMMANDS
 from .program import main as main
-from .running import displayed as displayed
+from .running import display_progress as display_progress

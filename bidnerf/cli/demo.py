@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 from bidnerf.cli.options import Seed
 from bidnerf.cli.output import console, print_table, say, show
 from bidnerf.cli.parser import Flag, Option
-from bidnerf.cli.running import working
+from bidnerf.cli.running import interruptible_work
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.registry import USUAL_BACKEND
 from bidnerf_core.settings import WholeNumbers
@@ -77,7 +77,7 @@ def run_demo(
         unseen = views(scene, camera, orbit(radius, frames, elevation=(15.0, 50.0), seed=seed + 1))
         began = time.monotonic()
         options = TrainOptions(DatasetOptions(background=background), overwrite=True)
-        with working():
+        with interruptible_work():
             stored = train(seen, backend, out / "map", config, options=options)
         seconds = time.monotonic() - began
         say(f"trained on {len(seen)} views of the closed-form scene, and baked: {seconds:.1f} s")
@@ -93,18 +93,18 @@ def run_demo(
             begin = trial.errors(start)
             unit = symbol(begin.unit)
             starts = ["none", ""], [f"{begin.translation:.3f} {unit}", f"{begin.rotation_deg:.1f} deg"]
-            for found, cells in zip((trial.auto, trial.bid), starts, strict=True):
-                end = trial.errors(found.T_world_camera)
+            for localization, cells in zip((trial.auto, trial.bid), starts, strict=True):
+                end = trial.errors(localization.T_world_camera)
                 rows.append(
                     [
                         view.frame.name,
-                        found.method,
+                        localization.method,
                         *cells,
                         f"{end.translation:.4f} {unit}",
                         f"{end.rotation_deg:.2f} deg",
-                        str(found.steps),
-                        f"{found.seconds:.1f}",
-                        "yes" if found.converged else "NO",
+                        str(localization.steps),
+                        f"{localization.seconds:.1f}",
+                        "yes" if localization.converged else "NO",
                     ]
                 )
         show("Pose errors before and after")

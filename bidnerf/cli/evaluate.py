@@ -21,7 +21,7 @@ from bidnerf.cli.options import (
 )
 from bidnerf.cli.output import check_folder, console, print_json, require_outside_maps, say, show
 from bidnerf.cli.parser import Flag, Group, Option, Without
-from bidnerf.cli.running import displayed, working
+from bidnerf.cli.running import display_progress, interruptible_work
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.settings import EXPERT, LARGEST_SEED, WholeNumbers
@@ -150,7 +150,7 @@ def run_evaluate(
         shards=work.shards,
     )
     require_outside_maps(out.parent, out)
-    with working("waiting for the trials under way (Ctrl-C again: at once)"):
+    with interruptible_work("waiting for the trials under way (Ctrl-C again: at once)"):
         table = evaluate(map, data or map, plan, out=out, workers=work.dask or work.workers)
     show(f"{amount(len(table.rows), 'trial')} in {out}; 'bidnerf report {out}' shows them")
 
@@ -193,7 +193,7 @@ def run_compare(
     plan = replace(starts, size=() if size is None else (size,)).plan(method, images)
     if out is not None:
         check_folder(out, folders)
-    with nullcontext() if out is None else output_folder(out, overwrite), displayed():
+    with nullcontext() if out is None else output_folder(out, overwrite), display_progress():
         comparison = compare(maps, data, plan)
         if out is not None:
             comparison.save(out / "compare.json")

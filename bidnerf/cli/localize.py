@@ -24,8 +24,8 @@ from bidnerf.cli.options import (
 )
 from bidnerf.cli.output import check_folder, check_output, print_json, say, show
 from bidnerf.cli.parser import Group, Option, Without
-from bidnerf.cli.running import displayed
-from bidnerf.cli.signals import uninterrupted
+from bidnerf.cli.running import display_progress
+from bidnerf.cli.signals import defer_interruptions
 from bidnerf_core.errors import InputError, UsageError, amount, enumeration
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ def run_localize(
     output.check(inputs)
     if len(maps) > 1 or maps_in(map) not in ([], [map]):
         _check_for_several(output, start)
-        with displayed():
+        with display_progress():
             collection = MapCollection(maps, method.method, method.config)
         finder: Localizer | MapCollection = collection
         answers, source = Answers(collection), queries.open(paths, images, collection.cameras)
@@ -173,7 +173,7 @@ def run_localize(
         for name in source.names:
             check_output(output.picture(name), inputs)
     shown = Run(output, answers, len(source.names), start_of)
-    with displayed(), shown.saved():
+    with display_progress(), shown.save_at_end():
         localize_each(finder, source, start=start_of, seed=seed, answers=answers, each=shown.show)
 
 
@@ -182,9 +182,9 @@ def _holds_maps(path: Path) -> bool:
     from bidnerf_core.io import IMAGE_SUFFIXES
     from bidnerf_core.maps import maps_in
 
-    found = maps_in(path)
-    if not found or found == [path]:
-        return bool(found)
+    maps = maps_in(path)
+    if not maps or maps == [path]:
+        return bool(maps)
     images = any(file.suffix.lower() in IMAGE_SUFFIXES for file in path.iterdir())
     return not images and find_reader(path) is None
 
@@ -235,7 +235,7 @@ class Run:
             write_file(self.output.picture(query.name), png_bytes(picture))
 
     @contextlib.contextmanager
-    def saved(self) -> Iterator[None]:
+    def save_at_end(self) -> Iterator[None]:
         """Write the pose file at the end and, if there are several queries, print how many converged.
 
         If the run is stopped early, the answers so far are written. Raises ``InputError`` if the file's format takes
@@ -250,7 +250,7 @@ class Run:
             yield
             is_whole = True
         finally:  # however the run ended: also by Ctrl-C, SIGTERM, a closed pipe or a full disk
-            with uninterrupted():
+            with defer_interruptions():
                 if is_whole and total > 1:
                     scene = answers.scene
                     more = f" in {len(scene)} maps" if isinstance(scene, MapCollection) else ""
@@ -273,29 +273,32 @@ def answer_lines(answer: Answer, full: bool) -> list[str]:
     from bidnerf.results import OPENCV_AXES, standard_deviations
     from bidnerf_core.geometry import symbol
 
-    found, error, placement = answer.localization, answer.error, answer.placement
-    verdict = "converged" if found.converged else f"NOT converged: {found.outcome.value}"
-    verdict = f"{verdict} ({found.reason})"
+    localization, error, placement = answer.localization, answer.error, answer.placement
+    verdict = "converged" if localization.converged else f"NOT converged: {localization.outcome.value}"
+    verdict = f"{verdict} ({localization.reason})"
     world, runner_up = "", []
     if placement is not None:
-        where = "in" if found.converged else "in none of the maps; nearest"
+        where = "in" if localization.converged else "in none of the maps; nearest"
         verdict, world = f"{where} {placement.map}: {verdict}", f"in the frame of {placement.map}, "
     if placement is not None and placement.runner_up is not None:
         name, other = placement.runner_up
         outcome = "converged too" if other.converged else other.outcome
         runner_up = [f"  runner-up {name}: {outcome} ({other.reason})"]
     if error is not None:
-        off = f"{float(error.translation):.4f} {symbol(error.unit)}, {float(error.rotation_deg):.3f} deg"
-        verdict = f"error {off}; {verdict}"
-    lines = [f"{answer.name}: {verdict}; {amount(found.steps, 'step')}, {found.seconds:.2f} s", *runner_up]
-    if full and found.covariance is not None:
-        position, rotation = standard_deviations(found.covariance)
+        offset = f"{float(error.translation):.4f} {symbol(error.unit)}, {float(error.rotation_deg):.3f} deg"
+        verdict = f"error {offset}; {verdict}"
+    lines = [
+        f"{answer.name}: {verdict}; {amount(localization.steps, 'step')}, {localization.seconds:.2f} s",
+        *runner_up,
+    ]
+    if full and localization.covariance is not None:
+        position, rotation = standard_deviations(localization.covariance)
         lines.append(
-            f"  uncertainty  {position:.4f} {symbol(found.unit)}, {math.degrees(rotation):.3f} deg (one standard deviation)"
+            f"  uncertainty  {position:.4f} {symbol(localization.unit)}, {math.degrees(rotation):.3f} deg (one standard deviation)"
         )
     if full:
-        lengths = "metres" if found.unit == "metres" else "units of the map"
-        rows = found.T_world_camera.matrix().tolist()
+        lengths = "metres" if localization.unit == "metres" else "units of the map"
+        rows = localization.T_world_camera.matrix().tolist()
         lines.append(f"  T_world_camera ({world}{OPENCV_AXES}; lengths in {lengths})")
         lines += ["    " + " ".join(f"{value: .6f}" for value in row) for row in rows]
     return lines

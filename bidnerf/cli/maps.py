@@ -24,7 +24,7 @@ from bidnerf.cli.options import (
 )
 from bidnerf.cli.output import check_folder, check_output, print_json, say, show
 from bidnerf.cli.parser import Flag, Group, Option, SettingsGroup, Without
-from bidnerf.cli.running import displayed, working
+from bidnerf.cli.running import display_progress, interruptible_work
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.progress import counter
 from bidnerf_core.settings import EXPERT, Above, WholeNumbers
@@ -169,7 +169,7 @@ def run_render(
     from bidnerf_core.maps import load_info, load_map
 
     check_folder(out, (map, data))
-    with output_folder(out, overwrite), displayed():
+    with output_folder(out, overwrite), display_progress():
         dataset = replace(images, background=load_info(map).bounds.background).open(data)
         names = list(frame) or dataset.frame_names(images.split)
         if not names:
@@ -263,7 +263,7 @@ def run_bake(
         find_features(landmark_features)
     # The baked parts may be damaged, so they are not loaded here.
     scene = load_map(map, device, baked=False)
-    with working():
+    with interruptible_work():
         scene.bake(data, config, images=images, rendered_landmarks=rendered_landmarks, features=landmark_features)
 
 
@@ -305,7 +305,7 @@ def run_extend(
     options = replace(images, background=info.bounds.background)
     opened: dict[Path, Path | Capture] = {path: options.open(path) for path in datasets}
     known = None if data is None else opened.get(data, data)
-    with working():
+    with interruptible_work():
         scene = extend(map, opened.get(new, new), known, split=images.split, steps=steps, config=config)
     added, total = len(scene.info.cameras) - len(info.cameras), len(scene.info.cameras)
     show(f"{map}: {amount(added, 'photo')} added, {amount(total, 'image')} in all")
@@ -384,5 +384,5 @@ def run_import(
         with wrong_usage():
             pose = read_pose(world.T_world_file)
     options = ImportOptions(images, target.landmark_features, target.device, target.overwrite, as_, world.scale, pose)
-    with working():
+    with interruptible_work():
         import_map(file, out, config, photos=photos, bake=not target.no_bake, options=options)

@@ -110,8 +110,8 @@ def require_outside_maps(folder: Path, out: Path) -> None:
     from bidnerf_core.maps import DESCRIPTION
 
     if (folder / DESCRIPTION).exists():
-        found = "exists already, as a map" if folder == out else "lies in the folder of a map"
-        raise UsageError(found, where=out, expected="a name outside of it")
+        reason = "exists already, as a map" if folder == out else "lies in the folder of a map"
+        raise UsageError(reason, where=out, expected="a name outside of it")
 
 
 def _require_writable(folder: Path, out: Path) -> None:

@@ -208,8 +208,8 @@ def as_usage_error(error: InputError) -> UsageError:
     """Return the error about a setting as one about the option of its name."""
     if error.where not in (None, "config"):
         return UsageError(error)
-    found = re.sub(r"^(\w+)(?= is )", lambda name: f"--{name[0].replace('_', '-')}", error.found)
-    return UsageError(found, expected=error.expected)
+    text = re.sub(r"^(\w+)(?= is )", lambda name: f"--{name[0].replace('_', '-')}", error.found)
+    return UsageError(text, expected=error.expected)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -400,7 +400,7 @@ def conversion(hint: Any, notes: Sequence[Any] = ()) -> tuple[int | str | None, 
     hint, own = _bare(hint)
     is_union = typing.get_origin(hint) in (typing.Union, types.UnionType)
     parts = [_bare(part) for part in typing.get_args(hint)] if is_union else [(hint, ())]
-    limits = [n for found in (notes, own, *(more for _, more in parts)) for n in found if isinstance(n, Allowed)]
+    limits = [n for group in (notes, own, *(more for _, more in parts)) for n in group if isinstance(n, Allowed)]
     members = [kind for kind, _ in parts]
     optional = type(None) in members
     tuples = [part for part in members if typing.get_origin(part) is tuple]

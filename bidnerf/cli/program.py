@@ -44,25 +44,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if given and not given[0].startswith("-") and given[0] in COMMANDS:
             name += f" {given[0]}"
-        with interruptions(), _warnings_as_lines(name), _remarks_as_lines():
+        with interruptions(), _warnings_as_lines(name), _log_as_lines():
             status = _dispatch(given)
             sys.stdout.flush()  # here, where a full disk can still be reported
             return status
     except KeyboardInterrupt as stopped:
-        return _failed(name, "interrupted", 128 + stopped.number if isinstance(stopped, Interrupted) else INTERRUPTED)
+        return _report(name, "interrupted", 128 + stopped.number if isinstance(stopped, Interrupted) else INTERRUPTED)
     except Cancelled as stopped:
-        return _failed(name, str(stopped), INTERRUPTED)
+        return _report(name, str(stopped), INTERRUPTED)
     except BrokenPipeError:
         return READER_GONE
     except OSError as error:  # a full disk, a folder without write permission
         where = f"{error.filename}: " if error.filename else ""
-        return _failed(name, f"{where}{error.strerror or error}", BAD_INPUT)
+        return _report(name, f"{where}{error.strerror or error}", BAD_INPUT)
     except InputError as error:
-        return _failed(name, str(error), WRONG_USAGE if isinstance(error, UsageError) else BAD_INPUT)
+        return _report(name, str(error), WRONG_USAGE if isinstance(error, UsageError) else BAD_INPUT)
     except RuntimeError as error:
         if type(error).__name__ != "OutOfMemoryError":  # torch's class; importing torch would delay --help
             raise
-        return _failed(name, f"the GPU's memory is full, try --device cpu ({error})", BAD_INPUT)
+        return _report(name, f"the GPU's memory is full, try --device cpu ({error})", BAD_INPUT)
     finally:
         try:
             sys.stdout.flush()
@@ -81,7 +81,7 @@ def _dispatch(given: list[str]) -> int:
         return DONE
     if given[0] not in COMMANDS:
         unknown = f"no command {given[0]!r}{spelling_hint(given[0], COMMANDS)}"
-        return _failed("bidnerf", unknown, WRONG_USAGE, f"\n{_usage()}")
+        return _report("bidnerf", unknown, WRONG_USAGE, f"\n{_usage()}")
     if any("\0" in word for word in given):
         raise UsageError("an argument holds a NUL character", expected="text")
     from bidnerf.cli.parser import parse  # imported here for the sake of a quick --version
@@ -105,16 +105,16 @@ def _usage() -> str:
 @contextlib.contextmanager
 def _warnings_as_lines(name: str) -> Iterator[None]:
     """Print each distinct ``InputWarning`` once, as one line on stderr, without the source line that Python would add."""
-    told = set[str]()
+    shown = set[str]()
     with warnings.catch_warnings():
 
         def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
             if not issubclass(category, InputWarning):
                 lines = warnings.formatwarning(message, category, *where[:2]).split("\n")
                 sys.stderr.write("\n".join(map(printable, lines)))
-            elif str(message) not in told:  # a broken plugin is reported again with every folder
-                told.add(str(message))
-                _failed(name, str(message), DONE)
+            elif str(message) not in shown:  # a broken plugin is reported again with every folder
+                shown.add(str(message))
+                _report(name, str(message), DONE)
 
         warnings.simplefilter("always", InputWarning)
         warnings.showwarning = show  # type: ignore[assignment]
@@ -122,7 +122,7 @@ def _warnings_as_lines(name: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _remarks_as_lines() -> Iterator[None]:
+def _log_as_lines() -> Iterator[None]:
     """Print each message that the library logs as one line on stderr."""
     logger, handler = logging.getLogger("bidnerf"), _Lines()
     before = logger.level, logger.propagate
@@ -145,7 +145,7 @@ class _Lines(logging.Handler):
         say(record.getMessage())
 
 
-def _failed(name: str, message: str, status: int, more: str = "") -> int:
+def _report(name: str, message: str, status: int, more: str = "") -> int:
     """Print the reason for a failure, or a warning, on one line, and return ``status``, even if stderr is closed."""
     with contextlib.suppress(OSError):
         print(f"{name}: {printable(' '.join(message.splitlines()))}", file=sys.stderr)

@@ -77,7 +77,7 @@ class Display:
 
 
 @contextlib.contextmanager
-def displayed() -> Iterator[None]:
+def display_progress() -> Iterator[None]:
     """Display the progress of the work in the context."""
     display = Display()
     try:
@@ -89,7 +89,7 @@ def displayed() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def working(
+def interruptible_work(
     announcement: str = "stopping after this step (Ctrl-C again: at once, back to the last checkpoint)",
 ) -> Iterator[None]:
     """Display the progress of the work in the context, and let Ctrl-C stop it at its next check; a second Ctrl-C stops it at once.
@@ -106,7 +106,7 @@ def working(
 
     handler.works = True
     try:
-        with job_context(cancel=cancel), displayed():
+        with job_context(cancel=cancel), display_progress():
             yield
     except Cancelled as stopped:
         if handler.waiting is None:  # something other than Ctrl-C stopped it

@@ -64,7 +64,7 @@ def installed_handler() -> Handler:
 
 
 @contextlib.contextmanager
-def uninterrupted() -> Iterator[None]:
+def defer_interruptions() -> Iterator[None]:
     """Defer interruptions to the end of the context, so that results are written completely."""
     handler = installed_handler()
     handler.writes = True

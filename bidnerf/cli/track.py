@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from bidnerf.cli.options import CameraGroup, Images, MapFolder, pose_file_help, wrong_usage
 from bidnerf.cli.output import check_output, print_table, say
 from bidnerf.cli.parser import Group, Option, SettingsGroup, Without
-from bidnerf.cli.running import displayed
-from bidnerf.cli.signals import uninterrupted
+from bidnerf.cli.running import display_progress
+from bidnerf.cli.signals import defer_interruptions
 from bidnerf_core import localization
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.registry import USUAL_METHOD
@@ -95,14 +95,14 @@ def run_track(
     path, began = Answers(scene, is_sequence=True), time.perf_counter()
     localizer = Localizer(scene, config=settings)
     try:
-        with displayed():
+        with display_progress():
             source = camera.source(images, localizer.assumed_cameras)
             recorded = replace(images, camera=source, background=scene.bounds.background).open_sequence(sequence)
             recorded = recorded if frames.split is None else recorded.split(frames.split)
             tracker = Tracker(localizer, tracking.config, start)
             track(tracker, recorded, every=frames.every, depth=frames.depth, answers=path)
     finally:  # however tracking ended, the frames so far are written
-        with uninterrupted():
+        with defer_interruptions():
             if path.given:
                 try:
                     path.save(out)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from bidnerf.cli.options import Images, Json, MapOutput, NewMap, PointChoice, refuse, wrong_usage
 from bidnerf.cli.output import check_folder, print_json
 from bidnerf.cli.parser import Flag, Group, Option, SettingsGroup
-from bidnerf.cli.running import working
+from bidnerf.cli.running import interruptible_work
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.registry import USUAL_BACKEND, USUAL_FEATURES
@@ -43,10 +43,10 @@ def run_poses(
     from bidnerf_core.io import to_plain
 
     check_folder(out, (photos,))
-    with working("stopping (Ctrl-C again: at once); what was found is kept"):
-        found = find_poses(photos, out, camera, overwrite)
+    with interruptible_work("stopping (Ctrl-C again: at once); what was found is kept"):
+        poses = find_poses(photos, out, camera, overwrite)
     if json:
-        print_json(to_plain(found))
+        print_json(to_plain(poses))
 
 
 def _backend_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
@@ -182,7 +182,7 @@ def run_train(
         sparse_depth.model_points,
         training.checkpoint_every,
     )
-    with working():
+    with interruptible_work():
         if not resumes:
             train(data, training.backend or USUAL_BACKEND, out, config, bake=bake, options=options)
             return

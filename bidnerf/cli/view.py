@@ -11,7 +11,7 @@ from bidnerf import service, viewer
 from bidnerf.cli.options import TEST_IMAGES, Device, Host, Images, MapFolder, Method, Names, Port, Queries
 from bidnerf.cli.output import check_output, console, say, show
 from bidnerf.cli.parser import Group, Option, Without
-from bidnerf.cli.running import displayed
+from bidnerf.cli.running import display_progress
 from bidnerf.service import LEAST_TOKEN, ServiceLimits
 from bidnerf.service import serve as serve_maps
 from bidnerf_core.errors import InputError, UsageError, spelling_hint
@@ -101,8 +101,8 @@ def run_view(
                 hint = f"no frame {name!r}{spelling_hint(name, source.names)}"
                 raise InputError(describe_other_split(name, splits) or hint)
         step = -(-len(source.names) // 24) if page.save else 1  # a page of at most 24 images, spread over all
-        places = [source.names.index(name) for name in frame] or range(0, len(source.names), step)
-        source = source.select(places)
+        indices = [source.names.index(name) for name in frame] or range(0, len(source.names), step)
+        source = source.select(indices)
     if page.save is None:
         serve_view(
             LiveView(localizer, source, path, rows, camera),
@@ -111,23 +111,23 @@ def run_view(
             ready=lambda address: say(f"look at {address}; Ctrl-C ends"),
         )
         return
-    answers = () if source is None else _localized(localizer, source)
+    answers = () if source is None else _localize_all(localizer, source)
     with console.status("drawing the map"):
         MapView(map_json(scene), answers, trajectory=path, results=rows).save(page.save)
     show(f"look at {page.save}")
 
 
-def _localized(localizer: Localizer, source: QuerySource) -> tuple[dict[str, Any], ...]:
+def _localize_all(localizer: Localizer, source: QuerySource) -> tuple[dict[str, Any], ...]:
     """Localize all queries, and return the page's JSON values of each. Raises ``InputError`` if none can be read."""
     from bidnerf.results import BAD_INPUT
     from bidnerf.viewer import answer_image
 
     answers, total = [], len(source.names)
-    with displayed():
+    with display_progress():
         count = counter("localizing and rendering", "images")
-        for place in range(total):
-            answers.append(answer_image(localizer, source, place))
-            count(place + 1, total)
+        for index in range(total):
+            answers.append(answer_image(localizer, source, index))
+            count(index + 1, total)
     unread = [answer for answer in answers if answer["outcome"] == BAD_INPUT]
     if unread and len(unread) == len(answers):
         raise InputError(unread[0]["reason"])

@@ -29,7 +29,7 @@ from bidnerf import Intrinsics, scenes
 from bidnerf.cli import COMMANDS, main
 
 # Inside: a line of progress, without a training that takes as long as the line says
-from bidnerf.cli.running import displayed
+from bidnerf.cli.running import display_progress
 from bidnerf.scenes import demo_object
 from bidnerf_core.backend import load_backend
 from bidnerf_core.datasets import open_dataset
@@ -96,7 +96,7 @@ def test_a_line_of_progress_leaves_out_what_the_recipe_does_not_tell(
     samples: float, shown: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     info = MapInfo("fog", {}, demo_object().bounds, 0, complete=False)
-    with displayed():
+    with display_progress():
         Checkpoints(info).step(TrainingStep(5, 5, 0.25, 6.0, samples))
     line = f"training: 5/5 steps, loss 0.25000  PSNR 6.00 dB{shown}, 0 s left\n"
     assert capsys.readouterr().err == line

@@ -24,7 +24,7 @@ import torch
 from bidnerf import SE3, Frame, InputError, Intrinsics, Localization, Localizer, Outcome, Tracker
 from bidnerf.cli import main
 from bidnerf.cli.output import check_folder, check_output
-from bidnerf.cli.signals import Interrupted, interruptions, uninterrupted
+from bidnerf.cli.signals import Interrupted, defer_interruptions, interruptions
 from bidnerf.results import Answers
 from bidnerf_core.datasets import DatasetFrames, Query, read_trajectory
 from bidnerf_core.errors import UsageError
@@ -167,7 +167,7 @@ def test_an_interruption_while_results_are_written_waits_for_them() -> None:
     written = list[int]()
 
     def write() -> None:
-        with interruptions(), uninterrupted():
+        with interruptions(), defer_interruptions():
             os.kill(os.getpid(), signal.SIGTERM)
             written.append(1)
 
