@@ -6,13 +6,10 @@ import errno
 import json
 import math
 import os
-import random
 import re
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -39,8 +36,7 @@ from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps import Checkpoints, MapInfo, load_info, load_map
 from bidnerf_core.registry import list_plugins
 from bidnerf_core.training import TrainingStep
-from commands import Run, assert_refused, strict
-from optional import require
+from commands import Run, assert_refused, quietly, strict
 from trainings import assert_same_map, stop_at
 
 LOCALIZE_KEYS = {
@@ -640,30 +636,26 @@ def test_render_writes_the_images_that_were_agreed_on(bidnerf: Run, shared: Path
 # Training that is interrupted.
 
 
-def test_a_stopped_training_goes_on_as_if_nothing_had_happened(bidnerf: Run, shared: Path, interrupted: Path) -> None:
-    info = load_info(interrupted)
-    assert (info.step, info.complete) == (tiny.STEPS // 2, False)
-    assert bidnerf("info", interrupted).status == 0
-    # A setting that is given again is compared with its own value alone, not with defaults of the others.
-    resumed = bidnerf("train", shared / "data", "--out", interrupted, "--resume", "--no-bake", "--base-resolution", "4")
-    assert (resumed.status, resumed.out) == (0, "")
-    assert f"resuming from step {tiny.STEPS // 2}" in resumed.err
-    assert load_info(interrupted).complete
-    assert sorted(f.suffix for f in interrupted.iterdir()) == [".json", ".safetensors"]
-    assert_same_map(interrupted, shared / "map")
-
-
-def test_a_training_resumes_over_the_background_that_it_began_with(
+def test_ctrl_c_saves_and_resuming_loses_nothing(
     bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    train = ["train", shared / "data", "--background", "black", *tiny.options(8)]
-    assert bidnerf(*train, "--out", tmp_path / "whole").status == 0
+    """Neither the background nor another setting has to be given again."""
+    data, whole, half = shared / "data", tmp_path / "whole", tmp_path / "half"
+    train = ["train", data, "--background", "black", *tiny.options(8)]
+    assert bidnerf(*train, "--out", whole).status == 0
     with monkeypatch.context() as patch:
         stop_at(patch, 5)
-        assert bidnerf(*train, "--out", tmp_path / "half").status == 130
-    resume = ["train", shared / "data", "--resume", "--no-bake"]
-    assert bidnerf(*resume, "--out", tmp_path / "half").status == 0
-    assert_same_map(tmp_path / "half", tmp_path / "whole")
+        stopped = bidnerf(*train, "--out", half)
+    saved = f"{half}: saved after step 5; --resume continues from there"
+    assert (stopped.status, stopped.out) == (130, "")
+    assert stopped.err.splitlines()[-2:] == [saved, "bidnerf train: interrupted"]
+    assert bidnerf("info", half).status == 0
+    # A setting that is given again is compared with its own value alone, not with defaults of the others.
+    resumed = bidnerf("train", data, "--out", half, "--resume", "--no-bake", "--base-resolution", "4")
+    assert (resumed.status, resumed.out) == (0, "")
+    assert "resuming from step 5" in resumed.err
+    assert sorted(file.suffix for file in half.iterdir()) == [".json", ".safetensors"]
+    assert_same_map(half, whole)
 
 
 def test_ctrl_c_before_anything_is_made_leaves_nothing(
@@ -695,7 +687,6 @@ def test_a_diverging_training_is_told_and_leaves_nothing(
 # Processes of their own.
 
 PROGRAM = [sys.executable, "-c", "import sys; from bidnerf.cli import main; sys.exit(main())"]
-ALONE = {**os.environ, "OMP_NUM_THREADS": "1"}
 
 
 @pytest.mark.parametrize(("code", "status"), [(None, 0), (3, 3), ("no licence", 1)])
@@ -734,25 +725,6 @@ def test_closed_streams(monkeypatch: pytest.MonkeyPatch) -> None:
     assert main(["info", "/nowhere"]) == 1
 
 
-def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
-    end = time.monotonic() + 120
-    while not condition():
-        assert time.monotonic() < end
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.005)
-
-
-LONG = 60  # steps
-
-
-@pytest.fixture(scope="module")
-def whole(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a training of so many steps comes to if it is left alone."""
-    out = tmp_path_factory.mktemp("whole") / "map"
-    assert main(["train", str(shared / "data"), "--out", str(out), *tiny.options(LONG)]) == 0
-    return out
-
-
 @pytest.mark.slow
 def test_the_demo_leaves_a_map_and_the_data_that_it_was_made_from(
     bidnerf: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -771,112 +743,10 @@ def test_the_demo_leaves_a_map_and_the_data_that_it_was_made_from(
     assert found["frame"] == view.frame.name
 
 
-# Runs commands in children, so that only their parent imports all that training needs. Prints the modules that localizing needs; then,
-# for each line on stdin with a file for what a command prints, one for what it complains of, and its words, the child's process id
-# and how it ended.
-FORKING = """
-import os, sys, bidnerf as bn, bidnerf.cli.localize
-bn.Localizer, bn.load_map
-print(*sys.modules, flush=True)
-import torch._dynamo, bidnerf.cli.train, bidnerf_core.backend
-from bidnerf.cli import main
-bn.open_dataset(sys.argv[1]).views("train")
-bidnerf_core.backend.load_backend("hashgrid")
-for line in sys.stdin:
-    out, err, *words = line.split()
-    child = os.fork()
-    if child == 0:
-        for number, path in ((1, out), (2, err)):
-            os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT), number)
-        status = main(words)
-        sys.stdout.flush()
-        os._exit(status)
-    print(child, flush=True)
-    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
-"""
-
-
-class Forking:
-    """A process that runs commands in children, one after the other."""
-
-    def __init__(self, process: subprocess.Popen[str]) -> None:
-        self.process = process
-        self.modules = {*self._line().split()}  # that were imported to localize
-
-    def _line(self) -> str:
-        return require(self.process.stdout).readline()
-
-    def begin(self, words: list[str], out: str = os.devnull, err: str = os.devnull) -> int:
-        """Begin a command, and return the id of its process."""
-        assert self.process.stdin is not None
-        self.process.stdin.write(" ".join([out, err, *words]) + "\n")
-        self.process.stdin.flush()
-        return self.ended()
-
-    def ended(self) -> int:
-        """Return the status of the command once it has ended."""
-        return int(self._line())
-
-
-@pytest.fixture(scope="module")
-def forking(shared: Path) -> Iterator[Forking]:
-    program = [sys.executable, "-c", FORKING, str(shared / "data")]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-    with subprocess.Popen(program, text=True, env=ALONE, **pipes) as process:
-        yield Forking(process)
-        require(process.stdin).close()
-
-
 @pytest.mark.slow
-def test_localizing_imports_nothing_that_only_other_work_needs(forking: Forking) -> None:
+def test_localizing_imports_nothing_that_only_other_work_needs() -> None:
     others = "imageio scipy.optimize matplotlib viser pycolmap av jinja2 uvicorn torch._dynamo"
-    assert "bidnerf_core.localization.localizer" in forking.modules
-    assert not {*others.split()} & forking.modules
-
-
-@pytest.mark.slow
-def test_ctrl_c_saves_and_resuming_loses_nothing(
-    bidnerf: Run, shared: Path, whole: Path, tmp_path: Path, forking: Forking
-) -> None:
-    out, said, complaints = tmp_path / "map", tmp_path / "said", tmp_path / "complaints"
-    train = ["train", str(shared / "data"), "--out", str(out)]
-    options = [*tiny.options(LONG), "--checkpoint-every", "0"]
-    child = forking.begin([*train, *options], str(said), str(complaints))
-    wait_for((out / "map.json").exists, forking.process)
-    os.kill(child, signal.SIGINT)
-    assert (forking.ended(), said.read_text()) == (130, "")
-    info = load_info(out)
-    assert complaints.read_text().splitlines()[-2:] == [
-        f"{out}: saved after step {info.step}; --resume continues from there",
-        "bidnerf train: interrupted",
-    ]
-    assert 0 < info.step < LONG
-    assert bidnerf(*train, "--resume", "--no-bake").status == 0
-    assert_same_map(out, whole)
-
-
-@pytest.mark.slow
-def test_a_training_that_is_killed_again_and_again_still_comes_to_its_end(
-    shared: Path, whole: Path, tmp_path: Path, forking: Forking
-) -> None:
-    out, steps = tmp_path / "map", []
-    train = ["train", str(shared / "data"), "--out", str(out), "--checkpoint-every", "0"]
-    chance = random.Random(0)
-    for _ in range(2):
-        before = (out / "map.json").read_bytes() if out.exists() else None
-        child = forking.begin([*train, *(["--resume", "--no-bake"] if before else tiny.options(LONG))])
-        wait_for(
-            lambda before=before: (out / "map.json").exists() and (out / "map.json").read_bytes() != before,
-            forking.process,
-        )
-        time.sleep(chance.uniform(0, 0.05))
-        os.kill(child, signal.SIGKILL)
-        assert forking.ended() == -signal.SIGKILL
-        stored = load_map(out)
-        assert not stored.info.complete, "raise LONG: it came to its end before it was killed"
-        steps.append(stored.info.step)
-    forking.begin([*train, "--resume", "--no-bake"])
-    assert forking.ended() == 0
-    assert steps == sorted(set(steps))
-    assert_same_map(out, whole)
-    assert sorted(file.suffix for file in out.iterdir()) == [".json", ".safetensors"]
+    program = "import sys, bidnerf as bn, bidnerf.cli.localize; bn.Localizer, bn.load_map; print(*sys.modules)"
+    imported = {*quietly([sys.executable, "-c", program]).split()}
+    assert "bidnerf_core.localization.localizer" in imported
+    assert not {*others.split()} & imported
