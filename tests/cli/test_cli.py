@@ -482,8 +482,7 @@ def test_localize_prints_the_object_that_was_agreed_on(
 ) -> None:
     quick = ["--method", "bid", "--max-steps", "3", "--rays", "64"]
     localize = ["localize", shared / "map", shared / "data", "--json", *quick]
-    outcome = bidnerf(*localize, "--perturb", "0.1", "5", "--frame", *frames)
-    assert outcome.status == 0, outcome.err
+    outcome = bidnerf(*localize, "--perturb", "0.1", "5", "--frame", *frames).succeed()
     found = strict(outcome.out)
     assert set(found) == LOCALIZE_KEYS
     assert torch.tensor(found["T_world_camera"]).shape == (4, 4)
@@ -504,8 +503,7 @@ def test_localize_prints_the_object_that_was_agreed_on(
     assert {key: type(found[key]) for key in kinds} == kinds
     # What it prints is a start that it takes.
     (tmp_path / "pose.json").write_text(outcome.out)
-    again = bidnerf(*localize, "--start", tmp_path / "pose.json", "--frame", *frames)
-    assert again.status == 0
+    again = bidnerf(*localize, "--start", tmp_path / "pose.json", "--frame", *frames).succeed()
     rigid = torch.tensor(strict(again.out)["T_world_camera"])
     assert torch.allclose(rigid[:3, :3] @ rigid[:3, :3].T, torch.eye(3), atol=1e-5)
 
@@ -525,8 +523,7 @@ def test_a_window_is_the_frame_and_those_before_it(bidnerf: Run, shared: Path, p
         ("t_0001", 3, "t_0000, t_0001"),
         ("t_0001", 1, "t_0001"),
     ):
-        found = bidnerf(*place, "--frame", frame, "--window", size)
-        assert found.status == 0
+        found = bidnerf(*place, "--frame", frame, "--window", size).succeed()
         assert found.err.endswith(f"{taken}: no measured depth; colour only\n")
         cut = "--window 3: t_0001 has only 1 before it" in found.err
         assert cut == (size == 3)

@@ -135,8 +135,7 @@ def test_a_map_that_was_imported_is_baked_from_where_a_dataset_was_seen(
     bake = ["bake", folder, "--rays", "20000", "--cells", "20000"]
     assert_refused(bidnerf(*bake), 1, "--data")
     tiny.write_dataset(tmp_path / "data", train=9, depth=False)
-    status, _, err = bidnerf(*bake, "--data", tmp_path / "data")
-    assert status == 0
+    err = bidnerf(*bake, "--data", tmp_path / "data").succeed().err
     assert "from 9 rendered views" in err
     surface = require(load_map(folder).surface)
     assert len(surface.keyframes) == 9
@@ -172,8 +171,7 @@ def test_training_bakes_unless_told_otherwise(
     assert load_map(shared / "map").surface is None
     # A map in which nothing is opaque has no surface to bake, and is a map.
     tiny.write_dataset(tmp_path / "data", depth=False)
-    status, _, err = bidnerf("train", tmp_path / "data", *options, "--out", tmp_path / "empty")
-    assert status == 0
+    err = bidnerf("train", tmp_path / "data", *options, "--out", tmp_path / "empty").succeed().err
     assert "no surface baked: no surface to bake" in err
     assert load_map(tmp_path / "empty").info.complete
 
@@ -230,8 +228,7 @@ def test_landmarks_of_rendered_images_are_replaced_each_time(baked: Path, bidner
 def test_damaged_landmarks_of_photos_are_replaced(baked: Path, bidnerf: Run) -> None:
     damaged = baked / str(load_info(baked).landmarks)
     damaged.write_bytes(b"")
-    status, _, err = bidnerf("bake", baked)
-    assert status == 0
+    err = bidnerf("bake", baked).succeed().err
     assert str(damaged) in err
     assert load_info(baked).landmark_source == "rendered images"
     assert load_map(baked).landmarks is not None

@@ -87,12 +87,10 @@ def test_trials_record_the_camera_and_are_resumed_by_it(
     out = tmp_path / "r.jsonl"
     words: list[Any] = ["evaluate", shared / "map", given / "data", "--out", out, *QUICK]
     words += ["--trials", 1, "--size", 0.5, "--workers", 1, "--camera", given / "camera.json"]
-    first = bidnerf(*words)
-    assert first.status == 0, first.err
+    bidnerf(*words).succeed()
     assert json.loads(out.read_text())["trial"]["camera"] == "camera.json"
     assert "1 of 1 trials are already there" in bidnerf(*words).err
-    other = bidnerf(*words, "--depth-unit", 0.001)
-    assert other.status == 0, other.err
+    other = bidnerf(*words, "--depth-unit", 0.001).succeed()
     assert "already there" not in other.err
     assert out.read_text().count("\n") == 2
 

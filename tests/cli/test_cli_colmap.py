@@ -33,15 +33,13 @@ def given(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_training_takes_depth_from_the_points(bidnerf: Run, given: Path, tmp_path: Path) -> None:
     train = ["train", given / "data", *tiny.options(1), "--depth-points", given / "sparse"]
-    found = bidnerf(*train, "--out", tmp_path / "map")
-    assert found.status == 0
+    found = bidnerf(*train, "--out", tmp_path / "map").succeed()
     assert "its unit is 0.37 m according to 6 training cameras, positions agree" in found.err
     info = load_info(tmp_path / "map")
     assert info.sparse_depth > 30
     assert f"depth at {info.sparse_depth} pixels of 6 of 6 images" in found.err
     assert "colour only" not in found.err
-    fewer = bidnerf(*train, "--out", tmp_path / "fewer", "--points-views", 4)
-    assert fewer.status == 0
+    bidnerf(*train, "--out", tmp_path / "fewer", "--points-views", 4).succeed()
     assert 0 < load_info(tmp_path / "fewer").sparse_depth < info.sparse_depth
 
 

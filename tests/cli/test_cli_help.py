@@ -140,8 +140,7 @@ def test_help_names_what_is_installed(bidnerf: Run) -> None:
 def test_help_ends_in_a_narrow_terminal(bidnerf: Run, monkeypatch: pytest.MonkeyPatch, columns: str) -> None:
     monkeypatch.setenv("COLUMNS", columns)
     for command in ("localize", "info"):
-        status, out, _ = bidnerf(command, "--help")
-        assert status == 0
+        out = bidnerf(command, "--help").succeed().out
         assert max(map(len, out.splitlines())) <= 40
     assert os.environ["COLUMNS"] == columns
 

@@ -62,8 +62,7 @@ def objects(out: str) -> list[dict[str, Any]]:
 def test_a_folder_of_photos_is_localized_in_one_run(
     bidnerf: Run, given: Path, place: list[Any], tmp_path: Path
 ) -> None:
-    status, out, err = bidnerf(*place, given / "photos", *FOCAL, "--json", "--draw", tmp_path)
-    assert status == 0, err
+    _, out, err = bidnerf(*place, given / "photos", *FOCAL, "--json", "--draw", tmp_path).succeed()
     found = objects(out)
     assert [each["frame"] for each in found] == ["t_0000", "t_0001", "t_0002"]
     assert all(each["error"] is None and each["method"] == "bid" for each in found)
@@ -78,8 +77,7 @@ def test_a_folder_of_photos_is_localized_in_one_run(
 
 
 def test_a_photo_has_no_error_since_it_has_no_truth(bidnerf: Run, given: Path, place: list[Any]) -> None:
-    status, out, _ = bidnerf(*place, given / "photos/t_0001.png", *FOCAL)
-    assert status == 0
+    out = bidnerf(*place, given / "photos/t_0001.png", *FOCAL).succeed().out
     assert out.startswith("t_0001: ")
     assert "error" not in out
     assert out.splitlines()[-5].startswith("  T_world_camera (camera axes x right")
@@ -93,8 +91,7 @@ def test_depth_that_is_missing_or_without_a_measurement_is_told(
     err = bidnerf(*place, given / "photos/t_0001.png", *FOCAL, "--depth", empty).err
     assert "the depth image holds no measurement, so only colour is used" in err
     photos = [given / "photos" / f"{name}.png" for name in ("t_0000", "t_0001")]
-    status, _, err = bidnerf(*place, *photos, *FOCAL, "--depth", given / "depth/t_0000.depth.png")
-    assert status == 0, err
+    err = bidnerf(*place, *photos, *FOCAL, "--depth", given / "depth/t_0000.depth.png").succeed().err
     assert "t_0001: no measured depth was given; colour only" in err
     assert "t_0000: no measured depth" not in err
 
@@ -153,8 +150,7 @@ def test_a_frame_of_another_split_is_told_where_it_is(bidnerf: Run, shared: Path
 
 def test_each_frame_of_a_split_or_of_all_is_a_query(bidnerf: Run, shared: Path, place: list[Any]) -> None:
     split = ["localize", shared / "map", shared / "data", *QUICK, "--perturb", "0.1", "5"]
-    status, out, _ = bidnerf(*split, "--json")
-    assert status == 0
+    out = bidnerf(*split, "--json").succeed().out
     found = objects(out)
     assert [each["frame"] for each in found] == ["t_0000", "t_0001", "t_0002"]
     assert all(each["error"]["translation"] > 0 for each in found)
@@ -253,8 +249,7 @@ def test_a_map_that_was_not_baked_is_baked_by_resume(
     before = load_info(map_folder)
     assert before.surface is None
     resume = ["train", shared / "data", "--out", map_folder, "--resume"]
-    status, _, err = bidnerf(*resume)
-    assert status == 0, err
+    err = bidnerf(*resume).succeed().err
     assert "training:" not in err
     assert load_info(map_folder).surface is not None
     assert load_info(map_folder).weights == before.weights

@@ -75,8 +75,7 @@ def test_never_and_images_without_keypoints_keep_the_given_poses(
 ) -> None:
     train = ["train", shared / "data", *tiny.options(1), "--refine-poses"]
     for when in ("never", "auto", "always"):
-        found = bidnerf(*train, when, "--out", tmp_path / when)
-        assert found.status == 0
+        found = bidnerf(*train, when, "--out", tmp_path / when).succeed()
         kept = "the poses are kept: refining them takes at least 8 images" in found.err
         assert kept == (when == "always")
         info = load_info(tmp_path / when)
@@ -92,8 +91,7 @@ def test_a_resumed_training_takes_the_refined_poses_again(
 ) -> None:
     refine_poses(monkeypatch)
     train = ["train", shared / "data", *tiny.options(8)]
-    told = bidnerf(*train, "--out", tmp_path / "whole")
-    assert told.status == 0
+    told = bidnerf(*train, "--out", tmp_path / "whole").succeed()
     assert "the poses are refined by" in told.err
     with monkeypatch.context() as patch:
         stop_at(patch, 5)

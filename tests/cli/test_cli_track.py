@@ -37,8 +37,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_accepted_poses_are_written_as_a_trajectory_and_drawn(bidnerf: Run, data: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    status, out, err = bidnerf("track", "MAP", data, "--out", tmp_path / "p.txt", "--plot", tmp_path / "p.png")
-    assert status == 0, err
+    _, out, err = bidnerf("track", "MAP", data, "--out", tmp_path / "p.txt", "--plot", tmp_path / "p.png").succeed()
     path = read_trajectory(tmp_path / "p.txt")
     assert path.times.tolist() == [0, 1, 2, 4, 5]
     truth = [T for _, _, T in flight()[:FRAMES]]
@@ -70,8 +69,7 @@ def test_images_without_a_focal_length_begin_with_the_camera_of_the_map(
     images.mkdir()
     for number, (_, frame, _) in enumerate(flight()[:3]):
         iio.imwrite(images / f"{number}.png", (255 * frame.rgb).round().byte().numpy())
-    status, _, err = bidnerf("track", "MAP", images, "--out", tmp_path / "path.json")
-    assert status == 0, err
+    err = bidnerf("track", "MAP", images, "--out", tmp_path / "path.json").succeed().err
     assert err.count("assumed to be that of the map's images") == 1
     for row, (_, _, T) in zip(json.loads((tmp_path / "path.json").read_text()), flight()[:3], strict=True):
         assert row["converged"]
@@ -105,8 +103,7 @@ def test_frames_of_another_scene_are_doubted(bidnerf: Run, tmp_path: Path) -> No
         noise = random.integers(0, 256, (CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
         iio.imwrite(tmp_path / "images" / f"{number}.png", noise)
     track = ("track", "MAP", tmp_path / "images", "--out", tmp_path / "path.json", "--hfov", "60")
-    status, _, err = bidnerf(*track)
-    assert status == 0, err
+    err = bidnerf(*track).succeed().err
     assert "no pose of 3 frames was accepted" in err.splitlines()[-1]
     assert len(json.loads((tmp_path / "path.json").read_text())) == 3
 
@@ -115,8 +112,7 @@ def test_one_split_of_a_dataset_is_tracked(bidnerf: Run, tmp_path: Path) -> None
     named = [View(replace(f, depth=None), T) for _, f, T in flight()[:3]]
     write_transforms(tmp_path / "data", {"train": named[:1], "test": named[1:]}, (0.0, 0.0, 0.0))
     track = ("track", "MAP", tmp_path / "data", "--out", tmp_path / "path.json", "--split")
-    status, _, err = bidnerf(*track, "test")
-    assert status == 0, err
+    bidnerf(*track, "test").succeed()
     assert len(json.loads((tmp_path / "path.json").read_text())) == 2
     assert_refused(bidnerf(*track, "val"), 1, tmp_path / "data", "'val'", "train, test", after_remarks=True)
 

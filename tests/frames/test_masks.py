@@ -293,8 +293,7 @@ def test_training_says_what_is_hidden(tmp_path: Path, bidnerf: Run) -> None:
     saved(masks / f"{first}.png", left(24, 24))
     saved(masks / f"{third}.png", 0 * left(24, 24))
     words = ("train", data, "--out", out, "--masks", masks, "--refine-poses", "never")
-    done = bidnerf(*words, *options())
-    assert done.status == 0
+    done = bidnerf(*words, *options()).succeed()
     assert "1 image left out, being entirely hidden" in done.err
     assert "masks hide 25 % of the pixels of 1 image; 1 image without hidden pixels" in done.err
     failed = bidnerf("train", data, "--out", tmp_path / "m2", "--mask-hides", "white", *options())

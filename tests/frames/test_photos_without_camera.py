@@ -47,8 +47,7 @@ def landmarks_of(*cameras: Intrinsics) -> LandmarkMap:
 @pytest.mark.slow
 def test_the_command_finds_the_pose(bidnerf: Run, photo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stored(monkeypatch, landmarks_of(CAMERA))
-    status, out, err = bidnerf("localize", "MAP", photo, "--json")
-    assert status == 0, err
+    _, out, err = bidnerf("localize", "MAP", photo, "--json").succeed()
     answer = json.loads(out)
     assert answer["converged"]
     error = pose_error(SE3.from_matrix(torch.tensor(answer["T_world_camera"])), unseen().T_ref_camera)

@@ -344,8 +344,7 @@ def test_results_and_reports_go_into_odd_names_and_not_into_pipes(bidnerf: Run, 
     """A name could control the terminal, and a pipe in the place of a page could hang the report."""
     out = tmp_path / "\x1b[2Jr.jsonl"
     quick = ["--trials", 1, "--workers", 1, "--method", "bid", "--max-steps", 1, "--rays", 32]
-    status, said, err = bidnerf("evaluate", "demo:blobs", "--out", out, *quick)
-    assert status == 0
+    _, said, err = bidnerf("evaluate", "demo:blobs", "--out", out, *quick).succeed()
     assert "\x1b" not in said + err
     assert "\\x1b[2Jr.jsonl" in said
     (tmp_path / "out").mkdir()

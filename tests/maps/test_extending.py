@@ -169,8 +169,7 @@ def test_the_command(bidnerf: Run, map_folder: Path, tmp_path: Path) -> None:
         tmp_path / "new",
         {"train": list(training_views()[7:9])},
     )
-    status, out, err = bidnerf("extend", map_folder, tmp_path / "new", "--steps", STEPS)
-    assert status == 0, err
+    _, out, err = bidnerf("extend", map_folder, tmp_path / "new", "--steps", STEPS).succeed()
     assert "2 photos added, 9 images in all" in out
     assert "2 of 2 photos localized" in err
     assert bidnerf("extend", map_folder, tmp_path / "new", "--steps", 0)[0] == 2

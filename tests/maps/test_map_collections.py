@@ -192,15 +192,13 @@ def test_the_command(bidnerf: Run, grounds: list[Map], tmp_path: Path, monkeypat
         (tmp_path / "maps" / name / "map.json").write_text("{}")
     file = tmp_path / "photo.png"
     iio.imwrite(file, (255 * view(POSES[1], "", SEEDS[1]).frame.rgb).round().to(torch.uint8).numpy())
-    status, out, err = bidnerf("localize", tmp_path / "maps", file, "--focal", 130, "--json")
-    assert status == 0, err
+    _, out, err = bidnerf("localize", tmp_path / "maps", file, "--focal", 130, "--json").succeed()
     answer = json.loads(out)
     assert (answer["map"], answer["converged"]) == ("m4", True)
     assert answer["runner_up"]["converged"] is False
     assert len(loaded) == 2
     two = (tmp_path / "maps" / "m0", tmp_path / "maps" / "m4")
-    status, out, err = bidnerf("localize", *two, file, "--focal", 130, "--out", tmp_path / "poses.json")
-    assert status == 0, err
+    out = bidnerf("localize", *two, file, "--focal", 130, "--out", tmp_path / "poses.json").succeed().out
     assert out.startswith("photo: in m4: converged")
     assert "runner-up m0: too few matches" in out
     assert json.loads((tmp_path / "poses.json").read_text())[0]["map"] == "m4"

@@ -190,8 +190,7 @@ def test_the_command(bidnerf: Run, tmp_path: Path) -> None:
     trained = tmp_path / "map"
     before = bn.train(tiny.views(3), out=trained, config=tiny.config(5), bake=False)
     tiny.write_anchor(trained, Anchor(47.0, 19.0, 100.0, metres_per_unit=0.5))
-    status, out, err = bidnerf("scale", trained, "--factor", "0.5", "--out", tmp_path / "half")
-    assert status == 0, err
+    _, out, err = bidnerf("scale", trained, "--factor", "0.5", "--out", tmp_path / "half").succeed()
     assert "all lengths multiplied by 0.5" in out
     half = bn.load_map(tmp_path / "half")
     assert half.unit == "metres"
@@ -200,8 +199,7 @@ def test_the_command(bidnerf: Run, tmp_path: Path) -> None:
     assert half.bounds.side == 0.5 * before.bounds.side
     names = [camera.name for camera in before.info.cameras]
     length = float((before.info.cameras[0].pose.translation - before.info.cameras[1].pose.translation).norm())
-    status, _, err = bidnerf("scale", tmp_path / "half", "--distance", names[0], names[1], length)
-    assert status == 0, err
+    bidnerf("scale", tmp_path / "half", "--distance", names[0], names[1], length).succeed()
     back = bn.load_map(tmp_path / "half")
     assert back.bounds.side == pytest.approx(before.bounds.side)
     view = before.info.cameras[0]

@@ -15,6 +15,11 @@ class CommandResult(NamedTuple):
     out: str
     err: str
 
+    def succeed(self) -> CommandResult:
+        """Return the result of a command whose status must be 0."""
+        assert self.status == 0, self.err
+        return self
+
 
 Run: TypeAlias = Callable[..., CommandResult]
 """The type of the fixture ``bidnerf``: runs a command whose words are the arguments."""

@@ -375,8 +375,7 @@ def test_view_saves_a_page_of_photos(bidnerf: Run, room: Map, tmp_path: Path) ->
     nothing = bidnerf("view", room.folder, none, "--save", page)
     assert_refused(nothing, 1, none, after_remarks=True)
     assert not page.exists()
-    some = bidnerf(*place, none, "--save", page)
-    assert some.status == 0, some.err
+    some = bidnerf(*place, none, "--save", page).succeed()
     assert str(none) in some.err
     good, bad = viewed.state_of(page.read_text())["answers"]
     assert (good["name"], good["accepted"]) == ("photo", True), good["reason"]
