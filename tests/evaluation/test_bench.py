@@ -11,7 +11,6 @@ import random
 import shutil
 import signal
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
@@ -40,26 +39,20 @@ from bidnerf.evaluation.results import as_line
 from bidnerf.results import pose_error
 from bidnerf.scenes import closed_form_data
 from bidnerf_core.datasets import DatasetOptions
+from commands import CommandResult, Run, assert_refused
 from refusals import refused
 from trial_results import timeless
 
 QUICK = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--workers", "1"]
 BLOBS = "demo:blobs"
-Evaluate = Callable[..., tuple[int, str]]
 
 pytestmark = pytest.mark.usefixtures("small_images")
 
 
 @pytest.fixture
-def evaluate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Evaluate:
-    """Runs it on the blobs with few rays and steps; the file is ``tmp_path / "r.jsonl"`` unless named."""
-
-    def run(*more: object, out: Path = tmp_path / "r.jsonl") -> tuple[int, str]:
-        words = ["evaluate", BLOBS, "--out", str(out), *QUICK, *map(str, more)]
-        status = main(words)
-        return status, capsys.readouterr().err
-
-    return run
+def evaluate(tmp_path: Path, bidnerf: Run) -> Run:
+    """Runs it on the blobs with few rays and steps; the file is ``tmp_path / "r.jsonl"``."""
+    return functools.partial(bidnerf, "evaluate", BLOBS, "--out", tmp_path / "r.jsonl", *QUICK)
 
 
 def blob_trial(seed: int = 0, steps: int = 2) -> Trial:
@@ -226,20 +219,16 @@ def test_a_half_written_last_line_is_dropped_and_nothing_else(tmp_path: Path, ke
         (b"\xff\xfe\n", "line 1: not JSON"),
     ],
 )
-def test_a_file_of_something_else_is_left_alone(tmp_path: Path, evaluate: Evaluate, content: bytes, said: str) -> None:
+def test_a_file_of_something_else_is_left_alone(tmp_path: Path, evaluate: Run, content: bytes, said: str) -> None:
     path = tmp_path / "r.jsonl"
     path.write_bytes(content)
-    status, err = evaluate("--trials", 1)
-    assert (status, err.count("\n")) == (1, 1)
-    assert said in err
+    assert_refused(evaluate("--trials", 1), 1, said)
     assert path.read_bytes() == content
 
 
-def test_a_file_is_written_by_one_at_a_time(tmp_path: Path, evaluate: Evaluate) -> None:
+def test_a_file_is_written_by_one_at_a_time(tmp_path: Path, evaluate: Run) -> None:
     with ResultsFile(tmp_path / "r.jsonl"):
-        status, err = evaluate("--trials", 1)
-    assert status == 1
-    assert "another process is writing to it" in err
+        assert_refused(evaluate("--trials", 1), 1, "another process is writing to it")
 
 
 def test_results_come_in_the_order_of_the_plan(tmp_path: Path) -> None:
@@ -275,45 +264,41 @@ def test_many_results_are_put_in_order_in_linear_time() -> None:
 
 
 def test_more_trials_and_other_methods_go_into_the_same_file(
-    tmp_path: Path, evaluate: Evaluate, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, evaluate: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "argv", [str(Path(__file__).parents[2] / ".venv/bin/bidnerf"), "evaluate", BLOBS])
-    assert evaluate("--trials", 2, "--size", 0.3)[0] == 0
+    evaluate("--trials", 2, "--size", 0.3).succeed()
     before = (tmp_path / "r.jsonl").read_bytes()
-    status, err = evaluate("--trials", 3, "--size", 0.3)
-    assert status == 0
-    assert "2 of 3 trials are already there" in err
+    assert "2 of 3 trials are already there" in evaluate("--trials", 3, "--size", 0.3).succeed().err
     assert (tmp_path / "r.jsonl").read_bytes().startswith(before)
-    assert evaluate("--trials", 2, "--method", "inerf", "--protocol", "inerf")[0] == 0
+    evaluate("--trials", 2, "--method", "inerf", "--protocol", "inerf").succeed()
     assert [r.method for r in read_results([tmp_path / "r.jsonl"])] == ["bid"] * 3 + ["inerf"] * 2
     assert len(read_runs(tmp_path / "r.jsonl")) == 3
     assert read_runs(tmp_path / "r.jsonl")[1].command == "bidnerf evaluate demo:blobs"
 
 
-def test_another_training_of_the_map_is_not_mixed_in(tmp_path: Path, evaluate: Evaluate) -> None:
-    assert evaluate("--trials", 1, "--size", 0.3)[0] == 0
+def test_another_training_of_the_map_is_not_mixed_in(tmp_path: Path, evaluate: Run) -> None:
+    evaluate("--trials", 1, "--size", 0.3).succeed()
     path = tmp_path / "r.jsonl"
     content = path.read_text()
     path.write_text(content.replace('"weights": "exact"', '"weights": "other"'))
-    status, err = evaluate("--trials", 1, "--size", 0.3)
-    assert status == 1
-    assert "another training run of map demo:blobs (other, expected exact)" in err
+    other = "another training run of map demo:blobs (other, expected exact)"
+    assert_refused(evaluate("--trials", 1, "--size", 0.3), 1, other)
     path.write_text(content.replace('"depth_weight": 1.0', '"depth_weight": 0.5'))
-    assert "was made with depth_weight 0.5, expected 1.0" in evaluate("--trials", 1, "--size", 0.3)[1]
+    assert "was made with depth_weight 0.5, expected 1.0" in evaluate("--trials", 1, "--size", 0.3).err
 
 
-def test_results_of_other_images_are_refused(tmp_path: Path, data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_results_of_other_images_are_refused(tmp_path: Path, data: Path, bidnerf: Run) -> None:
     """Folders are known by name, so the content decides: a moved copy is the same data, a changed one is not."""
 
-    def run(photos: Path) -> tuple[int, str]:
-        words = ["evaluate", BLOBS, str(photos), "--out", str(tmp_path / "r.jsonl"), *QUICK, "--size", "0.3"]
-        status = main([*words, "--trials", "3"])
-        return status, capsys.readouterr().err
+    def run(photos: Path) -> CommandResult:
+        trials = ["--size", 0.3, "--trials", 3]
+        return bidnerf("evaluate", BLOBS, photos, "--out", tmp_path / "r.jsonl", *QUICK, *trials)
 
-    assert run(data)[0] == 0
+    run(data).succeed()
     before = (tmp_path / "r.jsonl").read_bytes()
-    status, err = run(Path(shutil.copytree(data, tmp_path / "moved" / "data")))
-    assert (status, "3 of 3 trials are already there" in err) == (0, True)
+    moved = run(Path(shutil.copytree(data, tmp_path / "moved" / "data"))).succeed()
+    assert "3 of 3 trials are already there" in moved.err
     for what in ("images", "depth", "transforms.json"):
         changed = Path(shutil.copytree(data, tmp_path / what / "data"))
         if what == "transforms.json":
@@ -324,16 +309,12 @@ def test_results_of_other_images_are_refused(tmp_path: Path, data: Path, capsys:
         else:
             for image in (changed / what).glob("t_*.png"):
                 iio.imwrite(image, iio.imread(image)[::-1])
-        status, err = run(changed)
-        assert (status, err.count("\n")) == (1, 1), err
-        assert "made with other images, depth, masks or cameras" in err
+        assert_refused(run(changed), 1, "made with other images, depth, masks or cameras")
     assert (tmp_path / "r.jsonl").read_bytes() == before
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_results_of_an_earlier_version_are_resumed_and_reported(
-    tmp_path: Path, evaluate: Evaluate, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_results_of_an_earlier_version_are_resumed_and_reported(tmp_path: Path, evaluate: Run) -> None:
     path = tmp_path / "r.jsonl"
     here = Path(__file__).parent
     earlier = (here / "earlier_results.jsonl").read_text()
@@ -343,8 +324,7 @@ def test_results_of_an_earlier_version_are_resumed_and_reported(
     path.write_text(earlier)
     (tmp_path / "r.meta.json").write_bytes((here / "earlier_results.meta.json").read_bytes())
     assert [r.inputs for r in read_results([path])] == [None, None]
-    status, err = evaluate("--trials", 3, "--size", 0.3)
-    assert status == 0, err
+    err = evaluate("--trials", 3, "--size", 0.3).succeed().err
     assert "2 results of an earlier version do not record their images" in err
     assert "2 of 3 trials are already there" in err
     assert [r.inputs is None for r in read_results([path])] == [True, True, False]
@@ -380,16 +360,13 @@ def test_results_that_are_removed_meanwhile_are_missed(tmp_path: Path, replaced:
     ],
 )
 def test_numbers_and_text_that_nothing_can_hold_are_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, said: str
+    tmp_path: Path, bidnerf: Run, old: str, new: str, said: str
 ) -> None:
     line = as_line(ran(0).plain()).decode()
     assert old in line
     path = tmp_path / "r.jsonl"
     path.write_text(line.replace(old, new))
-    assert main(["report", str(path), "--out", str(tmp_path / "report")]) == 1
-    err = capsys.readouterr().err
-    assert said in err
-    assert err.count("\n") == 1
+    assert_refused(bidnerf("report", path, "--out", tmp_path / "report"), 1, said)
 
 
 # Running.

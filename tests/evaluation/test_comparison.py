@@ -34,6 +34,7 @@ from bidnerf.evaluation.run import InThisProcess, local_processes, terminate_on_
 from bidnerf.evaluation.summary import success_of
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.io import from_plain
+from commands import Run, assert_refused, strict
 from optional import require
 from refusals import refused
 from trial_results import timeless, trial_result
@@ -219,45 +220,20 @@ def test_the_picture_is_written(compared: Comparison, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("no_processes")
 def test_the_command_prints_a_table_and_writes_what_it_says(
-    maps: list[Path], data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    maps: list[Path], data: Path, tmp_path: Path, bidnerf: Run
 ) -> None:
-    folders = [str(maps[0]), str(data)]
-    options = [
-        *["--method", "bid", "--trials", "2", "--rays", "32", "--max-steps", "2", "--out"],
-        str(tmp_path / "out"),
-    ]
-    assert main(["compare", *folders, *options]) == 0
-    shown = capsys.readouterr()
+    quick = ["--method", "bid", "--trials", 2, "--rays", 32, "--max-steps", 2]
+    compare = ["compare", maps[0], data, *quick, "--out", tmp_path / "out"]
+    shown = bidnerf(*compare).succeed()
     assert "short" in shown.out
     assert "ms a step" in shown.out
     assert "2/2 trials" in shown.err
     kept = from_plain(Comparison, json.loads((tmp_path / "out" / "compare.json").read_text()), "compare.json")
     assert [len(column) for column in kept.results] == [2]
-    assert main(["compare", *folders, *options]) == 1  # what is there is not overwritten
-    assert "not empty" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("no_processes")
-def test_the_command_prints_json(maps: list[Path], data: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = [
-        "--method",
-        "bid",
-        "--rays",
-        "32",
-        "--max-steps",
-        "2",
-        "--size",
-        "0.3",
-        "--frame",
-        "t_0001",
-        "--trials",
-        "1",
-        "--json",
-    ]
-    assert main(["compare", str(maps[0]), str(data), *words]) == 0
-    found = json.loads(capsys.readouterr().out)
+    assert_refused(bidnerf(*compare), 1, "not empty")  # what is there is not overwritten
+    found = strict(bidnerf("compare", maps[0], data, *quick, "--size", 0.3, "--frame", "t_0001", "--json").out)
     assert found["size"] == [0.3]
-    assert found["rows"][0]["success"]["10%"]["rate"]["trials"] == 1
+    assert found["rows"][0]["success"]["10%"]["rate"]["trials"] == 2
 
 
 @pytest.mark.parametrize(
@@ -276,10 +252,7 @@ def test_mistakes_are_told_before_the_work_begins(
     expected: str,
     maps: list[Path],
     data: Path,
-    capsys: pytest.CaptureFixture[str],
+    bidnerf: Run,
 ) -> None:
     given = [word.format(map=maps[0], data=data) for word in words]
-    assert main(["compare", *given]) == status
-    error = capsys.readouterr().err
-    assert expected in error
-    assert len(error.splitlines()) == 1
+    assert_refused(bidnerf("compare", *given), status, expected)

@@ -39,6 +39,7 @@ from bidnerf.evaluation.summary import situation_titles, situations
 from bidnerf.results import success_rate_by_frame
 from bidnerf_core.datasets import DatasetOptions, write_transforms
 from bidnerf_core.errors import InputError
+from commands import Run, assert_refused
 from optional import require
 from trial_results import trial_result
 
@@ -176,12 +177,12 @@ def test_a_report_of_one_hopeless_trial_without_a_start(tmp_path: Path) -> None:
 
 
 def test_without_matplotlib_a_report_tells_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bidnerf: Run
 ) -> None:
     file = write(tmp_path / "r.jsonl", result(0, 2))
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    assert main(["report", str(file), "--out", str(tmp_path / "out")]) == 1
-    assert "matplotlib, which is missing: pip install 'bidnerf[plots]'" in capsys.readouterr().err
+    missing = "matplotlib, which is missing: pip install 'bidnerf[plots]'"
+    assert_refused(bidnerf("report", file, "--out", tmp_path / "out"), 1, missing)
 
 
 def test_figures_are_the_same_each_time(tmp_path: Path, results: list[TrialResult]) -> None:
@@ -194,22 +195,17 @@ def test_figures_are_the_same_each_time(tmp_path: Path, results: list[TrialResul
     [(None, "no such file"), (b"", "no finished trial"), (b"hello\n", "line 1: not JSON")],
 )
 def test_a_file_without_results_is_told_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: bytes | None, said: str
+    tmp_path: Path, bidnerf: Run, content: bytes | None, said: str
 ) -> None:
     file = tmp_path / "r.jsonl"
     if content is not None:
         file.write_bytes(content)
-    assert main(["report", str(file), "--out", str(tmp_path / "out")]) == 1
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert said in error
+    assert_refused(bidnerf("report", file, "--out", tmp_path / "out"), 1, said)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_report_replaces_a_report_and_nothing_else(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], results: list[TrialResult]
-) -> None:
+def test_a_report_replaces_a_report_and_nothing_else(tmp_path: Path, bidnerf: Run, results: list[TrialResult]) -> None:
     file, out = write(tmp_path / "r.jsonl", *results), tmp_path / "out"
     out.mkdir()  # empty: nothing is lost
     for title in ("first", "second"):
@@ -219,11 +215,8 @@ def test_a_report_replaces_a_report_and_nothing_else(
         other = tmp_path / name.partition(".")[0]
         other.mkdir()
         (other / name).write_text("<html>mine</html>")
-        capsys.readouterr()
-        assert main(["report", str(file), "--out", str(other)]) == 1
-        error = capsys.readouterr().err
-        assert error.count("\n") == 1
-        assert f"{other}: holds something other than a bidnerf report" in error
+        refused = bidnerf("report", file, "--out", other)
+        assert_refused(refused, 1, f"{other}: holds something other than a bidnerf report")
         assert [path.read_text() for path in other.iterdir()] == ["<html>mine</html>"]
 
 
@@ -271,19 +264,13 @@ def test_datasets_and_maps_are_named_where_they_differ() -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_report_without_starts_uses_no_share_of_their_error(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_report_without_starts_uses_no_share_of_their_error(tmp_path: Path, bidnerf: Run) -> None:
     free = [result(seed, 2 + seed, protocol="none") for seed in range(3)]
     file, out = write(tmp_path / "r.jsonl", *free), tmp_path / "out"
     assert main(["report", str(file), "--out", str(out)]) == 0
     assert "meet the criterion (under 5° and 0.05 units)" in read(out).text
     assert "at most 10 %" not in read(out).text
-    capsys.readouterr()
-    assert main(["report", str(file), "--out", str(out), "--criterion", "10%"]) == 2
-    err = capsys.readouterr().err
-    assert "no trial had a start" in err
-    assert err.count("\n") == 1
+    assert_refused(bidnerf("report", file, "--out", out, "--criterion", "10%"), 2, "no trial had a start")
     mixed = write(tmp_path / "m.jsonl", *free, result(0, 2), result(1, 3))
     assert main(["report", str(mixed), "--out", str(out), "--criterion", "10%"]) == 0
 
@@ -304,13 +291,10 @@ def test_a_median_counts_what_is_unknown_as_infinite(values: list[float | None],
     assert median(values) == expected
 
 
-def test_a_damaged_side_file_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], results: list[TrialResult]
-) -> None:
+def test_a_damaged_side_file_is_named(tmp_path: Path, bidnerf: Run, results: list[TrialResult]) -> None:
     file = write(tmp_path / "r.jsonl", *results)
     (tmp_path / "r.meta.json").write_text(json.dumps({"runs": 3}))
-    assert main(["report", str(file), "--out", str(tmp_path / "out")]) == 1
-    assert "runs is 3, expected a list" in capsys.readouterr().err
+    assert_refused(bidnerf("report", file, "--out", tmp_path / "out"), 1, "runs is 3, expected a list")
 
 
 def test_a_recorded_command_has_no_local_paths(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -400,16 +384,14 @@ def test_hostile_names_are_harmless_everywhere(tmp_path: Path, capfd: pytest.Cap
         assert drawing.stat().st_size > 2000
 
 
-def test_a_name_that_no_folder_can_have_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_name_that_no_folder_can_have_is_refused(tmp_path: Path, bidnerf: Run) -> None:
     line = json.dumps(result(0, 2).plain())
     for name in ("map", "data", "camera"):
         plain = json.loads(line)
         plain["trial"][name] = "a\0b"
         (tmp_path / "r.jsonl").write_text(json.dumps(plain))
-        assert main(["report", str(tmp_path / "r.jsonl"), "--out", str(tmp_path / "out")]) == 1
-        error = capsys.readouterr().err
-        assert f"{name} holds a NUL character" in error
-        assert error.count("\n") == 1
+        refused = bidnerf("report", tmp_path / "r.jsonl", "--out", tmp_path / "out")
+        assert_refused(refused, 1, f"{name} holds a NUL character")
 
 
 def test_more_than_can_be_drawn_is_in_the_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -192,7 +192,7 @@ def test_the_command(bidnerf: Run, grounds: list[Map], tmp_path: Path, monkeypat
         (tmp_path / "maps" / name / "map.json").write_text("{}")
     file = tmp_path / "photo.png"
     iio.imwrite(file, (255 * view(POSES[1], "", SEEDS[1]).frame.rgb).round().to(torch.uint8).numpy())
-    _, out, err = bidnerf("localize", tmp_path / "maps", file, "--focal", 130, "--json").succeed()
+    out = bidnerf("localize", tmp_path / "maps", file, "--focal", 130, "--json").succeed().out
     answer = json.loads(out)
     assert (answer["map"], answer["converged"]) == ("m4", True)
     assert answer["runner_up"]["converged"] is False

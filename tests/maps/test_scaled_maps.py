@@ -190,7 +190,7 @@ def test_the_command(bidnerf: Run, tmp_path: Path) -> None:
     trained = tmp_path / "map"
     before = bn.train(tiny.views(3), out=trained, config=tiny.config(5), bake=False)
     tiny.write_anchor(trained, Anchor(47.0, 19.0, 100.0, metres_per_unit=0.5))
-    _, out, err = bidnerf("scale", trained, "--factor", "0.5", "--out", tmp_path / "half").succeed()
+    out = bidnerf("scale", trained, "--factor", "0.5", "--out", tmp_path / "half").succeed().out
     assert "all lengths multiplied by 0.5" in out
     half = bn.load_map(tmp_path / "half")
     assert half.unit == "metres"
