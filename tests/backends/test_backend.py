@@ -12,7 +12,7 @@ from torch import nn
 from bidnerf.testing import SCENE_BOUNDS as BOUNDS
 from bidnerf.testing import awkward_rays, points
 from bidnerf_adanerf import backend as adanerf
-from bidnerf_core.backend import Backend, RecipeBackend, quick_config
+from bidnerf_core.backend import RecipeBackend, quick_config
 from bidnerf_core.fields import Rays, SceneBounds, render
 from bidnerf_core.training import Silent
 from bidnerf_hashgrid import HashGridConfig
@@ -79,12 +79,6 @@ def test_neither_unit_nor_origin_of_the_world_matters(backend: Any, scale: float
     rays = awkward_rays()["rays from outside"]
     moved = Rays(rays.origins * scale + shift, rays.directions, rays.near * scale, rays.far * scale)
     torch.testing.assert_close(render(there, moved).rgb, render(here, rays).rgb, rtol=0, atol=1e-4)
-
-
-@bundled
-def test_bundled_backends_are_backends(backend: Any) -> None:
-    assert isinstance(backend, Backend)
-    assert isinstance(quick_config(backend), backend.config_type)
 
 
 def test_small_scenes_get_the_settings_that_a_backend_offers_and_else_its_defaults() -> None:

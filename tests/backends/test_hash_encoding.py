@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import os
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Literal
 
@@ -239,16 +238,6 @@ def test_a_forked_process_has_threads_of_its_own() -> None:
         concurrently([partial(done.append, 1)] * 2, threads=2)
         os._exit(0 if len(done) == 4 else 1)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-
-
-def test_threads_do_not_disturb_each_other() -> None:
-    encoding = make()
-    batches = [torch.rand(500, 3, dtype=torch.float64) for _ in range(8)]
-    encoding.requires_grad_(False)
-    alone = [position_gradient(encoding, batch) for batch in batches]
-    with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(lambda batch: position_gradient(encoding, batch), batches))
-    assert all(map(torch.equal, alone, together))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")

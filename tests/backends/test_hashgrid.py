@@ -250,23 +250,6 @@ def test_the_coarse_level_does_not_see_the_fine_tables(field: HashGridField) -> 
     assert [gradient is None for gradient in gradients] == [False, False, True, True]
 
 
-def test_a_scene_of_another_size_is_the_same_scene() -> None:
-    """An untrained field is as opaque with lengths in millimetres as in metres."""
-    opacity = []
-    for unit in (1.0, 1000.0):
-        scaled = SceneBounds(
-            tuple(unit * x for x in BOUNDS.lower),
-            tuple(unit * x for x in BOUNDS.upper),
-            unit * BOUNDS.near,
-            unit * BOUNDS.far,
-        )
-        made = backend.build(tiny.config(), scaled)
-        rays = random_rays()
-        moved = scaled.rays((rays.origins * unit).float(), rays.directions.float())
-        opacity.append(render(made, moved).opacity.detach())
-    torch.testing.assert_close(opacity[0], opacity[1], atol=2e-3, rtol=1e-2)
-
-
 def test_a_ray_has_no_more_samples_than_the_limit_once_density_was_observed(field: HashGridField) -> None:
     """The intervals of rays that cross few occupied cells stay what they are; those of others keep their total length."""
     limited = backend.build(replace(field.config, samples_per_ray=12), BOUNDS)

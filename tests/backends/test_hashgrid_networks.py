@@ -99,15 +99,3 @@ def test_refuses_double_backward() -> None:
     (first,) = torch.autograd.grad(rgb.square().sum(), encoded, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
         first.sum().backward()
-
-
-def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    geometry, colour = made()
-    points = inputs(100)
-    of = [*points, *geometry.parameters(), *colour.parameters()]
-    results = []
-    for threads in (1, 3):
-        monkeypatch.setattr(networks, "threads_for", lambda *_, threads=threads: threads)
-        found = log_density_and_rgb(geometry, colour, *points)
-        results.append([*found, *gradients(found, of)])
-    assert all(map(torch.equal, *results))

@@ -536,12 +536,6 @@ def test_a_window_is_the_frame_and_those_before_it(bidnerf: Run, shared: Path, p
         assert_refused(bidnerf(*place, "--frame", *words), status, *named)
 
 
-def test_inerf_takes_one_image(bidnerf: Run, shared: Path) -> None:
-    place = ["localize", shared / "map", shared / "data", *QUICK, "--method", "inerf"]
-    assert bidnerf(*place, "--frame", "t_0000", "--pixels", "interest-points").status == 0
-    assert_refused(bidnerf(*place, "--frame", "t_0000", "t_0001"), 1, "inerf", "one image", "got 2")
-
-
 def test_localize_without_json_prints_to_stdout_too(bidnerf: Run, shared: Path) -> None:
     found = bidnerf("localize", shared / "map", shared / "data", "--frame", "t_0001", *QUICK)
     assert (found.status, found.err) == (0, "")

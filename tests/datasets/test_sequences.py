@@ -17,9 +17,6 @@ import tiny
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import (
     Capture,
-    DatasetOptions,
-    Reader,
-    capture_of,
     open_dataset,
     open_sequence,
     write_transforms,
@@ -108,26 +105,6 @@ def test_sequences_are_indexed_and_reversed_without_reading(tmp_path: Path) -> N
         sequence[1]
     with pytest.raises(IndexError):
         sequence[4]
-
-
-def test_captures_of_other_readers_are_sequences(tmp_path: Path) -> None:
-    views = tiny.views(3)
-
-    class Anything(Reader):
-        expected = "anything"
-
-        def recognises(self, path: Path) -> bool:
-            return True
-
-        def read(self, path: Path, options: DatasetOptions) -> Capture:
-            train, test = capture_of(views[:2], path, ("train",)), capture_of(views[2:], path, ("test",))
-            return Capture(path, [*train.shots, *test.shots])
-
-    sequence = open_sequence(tmp_path, readers=[Anything()])
-    assert names(sequence) == [view.frame.name for view in views]
-    assert [timed.split for timed in sequence] == ["train", "train", "test"]
-    with refused(where=tmp_path, found="its own cameras"):
-        open_sequence(tmp_path, readers=[Anything()], focal=100.0)
 
 
 def test_a_folder_of_images(tmp_path: Path) -> None:

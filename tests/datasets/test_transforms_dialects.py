@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
@@ -145,14 +144,6 @@ def test_depth_that_is_switched_off_is_not_read(capture: Path) -> None:
     instant_ngp(enable_depth_loading=False)(capture)
     assert remarks_of(capture) == []
     assert all(view.frame.depth is None for view in read_all(capture).values())
-
-
-def test_depth_of_another_size_is_that_of_the_nearest_measurement(capture: Path) -> None:
-    for file in (capture / "depth").iterdir():
-        iio.imwrite(file, (1000 + np.arange(12, dtype=np.uint16)).reshape(3, 4))
-    depth = read_all(capture)["r_3"].frame.depth
-    expected = (1 + np.arange(12, dtype=np.float32).reshape(3, 4) / 1000).repeat(4, 0).repeat(4, 1)
-    np.testing.assert_allclose(depth, expected, rtol=1e-6)
 
 
 def test_a_given_unit_of_depth_replaces_that_of_the_file(capture: Path) -> None:

@@ -6,14 +6,10 @@ import functools
 import itertools
 import json
 import math
-import os
-import random
 import shutil
-import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import imageio.v3 as iio
@@ -41,7 +37,6 @@ from bidnerf.scenes import closed_form_data
 from bidnerf_core.datasets import DatasetOptions
 from commands import CommandResult, Run, assert_refused
 from refusals import refused
-from trial_results import timeless
 
 QUICK = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--workers", "1"]
 BLOBS = "demo:blobs"
@@ -145,48 +140,6 @@ def test_closed_form_data_are_a_dataset(name: str) -> None:
 
 
 # Resuming.
-
-
-class Calls:
-    """Counts the calls of the package's functions, and kills this process in number ``last``."""
-
-    def __init__(self, last: int | None = None) -> None:
-        self.count, self.last = 0, last
-
-    def __call__(self, frame: FrameType, event: str, _: object) -> None:
-        self.count += event == "call" and f"{os.sep}bidnerf" in frame.f_code.co_filename
-        if self.count == self.last:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-
-def test_an_evaluation_killed_at_random_moments_equals_one_never_killed(tmp_path: Path) -> None:
-    whole, killed = tmp_path / "whole.jsonl", tmp_path / "killed.jsonl"
-
-    def run(out: Path, calls: Calls | None = None) -> int:
-        sys.setprofile(calls)
-        try:
-            return main(["evaluate", BLOBS, *QUICK, "--trials", "4", "--size", "0.3", "--out", str(out)])
-        finally:
-            sys.setprofile(None)
-
-    assert run(tmp_path / "first.jsonl") == 0  # what is imported first is there from here on
-    every = Calls()
-    assert run(whole, every) == 0
-    chance, kills, known = random.Random(0), 0, set[bytes]()
-    for _ in range(4):
-        moment = round(chance.uniform(0.3, 0.6) * every.count)
-        child = os.fork()
-        if child == 0:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-            os._exit(run(killed, Calls(moment)))
-        kills += os.WIFSIGNALED(os.waitpid(child, 0)[1])
-        lines = killed.read_bytes().split(b"\n")[:-1] if killed.exists() else []
-        assert known <= set(lines), "a finished trial was lost or run again"
-        known = set(lines)
-    assert kills >= 3
-    assert known
-    assert run(killed) == 0
-    assert timeless(read_results([killed])) == timeless(read_results([whole]))
 
 
 def _written(path: Path, *seeds: int) -> list[TrialResult]:

@@ -10,7 +10,7 @@ from bidnerf.scenes import GaussianBlobs, orbit
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import Objective, Observations, SceneBounds, colour_term, depth_term, render, widen
 from bidnerf_core.frames import Frame, View, draw, uniform
-from bidnerf_core.geometry import SE3, Robust, look_at, perturb
+from bidnerf_core.geometry import SE3, Robust, perturb
 from bidnerf_core.localization import Problem, rig
 from problems import FieldMap, localize, single
 
@@ -66,30 +66,6 @@ def test_gradient_by_the_pose_is_the_numerical_one(views: int, wide: float) -> N
     torch.testing.assert_close(found, torch.tensor(numerical, dtype=torch.float64), atol=1e-8, rtol=1e-5)
 
 
-SETTINGS = {
-    "rays": 128,
-    "max_steps": 200,
-    "learning_rate": 0.08,
-    "decay_steps": 80,
-    "depth_weight": 1.0,
-    "level": None,
-}
-
-
-@pytest.mark.slow
-def test_a_view_finds_its_place() -> None:
-    field = GaussianBlobs.random()
-    truth = orbit(4.0, 3, seed=1)[1]
-    start = perturb(truth, 0.3, 6.0, seed=3)
-    found = localize(single(field, BOUNDS, photograph(field, truth), start), "bid", SETTINGS, seed=0)
-    error = pose_error(found.T_world_camera, truth)
-    assert float(error.translation) < 0.03
-    assert float(error.rotation_deg) < 1.0
-    assert found.steps == 200
-    assert found.poses.translation.shape == (201, 3)
-    assert len(found.losses) == 200
-
-
 def test_a_moved_world_gives_a_moved_answer() -> None:
     """Map, start and truth moved together: the same steps, moved. The scene's box cannot turn, so it is made larger."""
     motion = SE3.exp(torch.tensor([0.2, -0.1, 0.3, 0.5, -0.7, 1.1], dtype=torch.float64))
@@ -141,16 +117,3 @@ def test_a_permuted_rig_gives_the_same_loss() -> None:
         rendering = render(field, pixels.rays(start, BOUNDS), BOUNDS.background)
         losses.append(PAPERS.loss(rendering, pixels))
     torch.testing.assert_close(*losses)
-
-
-def test_a_start_that_looks_away_is_not_accepted() -> None:
-    field = GaussianBlobs.random()
-    truth = look_at((4.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    away = look_at((4.0, 0.0, 0.0), (9.0, 0.0, 0.0))
-    found = localize(
-        single(field, BOUNDS, photograph(field, truth), away),
-        "bid",
-        {"rays": 64, "max_steps": 20, "level": None},
-    )
-    assert not found.converged
-    assert bool(found.T_world_camera.is_rigid())

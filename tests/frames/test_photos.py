@@ -12,7 +12,6 @@ import torch
 from PIL import Image, ImageOps
 
 from bidnerf import Frame, InputWarning, Intrinsics
-from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.frames import photos_in
 from optional import require
@@ -79,47 +78,6 @@ def test_a_photo_with_exif_needs_nothing_else(photo: Path) -> None:
         assert require(frame.camera_source).startswith("26 mm equivalent in EXIF: fx 30 px at 40x30 (the principal")
         assert frame.alpha is frame.depth is None
         torch.testing.assert_close(frame.rgb, torch.from_numpy(noise(HEIGHT, WIDTH)).float() / 255)
-
-
-def test_a_photo_without_a_camera_is_refused_in_one_line(tmp_path: Path) -> None:
-    path = write_photo(tmp_path / "a.jpg", noise(HEIGHT, WIDTH))
-    with refused(where=path, found="no focal length in EXIF", expected="a camera: --camera FILE"):
-        Frame.open(path)
-    assert Frame.open(path, focal=50.0).intrinsics.fx == 50
-    assert Frame.open(path, hfov=90.0).intrinsics.fx == pytest.approx(WIDTH / 2)
-
-
-def test_transparent_pixels_show_the_background(tmp_path: Path) -> None:
-    pixels = noise(HEIGHT, WIDTH, 4)
-    path = write_photo(tmp_path / "a.png", pixels)
-    raw = torch.from_numpy(pixels).float() / 255
-    for background, colour in (((0.0, 0.0, 0.0), 0.0), ("white", 1.0), ((0.5, 0.5, 0.5), 0.5)):
-        frame = Frame.read(path, CameraSource(focal=30.0), background=background)
-        torch.testing.assert_close(frame.alpha, raw[..., 3])
-        over = raw[..., :3] * raw[..., 3:] + colour * (1 - raw[..., 3:])
-        torch.testing.assert_close(frame.rgb, over, atol=0.501 / 255, rtol=0)  # rounded to bytes
-    with refused(found="background is 'pink'", expected="black"):
-        Frame.read(path, CameraSource(focal=30.0), background="pink")
-
-
-@pytest.mark.parametrize("code", [1, 6])
-def test_reducing_keeps_the_directions_of_pixels(tmp_path: Path, code: int) -> None:
-    path = write_photo(tmp_path / "a.png", noise(HEIGHT, WIDTH, 4), code)
-    steps = np.full((HEIGHT, WIDTH), 1000, dtype=np.uint16)
-    steps[:15] = 4000
-    depth = save_depth(tmp_path / "d.png", steps)
-    whole = quiet(path, depth, camera=CAMERA, depth_unit=0.001)
-    small = quiet(path, depth, camera=CAMERA, depth_unit=0.001, largest=20)
-    assert max(small.rgb.shape) == 20
-    big, little = whole.intrinsics, small.intrinsics
-    centres = big.pixel_centres(torch.float64)
-    torch.testing.assert_close(little.project(big.unproject(centres)), centres / 2, atol=1e-6, rtol=0)
-    blocks = whole.rgb.unflatten(0, (-1, 2)).unflatten(2, (-1, 2)).mean((1, 3))
-    torch.testing.assert_close(small.rgb, blocks, atol=1.001 / 255, rtol=0)  # the mean of bytes, and a byte
-    assert set(require(small.depth).flatten().tolist()) == {1.0, 4.0}  # never a mean over an edge
-    assert Frame.open(path, camera=CAMERA, largest=40).intrinsics == whole.intrinsics
-    with refused(found="largest is 0", expected="a positive whole number"):
-        Frame.open(path, camera=CAMERA, largest=0)
 
 
 @pytest.mark.data

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
@@ -14,14 +13,14 @@ from torch import Generator, Tensor
 
 import baked
 import module_fields
-from bidnerf.testing import DEVICE, DeviceFault, Elsewhere
+from bidnerf.testing import DEVICE, Elsewhere
 from bidnerf_core.devices import move_to, without_waiting
 from bidnerf_core.fields import RadianceField
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.localization import ColourSettings, DepthLossSettings, Images, RayTerms, rig, states_at
 from bidnerf_core.localization.terms.images import Thumbnail, surface_renderer
-from bidnerf_core.mapping import CostTerm, SurfaceMap, Surfels, cast, descend, trace
+from bidnerf_core.mapping import CostTerm, SurfaceMap, cast, descend, trace
 from problems import FieldMap
 
 
@@ -30,7 +29,6 @@ class Place:
     """Where steps are taken: on the CPU, or on the simulated device while ``mode`` is active."""
 
     mode: Elsewhere | None = None
-    surface: Callable[[SurfaceMap], SurfaceMap] = lambda surface: surface  # what is done to it there
 
     @property
     def device(self) -> torch.device:
@@ -40,7 +38,7 @@ class Place:
         return nullcontext() if self.mode is None else self.mode.strict()
 
     def toy(self) -> SurfaceMap:
-        found = self.surface(baked.toy().to(self.device))
+        found = baked.toy().to(self.device)
         found.warm_up()
         return found
 
@@ -85,7 +83,7 @@ def align_points_and_render(place: Place) -> list[Tensor]:
     """The steps of a refinement: rendered rays beside measured points."""
     (view,) = module_fields.shown(1, seed=5)
     field: RadianceField = move_to(module_fields.field(), place.device)
-    there = place.surface(module_fields.surface().to(place.device))
+    there = module_fields.surface().to(place.device)
     problem = rig(FieldMap(field, baked.BOUNDS, there), [view], None)
     points = baked.points(view, count=400, surface=there)
     rays = RayTerms(ColourSettings(), DepthLossSettings()).term(problem, 64, 0)
@@ -113,12 +111,3 @@ def test_steps_stay_on_the_device_and_lead_where_those_of_the_cpu_do(name: str) 
     for number, (ours, theirs) in enumerate(zip(found, expected, strict=True)):
         apart = 1e-5 * steepest if close and number >= 2 else close
         torch.testing.assert_close(ours, theirs, rtol=close, atol=apart)
-
-
-def test_a_part_of_the_surface_that_does_not_move_is_found() -> None:
-    def forgotten(there: SurfaceMap) -> SurfaceMap:
-        here: Surfels = replace(there.surfels, positions=there.surfels.positions.cpu())
-        return replace(there, surfels=here)
-
-    with Elsewhere() as mode, pytest.raises(DeviceFault):
-        align_points(Place(mode, forgotten))

@@ -406,12 +406,6 @@ def test_a_beginning_that_nobody_recognises_is_reported() -> None:
     assert_right(tracked(flight()[1:3], tracker), flight()[1:3])
 
 
-def test_a_map_that_cannot_be_searched_asks_for_a_start() -> None:
-    bare = replace(textured_map(), landmarks=None)
-    with refused(where="the map has no surface", found="method 'auto' then needs a start"):
-        Tracker(Localizer(bare))(flight()[0][1], 0.0)
-
-
 def test_the_state_does_not_grow(tmp_path: Path) -> None:
     """However long the sequence."""
     tracker, sizes = Tracker(localizer()), []

@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import nn
 
 import tiny
@@ -22,7 +20,6 @@ from bidnerf_core.fields import SceneBounds
 from bidnerf_core.maps import Anchor, Map, MapInfo, TrainOptions, load_info, load_map, store, write_parts
 from bidnerf_core.progress import Progress
 from bidnerf_core.training import TrainingState
-from drawn import poses, record, shares
 from interruptions import FULL, Stopped, outcomes
 
 
@@ -39,26 +36,6 @@ def save(folder: Path, trained: Map, step: int, anchor: Anchor | None = None) ->
 
 def names(folder: Path) -> set[str]:
     return {file.name for file in folder.iterdir()}
-
-
-@settings(max_examples=20)
-@given(
-    anchor=record(
-        Anchor,
-        latitude=st.floats(-89, 89),
-        longitude=st.floats(-180, 180),
-        metres_per_unit=st.floats(1e-3, 1e3),
-        T_enu_world=poses().map(lambda T: tuple(map(tuple, T.matrix().tolist()))),
-        position_sigma=shares,
-        orientation_sigma=shares,
-    )
-)
-def test_any_anchor_comes_back_as_it_was(anchor: Anchor, trained: Map, tmp_path: Path) -> None:
-    save(tmp_path, trained, 5, anchor)
-    assert load_info(tmp_path).anchor == anchor
-    save(tmp_path, trained, 5)
-    tiny.write_anchor(tmp_path, anchor)
-    assert load_info(tmp_path).anchor == anchor
 
 
 @pytest.mark.parametrize(

@@ -175,16 +175,6 @@ def test_any_description_comes_back_as_it_was(given_info: MapInfo, tmp_path: Pat
     assert replace(saved, **{p: getattr(given_info, p) for p in parts}) == given_info
 
 
-def test_what_follows_from_the_occupancy_is_brought_up_to_date_on_loading(tmp_path: Path) -> None:
-    sparse = field(0)
-    sparse.occupancy.restrict(torch.zeros(16, 16, 16, dtype=torch.bool))
-    write_parts(tmp_path, info(), TrainingState(5, sparse.state_dict(), {}))
-    loaded = load_map(tmp_path).field
-    assert isinstance(loaded, HashGridField)
-    assert not loaded.occupancy.near_occupied.any()
-    assert loaded.coarse_sampler.occupied.any()
-
-
 def test_views_of_shared_or_strided_memory_are_saved(tmp_path: Path) -> None:
     tensors = dict(state().field)
     weight = tensors["geometry.0.weight"]

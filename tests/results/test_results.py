@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
@@ -21,21 +20,20 @@ from hypothesis import strategies as st
 
 import bidnerf as bn
 import drawn
-from bidnerf import SE3, Frame, InputError, InputWarning, Localization, Localizer, Outcome
+from bidnerf import SE3, Frame, Localization, Outcome
 from bidnerf.results import (
     Answer,
     Answers,
     Failure,
     PosedImage,
     TrajectoryErrors,
-    localize_each,
     overlay,
     read_pose,
     within,
 )
 from bidnerf.testing import textured_map
-from bidnerf_core.datasets import Capture, DatasetOptions, Photos, Shot, write_transforms
-from bidnerf_core.frames import BLACK, View
+from bidnerf_core.datasets import write_transforms
+from bidnerf_core.frames import View
 from bidnerf_core.progress import Progress
 from drawn import record
 from flights import covered, flight
@@ -91,25 +89,8 @@ def test_a_cancelled_and_an_interrupted_tracking_leave_their_frames(folder: Path
     with pytest.raises(ZeroDivisionError, match="of the callback"):
         bn.track(scene(), folder, answers=path, progress=broken)
     assert len(path) == 1
-
-
-class Damaged(Shot):
-    """A frame whose files cannot be read."""
-
-    def frame(self, background: tuple[float, float, float] = BLACK, side: int | None = None) -> Frame:
-        raise InputError(f"{self.stem}: damaged")
-
-
-def test_a_frame_that_cannot_be_read_is_left_out_with_a_warning(folder: Path, tmp_path: Path) -> None:
-    sound = bn.open_sequence(folder)
-    places = [Damaged(stem=f"{n}") if n in (1, 3) else shot for n, shot in enumerate(sound.shots)]
-    frames = Capture(folder, places, sound.background)
-    with pytest.warns(InputWarning, match="left out") as caught:
-        path = bn.track(scene(), frames)
-    assert [str(each.message) for each in caught] == ["1: damaged; left out", "3: damaged; left out"]
-    assert (path.unread, [answer.number for answer in path.answers]) == (2, [0, 2, 4])
     with refused(found="every is 0", expected="1 or more"):
-        bn.track(scene(), frames, every=0)
+        bn.track(scene(), folder, every=0)
 
 
 def test_an_overlay_shows_photo_rendering_and_both(folder: Path) -> None:
@@ -238,26 +219,6 @@ def test_errors_within_their_bound_are_as_frequent_as_the_covariance_says() -> N
 
 
 # Several queries.
-
-
-def test_a_query_that_fails_does_not_stop_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = [tmp_path / f"{n}.png" for n in range(3)]
-    for file in (files[0], files[2]):
-        iio.imwrite(file, np.zeros((3, 4, 3), dtype=np.uint8))
-    monkeypatch.setattr(Localizer, "__call__", lambda self, *given, **more: replace(FOUND, outcome=Outcome.CONVERGED))
-    source = Photos(files, DatasetOptions(CAMERA))
-    seen = list[str]()
-    answers = localize_each(
-        Localizer(scene(), warm_up=False), source, each=lambda query, answer: seen.append(answer.name)
-    )
-    assert seen == ["0", "1", "2"]
-    assert [isinstance(answer, Failure) for answer in answers.given] == [False, True, False]
-    assert len(answers.accepted) == 2
-    answers.save(tmp_path / "found.json")
-    keys = [set(found) for found in json.loads((tmp_path / "found.json").read_text())]
-    assert keys[0] == keys[1] == keys[2]
-    with refused(where=files[1], found="no such file", expected="an image file"):
-        localize_each(Localizer(scene(), warm_up=False), Photos([files[1]], DatasetOptions(CAMERA)))
 
 
 def test_answers_in_a_format_of_poses_hold_the_accepted_ones(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -13,7 +13,6 @@ from torch import Generator, Tensor, nn
 
 import tiny
 from bidnerf.scenes import orbit
-from bidnerf.testing import DEVICE, Elsewhere
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.fields import SceneBounds
@@ -330,16 +329,3 @@ def test_where_few_pixels_have_depth_a_share_of_the_rays_goes_through_them() -> 
         assert int(here.sum()) > 10
         torch.testing.assert_close(batch.rays.directions[here], seen.directions.expand(int(here.sum()), 3))
     assert len(batch.observed.distance[~measured]) > 250
-
-
-def test_a_batch_on_another_device_is_that_of_the_cpu() -> None:
-    views = random_views(3, True, True)
-    here = RayBank(views, BOUNDS).draw(64, torch.Generator().manual_seed(3))
-    with Elsewhere():
-        there = RayBank(views, BOUNDS, DEVICE).draw(64, torch.Generator().manual_seed(3))
-        for name in ("rays", "observed"):
-            for part in vars(getattr(there, name)).values():
-                assert part.device == DEVICE
-        assert {there.background.device, there.image.device, there.deviation.device} == {DEVICE}
-        assert torch.equal(there.rays.directions.cpu(), here.rays.directions)
-        assert torch.equal(there.observed.rgb.cpu(), here.observed.rgb)
