@@ -238,18 +238,3 @@ def test_a_forked_process_has_threads_of_its_own() -> None:
         concurrently([partial(done.append, 1)] * 2, threads=2)
         os._exit(0 if len(done) == 4 else 1)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
-@both_interpolations
-def test_gpu_agrees_with_cpu(interpolation: Interpolation) -> None:
-    encoding = make(interpolation=interpolation)
-    positions = inner_points(encoding, 100)
-    expected = [encoding(positions), position_gradient(encoding, positions)]
-    expected += [table.grad.clone() for table in encoding.tables if table.grad is not None]
-    encoding.zero_grad()
-    encoding.cuda()
-    actual = [encoding(positions.cuda()), position_gradient(encoding, positions.cuda())]
-    actual += [table.grad for table in encoding.tables if table.grad is not None]
-    for ours, theirs in zip(actual, expected, strict=True):
-        torch.testing.assert_close(ours.cpu(), theirs)

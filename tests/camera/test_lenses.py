@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -90,18 +89,6 @@ def test_projection_is_colmaps(model: str) -> None:
     assert np.nanmax(np.abs(lens_of(model).project(points) - expected)) < 1e-9
     assert model in MODELS
     assert colmap_camera("test", model, *SIZE, PARAMETERS[model]) == lens_of(model)
-
-
-def test_fisheye_is_opencvs_and_resampling_its_undistortion() -> None:
-    lens = lens_of("OPENCV_FISHEYE")
-    image = photo_of(lens)
-    K = np.array([[60, 0, 99.5], [0, 62, 75.5], [0, 0, 1.0]])
-    flat = lens.pinhole
-    P = np.array([[flat.fx, 0, flat.cx - 0.5], [0, flat.fy, flat.cy - 0.5], [0, 0, 1]])
-    D, size = np.array(PARAMETERS["OPENCV_FISHEYE"][4:]), (flat.width, flat.height)
-    maps = cv2.fisheye.initUndistortRectifyMap(K, D, np.eye(3), P, size, cv2.CV_32FC1)
-    expected = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    assert np.abs(lens.resample(image).astype(int) - expected).max() <= 1
 
 
 @pytest.mark.parametrize("model", PARAMETERS)

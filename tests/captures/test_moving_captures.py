@@ -39,7 +39,6 @@ from bidnerf_core.mapping import (
     pose_updates,
     track_views,
 )
-from bidnerf_core.training import RayBank
 from inaccurate_captures import VIEWS, capture, turned, updates
 from landmark_scene import PINHOLE, Points, looking_in
 from optional import require
@@ -129,13 +128,6 @@ def test_wrong_intrinsics_are_no_motion(wrong: dict[str, Any], pose_error: float
     assert bool((found.tracked.motion == 0).all())
 
 
-@pytest.mark.slow
-def test_cameras_at_rest_get_no_motion() -> None:
-    found, _, _ = corrected(0.0)
-    assert found.refined
-    assert bool((found.tracked.motion == 0).all())
-
-
 def test_known_motions_leave_only_the_noise_of_keypoints() -> None:
     """What is built from the same tracks, landmarks and the scatter of poses, takes the motions into account."""
     tracked, _, true = tracks(1.0)
@@ -188,20 +180,6 @@ def test_training_gets_the_motions(monkeypatch: pytest.MonkeyPatch) -> None:
     assert sum(moved) >= VIEWS - 1  # an image whose keypoints are all left out keeps its pose
     assert [camera.motion is not None and any(camera.motion) for camera in found.cameras] == moved
     assert stored_cameras(views) != found.cameras
-
-
-def test_training_draws_the_rays_of_the_rows() -> None:
-    view = replace(unseen(), motion=motions(1.0)[2], landmarks=None)
-    still = replace(unseen(), landmarks=None)
-    batch = RayBank([still, view], BOUNDS).draw(500, torch.Generator().manual_seed(0))
-    for number, one in enumerate((still, view)):
-        expected = observe(one, all_pixels(one.frame))
-        here = batch.image == number
-        nearest = torch.cdist(batch.rays.directions[here], expected.directions).argmin(1)
-        close = {"rtol": 0.0, "atol": 1e-5}
-        torch.testing.assert_close(batch.rays.directions[here], expected.directions[nearest], **close)
-        torch.testing.assert_close(batch.rays.origins[here], expected.origins[nearest], **close)
-    assert int((batch.image == 1).sum()) > 100
 
 
 def test_an_image_is_rendered_row_by_row() -> None:

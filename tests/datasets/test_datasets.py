@@ -212,6 +212,7 @@ def test_splits_by_lists(nerfstudio: Path) -> None:
 def test_a_single_frame_is_in_both_splits(tmp_path: Path) -> None:
     alone = open_dataset(write_nerfstudio(tmp_path, small_views(1)))
     assert alone.frame_names("train") == alone.frame_names("test") == ["r_0"]
+    assert len(alone.views("all")) == 1
 
 
 def test_only_what_is_asked_for_is_read_and_in_that_order(blender: Path) -> None:

@@ -73,11 +73,6 @@ def test_the_name_of_a_sensor_says_the_camera(name: str, sensor: str, folder: Pa
     assert next(iter(open_sequence(renamed))).frame.intrinsics == expected
 
 
-def test_a_camera_of_another_shape_is_refused(folder: Path) -> None:
-    with refused(where=folder / "rgb/1305031102.175304.png", found="image is 16x12, but its camera is for 20x12"):
-        next(iter(open_sequence(folder, camera=Intrinsics(20, 20, 10, 6, 20, 12))))
-
-
 def test_frames_without_truth_are_in_the_sequence_alone(folder: Path) -> None:
     """The ground truth begins with the second frame and has a gap of 0.16 s around the sixth to ninth."""
     edit_rows(folder / "groundtruth.txt", lambda rows: rows[2:10] + rows[18:])

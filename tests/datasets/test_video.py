@@ -126,13 +126,6 @@ def test_a_rotated_video_is_upright(clip: Path, tmp_path: Path, degrees: int) ->
     assert (frame.intrinsics.width, frame.intrinsics.height) == frame.rgb.shape[1::-1]
 
 
-def test_a_camera_of_another_size_is_scaled(clip: Path) -> None:
-    full = Intrinsics(1000.0, 1000.0, 640.0, 480.0, 1280, 960)
-    assert next(iter(open_sequence(clip, camera=full))).frame.intrinsics == full.resized(WIDTH, HEIGHT)
-    with refused(where=clip, found="64x48, but its camera is for 100x100", expected="the same aspect ratio"):
-        next(iter(open_sequence(clip, camera=Intrinsics(50, 50, 50, 50, 100, 100))))
-
-
 def test_no_camera_is_an_error(clip: Path) -> None:
     with refused(where=clip, found="its focal length", expected="a camera: --camera FILE"):
         open_sequence(clip)

@@ -308,8 +308,7 @@ def solved(*views: View, rays: int = 0, matching: LandmarkMatcher | None = None,
     scene = replace(textured_map(surface=True), **changes)
     matching = (matching or matcher()).for_query()
     problem = rig(scene, views, None, matcher=matching)
-    found = require(Loop(problem.views, matching, problem, rays)())
-    return found
+    return require(Loop(problem.views, matching, problem, rays)())
 
 
 @functools.cache

@@ -135,9 +135,10 @@ def test_where_nothing_was_seen_there_is_no_surface() -> None:
 
 def test_views_that_contradict_each_other_have_no_surface() -> None:
     views = ball_views(4)
-    spoilt = []
-    for i, view in enumerate(views):
-        spoilt.append(View(replace(view.frame, depth=require(view.frame.depth) * (0.8 + 0.1 * i)), view.T_ref_camera))
+    spoilt = [
+        View(replace(view.frame, depth=require(view.frame.depth) * (0.8 + 0.1 * i)), view.T_ref_camera)
+        for i, view in enumerate(views)
+    ]
     with pytest.raises(InputError, match="several views agree on"):
         measured(spoilt, agreement=3, cells=4_000_000)
 

@@ -14,13 +14,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 import drawn
 from bidnerf.results import PosedImage, read_poses, write_poses
 
 # Inside: writers of single formats, with poses and names that a path does not have
-from bidnerf.results.pose_files import write_pose_transforms, write_tum
+from bidnerf.results.pose_files import write_pose_transforms
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import open_dataset, open_sequence, read_frames, read_posed_images, read_trajectory
 from bidnerf_core.errors import InputWarning
@@ -46,18 +45,6 @@ def images(names: list[str]) -> list[PosedImage]:
         PosedImage(name, number, CAMERA, pose)
         for number, (name, pose) in enumerate(zip(names, poses(len(names) - 2), strict=True))
     ]
-
-
-def test_a_tum_trajectory_is_what_scipy_reads(tmp_path: Path) -> None:
-    written = images([f"r_{i}" for i in range(12)])
-    write_tum(tmp_path / "poses.txt", written)
-    rows = np.loadtxt(tmp_path / "poses.txt")
-    assert rows[:, 0].tolist() == list(range(12))
-    for row, image in zip(rows, written, strict=True):
-        np.testing.assert_allclose(row[1:4], image.T_world_camera.translation, atol=1e-10)
-        matrix = Rotation.from_quat(row[4:]).as_matrix()  # x y z w
-        np.testing.assert_allclose(matrix, image.T_world_camera.rotation, atol=1e-10)
-    assert np.allclose(np.linalg.norm(rows[:, 4:], axis=1), 1)
 
 
 @pytest.mark.parametrize(

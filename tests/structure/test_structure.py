@@ -36,7 +36,7 @@ from bidnerf.structure.sources import (
     write_frames,
 )
 from bidnerf.testing import PoserContract
-from bidnerf_core.datasets import lacks_poses, write_transforms
+from bidnerf_core.datasets import lacks_poses
 from bidnerf_core.geometry import fit_similarity, look_at
 
 # Inside: each stage of the search for poses, with its rare geometry
@@ -413,27 +413,6 @@ def test_a_video_is_thinned_by_its_motion_and_not_by_its_shaking(tmp_path: Path)
     assert [int(image.name) for image in written] == frames
     assert written[-1].time == pytest.approx(frames[-1] / 30, abs=1e-3)
     assert lacks_poses(tmp_path / "clip.mp4")
-
-
-def test_split_all_reads_every_view_once(tmp_path: Path) -> None:
-    frames = {
-        split: [
-            bn.View(bn.Frame("a", torch.full((4, 5, 3), value), bn.Intrinsics(5, 5, 2.5, 2, 5, 4)), pose),
-            bn.View(bn.Frame(split, torch.full((4, 5, 3), value), bn.Intrinsics(5, 5, 2.5, 2, 5, 4)), pose),
-        ]
-        for split, value, pose in zip(("train", "test"), (0.2, 0.8), walk(2), strict=True)
-    }
-    write_transforms(tmp_path, frames)
-    read = bn.open_dataset(tmp_path).views("all")
-    assert [view.frame.name for view in read] == ["train_a", "train", "test_a", "test"]
-    single = tmp_path / "single"
-    write_single(single, frames["train"][0])
-    assert len(bn.open_dataset(single).views("all")) == 1  # in both splits
-
-
-def write_single(folder: Path, view: bn.View) -> None:
-    write_transforms(folder, {"train": [view]})
-    (folder / "transforms_train.json").rename(folder / "transforms.json")
 
 
 def test_pairs_with_many_matches_tell_a_folded_model() -> None:

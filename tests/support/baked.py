@@ -74,8 +74,7 @@ def problem(*views: View, start: SE3 | None = None, surface: SurfaceMap | None =
 
 def points(*views: View, count: int = 1000, seed: int = 0, surface: SurfaceMap | None = None) -> Surface:
     """Return measured points of views whose poses are known in the world, in the last one's frame."""
-    found = require(Surface.of(problem(*views).views, None, toy() if surface is None else surface, seed, count))
-    return found
+    return require(Surface.of(problem(*views).views, None, toy() if surface is None else surface, seed, count))
 
 
 def of_points(positions: Tensor, rgb: Tensor, normal: tuple[float, float, float], cells: int = 20) -> SurfaceMap:

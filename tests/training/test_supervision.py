@@ -84,30 +84,6 @@ def test_the_derivative_is_the_numerical_one() -> None:
     )
 
 
-def test_a_wall_behind_the_measured_surface_is_moved_forward() -> None:
-    density = torch.full((10,), 0.01, dtype=torch.float64)
-    density[9] = 50.0
-    slope = by_density(density, 3.25)
-    assert int(slope.argmin()) == 6
-    assert float(slope[6]) < 0
-
-
-def test_the_loss_is_the_mean_over_measured_rays() -> None:
-    densities = torch.rand(3, 10, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    parts = [ray(density, measured) for density, measured in zip(densities, (3.25, 0.0, 1.5), strict=True)]
-    first, none, last = (float(ray_termination(*part)) for part in parts)
-    assert none == 0
-    renderings, batches = zip(*parts, strict=True)
-    samples = RaySamples(*map(torch.cat, zip(*(r.samples.parts for r in renderings), strict=True)))
-    weights, distance = (torch.cat([getattr(r, name) for r in renderings]) for name in ("weights", "distance"))
-    together = Rendering(torch.zeros(3, 3), distance, weights.sum(-1), weights, samples)
-    measured = torch.cat([batch.observed.distance for batch in batches])
-    zero = measured.new_zeros(3, 3)
-    rays = Rays(zero, zero, zero[:, 0], zero[:, 0] + 5)
-    found = ray_termination(together, tiny.black_batch(rays, measured))
-    assert float(found) == pytest.approx((first + last) / 2)
-
-
 @dataclass(frozen=True)
 class Few:
     """How much of a depth image is kept."""
@@ -250,11 +226,3 @@ def test_weight_is_pulled_to_where_depth_was_measured() -> None:
     assert bool((slope < 0).all())  # any matter beats none: what a ray lacks counts as at the camera
     assert bool((slope[:7].diff() < 0).all())
     assert bool((slope[6:].diff() > 0).all())
-
-
-def test_matter_in_front_of_a_surface_is_removed() -> None:
-    density = torch.full((10,), 0.01, dtype=torch.float64)
-    density[6] = 50.0
-    slope = by_density(density, 3.25)
-    assert bool((slope[:6] > 0).all())
-    assert float(slope[7:].abs().max()) < 1e-9  # nobody sees what is behind it
