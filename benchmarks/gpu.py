@@ -90,7 +90,7 @@ def made_steps(
     problem = rig(scene, [view], perturb(view.T_ref_camera, 0.1, 2.0, seed=0))
     usual = METHODS["bid"].settings("paper-scene")
     loss = SampledLoss(
-        problem.on_device(),
+        move_to(problem, device),
         objective_of(usual.colour, usual.depth),
         0,
         DescentSettings(rays=rays, level=level),

@@ -26,7 +26,7 @@ from bidnerf.results.pose_files import PosedImage, pose_format, write_poses
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import UpDirection, given_cameras
 from bidnerf_core.datasets import Query, QuerySource
-from bidnerf_core.depth import describe_depth_noise
+from bidnerf_core.depth import UNKNOWN_SENSOR, describe_depth_noise
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3, LengthUnit, fit_similarity, symbol
@@ -69,7 +69,7 @@ class Answer:
         """
         intrinsics = localization.frame_as_taken(frame).intrinsics
         return Answer(
-            frame.name, number, intrinsics, replace(localization, poses=localization.poses[-1:], shown=None), **about
+            frame.name, number, intrinsics, replace(localization, poses=localization.poses[-1:], picture=None), **about
         )
 
     @property
@@ -414,7 +414,7 @@ def localize_each(
                     localization, truth = placement.found, None
                 else:
                     if number == 0:
-                        _log_depth(query, localizer.shared.depth_sensor)
+                        _log_depth(query, getattr(localizer.config, "depth_sensor", UNKNOWN_SENSOR))
                     begin = None if start is None else start(query)
                     localization = localizer(query.views, begin, seed=seed)
                 frame = query.frame.replace(name=query.name)

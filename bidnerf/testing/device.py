@@ -303,7 +303,7 @@ def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor
     objective = objective_of(ColourSettings(), DepthSettings(depth_scale=0.1))
     settings = DescentSettings(CHECKED_RAYS, level=level)
     generator = torch.Generator(device).manual_seed(0)
-    loss = SampledLoss(problem.on_device(), objective, 0, settings, BidConfig().reach, generator)
+    loss = SampledLoss(move_to(problem, problem.device), objective, 0, settings, BidConfig().reach, generator)
     steps = AdamSteps(loss, pivot("scene", problem), AdamSettings(), start.to(device))
     with without_waiting():
         steps()

@@ -33,7 +33,6 @@ from .methods import BidLmConfig as BidLmConfig
 from .methods import InerfConfig as InerfConfig
 from .methods import InerfLmConfig as InerfLmConfig
 from .methods import Method as Method
-from .methods import SharedSettings as SharedSettings
 from .methods import find_method as find_method
 from .methods import matches_landmarks as matches_landmarks
 from .methods import require_start as require_start
@@ -44,7 +43,7 @@ from .problem import Pivot as Pivot
 from .problem import Problem as Problem
 from .problem import SceneMap as SceneMap
 from .problem import landmark_cameras as landmark_cameras
-from .problem import on_device as on_device
+from .problem import move_map_to as move_map_to
 from .problem import origin_of as origin_of
 from .problem import pivot as pivot
 from .problem import rig as rig

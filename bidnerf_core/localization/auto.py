@@ -20,7 +20,7 @@ from bidnerf_core.localization.accept import Evidence, least_confidence
 from bidnerf_core.localization.by_surface import localize_by_depth, localize_by_images
 from bidnerf_core.localization.explanations import CAMERAS, MOVING
 from bidnerf_core.localization.loop import LandmarkAnswer, Loop
-from bidnerf_core.localization.methods import BidConfig, Method, SharedSettings, bid
+from bidnerf_core.localization.methods import BidConfig, Method, bid
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict, current_record
 from bidnerf_core.localization.settings import AutoConfig
@@ -162,6 +162,5 @@ AUTO = Method(
     AutoConfig,
     needs_start=False,
     uses_landmarks=True,
-    shared=lambda config: SharedSettings(config.landmarks, config.depth_sensor, config.fused_rays, config.risk),
     summary="landmarks, then search on the baked surface by depth or colour; no start needed",
 )

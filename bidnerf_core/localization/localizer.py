@@ -8,6 +8,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from numbers import Integral
 from operator import length_hint
@@ -15,27 +16,26 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from bidnerf_core.camera import CameraSource, Intrinsics
-from bidnerf_core.depth import DepthSensorModel, find_depth_sensor
+from bidnerf_core.depth import UNKNOWN_SENSOR, DepthSensorModel, find_depth_sensor
 from bidnerf_core.devices import constant, set_threads_here, threads_at_most, wait_for
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import Observations, device_of, has_field, render, render_picture
 from bidnerf_core.frames import Frame, View, photos_in
 from bidnerf_core.geometry import SE3, pose_from_matrix
-from bidnerf_core.io import LARGEST_INTEGER
+from bidnerf_core.io import LARGEST_INTEGER, png_bytes
 from bidnerf_core.localization.matching import LandmarkMatcher
 from bidnerf_core.localization.methods import USUAL_METHOD, find_method, require_use_of_depth, settings_of
 from bidnerf_core.localization.problem import (
     Problem,
     SceneMap,
     landmark_cameras,
-    on_device,
+    move_map_to,
     origin_of,
     rig,
     unit_of,
@@ -73,7 +73,7 @@ class Localizer:
         """
         scene = scene_of(scene, "Localizer")
         self.method = method
-        self.scene: SceneMap = scene if device is None else on_device(scene, device)
+        self.scene: SceneMap = scene if device is None else move_map_to(scene, device)
         self._method = find_method(method)
         if config is None or isinstance(config, Mapping):
             config = settings_of(method, dict(config or {}), preset=preset)
@@ -84,7 +84,6 @@ class Localizer:
             both = f"both preset {preset!r} and a {type(config).__name__}"
             raise InputError(f"got {both}", expected="one, or a dictionary of what differs")
         self.config = config
-        self.shared = self._method.shared(self.config)  # the settings that matter outside of the method
         landmarks = self.scene.landmarks if self._method.uses_landmarks else None
         self.matcher = None if landmarks is None else LandmarkMatcher(landmarks)
         if warm_up:
@@ -114,8 +113,14 @@ class Localizer:
         origin = origin_of(self.scene)
         near = None if start is None else start_pose(start).translated(-origin)
         problem = self.problem(query, near, depth_rays)
-        found = replace(self.solved(problem, seed), shown=shown_in(self.scene, problem.views[-1].frame))
-        return found.translated(origin)
+        found, frame = self.solved(problem, seed).translated(origin), problem.views[-1].frame
+        # Every n-th pixel, at most 240 along the longer side, since each rendered pixel takes time.
+        step = -(-max(frame.intrinsics.width, frame.intrinsics.height) // 240)
+        photo = frame.rgb_bytes[step // 2 :: step, step // 2 :: step].contiguous()
+        with suppress(TypeError):  # there is no weak reference to a map whose class has slots
+            scene = weakref.ref(self.scene)
+            found = replace(found, picture=functools.partial(picture_html, scene, photo, frame.intrinsics))
+        return found
 
     def many(
         self,
@@ -216,7 +221,7 @@ class Localizer:
     @property
     def depth_sensor(self) -> DepthSensorModel:
         """The noise model of the depth sensor; the generic model if the method has no such setting."""
-        return find_depth_sensor(self.shared.depth_sensor)
+        return find_depth_sensor(getattr(self.config, "depth_sensor", UNKNOWN_SENSOR))
 
     @property
     def assumed_cameras(self) -> tuple[Intrinsics, ...]:
@@ -226,7 +231,7 @@ class Localizer:
     @property
     def matches_landmarks(self) -> bool:
         """Whether the map has landmarks and the method, with its settings, matches them."""
-        return self.matcher is not None and self.shared.matches_landmarks
+        return self.matcher is not None and getattr(self.config, "landmarks", True)
 
     @torch.no_grad()
     def _warm_up(self) -> None:
@@ -293,39 +298,29 @@ def start_pose(start: Start, what: str = "start") -> SE3:
     return pose_from_matrix(matrix, what)
 
 
-def shown_in(scene: SceneMap, frame: Frame) -> Callable[[Localization], str]:
-    """Return a function that renders an answer to a frame as an HTML element, and holds only a small copy of the photo.
+def picture_html(
+    scene_reference: Callable[[], SceneMap | None],
+    photo: UInt8[Tensor, "h w 3"],
+    stated: Intrinsics,
+    found: Localization,
+) -> str:
+    """Return an HTML element with a small photo, the map rendered at the estimated pose, and a blend of both.
 
-    The function does not keep the map in memory. It returns "" once the map is gone, if the map does not support weak references, or
-    if the map cannot be rendered from the pose.
+    Returns "" if the map no longer exists, or cannot be rendered from the pose.
     """
-    # At most 240 pixels along the longer side, since each rendered pixel takes time.
-    small = frame.replace(depth=None).at_most(240)
-    stated = small.intrinsics
-    photo = cv2.imencode(".png", np.ascontiguousarray(small.rgb_bytes.cpu().numpy()))[1]
+    scene = scene_reference()
+    if scene is None:
+        return ""
+    camera = (found.intrinsics or stated).resized(photo.shape[1], photo.shape[0])
     try:
-        reference: Callable[[], SceneMap | None] = weakref.ref(scene)
-    except TypeError:  # a class with slots
-        return lambda found: ""
-
-    def shown(found: Localization) -> str:
-        scene, camera = reference(), stated
-        if scene is None:
-            return ""
-        if found.intrinsics is not None:
-            camera = found.intrinsics.resized(camera.width, camera.height)
-        try:
-            rendered = picture_at(scene, camera, found.T_world_camera.translated(-origin_of(scene)))
-        except InputError:
-            return ""
-        rgb = torch.from_numpy(cv2.imdecode(photo, cv2.IMREAD_COLOR)) / 255
-        both = torch.cat([rgb, rendered, (rgb + rendered) / 2], dim=1)
-        pixels = (both.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-        png = cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1]))[1].tobytes()
-        title = "the photo, the map at the pose found, and both blended"
-        return f'<img alt="{title}" title="{title}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
-
-    return shown
+        rendered = picture_at(scene, camera, found.T_world_camera.translated(-origin_of(scene)))
+    except InputError:
+        return ""
+    rgb = photo.cpu() / 255
+    both = torch.cat([rgb, rendered, (rgb + rendered) / 2], dim=1)
+    png = base64.b64encode(png_bytes((both.clamp(0, 1) * 255).round().byte().numpy())).decode()
+    title = "the photo, the map at the pose found, and both blended"
+    return f'<img alt="{title}" title="{title}" src="data:image/png;base64,{png}">'
 
 
 def picture_at(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:

@@ -24,7 +24,7 @@ from typing import Annotated, Any
 import torch
 from torch import Generator
 
-from bidnerf_core.depth import UNKNOWN_SENSOR
+from bidnerf_core.devices import move_to
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Support, support
@@ -66,18 +66,12 @@ RAYS = 1024
 
 
 @dataclass(frozen=True)
-class SharedSettings:
-    """The method settings that trackers, collections of maps and the command line also use."""
-
-    matches_landmarks: bool = True  # whether images are matched with the map's landmarks
-    depth_sensor: str = UNKNOWN_SENSOR  # name of the sensor that measured the depth
-    rays: int = 0  # number of rays that may be rendered to compare explanations of an image
-    risk: float | None = None  # tolerated fraction of wrong answers among the accepted ones
-
-
-@dataclass(frozen=True)
 class Method:
-    """A localization method: its solver, its settings, its inputs and its presets."""
+    """A localization method: its solver, its settings, its inputs and its presets.
+
+    If its settings have the names of those of ``auto``, trackers and collections of maps use them as well: ``landmarks``, whether images are
+    matched with landmarks; ``depth_sensor``; ``fused_rays``, a number of rays; and ``risk``.
+    """
 
     solve: Callable[[Problem, Any, int], Localization]
     """Solves a problem with settings of ``config_type``; all random choices are drawn from the seed."""
@@ -86,8 +80,6 @@ class Method:
     uses_depth: bool = True  # whether it uses measured depth
     presets: Mapping[str, Any] = field(default_factory=dict)  # alternatives to the default settings, by name
     uses_landmarks: bool = False  # whether the map's landmarks are prepared for it, as ``Problem.matcher``
-    # returns those of its settings that other parts of the package use
-    shared: Callable[[Any], SharedSettings] = lambda config: SharedSettings()
     summary: str = field(kw_only=True)  # one line
 
     def settings(self, preset: str | None = None) -> Any:
@@ -141,8 +133,7 @@ def _names_of(wanted: Callable[[Method], bool]) -> str:
 
 def matches_landmarks(method: str, config: Any) -> bool:
     """Return whether a method, with these settings, matches images with a map's landmarks."""
-    chosen = find_method(method)
-    return chosen.uses_landmarks and chosen.shared(config).matches_landmarks
+    return find_method(method).uses_landmarks and getattr(config, "landmarks", True)
 
 
 def settings_of(method: str, values: dict[str, Any], where: str = "config", preset: str | None = None) -> Any:
@@ -207,7 +198,7 @@ def descended(
         depth = replace(depth, depth_scale=rendered_depth_scale(problem.bounds))
     objective, generator = objective_of(config.colour, depth), Generator(device).manual_seed(seed)
     own = 0 if depth is None else depth.depth_rays
-    loss = SampledLoss(problem.on_device(), objective, own, config.descent, reach, generator)
+    loss = SampledLoss(move_to(problem, device), objective, own, config.descent, reach, generator)
     about = pivot(config.descent.pivot, problem)
     poses, losses, finite, ending = follow_gradient(loss, about, config.adam, start, device, generator)
     T, mean = poses[-1], recent_loss(losses)

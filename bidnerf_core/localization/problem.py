@@ -69,7 +69,7 @@ def origin_of(scene: object) -> Float[Tensor, "3"]:
     return torch.tensor(getattr(scene, "origin", (0.0, 0.0, 0.0)), dtype=torch.float64)
 
 
-def on_device(scene: _Map, device: torch.device | str) -> _Map:
+def move_map_to(scene: _Map, device: torch.device | str) -> _Map:
     """Return a map with field, surface and landmarks on ``device``; the given map is not modified.
 
     Raises ``InputError`` for an unavailable device, and if the field cannot be moved.
@@ -84,9 +84,7 @@ def on_device(scene: _Map, device: torch.device | str) -> _Map:
     if there is parts:
         return scene
     found = copy.copy(scene)
-    for name, part in there.items():
-        if part is not parts[name]:
-            object.__setattr__(found, name, part)
+    vars(found).update(there)  # although the map may be a frozen dataclass
     return found
 
 
@@ -137,17 +135,6 @@ class Problem:
         if not -len(offered) <= number < len(offered):
             raise InputError(f"level is {number}", expected=f"0 (coarsest) to {len(offered) - 1}")
         return offered[number]
-
-    def on_device(self) -> Problem:
-        """Return the problem with images, poses and depth rays on the field's device."""
-        device = self.device
-        rays = self.depth_rays
-        return replace(
-            self,
-            views=tuple(view.to(device) for view in self.views),
-            start=None if self.start is None else self.start.to(device),
-            depth_rays=None if rays is None else rays.to(device, rays.distance.dtype),
-        )
 
     def without_depth(self) -> Problem:
         """Return the problem without measured depth."""

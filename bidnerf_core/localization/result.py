@@ -95,16 +95,16 @@ class Localization:
     diagnostics: Any = None  # the measures by which the pose was accepted or rejected, a dataclass
     intrinsics: Intrinsics | None = None  # of the last image, if other than the given ones were used
     unit: LengthUnit = "units"  # of the position and its covariance: that of the map
-    shown: Callable[[Localization], str] | None = None  # returns the picture for a notebook; not stored
+    picture: Callable[[Localization], str] | None = None  # returns the HTML of a picture for a notebook; not stored
 
     def _repr_html_(self) -> str:
         """Return HTML for a notebook: the photo, the map rendered at the estimated pose, and a blend of both, above a line of text."""
-        picture = "" if self.shown is None else self.shown(self)
+        picture = "" if self.picture is None else self.picture(self)
         return f"{picture}<div>{html.escape(repr(self))}</div>"
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without the function that refers to the map, which other processes do not need."""
-        return self.__dict__ | {"shown": None}
+        return self.__dict__ | {"picture": None}
 
     def __repr__(self) -> str:
         """Return a one-line description, without the steps and the covariance."""
@@ -334,7 +334,7 @@ ADVICE = {
     ),
     Outcome.UNDETERMINED: Advice("The image does not fix all six degrees of freedom.", "Add depth or views."),
     Outcome.NOT_SETTLED: Advice(
-        "Newly drawn rays still ask for a step of more than 0.01.",
+        "Newly drawn rays still ask for a step of more than 0.02.",
         "Localize again from the pose, or raise `--fine-steps` and `--fine-rays`.",
     ),
     Outcome.HIGH_LOSS: Advice(

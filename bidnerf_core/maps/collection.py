@@ -183,7 +183,8 @@ class MapCollection:
         try:
             if not localizer.matches_landmarks:
                 return localizer(frame, seed=seed)
-            found = localize_by_landmarks(localizer.problem(frame), localizer.shared.rays, seed)
+            rays = getattr(localizer.config, "fused_rays", 0)
+            found = localize_by_landmarks(localizer.problem(frame), rays, seed)
         except InputError as error:  # such as a map without a surface
             return _no_localization(str(error), self.method)
         return replace(found, unit=unit_of(localizer.scene)).translated(origin_of(localizer.scene))

@@ -42,7 +42,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import lock
 from bidnerf_core.localization import Localizer as Localizer  # from the door, with maps to load
-from bidnerf_core.localization import on_device, origin_of, scene_of
+from bidnerf_core.localization import move_map_to, origin_of, scene_of
 from bidnerf_core.mapping import (
     BakeConfig,
     HeldOutTrial,
@@ -182,7 +182,7 @@ class Map:
         Of all computations with landmarks, only the comparison of descriptors runs on ``device``, see
         ``LandmarkMap.to``. Raises ``InputError`` for a device that is not usable on this machine.
         """
-        return on_device(self, device)
+        return move_map_to(self, device)
 
     def describe(self) -> MapSummary:
         """Return the facts about the map; ``str()`` gives a human-readable description."""

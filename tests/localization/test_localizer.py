@@ -108,7 +108,7 @@ def test_an_answer_is_sent_to_another_process_without_its_map() -> None:
     found = localizer()(FRAME, START)
     again = pickle.loads(pickle.dumps(found))
     assert again.plain() == found.plain()
-    assert again.shown is None
+    assert again.picture is None
 
 
 def test_a_localizer_opens_a_folder_and_names_its_map_in_one_line(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,13 @@ from bidnerf.testing import CAMERA, textured_map, view
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import read_tensors_and_metadata
-from bidnerf_core.localization import AutoConfig, TrackerConfig
+from bidnerf_core.localization import AutoConfig, Posterior, TrackerConfig
+from bidnerf_core.localization.explanations import correction_between
 from bidnerf_core.localization.tracking.motion import Clock
 
 # Inside: flow, and the parts of a state that only rare sequences fill
-from bidnerf_core.localization.tracking.points import alike
-from bidnerf_core.localization.tracking.state import TrackerState, correction_of
+from bidnerf_core.localization.tracking.points import correlate
+from bidnerf_core.localization.tracking.state import TrackerState
 from conditions import ground_landmarks, with_landmarks
 from flights import (
     FRAMES,
@@ -235,7 +237,7 @@ def test_a_state_with_damaged_numbers_or_tensors_is_refused_and_changes_nothing(
     rotation, noise = "motion.T_world_camera.rotation", "motion.noise"
     impossible = "the numbers are impossible"
     numbers: list[tuple[str, Any, str, str]] = [
-        ("frames", "3", ": frames", "found '3'"),
+        ("frames", "three", ": frames", "found 'three'"),
         ("age", -1, "", impossible),
         ("interval", 0, "", "no field 'interval'"),
         ("clock.interval", 0.0, "", impossible),
@@ -378,23 +380,40 @@ def test_flow_of_mere_noise_is_recognised() -> None:
     generator = np.random.default_rng(0)
     noise = [(150 + 5 * generator.standard_normal((96, 128))).astype(np.uint8) for _ in range(2)]
     place = torch.tensor([[30.5, 40.5], [60.5, 20.5], [3.5, 2.5]])
-    assert not bool(alike(noise[0], noise[1], place, place).any())
+    assert not bool(correlate(noise[0], noise[1], place, place).any())
     moved = np.roll(noise[0], (2, 3), (0, 1))
-    assert alike(noise[0], moved, place, place + torch.tensor([3.0, 2.0])).tolist()[:2] == [True, True]
+    assert correlate(noise[0], moved, place, place + torch.tensor([3.0, 2.0])).tolist()[:2] == [True, True]
 
 
 def test_a_corrected_camera_is_corrected_alike_at_another_focus_and_size() -> None:
     stated, true = replace(CAMERA, fx=140.0, cx=60.0), replace(CAMERA, fx=133.0, cy=50.0)
-    state = TrackerState(Clock(None, 0.1), camera=correction_of(stated, true))
+    state = TrackerState(Clock(None, 0.1), camera=require(correction_between(stated, true)))
     frame = replace(flight()[0][1], intrinsics=stated)
-    found = state.corrected(frame).intrinsics
+    found = state.correct(frame).intrinsics
     assert (found.fx, found.fy, found.cx, found.cy) == pytest.approx((true.fx, true.fy, true.cx, true.cy))
-    refocused = state.corrected(replace(frame, intrinsics=replace(stated, fx=154.0))).intrinsics
+    refocused = state.correct(replace(frame, intrinsics=replace(stated, fx=154.0))).intrinsics
     assert refocused.fx == pytest.approx(154 * 133 / 140)
-    small = state.corrected(replace(frame, rgb=torch.zeros((48, 64, 3)), depth=None, intrinsics=stated.scaled(0.5)))
+    small = state.correct(replace(frame, rgb=torch.zeros((48, 64, 3)), depth=None, intrinsics=stated.scaled(0.5)))
     assert small.intrinsics.cx == pytest.approx(true.scaled(0.5).cx)
     other = replace(frame, focal_is_approximate=True)  # of another source
-    assert state.corrected(other) is other
+    assert state.correct(other) is other
+
+
+@pytest.mark.parametrize(("least", "outcome"), [(0.9, Outcome.CONVERGED), (1.0, Outcome.UNCERTAIN)])
+def test_a_stated_risk_applies_to_the_confidence_of_tracked_poses(
+    monkeypatch: pytest.MonkeyPatch, least: float, outcome: Outcome
+) -> None:
+    monkeypatch.setattr(import_module("bidnerf_core.localization.auto"), "least_confidence", lambda risk: least)
+    careful = Localizer(textured_map(surface=True), config=AutoConfig(risk=0.05))
+    answers = tracked(flight()[:3], Tracker(careful, start=flight_pose(0)))
+    assert [answer.outcome for answer in answers] == [outcome] * 3
+    assert all(0.4 < require(answer.confidence) < 1 for answer in answers)
+
+
+def test_landmarks_that_do_not_determine_the_pose_are_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Posterior, "mixture", lambda self: torch.full((6, 6), torch.inf, dtype=torch.float64))
+    (answer,) = tracked(flight()[:1], Tracker(Localizer(textured_map()), start=flight_pose(0)))
+    assert not answer.converged
 
 
 def test_a_beginning_that_nobody_recognises_is_reported() -> None:

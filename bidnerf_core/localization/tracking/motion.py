@@ -92,7 +92,7 @@ class Motion:
         """Covariance of the pose as a right update (translation in metres, rotation in radians)."""
         return self.noise[:6, :6] + self.bias
 
-    def predicted(self, seconds: float, stamped: bool = True) -> Motion:
+    def predict(self, seconds: float, stamped: bool = True) -> Motion:
         """Return the state ``seconds`` later, or earlier if negative.
 
         After a gap of more than ``LONGEST_GAP``, the pose is unchanged, and its uncertainty grows with the camera's possible speed. Without
@@ -117,7 +117,7 @@ class Motion:
             noise[:6, :6] += _scaled(way, turn)
         return replace(motion, T_world_camera=T, noise=_symmetric(noise), bias=back @ self.bias @ back.T)
 
-    def corrected(self, measured: PoseEstimate) -> Motion:
+    def correct(self, measured: PoseEstimate) -> Motion:
         """Return the state after fusion with a measured pose.
 
         The biases of the measurement and the state are assumed to be fully correlated, so fusion does not reduce them.
@@ -130,7 +130,7 @@ class Motion:
         rest[:, :6] -= gain
         # Joseph's form stays positive semidefinite.
         noise = rest @ self.noise @ rest.T + gain @ measured.noise @ gain.T
-        shared = rest[:6, :6] @ _root(self.bias) + gain[:6] @ _root(measured.bias)
+        shared = rest[:6, :6] @ symmetric_root(self.bias) + gain[:6] @ symmetric_root(measured.bias)
         return Motion(
             retract(self.T_world_camera, delta[:6]).polished(),
             self.velocity + delta[6:],
@@ -140,21 +140,25 @@ class Motion:
             self.agility,
         )
 
-    def refined(self, fused: PoseEstimate) -> Motion:
-        """Return the state with the pose ``fused``, which already includes a measurement, and the velocity updated accordingly."""
+    def refine(self, T_world_camera: SE3, information: Float[Tensor, "6 6"]) -> Motion:
+        """Return the state at a pose that was fused with measurements of this ``information``, with the velocity updated accordingly.
+
+        Half of the variance of the measurements is common to consecutive frames.
+        """
+        fused = torch.linalg.inv(torch.linalg.inv(self.covariance) + information)
+        rest, own = torch.eye(6).double() - fused @ information, fused @ information @ fused / 2
         gain = torch.linalg.solve(self.noise[:6, :6], self.noise[:6]).T
-        delta = gain @ update_between(self.T_world_camera, fused.T_world_camera)
-        noise = self.noise + gain @ (fused.noise - self.noise[:6, :6]) @ gain.T
-        velocity = self.velocity + delta[6:]
+        delta = gain @ update_between(self.T_world_camera, T_world_camera)
+        change = rest @ self.noise[:6, :6] @ rest.T + own - self.noise[:6, :6]
         return replace(
             self,
-            T_world_camera=fused.T_world_camera,
-            velocity=velocity,
-            noise=_symmetric(noise),
-            bias=fused.bias,
+            T_world_camera=T_world_camera,
+            velocity=self.velocity + delta[6:],
+            noise=_symmetric(self.noise + gain @ change @ gain.T),
+            bias=rest @ self.bias @ rest.T + own,
         )
 
-    def updated(self, measured: PoseEstimate) -> Motion:
+    def update(self, measured: PoseEstimate) -> Motion:
         """Return the state after fusion with a measured pose, or reset to that pose if the prediction is incompatible with it.
 
         A pose whose covariance is not finite carries no information: the state is returned unchanged.
@@ -166,7 +170,7 @@ class Motion:
         # Beyond this squared Mahalanobis distance, the prediction is discarded.
         if float(off @ torch.linalg.solve(spread, off)) > 60.0:
             return Motion.at(measured, self.reach)
-        return replace(self.corrected(measured), agility=self._observed_agility(off[:3], spread[:3, :3]))
+        return replace(self.correct(measured), agility=self._observed_agility(off[:3], spread[:3, :3]))
 
     def _acceleration(self, agility: float = 1.0) -> Float[Tensor, "6 6"]:
         """Return the covariance of the acceleration (metres and radians per second squared) of a hand-held camera that is moved briskly."""
@@ -186,7 +190,7 @@ class Motion:
         ratio = min(9.0, float(off @ torch.linalg.solve(spread, off)) / 3)
         return min(1.0, max(0.1, self.agility * math.sqrt(1 - 0.4 + 0.4 * ratio)))
 
-    def moved(self, T_world_camera: SE3, relative: Float[Tensor, "6 6"], seconds: float) -> Motion:
+    def move(self, T_world_camera: SE3, relative: Float[Tensor, "6 6"], seconds: float) -> Motion:
         """Return the state ``seconds`` later, at a pose whose motion was measured between the images themselves.
 
         ``relative`` is the covariance of that motion, as a right update of the new pose.
@@ -219,7 +223,7 @@ def _symmetric(matrix: Tensor) -> Tensor:
     return (matrix + matrix.T) / 2
 
 
-def _root(covariance: Float[Tensor, "6 6"]) -> Float[Tensor, "6 6"]:
+def symmetric_root(covariance: Float[Tensor, "6 6"]) -> Float[Tensor, "6 6"]:
     """Return the symmetric square root of a positive semidefinite matrix."""
     values, axes = torch.linalg.eigh(covariance)
     return (axes * values.clamp(min=0).sqrt()) @ axes.T

@@ -24,7 +24,7 @@ from bidnerf_core.frames import Frame, visible_at
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.matching import cells, inlier_threshold, log10_nfa
 from bidnerf_core.localization.propose import from_poselib, pinhole, to_poselib
-from bidnerf_core.mapping import FIRST_CENTRE, Landmarks, Sights, States, measured_depth, point_variance
+from bidnerf_core.mapping import FIRST_CENTRE, LandmarkMap, Landmarks, Sights, States, measured_depth, point_variance
 
 POINTS = 400
 """Maximum number of landmarks, corners or measured pixels that are tracked or aligned."""
@@ -61,7 +61,13 @@ class Points:
         return Points(torch.zeros((0, 2)), wide, wide[:, :2], wide, torch.zeros(0, dtype=torch.long))
 
     @staticmethod
-    def measured(frame: Frame, image: Grey, T_world_camera: SE3, count: int, noise: DepthNoise) -> Points:
+    def of_landmarks(landmarks: LandmarkMap, number: Int[Tensor, "m"], pixels: Float[Tensor, "m 2"]) -> Points:
+        """Return the landmarks with these numbers, as seen at ``pixels``."""
+        some = landmarks[number]
+        return Points(pixels, some.positions.double(), some.deviations.double(), some.directions.double(), number)
+
+    @staticmethod
+    def detect(frame: Frame, image: Grey, T_world_camera: SE3, count: int, noise: DepthNoise) -> Points:
         """Detect up to ``count`` corners in the grey ``image`` of a frame with a known pose, and back-project those with measured depth.
 
         ``noise`` is the noise model of the depth.
@@ -93,8 +99,8 @@ class Points:
     def fresh(self) -> Points:
         return self[self.landmark == FRESH]
 
-    def followed(self, before: Grey, now: Grey, frame: Frame, predicted: SE3) -> Points:
-        """Return the points found in the next image by optical flow, starting from their projections at a predicted pose."""
+    def follow(self, before: Grey, now: Grey, frame: Frame, predicted: SE3) -> Points:
+        """Track the points to the next image by optical flow, starting from their projections at a predicted pose; some are lost."""
         guess = frame.intrinsics.project(predicted.inverse().apply(self.positions)).float()
         guess = torch.where(guess.isfinite().all(-1, keepdim=True), guess, self.pixels)
         pixels, found = flow(before, now, self.pixels, guess)
@@ -104,11 +110,11 @@ class Points:
                 pixels, found = again, found_again
         fresh = (self.landmark == FRESH) & found
         if bool(fresh.any()):  # unlike corners, landmarks are known to be distinctive
-            found[fresh.clone()] = alike(before, now, self.pixels[fresh], pixels[fresh])
+            found[fresh.clone()] = correlate(before, now, self.pixels[fresh], pixels[fresh])
         found &= visible_at(frame, pixels)
         return replace(self, pixels=pixels)[found]
 
-    def well_spread(self, camera: Intrinsics, most: int) -> Points:
+    def spread(self, camera: Intrinsics, most: int) -> Points:
         """Return up to ``most`` of the points, which are sorted best first, taken in turn from the cells of the image."""
         if len(self) <= most:
             return self
@@ -212,7 +218,7 @@ def flow(
     """
     if not len(pixels):
         return pixels, torch.zeros(0, dtype=torch.bool)
-    before = _as_bright_as(now, before)
+    before = _match_brightness(now, before)
     start = _corner_based(pixels)
     there, seen, _ = cv2.calcOpticalFlowPyrLK(before, now, start, _corner_based(guess), **FLOW)
     back, seen_back, _ = cv2.calcOpticalFlowPyrLK(now, before, there, start.copy(), maxLevel=1, **FLOW)
@@ -224,7 +230,7 @@ def flow(
     return torch.from_numpy(there + FIRST_CENTRE).to(pixels), torch.from_numpy(found)
 
 
-def alike(before: Grey, now: Grey, pixels: Float[Tensor, "m 2"], there: Float[Tensor, "m 2"]) -> Bool[Tensor, "m"]:
+def correlate(before: Grey, now: Grey, pixels: Float[Tensor, "m 2"], there: Float[Tensor, "m 2"]) -> Bool[Tensor, "m"]:
     """Return a mask of the patches around ``pixels`` of one image that resemble those around ``there`` in the next.
 
     In pure noise, the flow stays where its search started, and the patches do not correlate.
@@ -256,7 +262,7 @@ def _corner_based(pixels: Float[Tensor, "m 2"]) -> Float[np.ndarray, "m 2"]:
     return np.ascontiguousarray(pixels.float().numpy() - np.float32(FIRST_CENTRE))
 
 
-def _as_bright_as(model: Grey, image: Grey) -> Grey:
+def _match_brightness(model: Grey, image: Grey) -> Grey:
     """Return ``image`` with about the mean and standard deviation of ``model``; unchanged if the means hardly differ."""
     (mean, spread), (wanted, wanted_spread) = (np.ravel(cv2.meanStdDev(x)).tolist() for x in (image, model))
     # The flow assumes constant brightness, so larger changes of the mean than 2 % are compensated.

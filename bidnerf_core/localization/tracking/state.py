@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from jaxtyping import Float, UInt8
 from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import LARGEST_LENGTH
 from bidnerf_core.frames import Frame
@@ -75,20 +73,11 @@ class TrackerState:
     is_approximate: bool = False  # whether that kind is an approximate focal length
     doubt: Float[Tensor, "6 6"] = _zeros(6, 6)  # covariance of the pose due to errors of the intrinsics
 
-    def corrected(self, frame: Frame) -> Frame:
+    def correct(self, frame: Frame) -> Frame:
         """Return a frame with its camera corrected; unchanged if the correction suits only exact, or only approximate, focal lengths."""
         if frame.focal_is_approximate != self.is_approximate or not bool(self.camera.any()):
             return frame
         return frame.replace(intrinsics=true_intrinsics(frame.intrinsics, self.camera))
-
-
-def correction_of(stated: Intrinsics, true: Intrinsics) -> Float[Tensor, "6"]:
-    """Return the correction with which ``true_intrinsics`` turns ``stated`` into ``true`` (focal lengths, centre and k1 only)."""
-    across, down = true.fx / stated.fx, true.fy / stated.fy
-    bent = [camera.distortion[0] if camera.distortion else 0.0 for camera in (stated, true)]
-    centre = (true.cx - stated.cx) / stated.fx, (true.cy - stated.cy) / stated.fy
-    log_focal, log_aspect = math.log(across * down) / 2, math.log(across / down)
-    return torch.tensor([log_focal, *centre, bent[1] - bent[0], log_aspect, 0.0], dtype=torch.float64)
 
 
 def save_state(path: Path, state: TrackerState, key: str) -> None:

@@ -15,6 +15,7 @@ from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.auto import localize_by_landmarks, within_risk
 from bidnerf_core.localization.by_surface import is_blank
+from bidnerf_core.localization.explanations import correction_between
 from bidnerf_core.localization.localizer import NO_DISTANCES, Localizer, Start, start_pose
 from bidnerf_core.localization.problem import SceneMap, origin_of, unit_of
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -24,7 +25,6 @@ from bidnerf_core.localization.tracking.motion import Clock, Motion, PoseEstimat
 from bidnerf_core.localization.tracking.points import POINTS, Grey, Points
 from bidnerf_core.localization.tracking.state import (
     TrackerState,
-    correction_of,
     load_tracker_state,
     save_state,
 )
@@ -63,7 +63,8 @@ class Tracker:
         self._landmarks = None if matcher is None else matcher.landmarks
         # The 600 strongest keypoints of an image are matched with landmarks.
         features = None if matcher is None else limit_features(matcher.features, 600)
-        self._measure = Measurer(self._scene, self._landmarks, features, localizer.depth_sensor)
+        self._risk = getattr(localizer.config, "risk", None)
+        self._measure = Measurer(self._scene, self._landmarks, features, localizer.depth_sensor, self._risk)
         surface, bounds = self._scene.surface, self._scene.bounds
         corners = torch.tensor([bounds.lower, bounds.upper])
         self._extent = float((corners[1] - corners[0]).norm()) if surface is None else surface.extent
@@ -95,7 +96,7 @@ class Tracker:
         # Points are tracked from the last image, even across frames without one.
         state = state if image is None else replace(state, image=torch.from_numpy(image))
         self._state = state
-        stated, taken = frame.intrinsics, state.corrected(frame).intrinsics
+        stated, taken = frame.intrinsics, state.correct(frame).intrinsics
         return replace(
             answer,
             method="track",
@@ -117,32 +118,31 @@ class Tracker:
         self, stated: Frame, image: Grey | None, state: TrackerState, seconds: float
     ) -> tuple[Localization, TrackerState]:
         """Predict the pose and correct it by what the frame shows; if the result is rejected, search the map for the pose."""
-        frame, motion, measured = state.corrected(stated), state.motion, None
+        frame, motion, measured = state.correct(stated), state.motion, None
         if motion is None and self._start is not None:
             motion = self._at(frame, self._start, None)
             seconds = 0.0 if state.frames == 1 else seconds
-        predicted = None if motion is None else motion.predicted(seconds, state.clock.stamped)
+        predicted = None if motion is None else motion.predict(seconds, state.clock.stamped)
         how = "constant velocity"
         if motion is not None and predicted is not None:
             if image is not None:
                 before, points = state.image, Points.none()
                 if before is not None and tuple(before.shape) == image.shape:
-                    points = state.points.followed(before.numpy(), image, frame, predicted.T_world_camera)
+                    points = state.points.follow(before.numpy(), image, frame, predicted.T_world_camera)
                 moved = self._measure.odometry(frame, points.fresh, motion, predicted, seconds)
                 if moved is not None:
                     predicted, points, how = *moved, "odometry"
                 state = replace(state, points=points)
             measured = self._measure(frame, image, state, predicted)
-            if measured is not None and measured.verdict.accepted:
-                return self._answer(measured, predicted), self._after(frame, image, measured)
+            if measured is not None and measured.answer.converged:
+                return measured.answer, self._advance(frame, image, measured.motion, measured.state)
             if image is None and measured is not None:  # the shape still corrects some directions
-                state = replace(state, motion=measured.motion, lost=state.lost + 1)
-                return self._answer(measured, predicted), state
+                return measured.answer, replace(state, motion=measured.motion, lost=state.lost + 1)
         found = None
         if state.motion is None or predicted is None or state.lost or search_radius(frame, predicted) is None:
-            found = self._relocalized(frame, image, state, predicted)
+            found = self._relocalize(frame, image, state, predicted)
         if image is not None and found is not None and found.converged:
-            return self._found(stated, image, state, found)
+            return self._begin_at(stated, image, state, found)
         searchable = image is not None and (shows_shape(frame) or not is_blank(frame))
         state = replace(state, lost=state.lost + 1, searchable=state.searchable + searchable)
         if state.motion is None or predicted is None:
@@ -161,11 +161,11 @@ class Tracker:
             motion=replace(predicted, velocity=0.6 * predicted.velocity),
             points=self._corners(frame, image, state.points, predicted.T_world_camera),
         )
-        verdict = Verdict(Outcome.TOO_FEW_MATCHES, "no landmarks were recognised around the prediction")
-        verdict = verdict if measured is None else measured.verdict
-        reason = f"lost for {amount(state.lost, 'frame')}, bridged by {how}: {verdict.reason}"
-        bridged = Measurement(predicted, replace(verdict, reason=reason), 1.0, state)
-        return self._answer(bridged, predicted), state
+        why = Verdict(Outcome.TOO_FEW_MATCHES, "no landmarks were recognised around the prediction")
+        if measured is not None:
+            why = Verdict(measured.answer.outcome, measured.answer.reason, measured.answer.confidence)
+        why = replace(why, reason=f"lost for {amount(state.lost, 'frame')}, bridged by {how}: {why.reason}")
+        return Measurement.of(predicted, predicted, why, 1.0, state).answer, state
 
     def _at(self, frame: Frame, T: SE3, covariance: torch.Tensor | None) -> Motion:
         """Return the motion of a camera at a pose with unknown velocity; without a ``covariance``, the pose is as uncertain as a start."""
@@ -176,46 +176,28 @@ class Tracker:
             noise = bias = covariance / 2
         return Motion.at(PoseEstimate(T, noise, bias), self._reach(frame))
 
-    def _answer(self, measured: Measurement, predicted: Motion) -> Localization:
-        """Return the answer for a frame; its path leads from the prediction to the pose."""
-        path = SE3.stack([predicted.T_world_camera, measured.motion.T_world_camera])
-        losses = torch.tensor([measured.loss], dtype=torch.float64)
-        return Localization.of(
-            measured.verdict,
-            path,
-            losses,
-            "track",
-            clocks.perf_counter(),
-            measured.loss,
-            measured.motion.covariance,
-        )
-
-    def _after(self, frame: Frame, image: Grey | None, measured: Measurement) -> TrackerState:
+    def _advance(self, frame: Frame, image: Grey | None, motion: Motion, state: TrackerState) -> TrackerState:
         """Return the state after a frame whose pose was accepted."""
-        motion, state = measured.motion, measured.state
         away = (state.points.landmarks.positions - motion.T_world_camera.translation).norm(dim=-1)
         reach = float(away.median()) if len(away) else self._reach(frame)
         if self._landmarks is None:
-            points = self._corners(frame, image, state.points, motion.T_world_camera)
-            state = replace(state, points=points)
+            state = replace(state, points=self._corners(frame, image, state.points, motion.T_world_camera))
         return replace(state, motion=replace(motion, reach=reach), lost=0, searchable=0)
 
-    def _found(
+    def _begin_at(
         self, stated: Frame, image: Grey, state: TrackerState, found: Localization
     ) -> tuple[Localization, TrackerState]:
         """Start tracking at a pose found by a search."""
         reason = f"relocalized after {state.lost} frames: {found.reason}" if state.lost else found.reason
-        if found.intrinsics is not None:
-            camera = correction_of(stated.intrinsics, found.intrinsics)
+        true = found.intrinsics
+        if true is not None and (camera := correction_between(stated.intrinsics, true)) is not None:
             state = replace(state, camera=camera, is_approximate=stated.focal_is_approximate)
-        frame = state.corrected(stated)
+        frame, state = state.correct(stated), replace(state, points=Points.none(), searchable=0)
         motion = self._at(frame, found.T_world_camera, found.covariance)
-        state = replace(state, points=Points.none(), searchable=0)
         measured = self._measure(frame, image, state, motion)
-        if measured is not None and measured.verdict.accepted:
-            reason, state = f"{reason}; {measured.verdict.reason}", measured.state
-        measured = Measurement(motion, Verdict(found.outcome, reason), found.loss, state)
-        return replace(found, reason=reason, covariance=motion.covariance), self._after(frame, image, measured)
+        if measured is not None and measured.answer.converged:
+            reason, state = f"{reason}; {measured.answer.reason}", measured.state
+        return replace(found, reason=reason, covariance=motion.covariance), self._advance(frame, image, motion, state)
 
     def _corners(self, frame: Frame, image: Grey | None, points: Points, T_world_camera: SE3) -> Points:
         """Return the corners among ``points``, or new corners at the pose of this frame if few are left."""
@@ -223,9 +205,9 @@ class Tracker:
         # New corners are detected once fewer than half of ``POINTS`` are left.
         if image is None or not frame.has_depth or len(points) >= 0.5 * POINTS:
             return points
-        return Points.measured(frame, image, T_world_camera, POINTS, self.localizer.depth_sensor.noise)
+        return Points.detect(frame, image, T_world_camera, POINTS, self.localizer.depth_sensor.noise)
 
-    def _relocalized(
+    def _relocalize(
         self, frame: Frame, image: Grey | None, state: TrackerState, predicted: Motion | None
     ) -> Localization | None:
         """Search the map for the pose of a frame; None if no search is due or the frame is unsuitable.
@@ -246,7 +228,7 @@ class Tracker:
         problem = self.localizer.problem(frame, T if is_due else None)
         if self.localizer.matcher is not None and not is_due:
             problem = replace(problem, sensor=self.localizer.depth_sensor)
-            return within_risk(localize_by_landmarks(problem, 0, state.frames), self.localizer.shared.risk)
+            return within_risk(localize_by_landmarks(problem, 0, state.frames), self._risk)
         try:
             return self.localizer.solved(problem, state.frames)
         except InputError:
