@@ -45,8 +45,7 @@ class TrackingOptions:
         EXPERT,
         Option(
             "SHARE",
-            "tolerated fraction of wrong poses among those accepted after a search of the map; does not apply to the"
-            " frames tracked from there",
+            "tolerated fraction of wrong poses among those accepted",
             "accepted as usual",
         ),
     ] = None
