@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from bidnerf.testing import SCENE_BOUNDS as BOUNDS
-from bidnerf.testing import SIDE, BackendContract, Recorder, rgb_views, rgbd_views
+from bidnerf.testing import SIDE, BackendContract, Recorder, rgbd_views
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import (
@@ -194,12 +194,6 @@ def test_what_is_compared_with_measured_depth() -> None:
     assert float(loss) == pytest.approx(float(mse) + 0.5 * total / count / SIDE, rel=1e-4)
 
 
-def test_without_depth_only_colour_is_compared() -> None:
-    batch = RayBank(rgb_views(), BOUNDS).draw(50, torch.Generator().manual_seed(0))
-    loss, mse = supervised_loss(render(built(), batch.rays, batch.background), batch, SIDE, 0.5)
-    assert float(loss.detach()) == pytest.approx(float(mse))
-
-
 def test_both_levels_learn_from_a_step() -> None:
     field = built()
     generator = torch.Generator().manual_seed(0)
@@ -227,13 +221,3 @@ def test_a_step_takes_more_rays_where_there_is_little_room() -> None:
 def test_an_encoding_of_nothing_is_refused() -> None:
     with pytest.raises(InputError, match="expected one of them"):
         VanillaConfig(position_frequencies=0, include_input=False)
-
-
-def test_carving_leaves_what_is_seen() -> None:
-    """Each pixel that shows matter has room on its ray where its depth was measured."""
-    field = built(room_resolution=32)
-    carve(field, rgbd_views())
-    batch = RayBank(rgbd_views(), BOUNDS).draw(2000, torch.Generator().manual_seed(1))
-    hit = batch.observed.distance > 0
-    places = batch.rays.at(batch.observed.distance[:, None])[:, 0]
-    assert float(field.room.holds(places[hit]).float().mean()) > 0.99

@@ -586,14 +586,6 @@ def test_info_describes_a_map(bidnerf: Run, shared: Path) -> None:
     assert "distances" not in shown  # which are known
 
 
-def test_a_scaled_map_replaces_another_only_if_told(bidnerf: Run, shared: Path, map_folder: Path) -> None:
-    scale = ["scale", shared / "map", "--factor", 2, "--out", map_folder]
-    assert_refused(bidnerf(*scale), 2, map_folder, "exists already")
-    assert bidnerf(*scale, "--overwrite").status == 0
-    sides = [load_info(folder).bounds.size for folder in (shared / "map", map_folder)]
-    assert sides[1] == pytest.approx([2 * side for side in sides[0]])
-
-
 def test_render_refuses_names_whose_files_would_collide(bidnerf: Run, shared: Path, data: Path, tmp_path: Path) -> None:
     path = data / "transforms.json"
     first, second = json.loads(path.read_text())["test_filenames"][:2]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import pytest
 
 # Inside: the parser alone, and the options of all commands by name
-from bidnerf.cli import COMMANDS, main, parser
+from bidnerf.cli import COMMANDS, parser
 from bidnerf.cli.parser import FLAG, Group, Option, SettingsGroup, Without, parse
 from bidnerf.evaluation import PROTOCOLS
 from bidnerf_core.errors import UsageError
@@ -270,8 +270,3 @@ def test_values_are_refused_before_settings_are_loaded() -> None:
     for words in (["here", "--out", "x", "--size", "a"], ["here"]):
         with pytest.raises(UsageError, match=r"--size is 'a', expected a number|required: --where, --out"):
             parse("x", command, words)
-
-
-def test_a_command_needs_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stdout", None)
-    assert main(["info", "--help"]) == 0

@@ -13,15 +13,12 @@ import torch
 
 import sparse_model
 import tiny
-from bidnerf.scenes import demo_object, orbit
+from bidnerf.scenes import orbit
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.datasets import SparseChoice, SparsePoints, read_model
-from bidnerf_core.fields import render
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.training import RayBank, Silent, ray_termination
-from bidnerf_hashgrid import backend as hashgrid
 from optional import require
 from refusals import refused
 from sparse_model import Known
@@ -326,23 +323,3 @@ def test_the_scene_is_bounded_by_points_where_there_is_nothing_better(model: Pat
     good = scene.points[: scene.good]
     assert bool((good > torch.tensor(bounds.lower)).all() and (good < torch.tensor(bounds.upper)).all())
     assert max(bounds.size) < 3
-
-
-def test_training_is_supervised_by_the_points(model: Path, scene: Known) -> None:
-    """Matter of pixels that no point tells of comes nearer to where it is, too."""
-    dense = scene.views
-    views = [opened(model, scene).onto(bare(view), "train") for view in dense]
-    bounds = demo_object().bounds
-    assert not any(view.frame.has_dense_depth for view in views)
-
-    def misplaced(weight: float) -> float:
-        config = tiny.config(steps=40, depth_weight=weight, carve=False)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)
-            field = hashgrid.build(config, bounds)
-            hashgrid.train(field, views, config, Silent())
-        batch = RayBank(dense, bounds).draw(3000, torch.Generator().manual_seed(1))
-        with torch.no_grad():
-            return float(ray_termination(render(field, batch.rays, batch.background), batch))
-
-    assert misplaced(1.0) < 0.9 * misplaced(0.0)

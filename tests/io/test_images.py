@@ -8,7 +8,6 @@ import subprocess
 import sys
 import tracemalloc
 import warnings
-import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -35,6 +34,7 @@ from bidnerf_core.io import (
     resample_nearest,
 )
 from bidnerf_core.io.images import ImageHeader
+from bombs import png, png_of
 from optional import require
 from photo_files import noise
 from refusals import refused
@@ -42,29 +42,13 @@ from refusals import refused
 READERS = pytest.mark.parametrize("read", [read_image, read_header], ids=["image", "header"])
 
 
-def empty_png(path: Path, width: int, height: int, declared: tuple[int, int] | None = None) -> Path:
-    """Write the PNG of a black image without making the image: a few kilobytes, whatever the size.
-
-    Its header may declare another size.
-    """
-
-    def chunk(name: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
-    header = struct.pack(">IIBBBBB", *(declared or (width, height)), 8, 0, 0, 0, 0)
-    packer = zlib.compressobj()
-    rows = b"".join(packer.compress(bytes(width + 1)) for _ in range(height)) + packer.flush()
-    parts = (chunk(b"IHDR", header), chunk(b"IDAT", rows), chunk(b"IEND", b""))
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
-    return path
-
-
 @READERS
 @pytest.mark.parametrize("size", [(13360, 13360), (60000, 60000)])
 def test_images_of_too_many_pixels_take_no_memory(
     tmp_path: Path, read: Callable[[Path], object], size: tuple[int, int]
 ) -> None:
-    path = empty_png(tmp_path / "bomb.png", size[0], 1, size)
+    path = tmp_path / "bomb.png"
+    path.write_bytes(png_of(*size))
     tracemalloc.start()
     with refused(where=path, found="megapixels", expected="at most 178 megapixels"):
         read(path)
@@ -225,7 +209,8 @@ def test_strips_give_what_the_whole_image_gives(tmp_path: Path, monkeypatch: pyt
 
 
 def test_a_large_image_that_is_reduced_takes_little_memory(tmp_path: Path) -> None:
-    path = empty_png(tmp_path / "large.png", 6000, 6000)
+    path = tmp_path / "large.png"
+    path.write_bytes(png(6000, 6000, 8, 0, bytes(6001 * 6000)))
     tracemalloc.start()
     rgb, _ = read_image(path, size=(64, 64))
     assert rgb.shape == (64, 64, 3)
@@ -337,7 +322,8 @@ def test_threads_that_read_images_leave_warnings_as_they_were(tmp_path: Path) ->
 
 def test_oddities_of_a_file_cause_no_warning(tmp_path: Path) -> None:
     """Run apart, since pytest has filters of its own."""
-    path = empty_png(tmp_path / "large.png", 9500, 1, (9500, 9500))  # Pillow warns from 89 megapixels on
+    path = tmp_path / "large.png"
+    path.write_bytes(png_of(9500, 9500))  # Pillow warns from 89 megapixels on
     code = f"from pathlib import Path; from bidnerf_core.io.images import read_header; read_header(Path({str(path)!r}))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr == ""

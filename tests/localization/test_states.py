@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import baked
 import blob_images
 from bidnerf import SE3, Intrinsics, View
 from bidnerf.testing import textured_map, training_views, unseen
@@ -25,7 +26,6 @@ from bidnerf_core.mapping import (
     Normal,
     Sights,
     States,
-    Surfels,
     imaged,
     project,
     rays_through,
@@ -167,12 +167,10 @@ def test_points_behind_the_camera_have_no_influence() -> None:
 
 def term_of_the_surface(rig: bool) -> tuple[Surface, States]:
     view, others = unseen(), training_views()[:2] if rig else ()
-    surface = require(textured_map(surface=True).surface)
-    parts = surface.surfels
-    exact = Surfels(*(x.double() for x in (parts.positions, parts.normals, parts.rgb, parts.rgb_gradient)))
+    surface = baked.exact(require(textured_map(surface=True).surface))
     truth = view.T_ref_camera
     views = [View(v.frame, truth.inverse() @ v.T_ref_camera) for v in (*others, view)]
-    term = require(Surface.of(views, None, replace(surface, surfels=exact), 0, 300))
+    term = require(Surface.of(views, None, surface, 0, 300))
     at = drawn(2, moving=False, about=truth)
     term = replace(term, rgb=term.rgb.double(), coloured=term.coloured.double(), colour_weight=0.7, noise=0.05)
     return term, replace(at, z=0.1 * at.z)

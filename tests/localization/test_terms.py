@@ -200,9 +200,9 @@ def test_points_on_their_surface_cost_least_in_any_world_frame() -> None:
     assert float(near_points.mean()) > 0.9
     assert float(alike.mean()) > 0.7
     darker = replace(term, rgb=0.6 * term.rgb + 0.1)
-    restored = darker.exposed(truth)
+    restored = darker.match_exposure(truth)
     assert float(restored.inliers(truth)[1].mean()) > float(darker.inliers(truth)[1].mean())
-    assert term.exposed(truth) is term
+    assert term.match_exposure(truth) is term
 
 
 def small_image(width: int = 24) -> tuple[Images, SE3]:
@@ -282,21 +282,3 @@ def test_averages_keep_means_and_places(size: int) -> None:
     torch.testing.assert_close(found[..., 2], even.rgb[..., 2])
     off = (found - even.rgb)[inside, inside]
     assert off.numel() == 0 or float(off.abs().max()) < 5e-3
-
-
-@pytest.mark.parametrize("weight", [0.0, 0.7], ids=["distances", "colours"])
-def test_the_gradient_by_points_is_the_numerical_one(weight: float) -> None:
-    view = baked.unseen()[0]
-    points = baked.points(view, count=150, surface=baked.exact(baked.toy()))
-    # Points beside an edge pull along the plane too, which steps neglect.
-    term = replace(points, noise=0.05, colour_weight=weight)
-    states = near(view.T_ref_camera)
-    on_disc = (term._offsets(states)[1] - term._offsets(states)[0].square()).amax(0) < 1e-12
-    kept = on_disc.nonzero()[:, 0]
-    names = ("sights", "z", "fixed", "rgb", "coloured")
-    term = replace(term, **{name: getattr(term, name)[kept] for name in names})
-    assert len(kept) > 80
-    normal = term(states)
-    expected = numerical(lambda s: term(s).cost, states, 1e-6)
-    scale = float(expected.abs().max())
-    torch.testing.assert_close(normal.gradient[:, :6], expected, rtol=0.02, atol=0.02 * scale)

@@ -20,7 +20,7 @@ from bidnerf_core.io import FileInUse, lock
 # Inside: the place of a map by its name
 from bidnerf_core.maps import Anchor, Map, MapInfo, factor_of_distance, factor_of_poses, load_info
 from bidnerf_core.maps.known_lengths import locate_point
-from commands import Run
+from commands import Run, assert_refused
 from optional import require
 from refusals import refused
 
@@ -205,4 +205,5 @@ def test_the_command(bidnerf: Run, tmp_path: Path) -> None:
     view = before.info.cameras[0]
     assert view.pose.translation.tolist() == pytest.approx(back.info.cameras[0].pose.translation.tolist())
     assert bidnerf("scale", tmp_path / "half")[0] == 2
+    assert_refused(bidnerf("scale", trained, "--factor", 2, "--out", tmp_path / "half"), 2, "exists already")
     assert bidnerf("scale", tmp_path / "half", "--factor", "-1")[0] == 1
