@@ -5,7 +5,7 @@ The module also re-exports what backends need: the interfaces of fields and samp
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from threading import Lock
 from typing import Any, Generic, Protocol, TypeVar, cast, runtime_checkable
@@ -68,12 +68,14 @@ class Backend(Protocol):
         ...
 
 
-def _defects(backend: Any) -> Iterator[str]:
-    methods = {"build": ("config", "bounds"), "train": ("field", "views", "config", "report")}
-    yield from interface_defects(backend, ("summary", "config_type"), methods)
-
-
-BACKENDS: Plugins[Backend] = Plugins("backends", _defects)
+BACKENDS: Plugins[Backend] = Plugins(
+    "backends",
+    lambda backend: interface_defects(
+        backend,
+        ("summary", "config_type"),
+        {"build": ("config", "bounds"), "train": ("field", "views", "config", "report")},
+    ),
+)
 """All backends by name; a backend is imported when it is looked up."""
 
 

@@ -230,8 +230,7 @@ class _Remote:
                     self._lane.memory = graph_memory(self._lane.device)
             self._step()
         self._calls += 1
-        bytes_of = self._bytes.cpu().split([part.nbytes for part in self._parts])
-        shapes = zip(bytes_of, self._parts, strict=True)
+        shapes = zip(self._bytes.cpu().split([part.nbytes for part in self._parts]), self._parts, strict=True)
         return _rebuild(self._result, (b.clone().view(part.dtype).view(part.shape) for b, part in shapes))
 
 
@@ -254,8 +253,7 @@ def _structure(value: Any, tensors: list[Tensor]) -> Hashable:
 
 def _rebuild(value: Any, tensors: Iterator[Tensor]) -> Any:
     """Return ``value`` with its tensors replaced, in order, by the next ones from ``tensors``."""
-    whole = nn.Module, Resident
-    return _map_parts(value, lambda part: next(tensors) if isinstance(part, Tensor) else part, whole)
+    return _map_parts(value, lambda part: next(tensors) if isinstance(part, Tensor) else part, (nn.Module, Resident))
 
 
 # Moving objects that hold tensors to a device.

@@ -190,8 +190,10 @@ def _declared(group: str) -> tuple[PluginInfo, ...]:
             dist = metadata[p.dist]
             points.append((p, dist["Name"], dist["Version"], dist.get("Summary", "")))
     except Exception as error:
-        why = f"the metadata of an installed package cannot be read ({_describe(error)})"
-        raise PluginError(why, expected="a sound one; reinstall or remove it") from error
+        raise PluginError(
+            f"the metadata of an installed package cannot be read ({_describe(error)})",
+            expected="a sound one; reinstall or remove it",
+        ) from error
     for p, *source in points:
         try:
             names = p.load() if p.name == TABLE else [p.name]
@@ -228,8 +230,7 @@ def load_plugin(group: str, name: str, defects: Defects | None = None, wanted_by
     kind = f"{'an' if GROUPS[group][0] in 'aeiou' else 'a'} {GROUPS[group]}"
     doing = "cannot be imported"
     try:
-        point = EntryPoint(name, info.value, group)
-        plugin = registered[group, name] if (group, name) in registered else point.load()
+        plugin = registered[group, name] if (group, name) in registered else EntryPoint(name, info.value, group).load()
         if isinstance(plugin, Mapping):
             plugin = plugin[name]
         doing = f"not {kind}"

@@ -153,8 +153,11 @@ def from_flat(base: S | type[S], values: dict[str, Any], where: str) -> S:
     for name in values:
         if name not in known:
             hint = spelling_hint(name, known)
-            found = f"{type(default).__name__} has no setting {name!r}{hint}"
-            raise InputError(found, where=where, expected=None if hint else f"any of {', '.join(known)}")
+            raise InputError(
+                f"{type(default).__name__} has no setting {name!r}{hint}",
+                where=where,
+                expected=None if hint else f"any of {', '.join(known)}",
+            )
     return _with_values(default, values, where)
 
 

@@ -250,8 +250,9 @@ def parse_calibration(where: str, values: Mapping[str, Any], size: tuple[int, in
     """
     inner = [value for key, value in values.items() if re.fullmatch(r"cam\d+", str(key))]  # in Kalibr
     if len(inner) > 1:
-        expected = "one; keep only the lines of this photo's camera"
-        raise InputError(f"holds {len(inner)} cameras", where=where, expected=expected)
+        raise InputError(
+            f"holds {len(inner)} cameras", where=where, expected="one; keep only the lines of this photo's camera"
+        )
     for inside in (*inner, values.get("intrinsic")):  # Open3D nests the camera of a view
         values = inside if isinstance(inside, Mapping) else values
     if inner and (kind := values.get("camera_model", "pinhole")) != "pinhole":
@@ -262,8 +263,7 @@ def parse_calibration(where: str, values: Mapping[str, Any], size: tuple[int, in
         names = ("k1", "k2", "k3", "k4") if model.lower() in DISTORTIONS[FISHEYE] else ("k1", "k2", "p1", "p2", "k3")
         four, lens = ([values.get(f"{slam}.{x}", 0.0) for x in some] for some in (("fx", "fy", "cx", "cy"), names))
     if given is None and four is None:
-        fault = f"no camera matrix ({', '.join(KEYS['K'][:3])} or K)"
-        raise InputError(fault, where=where, expected=EXPECTED)
+        raise InputError(f"no camera matrix ({', '.join(KEYS['K'][:3])} or K)", where=where, expected=EXPECTED)
     K = _array(where, four if given is None else given)
     if K.shape == (4,):
         K = np.array(((K[0], 0, K[2]), (0, K[1], K[3]), (0, 0, 1)))
@@ -284,8 +284,9 @@ def _opencv_camera(where: str, K: Any, lens: tuple[float, ...], model: str, size
     """Return the camera of a matrix and coefficients, as ``Intrinsics.from_opencv`` does, or a fisheye lens."""
     kind = next((kind for kind, names in DISTORTIONS.items() if model.lower() in names), None)
     if kind is None:
-        expected = "plumb_bob, rational_polynomial or equidistant"
-        raise InputError(f"distortion model {model}", where=where, expected=expected)
+        raise InputError(
+            f"distortion model {model}", where=where, expected="plumb_bob, rational_polynomial or equidistant"
+        )
     try:
         if kind == PERSPECTIVE:
             return Intrinsics.from_opencv(K, lens or None, size)

@@ -73,8 +73,10 @@ class Intrinsics:
         camera = Intrinsics(focal, focal, 0.0, 0.0, width, height)
         question_focal(focal, width, height)
         if focal > 1000 * max(width, height):  # a field of view of 0.06 degrees, as of a telescope
-            fault = f"focal length is {focal} px for an image of {width}x{height}"
-            raise InputError(fault, expected="at most 1000 times its longer side")
+            raise InputError(
+                f"focal length is {focal} px for an image of {width}x{height}",
+                expected="at most 1000 times its longer side",
+            )
         return replace(camera, cx=width / 2, cy=height / 2)
 
     @staticmethod
@@ -127,8 +129,7 @@ class Intrinsics:
     def unproject(self, pixels: Float[Tensor, "*p 2"]) -> Float[Tensor, "*p 3"]:
         """Return the points on the plane z = 1 that appear at ``pixels`` (u, v); they are not unit vectors."""
         if self.distortion:
-            flat = self._undistort(pixels.reshape(-1, 2).double())
-            pixels = flat.to(pixels.dtype).reshape(pixels.shape)
+            pixels = self._undistort(pixels.reshape(-1, 2).double()).to(pixels.dtype).reshape(pixels.shape)
         x = (pixels[..., 0] - self.cx) / self.fx
         y = (pixels[..., 1] - self.cy) / self.fy
         return torch.stack([x, y, torch.ones_like(x)], dim=-1)
@@ -157,8 +158,7 @@ class Intrinsics:
         pixels = torch.stack([u, v], dim=-1)
         if self.distortion:
             exact = pixels.reshape(-1, 2).double()
-            flat = distort_points(exact, *self._distortion_at(exact))
-            pixels = flat.to(pixels.dtype).reshape(pixels.shape)
+            pixels = distort_points(exact, *self._distortion_at(exact)).to(pixels.dtype).reshape(pixels.shape)
         return pixels
 
     def pixel_centres(self, dtype: torch.dtype = torch.float32) -> Float[Tensor, "h w 2"]:
@@ -304,8 +304,7 @@ def focal_length(pixels: int, angle: float) -> float:
 
 def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Return whether two sizes (width, height) may belong to one image at two resolutions."""
-    ratio = size[0] * other[1] / (size[1] * other[0])
-    return abs(ratio - 1) <= 0.005  # sizes are rounded when an image is resized
+    return abs((size[0] * other[1] / (size[1] * other[0])) - 1) <= 0.005  # sizes are rounded when an image is resized
 
 
 def reduced_size(width: int, height: int, largest: int) -> tuple[int, int]:

@@ -250,8 +250,7 @@ class PanoramaFace(Lens):
         return turn @ tilt
 
     def project(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-        rays = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1) @ self.rotation.T
-        x, y, z = np.moveaxis(rays, -1, 0)
+        x, y, z = np.moveaxis(np.concatenate([points, np.ones_like(points[..., :1])], axis=-1) @ self.rotation.T, -1, 0)
         longitude, latitude = np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))  # downwards
         return np.stack([longitude / (2 * math.pi) + 0.5, latitude / math.pi + 0.5], axis=-1) * self.stored_size
 
@@ -307,7 +306,8 @@ def colmap_model(camera: Intrinsics) -> tuple[str, list[float]]:
     """
     k = camera.distortion
     if any(k[8:]):
-        fault = "a camera with thin prism distortion or a tilted sensor"
-        raise InputError(fault, expected="one that a COLMAP model describes")
+        raise InputError(
+            "a camera with thin prism distortion or a tilted sensor", expected="one that a COLMAP model describes"
+        )
     model, count = ("PINHOLE", 0) if not any(k) else ("OPENCV", 4) if not any(k[4:]) else ("FULL_OPENCV", 8)
     return model, [camera.fx, camera.fy, camera.cx, camera.cy, *(*k, *[0.0] * 8)[:count]]

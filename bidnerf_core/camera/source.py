@@ -40,8 +40,7 @@ class ResolvedCamera:
         side = check_side(largest)
         if side is None or max(self.camera.width, self.camera.height) <= side:
             return self
-        size = reduced_size(self.camera.width, self.camera.height, side)
-        return replace(self, camera=self.camera.resized(*size))
+        return replace(self, camera=self.camera.resized(*reduced_size(self.camera.width, self.camera.height, side)))
 
 
 def check_side(largest: int | None) -> int | None:
@@ -91,8 +90,9 @@ class Raster:
         if same_aspect(given, self.upright_size):
             return image
         size = "x".join(map(str, self.upright_size))
-        fault = f"{what} is {given[0]}x{given[1]}, but its image is {size};"
-        raise InputError(fault, where=where, expected="the same aspect ratio")
+        raise InputError(
+            f"{what} is {given[0]}x{given[1]}, but its image is {size};", where=where, expected="the same aspect ratio"
+        )
 
 
 @dataclass(frozen=True)
@@ -173,8 +173,11 @@ def folder_camera(
     beside = next((file for name in ("camera.json", "cameras.txt") if (file := folder / name).is_file()), None)
     camera = given or beside or published
     if camera is None:
-        expected = f"its camera: camera.json or cameras.txt in the folder, or --camera with {ways} (camera= in Python)"
-        raise InputError(f"{unknown};", where=folder, expected=expected)
+        raise InputError(
+            f"{unknown};",
+            where=folder,
+            expected=f"its camera: camera.json or cameras.txt in the folder, or --camera with {ways} (camera= in Python)",
+        )
     return CameraSource(camera)
 
 
@@ -190,8 +193,9 @@ def _fit(where: str, raster: Raster, given: Camera, origin: str) -> ResolvedCame
         expected = "one with the same aspect ratio"
         if same_aspect((given.height, given.width), raster.size):
             expected = "images that are not turned by a quarter against their cameras: export them as stored"
-        fault = f"image is {size}, but its camera is for {given.width}x{given.height}"
-        raise InputError(fault, where=where, expected=expected)
+        raise InputError(
+            f"image is {size}, but its camera is for {given.width}x{given.height}", where=where, expected=expected
+        )
     return ResolvedCamera(fitted, f"{origin}: {fitted.sentence}")
 
 

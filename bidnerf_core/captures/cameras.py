@@ -263,8 +263,7 @@ def cameras_beside(path: Path, placement: Similarity) -> tuple[StoredCamera, ...
             fx, fy = float(entry["fx"]), float(entry["fy"])
             camera = Intrinsics(fx, fy, width / 2, height / 2, int(width), int(height))
             rotation, position = (torch.tensor(entry[key], dtype=torch.float64) for key in ("rotation", "position"))
-            turned = placement.T_target_source.rotation.double() @ rotation
-            rows = _rows(SE3(turned, placement.apply(position)))
+            rows = _rows(SE3(placement.T_target_source.rotation.double() @ rotation, placement.apply(position)))
             cameras.append(StoredCamera(str(entry["img_name"]), camera, rows))
     except (InputError, KeyError, TypeError, ValueError, RuntimeError) as error:
         message = f"{file}: camera {len(cameras)} is not readable in Inria's layout ({error}); ignored"

@@ -52,8 +52,7 @@ class UpDirection:
 
 def up_from_gravity(direction: Sequence[float]) -> UpDirection:
     """Return a capture's measured upward ``direction`` (a vector of any length in the world frame), normalized."""
-    unit = normalize(torch.tensor(tuple(direction), dtype=torch.float64), dim=0)
-    return UpDirection((*unit.tolist(),), "gravity")
+    return UpDirection((*normalize(torch.tensor(tuple(direction), dtype=torch.float64), dim=0).tolist(),), "gravity")
 
 
 def coverage(

@@ -397,8 +397,7 @@ def _in_file_axes(clause: str, remedy: str, understand: Callable[[SE3], SE3]) ->
     for axes in both:
         yield Reading(clause, remedy, partial(whole, before=axes, after=axes))
     for before, after in (both, both[::-1]):
-        understood = partial(whole, before=before, after=after)
-        yield Reading(clause + REVERSED_TOO, f"{remedy}, then {SWAP}", understood)
+        yield Reading(clause + REVERSED_TOO, f"{remedy}, then {SWAP}", partial(whole, before=before, after=after))
 
 
 def signed_permutations(determinant: int) -> list[Float[Tensor, "3 3"]]:

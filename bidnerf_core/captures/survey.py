@@ -146,8 +146,7 @@ def link_photos(seen: TrackedKeypoints) -> csr_array:
     all others, and yield a point in front of both cameras.
     """
     shape = (len(seen.images), max(1, seen.count))
-    ones = np.ones(len(seen.point), np.int32)
-    shows = csr_array((ones, (seen.image.numpy(), seen.point.numpy())), shape=shape)
+    shows = csr_array((np.ones(len(seen.point), np.int32), (seen.image.numpy(), seen.point.numpy())), shape=shape)
     shared = (shows @ shows.T).tocoo()
     row, column = shared.coords
     enough = (shared.data >= 5) & (row != column)
@@ -159,8 +158,7 @@ def groups(links: csr_array) -> Int[Tensor, "v"]:
     """Return the group index of each image, 0 for the largest group; -1 if too few images are linked to form a group."""
     label = torch.from_numpy(connected_components(links, directed=False)[1]).long()
     sizes = torch.bincount(label)
-    rank = sizes.argsort(descending=True, stable=True).argsort()
-    return torch.where(sizes >= LEAST_GROUP, rank, -1)[label]
+    return torch.where(sizes >= LEAST_GROUP, sizes.argsort(descending=True, stable=True).argsort(), -1)[label]
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,8 +242,7 @@ def relocate_photos(
         view, features = views[number], tracked.detector_of(views[number], number)
         answer = Loop([View(view.frame, SE3.identity())], matcher, features=features)()
         # Only these outcomes determine the pose, or the poses that look the same.
-        conclusive = (Outcome.CONVERGED, Outcome.AMBIGUOUS, Outcome.MIRRORED)
-        if answer is None or answer.verdict.outcome not in conclusive:
+        if answer is None or answer.verdict.outcome not in (Outcome.CONVERGED, Outcome.AMBIGUOUS, Outcome.MIRRORED):
             continue
         mirrored = answer.verdict.outcome is Outcome.MIRRORED
         others = [answer.posterior.place(g) for g, mode in enumerate(answer.modes) if mode.name != MIRROR]

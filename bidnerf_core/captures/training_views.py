@@ -97,8 +97,7 @@ def prepare_views(
         if tracked is None and not trust_poses:
             # Up to twelve evenly spread runs of five consecutive views suffice to check the poses.
             every = 5 * max(1, math.ceil(len(views) / 60))
-            some = [view for number, view in enumerate(views) if number % every < 5]
-            _check_poses(detect_keypoints(some, SIFT))
+            _check_poses(detect_keypoints([view for number, view in enumerate(views) if number % every < 5], SIFT))
         return TrainingViews(seeing, tracked, stored_cameras(views), distances=shows_distances(views, tracked))
     tracked = _track(views, features, trust_poses, depth_unit)
     fit = training_poses(tracked, views, 0.0 if refinement == "always" else INCONSISTENT)

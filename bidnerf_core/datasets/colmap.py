@@ -84,8 +84,9 @@ class SparsePoints:
             self.metres, self.cameras = fit.scale, int(used.sum())
             self.misfit = float(errors[used].median()) / spread(here[used])
         except InputError as error:
-            where = f"{folder}: the unit cannot be estimated from the training cameras"
-            raise InputError(error, where=where) from error
+            raise InputError(
+                error, where=f"{folder}: the unit cannot be estimated from the training cameras"
+            ) from error
         # A larger misfit indicates a different scene; a hand-held camera that moved by decimetres reaches 0.03.
         if self.misfit > 0.2:
             raise InputError(
@@ -103,8 +104,11 @@ class SparsePoints:
         fits = [(folders, image) for folders, image in self._images.get(name, []) if not others & set(folders)]
         fits = [(folders, image) for folders, image in fits if split in folders] or fits
         if len(fits) > 1:
-            found = f"frame {name!r} may be any of {', '.join(image.name for _, image in fits[:4])};"
-            raise InputError(found, where=self.folder, expected="one image of that name")
+            raise InputError(
+                f"frame {name!r} may be any of {', '.join(image.name for _, image in fits[:4])};",
+                where=self.folder,
+                expected="one image of that name",
+            )
         return fits[0][1] if fits else None
 
     @property
@@ -132,5 +136,4 @@ class SparsePoints:
         points = self.seen(view.frame.name, split)
         if view.frame.has_depth or len(points) == 0:
             return view
-        depth = nearest_depth(points, view.frame.intrinsics)
-        return View(view.frame.replace(depth=depth), view.T_ref_camera)
+        return View(view.frame.replace(depth=nearest_depth(points, view.frame.intrinsics)), view.T_ref_camera)

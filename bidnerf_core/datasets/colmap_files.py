@@ -73,8 +73,11 @@ def read_model(folder: Path) -> tuple[list[ModelImage], ModelPoints]:
     """Read the model in ``folder``. Raises ``InputError`` if there is no model, or if a file is damaged."""
     images, points = files_of(folder, "images", "points3D") or (None, None)
     if images is None or points is None:
-        expected = "images.bin and points3D.bin, or the same as .txt, as in sparse/0 of a project"
-        raise InputError("no COLMAP sparse model in it", where=folder, expected=expected)
+        raise InputError(
+            "no COLMAP sparse model in it",
+            where=folder,
+            expected="images.bin and points3D.bin, or the same as .txt, as in sparse/0 of a project",
+        )
     found = sorted((n[0], n[1:4], n[7], len(track)) for _, n, _, track in _entries(points, POINTS))
     ids, positions, errors, tracks = zip(*found, strict=True) if found else ((), (), (), ())
     if len(set(ids)) < len(ids):
@@ -94,8 +97,7 @@ def read_posed_images(folder: Path) -> tuple[list[ModelImage], dict[int, Camera]
     """
     files = files_of(folder, "cameras", "images")
     if files is None:
-        expected = ".bin or .txt"
-        raise InputError("no cameras and images of a COLMAP sparse model", where=folder, expected=expected)
+        raise InputError("no cameras and images of a COLMAP sparse model", where=folder, expected=".bin or .txt")
     cameras, images = files
     if cameras.suffix == ".txt":
         return _images(images), read_text_cameras(cameras)
@@ -122,8 +124,7 @@ def depth_map_of(model: Path, name: str) -> Path | None:
 
 def read_colmap_depth(path: Path) -> DepthImage:
     """Read a depth map, in units of the model. Raises ``InputError`` for a truncated file and for any other format."""
-    content = read_file(path, "a COLMAP depth map")
-    *sizes, numbers = content.split(b"&", 3)
+    *sizes, numbers = read_file(path, "a COLMAP depth map").split(b"&", 3)
     if len(sizes) != 3 or not all(size.isdigit() and len(size) < 10 for size in sizes):
         raise InputError("does not begin with width&height&channels&", where=path, expected="a COLMAP depth map")
     width, height, channels = map(int, sizes)
@@ -167,8 +168,11 @@ def _parameters(path: Path, numbers: Sequence[Any]) -> int:
     for known, _, places in MODELS.values():
         if known == model:
             return max(places) + 1
-    expected = f"one of {', '.join(MODELS)}; undistort the images with COLMAP"
-    raise InputError(f"camera {number} has the model {model}", where=path, expected=expected)
+    raise InputError(
+        f"camera {number} has the model {model}",
+        where=path,
+        expected=f"one of {', '.join(MODELS)}; undistort the images with COLMAP",
+    )
 
 
 CAMERAS = _Columns("IiQQ", np.dtype([("parameter", "<f8")]), "", length=_parameters)
@@ -193,8 +197,7 @@ def _binary(path: Path, columns: _Columns) -> Iterator[_Entry]:
 
     def take(size: int) -> bytes:
         if len(found := file.read(min(size, len(content)))) < size:  # a wrong size may exceed the memory
-            found_end = f"ends too early, at byte {len(content)};"
-            raise InputError(found_end, where=path, expected="a complete COLMAP file")
+            raise InputError(f"ends too early, at byte {len(content)};", where=path, expected="a complete COLMAP file")
         return found
 
     def unpack(layout: str) -> tuple[Any, ...]:
@@ -202,8 +205,7 @@ def _binary(path: Path, columns: _Columns) -> Iterator[_Entry]:
 
     (count,) = unpack("Q")
     if count > len(content) - 8:
-        found = f"declares {count} entries in {len(content) - 8} bytes; is the file damaged?"
-        raise InputError(found, where=path)
+        raise InputError(f"declares {count} entries in {len(content) - 8} bytes; is the file damaged?", where=path)
     for _ in range(count):
         numbers, name = list(unpack(columns.numbers)), b""
         if columns.item_text:
@@ -243,8 +245,7 @@ def stored_keypoints(path: Path) -> Iterator[tuple[str, Keypoints]]:
 
     Raises ``InputError`` for a file that cannot be read, and if h5py, required for hloc features, is not installed.
     """
-    read = _of_features if path.suffix == ".h5" else _of_database
-    for name, pixels, scales, descriptors in read(path):
+    for name, pixels, scales, descriptors in (_of_features if path.suffix == ".h5" else _of_database)(path):
         count = len(pixels)
         if not (len(scales) == len(descriptors) == count and np.isfinite(pixels).all() and (scales > 0).all()):
             raise InputError(

@@ -67,8 +67,9 @@ class DatasetOptions:
         from bidnerf_core.depth import FARTHEST
 
         if not 0 < self.depth_unit <= FARTHEST:
-            expected = "a positive number of metres per step, such as 0.001"
-            raise InputError(f"depth_unit is {self.depth_unit:g}", expected=expected)
+            raise InputError(
+                f"depth_unit is {self.depth_unit:g}", expected="a positive number of metres per step, such as 0.001"
+            )
 
     def open(self, path: str | Path, readers: Sequence[Reader] | None = None) -> Capture:
         """Open the dataset in the folder ``path``.
@@ -78,9 +79,9 @@ class DatasetOptions:
         ``InputError`` if the folder does not exist, if no reader recognizes it, if no image is left, and if a
         metadata file is invalid.
         """
-        from bidnerf_core.datasets.reader import read_dataset
+        from bidnerf_core.datasets.reader import read_capture
 
-        return read_dataset(self, path, readers)
+        return read_capture(self, path, readers)
 
     def open_sequence(self, path: str | Path, readers: Sequence[Reader] | None = None) -> Capture:
         """Open the frames of a dataset, a folder of images or a video in chronological order; nothing is decoded yet.
@@ -89,9 +90,9 @@ class DatasetOptions:
         assumed cameras of a ``CameraSource``. Raises ``InputError`` if nothing is found, if a metadata file is invalid,
         and for a missing or superfluous camera.
         """
-        from bidnerf_core.datasets.reader import read_sequence
+        from bidnerf_core.datasets.reader import read_capture
 
-        return read_sequence(self, path, readers)
+        return read_capture(self, path, readers, in_time_order=True)
 
     @property
     def camera_source(self) -> CameraSource:
@@ -138,8 +139,9 @@ class DatasetOptions:
         register = self.registration
         if register is None or register is True:
             if register and own is None:
-                expected = "the file of one (register_depth=)"
-                raise InputError("its depth sensor is not known", where=where, expected=expected)
+                raise InputError(
+                    "its depth sensor is not known", where=where, expected="the file of one (register_depth=)"
+                )
             return own
         if register is False:
             return None

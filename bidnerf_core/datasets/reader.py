@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Generic, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, Literal, Protocol, TypeVar, cast, runtime_checkable
 
 from bidnerf_core.camera import Camera, CameraSource, Intrinsics
 from bidnerf_core.datasets.capture import Capture, drop_missing_files, hold_out, warn_about
@@ -25,47 +25,40 @@ OpenQuestion = Literal["camera", "focal", "register_depth", "depth_unit"]
 """An option of ``DatasetOptions`` that a format may leave open."""
 
 
-def read_dataset(options: DatasetOptions, path: str | Path, readers: Sequence[Reader] | None = None) -> Capture:
-    """Read the dataset in a folder, see ``DatasetOptions.open``."""
-    folder = Path(path)
-    if not folder.exists():
-        raise InputError("no such folder", where=folder)
-    reader = _reader_of(folder, readers)
-    if reader is None:
-        raise no_dataset(folder, readers)
-    return _read(options, reader, folder).require_poses()
-
-
-def read_sequence(options: DatasetOptions, path: str | Path, readers: Sequence[Reader] | None = None) -> Capture:
-    """Read frames in chronological order, see ``DatasetOptions.open_sequence``."""
-    # The readers of photos and videos are not registered: they find no poses.
-    from bidnerf_core.datasets.formats.photos import reader as photos
-    from bidnerf_core.datasets.formats.photos import video_reader as video
-
-    path = Path(path)
-    if not path.exists():
-        raise InputError("no such file or folder", where=path)
-    reader = _reader_of(path, readers) or next((r for r in (photos, video) if r.recognises(path)), None)
-    if reader is None and path.is_dir():
-        raise InputError("no images in it", where=path, expected="image files or a dataset")
-    if reader is None:
-        raise no_dataset(path, or_else=f", or {video.expected}")
-    return _read(options, reader, path).in_time_order()
-
-
-def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
-    """Return the capture that a reader reads, with splits assigned and masks added.
+def read_capture(
+    options: DatasetOptions, path: str | Path, readers: Sequence[Reader] | None = None, in_time_order: bool = False
+) -> Capture:
+    """Read a dataset, or frames in chronological order; see ``DatasetOptions.open`` and ``DatasetOptions.open_sequence``.
 
     Raises ``InputError`` for options that the format does not accept, and if a third-party reader fails.
     """
+    path, or_else = Path(path), ""
+    if not path.exists():
+        raise InputError("no such file or folder" if in_time_order else "no such folder", where=path)
+    reader = find_reader(path, readers)
+    if reader is None and in_time_order:
+        # The readers of photos and videos are not registered: they find no poses.
+        from bidnerf_core.datasets.formats.photos import reader as photos
+        from bidnerf_core.datasets.formats.photos import video_reader as video
+
+        reader, or_else = next((r for r in (photos, video) if r.recognises(path)), None), f", or {video.expected}"
+        if reader is None and path.is_dir():
+            raise InputError("no images in it", where=path, expected="image files or a dataset")
+    if reader is None:
+        raise no_dataset(path, readers, or_else)
     source = options.camera_source
-    own_camera = "is a dataset with its own cameras; leave out the camera"
-    registered = "has no depth, or its depth is already registered to its images; leave out register_depth"
-    fixed_unit = "has no depth images, or depth in a fixed unit; leave out depth_unit"
     given: list[tuple[OpenQuestion, bool, str]] = [
-        ("camera", source.is_given, own_camera),
-        ("register_depth", options.registration not in (None, False), registered),
-        ("depth_unit", options.depth_unit is not None, fixed_unit),
+        ("camera", source.is_given, "is a dataset with its own cameras; leave out the camera"),
+        (
+            "register_depth",
+            options.registration not in (None, False),
+            "has no depth, or its depth is already registered to its images; leave out register_depth",
+        ),
+        (
+            "depth_unit",
+            options.depth_unit is not None,
+            "has no depth images, or depth in a fixed unit; leave out depth_unit",
+        ),
         (
             "focal",
             source.is_given and source.camera is None,
@@ -77,16 +70,16 @@ def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
             raise InputError(problem, where=path)
     try:
         capture: Any = reader.read(path, options)
-    except (InputError, OSError, MemoryError):
-        raise
     except Exception as error:
-        if isinstance(reader, Format):
+        if isinstance(error, InputError | OSError | MemoryError) or isinstance(reader, Format):
             raise
-        who = f"reader {type(reader).__name__} failed to open it"
-        raise InputError(f"{who}: {type(error).__name__}: {error}", where=path) from error
+        raise InputError(
+            f"reader {type(reader).__name__} failed to open it: {type(error).__name__}: {error}", where=path
+        ) from error
     if not isinstance(capture, Capture):
-        who = f"reader {type(reader).__name__} returned a {type(capture).__name__}"
-        raise InputError(who, where=path, expected="a Capture")
+        raise InputError(
+            f"reader {type(reader).__name__} returned a {type(capture).__name__}", where=path, expected="a Capture"
+        )
     shots = drop_missing_files(capture)
     farthest = 1e10  # even in millimetres from the centre of the Earth, its surface is at 6.4e9
     for shot in shots:
@@ -102,11 +95,16 @@ def _read(options: DatasetOptions, reader: Reader, path: Path) -> Capture:
         shots = hold_out(shots, rate=capture.rate)
         posed = [bool(shot.splits) for shot in shots if shot.T_world_camera is not None]
         if not all(posed):
-            rate = f"{capture.rate:g} per second; the sequence has all"
-            warn_about(path, f"the dataset has {sum(posed)} of {amount(len(posed), 'frame')}, {rate}")
+            warn_about(
+                path,
+                f"the dataset has {sum(posed)} of {amount(len(posed), 'frame')}, {capture.rate:g} per second; the"
+                " sequence has all",
+            )
     faces = [replace(face, name="") for shot in shots for face in shot.faces()]
     capture = replace(capture, shots=faces, largest=options.largest)
-    return capture if (masks := options.mask_folder) is None else capture.with_masks(masks)
+    masks = options.mask_folder
+    capture = capture if masks is None else capture.with_masks(masks)
+    return capture.in_time_order() if in_time_order else capture.require_poses()
 
 
 def open_dataset(
@@ -127,10 +125,9 @@ def open_dataset(
     the format. ``depth_unit`` (metres per step of depth images) overrides the unit of the format. ``masks``
     is a folder of images whose black pixels are ignored (see ``MaskFolder``).
     """
-    options = DatasetOptions(
+    return DatasetOptions(
         camera, register_depth=register_depth, depth_unit=depth_unit, masks=masks, background=background
-    )
-    return options.open(path, readers)
+    ).open(path, readers)
 
 
 def open_sequence(
@@ -214,9 +211,7 @@ class Format(Generic[Match]):
         return bool(self.find(path))
 
     def read(self, path: Path, options: DatasetOptions) -> Capture:
-        match = self.find(path)
-        assert match is not None  # ensured by recognises
-        return self.load(path, match, options)
+        return self.load(path, cast(Match, self.find(path)), options)  # which recognises ensured
 
 
 def first_file(path: Path, *names: str) -> Path | None:
@@ -224,21 +219,23 @@ def first_file(path: Path, *names: str) -> Path | None:
     return next((file for name in names if is_file(file := path / name)), None)
 
 
-def _defects(reader: Any) -> Iterator[str]:
-    methods = {"recognises": ("path",), "read": ("path", "options")}
-    yield from interface_defects(reader, ("accepts", "expected"), methods)
-
-
-READERS: Plugins[Reader] = Plugins("readers", _defects)
+READERS: Plugins[Reader] = Plugins(
+    "readers",
+    lambda reader: interface_defects(
+        reader, ("accepts", "expected"), {"recognises": ("path",), "read": ("path", "options")}
+    ),
+)
 """The readers by name."""
 
 
-def find_reader(folder: Path) -> Reader | None:
-    """Return the reader of highest precedence that recognizes a folder, or None.
+def find_reader(folder: Path, given: Sequence[Reader] | None = None) -> Reader | None:
+    """Return the reader of highest precedence that recognizes a folder, or the first of those ``given``; None if none does.
 
     A third-party reader that cannot be loaded or fails is reported by an ``InputWarning`` when its turn comes. Raises
     ``InputError`` if several readers of the same precedence recognize the folder.
     """
+    if given is not None:
+        return next((each for each in given if may_hold(each, folder) and each.recognises(folder)), None)
     readers = dict[str, Reader | PluginError]()
     for name in READERS:
         try:
@@ -252,8 +249,11 @@ def find_reader(folder: Path) -> Reader | None:
     for _, names in groupby(sorted(readers, key=precedence, reverse=True), precedence):
         claims = {name: reader for name in names if (reader := _if_recognised(name, readers[name], folder))}
         if len(claims) > 1:
-            found = f"is recognized by the readers {enumeration(list(claims))}"
-            raise InputError(found, where=folder, expected="one format, or one reader installed for it")
+            raise InputError(
+                f"is recognized by the readers {enumeration(list(claims))}",
+                where=folder,
+                expected="one format, or one reader installed for it",
+            )
         if claims:
             return next(iter(claims.values()))
     return None
@@ -278,13 +278,6 @@ def may_hold(reader: Reader, path: Path) -> bool:
     return path.is_dir() or path.suffix.lower() in getattr(reader, "suffixes", ())
 
 
-def _reader_of(folder: Path, readers: Sequence[Reader] | None) -> Reader | None:
-    """Return the first of ``readers`` (by default, all readers) that recognizes a folder, or None."""
-    if readers is None:
-        return find_reader(folder)
-    return next((each for each in readers if may_hold(each, folder) and each.recognises(folder)), None)
-
-
 def file_of_dataset(path: Path) -> str | None:
     """If ``path`` is a file of a dataset, return an error clause asking for its folder instead; otherwise return None."""
     if path.suffix.lower() in IMAGE_SUFFIXES or not path.is_file() or find_reader(path.parent) is None:
@@ -300,15 +293,18 @@ def no_dataset(path: Path, readers: Sequence[Reader] | None = None, or_else: str
     if not path.is_dir():
         if (instead := file_of_dataset(path)) is not None:
             return InputError(f"{instead}{or_else}", where=path)
-        expected = f"the folder of a dataset{or_else}; unpack an archive first"
-        return InputError("is a file", where=path, expected=expected)
+        return InputError(
+            "is a file", where=path, expected=f"the folder of a dataset{or_else}; unpack an archive first"
+        )
     if (path / "cameras.json").is_file() and (path / "point_cloud").is_dir():
-        splat = "'bidnerf import' with its point_cloud.ply, or the capture that it was trained on"
-        return InputError("is the output of 3D Gaussian Splatting", where=path, expected=splat)
+        return InputError(
+            "is the output of 3D Gaussian Splatting",
+            where=path,
+            expected="'bidnerf import' with its point_cloud.ply, or the capture that it was trained on",
+        )
     children = (child for child in sorted(path.iterdir()) if child.is_dir())
-    if (inside := next((child for child in children if _reader_of(child, readers)), None)) is not None:
-        expected = f"one of the folders in it, such as {inside.name}"
-        return InputError("no dataset found", where=path, expected=expected)
+    if (inside := next((child for child in children if find_reader(child, readers)), None)) is not None:
+        return InputError("no dataset found", where=path, expected=f"one of the folders in it, such as {inside.name}")
     found = "contains no photos and is no dataset;" if any(path.iterdir()) else "the folder is empty;"
     if photos := photos_in(path)[0]:
         found = (

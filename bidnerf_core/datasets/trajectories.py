@@ -77,8 +77,7 @@ def read_table(path: Path, expected: str, columns: str, needed: set[str]) -> lis
             rows.append((line, [cell.strip() for cell in next(csv.reader([line.text]))]))
         except csv.Error as error:  # such as a carriage return inside a field
             raise line.error(f" is no row of comma-separated values ({error})") from error
-    complete = _complete(path, rows, len(names), columns)
-    return [(row, dict(zip(names, cells, strict=False))) for row, cells in complete]
+    return [(row, dict(zip(names, cells, strict=False))) for row, cells in _complete(path, rows, len(names), columns)]
 
 
 def _complete(
@@ -109,8 +108,7 @@ def _timed_rows(rows: Sequence[Row], path: Path, columns: str, nanoseconds: bool
     """
     timed = list[TimedRow]()
     columns = f"timestamp {columns}"
-    split = [(row, _words(row)) for row in rows]
-    for row, (stamp, *words) in _complete(path, split, len(columns.split()), columns):
+    for row, (stamp, *words) in _complete(path, [(row, _words(row)) for row in rows], len(columns.split()), columns):
         try:
             time = float(stamp)
         except ValueError as error:
@@ -186,8 +184,11 @@ def read_trajectory(path: Path, times: Sequence[float] | None = None) -> Traject
         kind = f"rows of {KITTI_ROW} numbers, KITTI's 3x4 camera-to-world poses"
         if times is None or len(times) != len(rows):
             images = "images with known times" if times is None else amount(len(times), "image")
-            found = f"has {kind}, which have no times; there are {len(rows)} for {images}"
-            raise InputError(found, where=path, expected="one for each image")
+            raise InputError(
+                f"has {kind}, which have no times; there are {len(rows)} for {images}",
+                where=path,
+                expected="one for each image",
+            )
         warn_about(path, f"is read as {kind}, one for each image")
         poses = SE3.stack(read_matrices(path))
         return Trajectory(torch.tensor(times, dtype=torch.float64), poses.rotation, poses.translation)
@@ -206,8 +207,9 @@ def read_trajectory(path: Path, times: Sequence[float] | None = None) -> Traject
         warn_about(path, f"{left} of {len(timed)} not finite or zero, left out")
     for (one, pose), (other, others) in pairwise(known):
         if one.time == other.time and pose != others:
-            found = f"another pose at the time {other.time:.6f}"
-            raise InputError(found, where=other.row.where, expected="one pose per time")
+            raise InputError(
+                f"another pose at the time {other.time:.6f}", where=other.row.where, expected="one pose per time"
+            )
     stamps, first = np.unique([row.time for row, _ in known], return_index=True)
     values = torch.tensor([numbers for _, numbers in known], dtype=torch.float64)[torch.from_numpy(first)]
     rotations = torch.from_numpy(Rotation.from_quat(values[:, 3:].numpy()).as_matrix())

@@ -94,8 +94,9 @@ class Video:
         except (OSError, ValueError, MemoryError) as error:
             why = error
         self.close()
-        found = f"breaks off at frame {number} ({reason(why)})"
-        raise BreaksOff(found, where=self.path, expected="a complete video file") from why
+        raise BreaksOff(
+            f"breaks off at frame {number} ({reason(why)})", where=self.path, expected="a complete video file"
+        ) from why
 
     def _seek(self, number: int) -> None:
         """Seek to the key frame before a frame."""

@@ -69,8 +69,11 @@ def frame_entry(
     """
     lens = ("k1", "k2", "p1", "p2", "k3")
     if len(camera.distortion) > len(lens):
-        found = f"the lens has {len(camera.distortion)} coefficients"
-        raise InputError(found, where=f"frame {name}", expected=f"at most {len(lens)}")
+        raise InputError(
+            f"the lens has {len(camera.distortion)} coefficients",
+            where=f"frame {name}",
+            expected=f"at most {len(lens)}",
+        )
     matrix = T_world_camera.to("cpu", torch.float64).matrix()
     return {
         "file_path": file_path,

@@ -71,8 +71,7 @@ class DepthCamera:
         border = torch.cat([centres[[0, -1]].reshape(-1, 2), centres[:, [0, -1]].reshape(-1, 2)])
         edge, pixel = coarse.unproject(border)[:, :2], torch.tensor([1 / coarse.fx, 1 / coarse.fy], dtype=torch.float64)
         x = points[:, :2] / points[:, 2:].clamp(min=1e-9)
-        ahead = ((x >= edge.amin(0) - pixel) & (x <= edge.amax(0) + pixel)).all(-1)
-        nearest = nearest_depth(points[ahead], coarse)
+        nearest = nearest_depth(points[((x >= edge.amin(0) - pixel) & (x <= edge.amax(0) + pixel)).all(-1)], coarse)
         # A small number of measurements may all lie outside.
         if int(measured.sum()) >= 1000 and not bool((nearest > 0).any()):
             away = float(torch.linalg.vector_norm(self.T_colour_depth.translation))
@@ -89,6 +88,5 @@ def nearest_depth(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Float[Ten
     """Return planar z (metres) of the nearest of the ``points`` (camera frame) in each pixel; 0 if there is none."""
     row, column, inside = camera.cells(points)
     empty = torch.full((camera.height * camera.width,), torch.inf)
-    cell = (row * camera.width + column)[inside]
-    nearest = empty.scatter_reduce(0, cell, points[inside, 2].float(), "amin")
+    nearest = empty.scatter_reduce(0, (row * camera.width + column)[inside], points[inside, 2].float(), "amin")
     return torch.where(nearest.isfinite(), nearest, 0).reshape(camera.height, camera.width)

@@ -110,8 +110,11 @@ class Frame:
         where, camera = f"frame {self.name}", self.intrinsics
         _check_camera(where, camera)
         if camera.distortion and not _has_rays(replace(camera, distortion=tuple(camera.distortion))):
-            fault = f"distortion is {camera.distortion}, which maps no ray to some of its pixels;"
-            raise InputError(fault, where=where, expected="coefficients of a real lens")
+            raise InputError(
+                f"distortion is {camera.distortion}, which maps no ray to some of its pixels;",
+                where=where,
+                expected="coefficients of a real lens",
+            )
         for what in IMAGES:
             image = self.__dict__[what]
             if image is not None or what == "rgb":
@@ -125,8 +128,7 @@ class Frame:
         if self.hidden is None:
             return
         if self.hidden.device.type == "cpu" and bool(self.hidden.all()):
-            fault = "hidden is all true"
-            raise WhollyHidden(fault, where=where, expected="booleans that leave something visible")
+            raise WhollyHidden("hidden is all true", where=where, expected="booleans that leave something visible")
         if self.depth is not None:
             hidden = self.hidden.to(self.depth.device)
             # A depth image that needs no change stays in its store; the host does not wait for an accelerator.
@@ -377,11 +379,12 @@ class Frame:
 
 def _check_camera(where: str, camera: object) -> None:
     if not isinstance(camera, Intrinsics):
-        expected = (
-            "Intrinsics(fx=..., fy=..., cx=..., cy=..., width=..., height=...) or, from a matrix,"
-            " Intrinsics.from_opencv(K, distortion, (width, height))"
+        raise InputError(
+            f"camera is a {type(camera).__name__}",
+            where=where,
+            expected="Intrinsics(fx=..., fy=..., cx=..., cy=..., width=..., height=...) or, from a matrix,"
+            " Intrinsics.from_opencv(K, distortion, (width, height))",
         )
-        raise InputError(f"camera is a {type(camera).__name__}", where=where, expected=expected)
 
 
 def _check_image(where: str, what: str, image: object, camera: Intrinsics) -> None:
@@ -396,8 +399,11 @@ def _check_image(where: str, what: str, image: object, camera: Intrinsics) -> No
         )
     shape, wanted = tuple(image.shape), (camera.height, camera.width, *((3,) if what == "rgb" else ()))
     if len(shape) != len(wanted) or shape[2:] != wanted[2:]:
-        expected = "(height, width, 3); Frame.from_numpy takes grey and RGBA" if what == "rgb" else "(height, width)"
-        raise InputError(f"{what} has shape {shape}", where=where, expected=expected)
+        raise InputError(
+            f"{what} has shape {shape}",
+            where=where,
+            expected="(height, width, 3); Frame.from_numpy takes grey and RGBA" if what == "rgb" else "(height, width)",
+        )
     if shape != wanted:
         expects = f"{camera.width}x{camera.height}"
         raise InputError(f"{what} is {shape[1]}x{shape[0]}, but its camera expects {expects}", where=where)

@@ -88,8 +88,9 @@ class MaskFolder:
         if hides not in get_args(HiddenColour):
             raise InputError(f"mask_hides is {hides!r}", expected=f"one of {', '.join(get_args(HiddenColour))}")
         if not self.path.is_dir():
-            what = "is a file" if self.path.exists() else "no such folder"
-            raise InputError(what, where=self.path, expected="a folder of masks")
+            raise InputError(
+                "is a file" if self.path.exists() else "no such folder", where=self.path, expected="a folder of masks"
+            )
         files = sorted(
             f
             for f in self.path.rglob("*")

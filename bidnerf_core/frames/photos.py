@@ -55,8 +55,7 @@ def photos_in(folder: str | Path) -> tuple[list[Path], list[Path]]:
     except FileNotFoundError as error:
         raise InputError("no such folder", where=folder) from error
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise InputError(reason, where=folder, expected="a folder of photos") from error
+        raise InputError((error.strerror or str(error)).lower(), where=folder, expected="a folder of photos") from error
     photos = [file for file in files if _is_photo(file)]
     return photos, [file for file in files if not _is_photo(file)]
 

@@ -86,8 +86,7 @@ def draw(
     Images may be on any device; the result is on ``device``, by default that of the images.
     """
     share = max(1, count // len(views))
-    parts = [observe(view, drawer(view.frame, share, generator), dtype, device) for view in views]
-    return Observations.stacked(parts)
+    return Observations.stacked([observe(view, drawer(view.frame, share, generator), dtype, device) for view in views])
 
 
 def measured_middle(views: Sequence[View]) -> Float[Tensor, "3"] | None:
@@ -102,8 +101,7 @@ def measured_middle(views: Sequence[View]) -> Float[Tensor, "3"] | None:
         number = (view.frame.depth.flatten()[::4] > 0).nonzero()[:, 0]
         number = 4 * number[:: max(1, len(number) // 200_000)]
         width = view.frame.intrinsics.width
-        sampled = torch.stack([number % width, number // width], dim=-1)
-        pixels = observe(view, sampled, torch.float64, "cpu")
+        pixels = observe(view, torch.stack([number % width, number // width], dim=-1), torch.float64, "cpu")
         points.append(pixels.points[pixels.measured])
     together = torch.cat(points) if points else torch.zeros((0, 3))
     return together.median(0).values if len(together) else None
@@ -119,8 +117,7 @@ def interest_points(frame: Frame) -> Int[Tensor, "n 2"]:
     grey = rgb_to_grayscale(frame.rgb.detach().float().cpu().permute(2, 0, 1)[None])
     response = nms2d(gftt_response(grey), (5, 5))[0, 0]
     # Corners are at least a hundredth as strong as the strongest. A blank wall with noise of 1/255 stays below 1e-5.
-    strong = response > max(0.01 * float(response.max()), 1e-5)
-    return strong.nonzero().flip(-1)
+    return (response > max(0.01 * float(response.max()), 1e-5)).nonzero().flip(-1)
 
 
 def interest_regions(frame: Frame) -> Int[Tensor, "n 2"]:

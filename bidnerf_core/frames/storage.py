@@ -53,8 +53,7 @@ class PixelStore:
         if start + size > len(self._block):
             self._block, start = self._new_block(size), 0
         self._used = start + size
-        copy = self._block[start : start + size].view(image.dtype).view(image.shape)
-        return copy.copy_(image)
+        return self._block[start : start + size].view(image.dtype).view(image.shape).copy_(image)
 
     def _new_block(self, least: int) -> Tensor:
         size = max(least, min(BLOCK, self._expected + ALIGNMENT))
@@ -69,11 +68,10 @@ class PixelStore:
                     os.truncate(file.fileno(), size)
                 return torch.from_numpy(np.memmap(file, np.uint8, "r+", shape=(size,)))
         except OSError as error:
-            folder = self._folder or tempfile.gettempdir()
             raise InputError(
                 f"no room for {self._expected / 1e6:.0f} MB of images ({error.strerror or error}), free that"
                 " much, or read them smaller (--largest, largest=)",
-                where=folder,
+                where=self._folder or tempfile.gettempdir(),
             ) from error
 
 

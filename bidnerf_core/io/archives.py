@@ -29,8 +29,11 @@ class Archive:
             members = self._zip.infolist()
         except DAMAGES as error:
             cut = begins == b"PK"
-            why = "ends too early, probably an incomplete copy" if cut else f"is not a zip archive ({error})"
-            raise InputError(why, where=path, expected=expected) from error
+            raise InputError(
+                "ends too early, probably an incomplete copy" if cut else f"is not a zip archive ({error})",
+                where=path,
+                expected=expected,
+            ) from error
         self._members = {member.filename: member for member in members}
 
     @property

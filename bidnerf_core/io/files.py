@@ -228,8 +228,9 @@ def output_folder(
             probe.write_bytes(b"")
             probe.unlink()
     except OSError as error:
-        found, expected = f"cannot be written ({error.strerror})", "a folder that can be created and written"
-        raise InputError(found, where=out, expected=expected) from error
+        raise InputError(
+            f"cannot be written ({error.strerror})", where=out, expected="a folder that can be created and written"
+        ) from error
     # The folder is removed while the lock is held: afterwards, it may belong to another process.
     with lock(out), removed_on_failure():
         check()  # another process may have finished meanwhile

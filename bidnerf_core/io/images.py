@@ -80,8 +80,9 @@ def read_image(
     with open_image(path) as image:
         width, height = image.size if size is None else size
         if image.mode == "F":  # such as depth
-            expected = "grey, RGB or RGBA with 8 or 16 bits per channel"
-            raise InputError("image is of float32", where=path, expected=expected)
+            raise InputError(
+                "image is of float32", where=path, expected="grey, RGB or RGBA with 8 or 16 bits per channel"
+            )
         for strip, white in _strips(path, image):
             colour, cover = split_alpha(pixel_array(strip, f"{path}: image", white))
             rgb.append(reduce_image(composite(colour, cover, background), width, len(strip)))
@@ -247,8 +248,9 @@ def _pixels(path: ImageSource, image: Image.Image) -> np.ndarray:
         with open_binary(path, "an image file") as file:
             deep = cv2.imdecode(np.frombuffer(file.read(), np.uint8), cv2.IMREAD_UNCHANGED)
         if deep is None or deep.ndim != 3 or deep.shape[2] not in (3, 4):
-            found = "not readable as an image with 16 bits per channel"
-            raise InputError(found, where=path, expected="a complete image file")
+            raise InputError(
+                "not readable as an image with 16 bits per channel", where=path, expected="a complete image file"
+            )
         return cv2.cvtColor(deep, cv2.COLOR_BGR2RGB if deep.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
     if image.mode in ("P", "PA", *CONVERTED):
         image = image.convert("RGBA" if image.has_transparency_data else "RGB")
@@ -266,15 +268,20 @@ def open_image(path: ImageSource) -> Iterator[Image.Image]:
     """
     raw = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
     if isinstance(path, Path) and path.suffix.lower() in raw:
-        found = "is a raw photo, of which only a thumbnail would be read"
-        raise InputError(found, where=path, expected="a JPEG, PNG or TIFF file developed from it")
+        raise InputError(
+            "is a raw photo, of which only a thumbnail would be read",
+            where=path,
+            expected="a JPEG, PNG or TIFF file developed from it",
+        )
     with open_binary(path, "an image file") as file:
         if is_heif(file.read(12)):
             try:
                 import pillow_heif
             except ImportError as error:
-                found = "is HEIC, which needs the package pillow-heif (pip install pillow-heif); or convert the photo to JPEG"
-                raise InputError(found, where=path) from error
+                raise InputError(
+                    "is HEIC, which needs the package pillow-heif (pip install pillow-heif); or convert the photo to JPEG",
+                    where=path,
+                ) from error
             pillow_heif.register_heif_opener()
         file.seek(0)
         _check_segments(path, file)
@@ -317,8 +324,11 @@ def _check_segments(path: ImageSource, file: BinaryIO) -> None:
         if code == b"\xd9":  # the end of the image, after which phones store videos
             return
         if scans > most_scans or segments > most_segments:
-            found = f"has more than {most_scans} scans or {most_segments} segments"
-            raise InputError(found, where=path, expected="a JPEG file of fewer")
+            raise InputError(
+                f"has more than {most_scans} scans or {most_segments} segments",
+                where=path,
+                expected="a JPEG file of fewer",
+            )
         length = content[marker.end() : marker.end() + 2]
         at = marker.end() + (0 if code == b"\xd8" else max(2, int.from_bytes(length, "big")))
 

@@ -184,8 +184,7 @@ def to_plain(value: Any, where: str = "", tensors: dict[str, Tensor] | None = No
     ``with_tensors`` puts them back.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = [f.name for f in dataclasses.fields(value) if f.init]
-        value = {name: getattr(value, name) for name in fields}
+        value = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
     if isinstance(value, dict):
         if odd := [key for key in value if not isinstance(key, str)]:
             raise InputError(f"{where or 'value'} has the key {odd[0]!r}", expected="text")
@@ -261,8 +260,10 @@ def check_fields(instance: Any) -> None:
     except ValidationError as error:
         errors = error.errors(include_url=False)
         name = errors[0]["loc"][1]
-        expected = expected_kinds([e for e in errors if e["loc"][1] == name])
-        raise InputError(f"{name} is {_shown(values[str(name)])}", expected=expected) from None
+        raise InputError(
+            f"{name} is {_shown(values[str(name)])}",
+            expected=expected_kinds([e for e in errors if e["loc"][1] == name]),
+        ) from None
 
 
 @functools.cache
@@ -275,8 +276,7 @@ def _fields_type(kind: Any) -> Any:
     types = {
         name: cast(Any, InstanceOf)[of] if dataclasses.is_dataclass(of) else hints[name] for name, of in plain.items()
     }
-    own = {field.name: types[field.name] for field in dataclasses.fields(kind)}
-    return cast(Any, TypedDict)(kind.__name__, own)
+    return cast(Any, TypedDict)(kind.__name__, {field.name: types[field.name] for field in dataclasses.fields(kind)})
 
 
 @functools.cache
@@ -334,8 +334,7 @@ def parse_yaml(content: bytes, where: str, expected: str) -> Any:
     # Limits on bytes (a calibration with the points of all its images takes some 100,000) and on the depth of nesting
     most, deepest = 2**20, 50
     if len(content) > most:
-        found = f"has {len(content):,} bytes of YAML"
-        raise InputError(found, where=where, expected=f"{expected} of at most {most:,}")
+        raise InputError(f"has {len(content):,} bytes of YAML", where=where, expected=f"{expected} of at most {most:,}")
     try:
         text = re.sub(r"\A\s*%YAML.*\n", "", content.decode("utf-8-sig"))  # OpenCV's is malformed
         depth = 0

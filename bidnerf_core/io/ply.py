@@ -84,8 +84,7 @@ def read_ply_header(path: Path, expected: str = "a PLY file") -> PlyHeader:
                 case _:
                     raise ValueError
         except (ValueError, KeyError) as error:
-            found = f"its header has the line {line[:60]!r}"
-            raise InputError(found, where=path, expected=expected) from error
+            raise InputError(f"its header has the line {line[:60]!r}", where=path, expected=expected) from error
     if not order:
         raise InputError("its header names no format", where=path, expected=expected)
     for (
@@ -124,8 +123,9 @@ def read_ply(path: Path, expected: str = "a PLY file") -> dict[str, np.ndarray]:
                 elif kind.itemsize:
                     found[name] = np.frombuffer(file.read(element.count * kind.itemsize), kind)
             except (ValueError, TypeError, OverflowError) as error:
-                numbers = f"{element.count:,} rows of {len(element.properties)} numbers ({error})"
-                raise InputError(where=path, expected=numbers) from error
+                raise InputError(
+                    where=path, expected=f"{element.count:,} rows of {len(element.properties)} numbers ({error})"
+                ) from error
     return found
 
 

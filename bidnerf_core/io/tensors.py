@@ -160,8 +160,11 @@ def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
     size = path.stat().st_size
     archive = Archive(path, expected) if zipfile.is_zipfile(path) else None
     if archive is not None and archive.unpacked_size > size:
-        found = f"unpacks to {archive.unpacked_size / 2**20:,.0f} MiB"
-        raise InputError(found, where=path, expected=f"{expected} that is not compressed, as torch.save writes it")
+        raise InputError(
+            f"unpacks to {archive.unpacked_size / 2**20:,.0f} MiB",
+            where=path,
+            expected=f"{expected} that is not compressed, as torch.save writes it",
+        )
     try:
         arrays = [f"numpy.{core}.multiarray.scalar" for core in ("_core", "core")]
         kinds = [f"numpy.dtypes.Float{bits}DType" for bits in (64, 32)]
@@ -181,6 +184,9 @@ def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
         needed = tensor.numel() * tensor.element_size()
         stored = tensor.untyped_storage().nbytes() if tensor.layout is torch.strided else 0
         if needed > min(stored, size):
-            found = f"a tensor {tuple(tensor.shape)} needs {needed:,} bytes, but the file has only {size:,};"
-            raise InputError(found, where=path, expected=expected)
+            raise InputError(
+                f"a tensor {tuple(tensor.shape)} needs {needed:,} bytes, but the file has only {size:,};",
+                where=path,
+                expected=expected,
+            )
     return content

@@ -134,8 +134,7 @@ class MapCollection:
 
     def _load(self, name: str) -> Localizer:
         scene = self._maps[name]
-        stored = scene if isinstance(scene, Map) else load_map(scene)
-        return Localizer(stored, self.method, self.config, warm_up=False)
+        return Localizer(scene if isinstance(scene, Map) else load_map(scene), self.method, self.config, warm_up=False)
 
     def rank(self, frame: Frame) -> dict[str, float]:
         """Return the cosine similarity of an image to each map, most similar first; -1 where it cannot be computed."""
@@ -168,11 +167,9 @@ class MapCollection:
                 break
         chosen = max(quick, key=lambda name: _merit(quick[name]))  # the first of equal ones
         found = self.localizer(chosen)(frame, seed=seed)
-        others = [name for name in quick if name != chosen]
-        second = max(others, key=lambda name: _merit(quick[name]), default=None)
+        second = max([name for name in quick if name != chosen], key=lambda name: _merit(quick[name]), default=None)
         runner_up = None if second is None else (second, quick[second])
-        backend = self._infos[chosen].backend
-        return Placement(chosen, found, runner_up, ranking, tuple(quick), backend)
+        return Placement(chosen, found, runner_up, ranking, tuple(quick), self._infos[chosen].backend)
 
     def _by_landmarks(self, name: str, frame: Frame, seed: int) -> Localization:
         """Localize a frame with the landmarks of a map.
@@ -203,8 +200,7 @@ class MapCollection:
             same = [found.descriptors for name, found in landmarks.items() if keys[name] == key]
             self._vocabularies[key] = Vocabulary.of(same)
         for name, found in landmarks.items():
-            cameras = cameras_of(self._infos[name])
-            self._pooled_views[name] = pool_views(self._vocabularies[keys[name]], found, cameras)
+            self._pooled_views[name] = pool_views(self._vocabularies[keys[name]], found, cameras_of(self._infos[name]))
         if bare := [name for name in self._maps if name not in landmarks]:
             log.info(f"{amount(len(bare), 'map')} without landmarks, tried last: {', '.join(bare)}")
         return keys

@@ -160,8 +160,11 @@ def load_info(folder: Path) -> MapInfo:
     """Load and check ``map.json`` and any ``anchor.json``. Raises ``InputError`` unless they describe a map of this version."""
     path = folder / DESCRIPTION
     if not folder.is_dir():
-        what = "is a file" if folder.exists() else "no such folder"
-        raise InputError(what, where=folder, expected="a map: a folder as written by 'bidnerf train'")
+        raise InputError(
+            "is a file" if folder.exists() else "no such folder",
+            where=folder,
+            expected="a map: a folder as written by 'bidnerf train'",
+        )
     if not path.exists():
         raise InputError(f"no {DESCRIPTION} found", where=folder, expected="a map as written by 'bidnerf train'")
     found = read_json(path, "the description of a map")

@@ -319,8 +319,7 @@ def _present(landmarks: LandmarkMap, more: LandmarkMap) -> Bool[Tensor, "n"]:
     Two landmarks match if their distance is at most three times the sum of their standard deviations, and
     their descriptors are similar.
     """
-    count = min(4, len(landmarks))
-    away, near = cKDTree(landmarks.positions.numpy()).query(more.positions.numpy(), k=count)
+    away, near = cKDTree(landmarks.positions.numpy()).query(more.positions.numpy(), k=min(4, len(landmarks)))
     distance = torch.from_numpy(np.asarray(away).reshape(len(more), -1))
     index = torch.from_numpy(np.asarray(near).reshape(len(more), -1))
     deviation = more.deviations.amax(-1)[:, None] + landmarks.deviations.amax(-1)[index]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -87,12 +86,14 @@ class Importer(Protocol):
         ...
 
 
-def _defects(importer: Any) -> Iterator[str]:
-    methods = {"recognises": ("path",), "read": ("path", "config", "placement")}
-    yield from interface_defects(importer, ("summary", "config_type"), methods)
-
-
-IMPORTERS: Plugins[Importer] = Plugins("importers", _defects)
+IMPORTERS: Plugins[Importer] = Plugins(
+    "importers",
+    lambda importer: interface_defects(
+        importer,
+        ("summary", "config_type"),
+        {"recognises": ("path",), "read": ("path", "config", "placement")},
+    ),
+)
 """The installed importers, by name."""
 
 OFFERED = {

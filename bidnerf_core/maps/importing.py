@@ -286,8 +286,7 @@ def ratio_to_measured_depth(field: RadianceField, bounds: SceneBounds, views: Se
     if not measured:
         return None
     generator = torch.Generator().manual_seed(0)
-    count = max(4096, len(measured))
-    pixels = draw(measured, count, uniform, generator, device=device_of(field)).flattened()
+    pixels = draw(measured, max(4096, len(measured)), uniform, generator, device=device_of(field)).flattened()
     seen = render(field, bounds.rays(pixels.origins, pixels.directions), bounds.background)
     both = (pixels.distance > 0) & (seen.opacity > 0.5)  # the depth of a less opaque ray is meaningless
     if int(both.sum()) < 200:

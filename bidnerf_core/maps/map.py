@@ -148,8 +148,7 @@ class Map:
             return up_from_gravity(self.info.gravity_up)
         if not self.info.cameras:
             return None
-        normals = None if self.surface is None else self.surface.surfels.normals
-        return up_direction(poses_of(self.info.cameras), normals)
+        return up_direction(poses_of(self.info.cameras), None if self.surface is None else self.surface.surfels.normals)
 
     @property
     def colour_noise(self) -> float | None:

@@ -217,8 +217,7 @@ class Checkpoints:
         self._job.progress(Progress("training", progress.step, progress.total, "steps", figures))
 
     def due(self, step: int) -> bool:
-        waited = self.folder is not None and time.monotonic() - self._saved > self._seconds
-        return step == self._total or waited
+        return step == self._total or (self.folder is not None and time.monotonic() - self._saved > self._seconds)
 
     def save(self, state: TrainingState) -> None:
         seconds = self._earlier + time.monotonic() - self._began

@@ -88,12 +88,11 @@ class StructureImporter:
         found += [f"left out: {line}" for line in left_out]
         poses = [image.T_camera_model.inverse() for image in images]
         scaled = [SE3(T.rotation, placement.scale * T.translation) for T in poses]
-        names = unique_names([shots[number].parts for number in usable])
         posed = [
             replace(
                 shots[number], name=name, T_world_camera=placement.T_target_source @ scaled[number], splits=("train",)
             )
-            for number, name in zip(usable, names, strict=True)
+            for number, name in zip(usable, unique_names([shots[number].parts for number in usable]), strict=True)
         ]
         structure = Structure(
             Capture(path, posed),

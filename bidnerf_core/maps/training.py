@@ -225,8 +225,9 @@ def settings_from(config: Any, kind: type, what: str) -> Any:
     if config is None or isinstance(config, dict):
         return from_plain(kind, config or {}, f"settings of {what}")
     if not isinstance(config, kind):
-        found = f"config is a {type(config).__name__}"
-        raise InputError(found, expected=f"a {kind.__name__} or a dict of its settings")
+        raise InputError(
+            f"config is a {type(config).__name__}", expected=f"a {kind.__name__} or a dict of its settings"
+        )
     return config
 
 
@@ -238,8 +239,9 @@ def _with_field(
     read, views = views_again(info, data, images, options.depth_points, options.point_choice, scene.folder)
     own = {camera.name for camera in info.cameras}
     if unknown := [view.frame.name for view in read.views if view.frame.name not in own]:
-        found, expected = f"image {unknown[0]!r} is none of those of {scene.name}", "images of that map"
-        raise InputError(found, where=read.where, expected=expected)
+        raise InputError(
+            f"image {unknown[0]!r} is none of those of {scene.name}", where=read.where, expected="images of that map"
+        )
     tracked, views = track_landmarks(views, info.landmark_features, True, read.depth_unit)
     bounds = estimate_bounds(views, read.background)
     info = replace(info, bounds=bounds, complete=False, hidden=read.hidden, sparse_depth=read.sparse_depth)
@@ -301,8 +303,7 @@ def resume(
                 log.info(f"{out}: ends with the {amount(info.step, 'step')} done so far")
                 field = cast(nn.Module, trained_field(scene.field)).state_dict()
                 done = replace(info, complete=True)  # the state that resuming would need is dropped
-                stored = write_parts(out, done, TrainingState(info.step, field, {}), keep=True)
-                scene = replace(scene, info=stored)
+                scene = replace(scene, info=write_parts(out, done, TrainingState(info.step, field, {}), keep=True))
             return _complete(scene, views, tracked, options, baking, out=out)
         scene, state = Map(info, NoField(), None, read_part(out, info, "landmarks"), out), None
         if info.step:

@@ -103,8 +103,7 @@ class ReadViews:
             if frame is not None and file is not None and frame.lens is None:
                 turned = frame.orientation
                 if (turned.mirrors_columns + turned.mirrors_rows + turned.transposes) % 2 == 0:
-                    orientation = None if turned == UPRIGHT else turned
-                    camera = replace(camera, file=file, orientation=orientation)
+                    camera = replace(camera, file=file, orientation=None if turned == UPRIGHT else turned)
             found.append(camera)
         return tuple(found)
 
@@ -215,8 +214,7 @@ def useful_size(frame: Frame, count: int) -> int:
     """
     most = min(MOST_BYTES, available_memory() // 4)
     longer = max(frame.intrinsics.width, frame.intrinsics.height)
-    fitting = int(longer * (most / (count * bytes_of(frame))) ** 0.5)
-    return min(USEFUL_SIDE, max(LEAST_SIDE, fitting))
+    return min(USEFUL_SIDE, max(LEAST_SIDE, int(longer * (most / (count * bytes_of(frame))) ** 0.5)))
 
 
 def _unit_of(views: Sequence[View]) -> LengthUnit:
@@ -226,8 +224,7 @@ def _unit_of(views: Sequence[View]) -> LengthUnit:
 
 def _with_depth(read: ReadViews, model: Path, choice: SparseChoice, split: str) -> ReadViews:
     """Return the views with depth from the points of a COLMAP model, and with the number of pixels that have such depth."""
-    places = [(view.frame.name, view.T_ref_camera) for view in read.views]
-    sparse = SparsePoints(model, places, choice, split)
+    sparse = SparsePoints(model, [(view.frame.name, view.T_ref_camera) for view in read.views], choice, split)
     changed = [sparse.onto(view, split) for view in read.views]
     new = [after for after, before in zip(changed, read.views, strict=True) if after is not before]
     count = sum(int((view.frame.depth > 0).sum()) for view in new if view.frame.depth is not None)

@@ -156,15 +156,15 @@ def shot_of(model: Path, image: ModelImage, file: Path | None, cameras: dict[int
     Raises ``InputError`` if its camera is missing.
     """
     if image.camera not in cameras:
-        found = f"image {image.name!r} has the camera {image.camera}, which is missing from cameras"
-        raise InputError(found, where=model)
+        raise InputError(
+            f"image {image.name!r} has the camera {image.camera}, which is missing from cameras", where=model
+        )
     name, depth = posix_name(image.name), depth_map_of(model, image.name)
-    read = None if depth is None else DepthFile(depth, partial(read_colmap_depth, depth))
     return Shot(
         image=file,
         camera=cameras[image.camera],
         T_world_camera=image.T_camera_model.inverse(),
-        depth=read,
+        depth=None if depth is None else DepthFile(depth, partial(read_colmap_depth, depth)),
         stem=name.stem,
         folders=name.parts[:-1],
     )

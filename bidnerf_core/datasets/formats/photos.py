@@ -38,7 +38,7 @@ class PhotoShot(Shot):
     def frame(self, background: Colour = BLACK, side: int | None = None) -> Frame:
         """Read the photo as ``Frame.read`` does."""
         source = self.camera if isinstance(self.camera, CameraSource) else CameraSource(self.camera)
-        frame = Frame.read(
+        return Frame.read(
             self.image,
             source,
             depth=self.depth_image,
@@ -46,8 +46,7 @@ class PhotoShot(Shot):
             sensor=self.sensor,
             background=None if self.awaits_background else background,
             largest=side,
-        )
-        return frame.replace(name=self.name)
+        ).replace(name=self.name)
 
 
 def _read(path: Path, photos: list[Path], options: DatasetOptions) -> Capture:

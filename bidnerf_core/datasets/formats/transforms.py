@@ -53,8 +53,9 @@ def _read(path: Path, files: list[Path], options: DatasetOptions) -> Capture:
     for (frame, splits), image in zip(listed, images, strict=True):
         camera = _camera(frame, size)
         if isinstance(camera, PanoramaFace) and frame.depth_path is not None:
-            expected = "none, or pinhole images with depth"
-            raise frame.record.error("an equirectangular image has depth", expected=expected)
+            raise frame.record.error(
+                "an equirectangular image has depth", expected="none, or pinhole images with depth"
+            )
         depth = frame.depth_path and names.path(frame.depth_path, moved=True)
         unit = options.depth_unit or frame.depth_unit
         masks = [MaskFile(names.path(frame.mask_path, moved=True))] if frame.mask_path else []
@@ -98,12 +99,13 @@ def _check_images(folder: Path, frames: Sequence[FrameRecord], images: Sequence[
     for frame, image in zip(frames, images, strict=True):
         other, written = owner.setdefault(image, frame), frame.record.text("file_path") or ""
         if other.file_path != frame.file_path:
-            expected = f"different images, though {other.file_path} and {frame.file_path} may both be {image}"
-            raise frame.record.error("has the image of another frame", expected=expected)
+            raise frame.record.error(
+                "has the image of another frame",
+                expected=f"different images, though {other.file_path} and {frame.file_path} may both be {image}",
+            )
         if not remarked and is_file(image) and not str(image).startswith(str(folder / written)):
             remarked = True
-            text = f"file_path {written!r} is taken for {image.relative_to(folder)}, and others likewise"
-            warn_about(folder, text)
+            warn_about(folder, f"file_path {written!r} is taken for {image.relative_to(folder)}, and others likewise")
 
 
 def _camera(frame: FrameRecord, size: tuple[int, int] | None) -> Camera | CameraSource:

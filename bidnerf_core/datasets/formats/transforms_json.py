@@ -81,8 +81,10 @@ def read_frames(file: Record) -> list[FrameRecord]:
     """
     entries = file.items("frames")
     if not entries:
-        found = "no frames" if entries is None else "frames is empty"
-        raise file.error(found, expected="a list of objects with file_path and transform_matrix")
+        raise file.error(
+            "no frames" if entries is None else "frames is empty",
+            expected="a list of objects with file_path and transform_matrix",
+        )
     unposed = {number: entry for number, entry in enumerate(entries) if _lacks_pose(entry)}
     if 0 < len(unposed) < len(entries):
         count, first = len(unposed), next(iter(unposed.values())).get("file_path")
