@@ -311,8 +311,7 @@ def _map_parts(value: Any, change: Callable[[Any], Any], whole: tuple[type, ...]
         return content if any(content[key] is not value[key] for key in value) else value
     if type(value) in (list, tuple):
         items = [_map_parts(part, change, whole) for part in value]
-        same = all(new is old for new, old in zip(items, value, strict=True))
-        return value if same else type(value)(items)
+        return value if all(new is old for new, old in zip(items, value, strict=True)) else type(value)(items)
     return value
 
 

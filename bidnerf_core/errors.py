@@ -10,25 +10,21 @@ class InputError(ValueError):
     """Raised for an input that cannot be used.
 
     The message is a single line, ``where: found, expected ...``, which can be shown to the user unchanged; its parts
-    are attributes. If ``found`` ends in a colon or a semicolon, no comma is added. ``InputError(error, where=path)``
-    adds context to ``error``: ``path`` is put before ``error.where``, and the other parts are unchanged.
+    are attributes: ``where`` is the file, frame, argument or setting that is wrong, or None if the message does not begin
+    with one; ``found`` is what was found there, or the whole problem; ``expected`` is what was expected, with any advice
+    that follows, or None if the message does not say. If ``found`` ends in a colon or a semicolon, no comma is added.
+    ``InputError(error, where=path)`` adds context to ``error``: ``path`` is put before ``error.where``, and the other
+    parts are unchanged.
     """
-
-    where: str | None
-    """The file, frame, argument or setting that is wrong, None if the message does not begin with one."""
-    found: str
-    """What was found there, or the whole problem."""
-    expected: str | None
-    """What was expected, with any advice that follows; None if the message does not say."""
 
     def __init__(self, found: object = "", *, where: object = None, expected: object = None) -> None:
         parts = [where]
         if isinstance(found, InputError):
             parts.append(found.where)
             expected, found = found.expected if expected is None else expected, found.found
-        self.where = ": ".join(str(part) for part in parts if part) or None
-        self.found = str(found)
-        self.expected = None if expected is None else str(expected)
+        self.where: str | None = ": ".join(str(part) for part in parts if part) or None
+        self.found: str = str(found)
+        self.expected: str | None = None if expected is None else str(expected)
         problem = self.found
         if self.expected is not None:
             comma = "" if problem.endswith((":", ";")) or not problem else ","

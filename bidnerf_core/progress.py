@@ -1,7 +1,8 @@
-"""Progress reports and cancellation of long-running work."""
+"""Progress reports, remarks and cancellation of long-running work."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -9,6 +10,9 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from bidnerf_core.errors import Cancelled, InputError
+
+log = logging.getLogger("bidnerf")
+"""The logger of the remarks that users see."""
 
 
 @dataclass(frozen=True)

@@ -76,10 +76,8 @@ def read_exif(path: Path) -> Exif:
             exif = image.getexif()
             tags: dict[int, Any] = {**exif, **exif.get_ifd(IFD.Exif)}
             # The length in millimetres of the resolution's unit: inch, centimetre, millimetre, micrometre.
-            units = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-            unit = units.get(tags.get(Base.FocalPlaneResolutionUnit, 2))
-            sides = (Base.ExifImageWidth, Base.ExifImageHeight)
-            width, height = (_positive(tags.get(key)) for key in sides)
+            unit = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}.get(tags.get(Base.FocalPlaneResolutionUnit, 2))
+            width, height = (_positive(tags.get(key)) for key in (Base.ExifImageWidth, Base.ExifImageHeight))
             x, y = (_positive(tags.get(k)) for k in (Base.FocalPlaneXResolution, Base.FocalPlaneYResolution))
             return Exif(
                 Orientation.from_exif(tags.get(Base.Orientation, 1)),

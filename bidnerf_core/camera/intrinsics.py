@@ -184,8 +184,7 @@ class Intrinsics:
 
     def quarter_turns(self) -> tuple[Intrinsics, ...]:
         """Return two cameras: this one turned 90 degrees to either side. Returns none for a tilted sensor (14 coefficients)."""
-        tilted = any(self.distortion[12:])
-        return () if tilted else tuple(self.upright(Orientation.from_exif(code)) for code in (6, 8))
+        return () if any(self.distortion[12:]) else tuple(self.upright(Orientation.from_exif(code)) for code in (6, 8))
 
     def centre_crop(self, width: int, height: int) -> Intrinsics:
         """Return the camera of the largest centre crop that has the aspect ratio of the given size, resized to that size."""

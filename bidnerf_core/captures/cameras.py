@@ -260,8 +260,7 @@ def cameras_beside(path: Path, placement: Similarity) -> tuple[StoredCamera, ...
         record = parse_record(str(file), b'{"cameras":' + read_file(file, INRIA_CAMERAS) + b"}")
         for entry in record.items("cameras") or []:
             width, height = entry["width"], entry["height"]
-            fx, fy = float(entry["fx"]), float(entry["fy"])
-            camera = Intrinsics(fx, fy, width / 2, height / 2, int(width), int(height))
+            camera = Intrinsics(float(entry["fx"]), float(entry["fy"]), width / 2, height / 2, int(width), int(height))
             rotation, position = (torch.tensor(entry[key], dtype=torch.float64) for key in ("rotation", "position"))
             rows = _rows(SE3(placement.T_target_source.rotation.double() @ rotation, placement.apply(position)))
             cameras.append(StoredCamera(str(entry["img_name"]), camera, rows))

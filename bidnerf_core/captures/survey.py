@@ -150,8 +150,7 @@ def link_photos(seen: TrackedKeypoints) -> csr_array:
     shared = (shows @ shows.T).tocoo()
     row, column = shared.coords
     enough = (shared.data >= 5) & (row != column)
-    links = np.ones(int(enough.sum()), bool), (row[enough], column[enough])
-    return csr_array(links, shape=(len(seen.images),) * 2)
+    return csr_array((np.ones(int(enough.sum()), bool), (row[enough], column[enough])), shape=(len(seen.images),) * 2)
 
 
 def groups(links: csr_array) -> Int[Tensor, "v"]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -50,9 +49,7 @@ from bidnerf_core.mapping import (
     resections,
     track_views,
 )
-from bidnerf_core.progress import counter
-
-log = logging.getLogger("bidnerf")
+from bidnerf_core.progress import counter, log
 
 RefinementChoice = Literal["auto", "always", "never"]
 """When to refine the given poses: ``auto`` refines them if they are inconsistent."""

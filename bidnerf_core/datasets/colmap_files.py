@@ -118,8 +118,7 @@ def depth_map_of(model: Path, name: str) -> Path | None:
     """Return the depth map of an image of a model ``WORKSPACE/sparse`` or ``WORKSPACE/sparse/0``, or None."""
     folders = (folder / "stereo/depth_maps" for folder in (model.parent, model.parent.parent))
     kinds = ("geometric", "photometric")  # the more reliable one first
-    files = (folder / f"{name}.{kind}.bin" for folder in folders for kind in kinds)
-    return next(filter(is_file, files), None)
+    return next(filter(is_file, (folder / f"{name}.{kind}.bin" for folder in folders for kind in kinds)), None)
 
 
 def read_colmap_depth(path: Path) -> DepthImage:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import logging
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,8 +18,7 @@ from bidnerf_core.frames import DEPTH_STEM, Frame, View, photos_in
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import looks_like_image
 from bidnerf_core.localization import window as windowed
-
-log = logging.getLogger("bidnerf")
+from bidnerf_core.progress import log
 
 
 @dataclass(frozen=True, eq=False)

@@ -149,8 +149,7 @@ def open_sequence(
     of images is registered if a sensor is given, and in millimetres unless a unit is given. Raises ``InputError``
     as ``DatasetOptions.open_sequence`` does.
     """
-    source = CameraSource(camera, focal, hfov, tuple(assumed))
-    return DatasetOptions(source, **options).open_sequence(path, readers)
+    return DatasetOptions(CameraSource(camera, focal, hfov, tuple(assumed)), **options).open_sequence(path, readers)
 
 
 @runtime_checkable

@@ -192,8 +192,7 @@ def read_trajectory(path: Path, times: Sequence[float] | None = None) -> Traject
         warn_about(path, f"is read as {kind}, one for each image")
         poses = SE3.stack(read_matrices(path))
         return Trajectory(torch.tensor(times, dtype=torch.float64), poses.rotation, poses.translation)
-    lines = content.decode("utf-8-sig", "replace").splitlines()
-    comments = [line for line in lines if line.lstrip().startswith("#")]
+    comments = [line for line in content.decode("utf-8-sig", "replace").splitlines() if line.lstrip().startswith("#")]
     timed = _timed_rows(rows, path, POSE, any("[ns]" in line for line in comments))
     order, known = _quaternion_order(comments, rows[0]), list[tuple[TimedRow, list[float]]]()
     for row in timed:

@@ -48,8 +48,7 @@ def write_transforms(
 def _write_view(folder: Path, split: str, view: View, background: tuple[float, float, float]) -> dict[str, Any]:
     """Write the images of a frame and return the frame's entry."""
     frame = view.frame
-    file = f"images/{split}/{frame.name}.png"
-    entry = frame_entry(file, frame.name, frame.intrinsics, view.T_ref_camera)
+    entry = frame_entry(f"images/{split}/{frame.name}.png", frame.name, frame.intrinsics, view.T_ref_camera)
     _write(folder / entry["file_path"], _colours(frame, background))
     if frame.depth is not None:
         largest = 65534  # readers interpret the largest 16-bit number as "not measured"

@@ -106,8 +106,7 @@ def _absent(values: np.ndarray, metres: np.ndarray) -> dict[str, np.ndarray]:
         absent = {"NaN": np.isnan(values), "infinite": np.isinf(values), "negative": finite & (values < 0)}
         absent |= {str(largest): values == largest, f"{clipped:g}": np.abs(values - clipped) < 1e-5}
         absent |= {f"{NOTHING:g} or more": finite & (values >= NOTHING)}
-    known = np.logical_or.reduce(list(absent.values()))
-    return absent | {f"over {FARTHEST:g} m": ~known & (metres > FARTHEST)}
+    return absent | {f"over {FARTHEST:g} m": ~np.logical_or.reduce(list(absent.values())) & (metres > FARTHEST)}
 
 
 def _at_limit(values: np.ndarray, metres: np.ndarray, unmeasured: np.ndarray) -> dict[str, np.ndarray]:

@@ -56,8 +56,7 @@ def photos_in(folder: str | Path) -> tuple[list[Path], list[Path]]:
         raise InputError("no such folder", where=folder) from error
     except OSError as error:
         raise InputError((error.strerror or str(error)).lower(), where=folder, expected="a folder of photos") from error
-    photos = [file for file in files if _is_photo(file)]
-    return photos, [file for file in files if not _is_photo(file)]
+    return [file for file in files if _is_photo(file)], [file for file in files if not _is_photo(file)]
 
 
 def _is_photo(file: Path) -> bool:

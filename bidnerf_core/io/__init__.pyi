@@ -9,6 +9,7 @@ from .files import open_binary as open_binary
 from .files import output_folder as output_folder
 from .files import read_file as read_file
 from .files import read_open_file as read_open_file
+from .files import reason as reason
 from .files import take_lock as take_lock
 from .files import usable_cores as usable_cores
 from .files import write_file as write_file
@@ -29,7 +30,6 @@ from .images import png_bytes as png_bytes
 from .images import read_compact_image as read_compact_image
 from .images import read_header as read_header
 from .images import read_image as read_image
-from .images import reason as reason
 from .images import reduce_image as reduce_image
 from .images import resample_nearest as resample_nearest
 from .images import split_alpha as split_alpha

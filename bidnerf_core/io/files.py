@@ -60,8 +60,9 @@ def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
     except PermissionError as error:
         raise InputError("permission denied", where=path, expected=f"a readable file: {expected}") from error
     except (OSError, ValueError) as error:  # a NUL in the name raises ValueError
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"cannot be opened ({reason})", where=path, expected=expected) from error
+        raise InputError(
+            f"cannot be opened ({getattr(error, 'strerror', None) or error})", where=path, expected=expected
+        ) from error
     if file is None:
         kinds = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFCHR: "a device"}
         raise InputError(f"is {kinds.get(stat.S_IFMT(mode), 'no regular file')}", where=path, expected=expected)
@@ -69,6 +70,11 @@ def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
         file.close()
         raise InputError("is a pointer of Git LFS, not the file", where=path, expected="git lfs pull")
     return file
+
+
+def reason(error: Exception) -> str:
+    """Return the first line of an error's message, or the error's type if the message is empty."""
+    return str(error).strip().partition("\n")[0][:120] or type(error).__name__
 
 
 def read_file(path: Path, expected: str, most: int = LARGEST_TEXT) -> bytes:
@@ -182,8 +188,7 @@ def available_memory() -> int:
 
 def usable_cores() -> int:
     """Return the number of cores that this process may use."""
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return usable or 1
+    return (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()) or 1
 
 
 @contextlib.contextmanager
@@ -206,8 +211,11 @@ def output_folder(
             raise InputError("is a file", where=out, expected="the name of a folder")
         files = out.iterdir() if out.is_dir() and not overwrite else ()
         if not all(is_temporary(file.name) or is_leftover(file) for file in files):
-            what = described(out) or "exists already and is not empty"
-            raise InputError(f"{what}; name another folder, or overwrite it (--overwrite)", where=out)
+            raise InputError(
+                f"{described(out) or 'exists already and is not empty'}; name another folder, or overwrite it"
+                " (--overwrite)",
+                where=out,
+            )
 
     @contextlib.contextmanager
     def removed_on_failure() -> Iterator[None]:

@@ -19,7 +19,7 @@ from PIL import Image, TiffImagePlugin, UnidentifiedImageError, WebPImagePlugin 
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import PackedFile, open_binary
+from bidnerf_core.io.files import PackedFile, open_binary, reason
 
 Background: TypeAlias = str | Sequence[float]
 """A background as users give it: "white", "black" or an rgb triple in [0, 1]."""
@@ -227,8 +227,7 @@ def _strips(path: ImageSource, image: Image.Image) -> Iterator[tuple[np.ndarray,
 
 def _is_deep(image: Image.Image) -> bool:
     """Return whether an open image has 16 bits per channel; Pillow reduces images with several such channels to 8 bits."""
-    is_grey = image.mode.startswith("I;16") or (image.format == "PNG" and image.mode == "I")
-    return is_grey or _is_deep_colour(image)
+    return image.mode.startswith("I;16") or (image.format == "PNG" and image.mode == "I") or _is_deep_colour(image)
 
 
 def _is_deep_colour(image: Image.Image) -> bool:
@@ -291,8 +290,8 @@ def open_image(path: ImageSource) -> Iterator[Image.Image]:
         try:
             with Image.open(file, formats=[name for name in FORMATS if name in Image.OPEN]) as image:
                 if image.width * image.height > LARGEST_IMAGE:
-                    megapixels = image.width * image.height / 1e6
-                    raise _too_large(path, f"{image.width}x{image.height}, {megapixels:.0f} megapixels")
+                    size = f"{image.width}x{image.height}, {image.width * image.height / 1e6:.0f} megapixels"
+                    raise _too_large(path, size)
                 yield image
         except InputError:
             raise
@@ -352,12 +351,6 @@ def looks_like_image(path: Path) -> bool:
         return False
     first = rb"(?s)\x89PNG\r\n|\xff\xd8\xff|II\*\0|MM\0\*|GIF8|RIFF....WEBP|BM....\0\0\0\0|....ftypavi[fs]"
     return re.match(first, head) is not None or is_heif(head)
-
-
-def reason(error: Exception) -> str:
-    """Return the first line of a decoder's message, or the error's type if the message is empty."""
-    text = str(error).strip()
-    return text.splitlines()[0][:120] if text else type(error).__name__
 
 
 def png_bytes(pixels: Shaped[np.ndarray, "h w *channels"]) -> bytes:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar, cast
 
 from bidnerf_core.errors import InputError, spelling_hint
-from bidnerf_core.io.files import read_file
+from bidnerf_core.io.files import read_file, reason
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
@@ -64,11 +64,12 @@ def parse_json(content: bytes | str, where: str, expected: str) -> Any:
         found = json.loads(text)
         if "\\ud" in text.lower():  # half of a surrogate pair, which no file or terminal can represent
             json.dumps(found, ensure_ascii=False).encode()
+    except json.JSONDecodeError as error:
+        raise InputError(
+            f"not JSON ({error.msg} at line {error.lineno}, column {error.colno})", where=where, expected=expected
+        ) from error
     except (ValueError, RecursionError) as error:
-        reason = str(error)
-        if isinstance(error, json.JSONDecodeError):
-            reason = f"{error.msg} at line {error.lineno}, column {error.colno}"
-        raise InputError(f"not JSON ({reason})", where=where, expected=expected) from error
+        raise InputError(f"not JSON ({error})", where=where, expected=expected) from error
     return found
 
 
@@ -344,5 +345,4 @@ def parse_yaml(content: bytes, where: str, expected: str) -> Any:
                 raise yaml.YAMLError(f"aliases, or more than {deepest} lists and mappings within each other")
         return next(iter(yaml.load_all(text, Loader=loader)), None)
     except (UnicodeDecodeError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"is not YAML ({reason})", where=where, expected=expected) from error
+        raise InputError(f"is not YAML ({reason(error)})", where=where, expected=expected) from error

@@ -24,7 +24,7 @@ from torch.utils._pytree import tree_leaves
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.io.archives import Archive
-from bidnerf_core.io.files import open_binary
+from bidnerf_core.io.files import open_binary, reason
 
 _Part = TypeVar("_Part")
 
@@ -42,8 +42,7 @@ def read_array(path: Path, expected: str) -> np.ndarray:
         try:
             return _array(file, os.fstat(file.fileno()).st_size)
         except Exception as error:  # NumPy parses the header as Python, which may raise anything
-            reason = str(error).strip().partition("\n")[0][:120] or type(error).__name__
-            raise InputError(f"not readable as an array ({reason})", where=path, expected=expected) from error
+            raise InputError(f"not readable as an array ({reason(error)})", where=path, expected=expected) from error
 
 
 def _array(file: BinaryIO | io.BytesIO, size: int) -> np.ndarray:
@@ -129,13 +128,25 @@ def load_part(path: Path, make: Callable[[dict[str, Tensor]], _Part], what: str,
     try:
         return make(tensors)
     except (KeyError, ValueError) as error:
-        why = f"no tensor {error}" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"not {what} ({why})", where=path, expected=expected) from error
+        raise InputError(
+            f"not {what} ({'no tensor ' if isinstance(error, KeyError) else ''}{error})", where=path, expected=expected
+        ) from error
 
 
 def pack_tensors(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return contiguous copies of ``tensors`` on the CPU, as safetensors requires."""
     return {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+
+
+IGNORED = (
+    "numpy._core.multiarray.scalar",
+    "numpy.core.multiarray.scalar",
+    "numpy.dtypes.Float64DType",
+    "numpy.dtypes.Float32DType",
+    "numpy.dtype",
+    "_codecs.encode",
+)
+"""What a saved NumPy number calls; in its place, ``_Ignored`` is made."""
 
 
 class _Ignored:
@@ -166,21 +177,19 @@ def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
             expected=f"{expected} that is not compressed, as torch.save writes it",
         )
     try:
-        arrays = [f"numpy.{core}.multiarray.scalar" for core in ("_core", "core")]
-        kinds = [f"numpy.dtypes.Float{bits}DType" for bits in (64, 32)]
-        names = [*arrays, *kinds, "numpy.dtype", "_codecs.encode"]
-        with torch.serialization.safe_globals([(_Ignored, name) for name in names]):
+        with torch.serialization.safe_globals([(_Ignored, name) for name in IGNORED]):
             content = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped and archive is not None)
     except Exception as error:  # each kind of damage raises a different exception
         code = re.search(r"GLOBAL ([\w.]+)", str(error))  # how torch names what a file tried to call
-        if isinstance(error, pickle.UnpicklingError) and code:
-            found = f"would run code ({code[1]}) and was not read"
-        else:
-            found = f"not written by torch.save, or damaged ({type(error).__name__});"
-        raise InputError(found, where=path, expected=expected) from error
-    for tensor in () if mapped else tree_leaves(content):  # those that stay in the file take no memory
-        if not isinstance(tensor, Tensor):
-            continue
+        raise InputError(
+            f"would run code ({code[1]}) and was not read"
+            if isinstance(error, pickle.UnpicklingError) and code
+            else f"not written by torch.save, or damaged ({type(error).__name__});",
+            where=path,
+            expected=expected,
+        ) from error
+    tensors = (leaf for leaf in tree_leaves(content) if isinstance(leaf, Tensor))
+    for tensor in () if mapped else tensors:  # those that stay in the file take no memory
         needed = tensor.numel() * tensor.element_size()
         stored = tensor.untyped_storage().nbytes() if tensor.layout is torch.strided else 0
         if needed > min(stored, size):

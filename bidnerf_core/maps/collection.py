@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -32,9 +31,7 @@ from bidnerf_core.mapping import LandmarkMap, Vocabulary, detect, find_features,
 from bidnerf_core.maps.description import DESCRIPTION, cameras_of, load_info
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.maps.store import read_part
-from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context
-
-log = logging.getLogger("bidnerf")
+from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context, log
 
 _Scene = TypeVar("_Scene", bound=Map | str | Path)
 

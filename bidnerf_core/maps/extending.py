@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import logging
 import math
 from collections.abc import Container, Sequence
 from dataclasses import replace
@@ -47,9 +46,7 @@ from bidnerf_core.maps.map import USUAL_BAKE, Map, load_map
 from bidnerf_core.maps.store import with_tracks_in
 from bidnerf_core.maps.training import TrainOptions, train_field
 from bidnerf_core.maps.views import Images, views_again
-from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context
-
-log = logging.getLogger("bidnerf")
+from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context, log
 
 NewPhotos: TypeAlias = Sequence[Frame] | Sequence[View] | Capture | str | Path
 """Photos to add: frames, views, a dataset or the path to one, or the path to a photo or a folder of photos.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import math
 import os
 import warnings
@@ -43,11 +42,9 @@ from bidnerf_core.maps.map import Map
 from bidnerf_core.maps.store import build_frozen_field, map_folder, write_parts
 from bidnerf_core.maps.training import MapOptions, bake_if_possible, bake_settings, settings_from
 from bidnerf_core.maps.views import USEFUL_SIDE, Images, Origin, ReadViews, choose_origin, read_views
-from bidnerf_core.progress import Cancel, ProgressCallback, job_context
+from bidnerf_core.progress import Cancel, ProgressCallback, job_context, log
 from bidnerf_core.settings import Above
 from bidnerf_core.training import TrainingState
-
-log = logging.getLogger("bidnerf")
 
 CAMERA = Intrinsics.from_hfov(70.0, 192, 192)
 VIEWS = 48
@@ -324,8 +321,7 @@ def viewpoints(
     although rays hit nothing there. The result is deterministic.
     """
     generator = torch.Generator().manual_seed(0)
-    lower, size = torch.tensor(bounds.lower), torch.tensor(bounds.size)
-    places = lower + size * torch.rand((400, 3), generator=generator)
+    places = torch.tensor(bounds.lower) + torch.tensor(bounds.size) * torch.rand((400, 3), generator=generator)
     distance = _distances(field, bounds, places)
     hit = distance > 0
     nearest = torch.where(hit, distance, torch.inf).quantile(0.1, dim=1)  # exceeded by nine out of ten rays

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import math
 import time
 from collections.abc import Sequence
@@ -70,10 +69,8 @@ from bidnerf_core.maps.store import (
 )
 from bidnerf_core.maps.summary import MapSummary
 from bidnerf_core.maps.views import Images, views_again
-from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context
+from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context, log
 from bidnerf_core.training import TrainingState
-
-log = logging.getLogger("bidnerf")
 
 USUAL_BAKE = BakeConfig()
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import logging
 import math
 import os
 import re
@@ -48,10 +47,8 @@ from bidnerf_core.mapping import (
     surface_tensors,
 )
 from bidnerf_core.maps.description import ANCHOR, DESCRIPTION, PART_NAMES, MapInfo, load_info
-from bidnerf_core.progress import Progress, current_job
+from bidnerf_core.progress import Progress, current_job, log
 from bidnerf_core.training import TrainingState, TrainingStep
-
-log = logging.getLogger("bidnerf")
 
 NEEDED = "a safetensors file, without which the map is incomplete"
 BAKED = "a safetensors file, which 'bidnerf bake' can recreate"

@@ -6,7 +6,6 @@ Landmarks are built first: they can localize images without a field, and remain 
 from __future__ import annotations
 
 import contextlib
-import logging
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -52,18 +51,10 @@ from bidnerf_core.maps.store import (
     write_parts,
 )
 from bidnerf_core.maps.views import Images, ReadViews, choose_origin, read_views, views_again
-from bidnerf_core.progress import (
-    Cancel,
-    ProgressCallback,
-    counter,
-    duration_text,
-    job_context,
-)
+from bidnerf_core.progress import Cancel, ProgressCallback, counter, duration_text, job_context, log
 from bidnerf_core.registry import USUAL_BACKEND, USUAL_POSER, PluginError
 from bidnerf_core.settings import NotNegative, Settings
 from bidnerf_core.training import TrainingState, TrainingStopped
-
-log = logging.getLogger("bidnerf")
 
 
 @dataclass(frozen=True)

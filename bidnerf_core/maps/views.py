@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 import sys
@@ -39,9 +38,7 @@ from bidnerf_core.frames import (
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import available_memory, background_colour
 from bidnerf_core.maps.description import MapInfo
-from bidnerf_core.progress import counter
-
-log = logging.getLogger("bidnerf")
+from bidnerf_core.progress import counter, log
 
 Images: TypeAlias = Capture | Sequence[View] | str | Path
 """Images with poses: a dataset, the path to one, or views whose reference frame is the world."""

@@ -37,10 +37,9 @@ class PhotoShot(Shot):
 
     def frame(self, background: Colour = BLACK, side: int | None = None) -> Frame:
         """Read the photo as ``Frame.read`` does."""
-        source = self.camera if isinstance(self.camera, CameraSource) else CameraSource(self.camera)
         return Frame.read(
             self.image,
-            source,
+            self.camera if isinstance(self.camera, CameraSource) else CameraSource(self.camera),
             depth=self.depth_image,
             depth_unit=self.depth_unit,
             sensor=self.sensor,
